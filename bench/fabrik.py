@@ -20,10 +20,11 @@ from common.arrays import Float
 from common.calibration import FilterCalibration, RigCalibration
 from common.hand_model import FINGER_JOINTS
 from common.messages import HandPose, MarkerDetections
+from master.estimator.cameras import CameraArrays
+from master.fabrik.intersection import triangulate
 from master.rig import RigSetup, build_pipeline, load_setup
 from master.rig_pipeline import line_of
 from master.stages import StageTimes
-from master.stereo.triangulate import Triangulator
 
 ROOT = Path(__file__).resolve().parents[1]
 SECONDS, SEED = 10.0, 7
@@ -121,7 +122,7 @@ def _law_rows(desk: RigSetup) -> Iterator[Row]:
             seen = ((uv > 0.0) & (uv < [cameras[0].width_px, cameras[0].height_px])).all(axis=(0, 2))
             uv = uv + rng.normal(0.0, noise_px, uv.shape)
             by_law = line.triangulate(uv, np.full((2, count), 0.1), nothing, None, 0.0, as_seen=True).points_m
-            by_rays = Triangulator.of(cameras).triangulate(uv, 0.1).points
+            by_rays = triangulate(CameraArrays.of(cameras), uv, 0.1).points_m
             off.append((by_law - by_rays)[seen, 2])
             inside.append(some[seen, 2])
         mm = 1e3 * np.concatenate(off)

@@ -18,10 +18,11 @@ from bench.row import Row, median_us
 from common.camera_model import CameraModel
 from common.geometry import axis_rotation, rigid
 from common.hand_model import HandModel
+from master.estimator.cameras import CameraArrays
 from master.fabrik.fabrik import Fabrik
 from master.fabrik.finger import Finger, FingerSolver
+from master.fabrik.intersection import triangulate
 from master.fabrik.rotations import Vector
-from master.stereo.triangulate import Triangulator
 
 HANDS = 2000
 _SEED = 2
@@ -140,8 +141,9 @@ def _triangulation_row() -> Row:
     matrix = np.array([[503.0, 0.0, 319.5], [0.0, 503.0, 239.5], [0.0, 0.0, 1.0]])
     lens = np.array([0.105, -0.21, 0.0006, -0.0009, 0.05])
     poses = [rigid(axis_rotation(1, -0.4 * x), np.array([x, 0.0, 0.0])) for x in (0.0, 0.075)]
-    rig = Triangulator.of([CameraModel(matrix, lens, pose, 640, 480, 0.0) for pose in poses])
+    cameras = [CameraModel(matrix, lens, pose, 640, 480, 0.0) for pose in poses]
+    arrays = CameraArrays.of(cameras)
     points = np.random.default_rng(4).uniform([-0.15, -0.15, 0.45], [0.15, 0.15, 0.8], (6, 3))
-    uv = np.stack([camera.project(points) for camera in rig.cameras])
-    one, spread = median_us(lambda: rig.triangulate(uv))
+    uv = np.stack([camera.project(points) for camera in cameras])
+    one, spread = median_us(lambda: triangulate(arrays, uv))
     return Row("triangulation with covariance, 6 markers, 2 cameras", one, "us", f"± {spread:.3g}; goal 150")

@@ -1,7 +1,7 @@
 """Two cameras that nobody synchronised, and markers that cross in front of them: exact projections, row by row.
 
 The rig is the desk's: 75 mm apart, 497 px, lenses that distort. The second camera runs late by any offset; a marker is
-seen when its own row is exposed, as the mean over the exposure, with noise. What `FrameSync` and `Triangulator` make of
+seen when its own row is exposed, as the mean over the exposure, with noise. What `FrameSync` and `triangulate` make of
 the messages is held against the exact place at the moment of each instant.
 """
 
@@ -16,9 +16,10 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 from common.messages import MarkerDetections
+from master.estimator.cameras import CameraArrays
+from master.fabrik.intersection import triangulate
 from master.fabrik.sync import FrameSet, FrameSync
 from master.rig import load_setup
-from master.stereo.triangulate import Triangulator
 
 CALIBRATION = Path(__file__).resolve().parents[1] / "calib_json"
 DEPTH_M, SPEED_M_S = 0.5, 1.0
@@ -138,7 +139,7 @@ class Outcome:
 def outcome(motion: Making, shooting: Shooting, treatment: Treatment, seeds: range) -> Outcome:
     """Errors over all markers, instants and seeds."""
     cameras = load_setup(CALIBRATION, "desk").models
-    triangulator = Triangulator.of(tuple(cameras.values()))
+    arrays = CameraArrays.of(tuple(cameras.values()))
     depth: list[Float] = []
     across: list[Float] = []
     chi2: list[Float] = []
@@ -147,13 +148,13 @@ def outcome(motion: Making, shooting: Shooting, treatment: Treatment, seeds: ran
         rng = np.random.default_rng(seed)
         moving = motion(rng)
         for instant, wait_s in _instants(cameras, moving, shooting, treatment, rng):
-            found = triangulator.triangulate(instant.uv, instant.sigma_px)
+            found = triangulate(arrays, instant.uv, instant.sigma_px)
             truth = moving(np.full(MARKERS, (instant.t_ns - START_NS) * 1e-9))
-            ok = np.isfinite(found.points[:, 0])
-            error = (found.points - truth)[ok]
+            ok = np.isfinite(found.points_m[:, 0])
+            error = (found.points_m - truth)[ok]
             depth.append(100.0 * error[:, 2] / truth[ok, 2])
             across.append(1e3 * np.hypot(error[:, 0], error[:, 1]))
-            chi2.append(np.einsum("mi,mij,mj->m", error, np.linalg.inv(found.covariance[ok]), error))
+            chi2.append(np.einsum("mi,mij,mj->m", error, np.linalg.inv(found.cov_m2[ok]), error))
             waited.append(wait_s)
     return Outcome(np.concatenate(depth), np.concatenate(across), np.concatenate(chi2), np.array(waited))
 

@@ -11,10 +11,13 @@ from common.arrays import Float
 from common.errors import CalibrationError
 from common.geometry import cross
 from common.messages import Detections
+from master.fabrik.caps import CapTables
 from master.fabrik.compile import log_if_slow
-from master.fabrik.depth import LAW_MISFIT, depth_law, law_contradicts, law_misfit
+from master.fabrik.depth import LAW_MISFIT, CalibrationResidual, depth_law, law_contradicts, law_misfit
+from master.fabrik.intersection import RAYS, limits_of
 from master.fabrik.one_euro import OneEuroParameters, PointFilter
 from master.fabrik.palm import PalmFitter
+from master.fabrik.rays import RayTriangulator
 from master.fabrik.solver import FabrikSolver
 from master.fabrik.sync import FrameSync
 from master.fabrik.triangulate import DepthTriangulator, Triangulate, disparity_tables
@@ -25,9 +28,8 @@ from master.ik.tracker import HandTracker
 from master.rig_setup import RigSetup
 from master.stereo.caps import CapModel
 from master.stereo.locate import CapLocator
-from master.stereo.misfit import RIG_PX, limits
 from master.stereo.pipeline import MarkerPipeline, OtherSensors, SolvedPose, Stage
-from master.stereo.place import CalibrationResidual, Placement
+from master.stereo.place import Placement
 from master.wrist.pipeline import WristPipeline
 
 _MOUNTED_RAD = np.radians(0.5)  # standard deviation of the pitch of cameras mounted by eye
@@ -83,11 +85,13 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
     """
     rig, cameras = setup.rig, tuple(setup.models.values())
     rates = {name: setup.cameras[name].frame_rate_hz for name in setup.models}
-    caps, residual = CapModel(setup.hand, rig.markers), CalibrationResidual.of(rig)
+    residual = CalibrationResidual.of(rig)
     law = depth_law(rig, cameras)
     triangulate: Triangulate
-    if law is None:
-        triangulate = CapLocator(cameras, caps, Placement(cameras, residual))
+    if law is None and rig.solver == "fabrik":
+        triangulate = RayTriangulator(cameras, CapTables.of(setup.hand, rig.markers), residual.rays_px)
+    elif law is None:
+        triangulate = CapLocator(cameras, CapModel(setup.hand, rig.markers), Placement(cameras, residual))
     else:
         if contradiction := law_contradicts(rig, cameras):
             raise CalibrationError(
@@ -96,9 +100,9 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
             )
         off, _ = law_misfit(law, cameras, rig.volume)
         tilt_px = 0.0 if off <= LAW_MISFIT else float(cameras[0].matrix[1, 1]) * _MOUNTED_RAD
-        row_px = hypot(sqrt(2.0) * RIG_PX, tilt_px)
-        tables = disparity_tables(cameras, law, residual.law, row_px, float(limits(2)[2]))
-        triangulate = DepthTriangulator(tables, caps)
+        row_px = hypot(sqrt(2.0) * RAYS.rig_px, tilt_px)
+        tables = disparity_tables(cameras, law, residual.law, row_px, float(limits_of(2)[2]))
+        triangulate = DepthTriangulator(tables, CapTables.of(setup.hand, rig.markers))
     line = FabrikSolver(
         setup.models,
         setup.hand,

@@ -13,7 +13,8 @@ from common.geometry import rigid
 from common.hand_model import CHAINS, HandJoints, HandModel
 from common.hand_profiles import generated_profile
 from common.messages import MarkerDetections
-from master.stereo.caps import CapModel
+from master.fabrik.cap_views import seen_shift
+from master.fabrik.caps import CapTables
 
 MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
 RIGHT = HandModel.of(generated_profile("made-right", "right"))
@@ -96,12 +97,38 @@ def camera_models(rig: RigCalibration, row_time_us: float = 0.0) -> dict[str, Ca
     }
 
 
+def cap_views(
+    model: HandModel,
+    markers: tuple[str, ...],
+    joints: HandJoints,
+    points: Float,
+    cameras: tuple[CameraModel, ...],
+) -> tuple[Float, Float]:
+    """Seen centroid less the caps' own (C, M, 2) [px], and the area that whole caps show (C, M) [m^2]; 0 where flat."""
+    caps, shift = CapTables.of(model, markers), np.empty(3)
+    bias, whole = np.zeros((len(cameras), len(markers), 2)), np.zeros((len(cameras), len(markers)))
+    for c, camera in enumerate(cameras):
+        for m, point in enumerate(points):
+            if (row := int(caps.row[m])) < 0 or np.isnan(point).any():
+                continue
+            ahead = -np.ascontiguousarray(joints.rotation[caps.joint[row], :, 2])
+            back = (camera.centre - point) / np.linalg.norm(camera.centre - point)
+            whole[c, m] = seen_shift(caps, row, ahead, back, shift)
+            bias[c, m] = camera.project(point + shift) - camera.project(point)
+    return bias, whole
+
+
+def cap_bias_px(joints: HandJoints, points: Float, cameras: tuple[CameraModel, ...]) -> Float:
+    """Seen centroid less the caps' own (C, 6, 2) [px] of the hand `RIGHT`."""
+    return cap_views(RIGHT, MARKERS, joints, points, cameras)[0]
+
+
 def cap_areas_px2(joints: HandJoints, models: tuple[CameraModel, ...]) -> Float:
     """Areas (C, 6) that cameras see of whole caps, which differ with the side they see; flat markers have 400 px."""
-    caps, points = CapModel(RIGHT, MARKERS), RIGHT.marker_points(joints, MARKERS)
-    shown = caps.look(caps.tilted(joints, np.zeros((5, 3, 3)))[:1], points, models).whole_m2[0]
+    points = RIGHT.marker_points(joints, MARKERS)
+    shown = cap_views(RIGHT, MARKERS, joints, points, models)[1]
     scale = [m.matrix[0, 0] / np.linalg.norm(points - m.centre, axis=1) for m in models]
-    return np.where(caps.on_finger, shown * np.square(scale), 400.0)
+    return np.where(CapTables.of(RIGHT, MARKERS).row >= 0, shown * np.square(scale), 400.0)
 
 
 def detections(

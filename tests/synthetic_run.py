@@ -9,8 +9,7 @@ from common.calibration import RigCalibration
 from common.hand_model import HandJoints
 from common.messages import MarkerDetections
 from master.rig import RigSetup
-from master.stereo.caps import CapModel
-from tests.hand_helpers import MARKERS, RIGHT, camera_file, detections, palm, rig_file
+from tests.hand_helpers import MARKERS, RIGHT, camera_file, cap_bias_px, detections, palm, rig_file
 
 PERIOD_NS = 16_666_667
 ROW_TIME_US = 20.6
@@ -45,9 +44,8 @@ def setup_of(rig: RigCalibration) -> RigSetup:
 def synthetic_run(frames: int = 40, **changes: object) -> SyntheticRun:
     """Two cameras at 60 Hz, the right one 5 ms late, rolling shutters."""
     setup = setup_of(rig_file(**changes))  # pyright: ignore[reportArgumentType]
-    caps = CapModel(RIGHT, MARKERS)
     messages: list[MarkerDetections] = []
-    for c, (name, camera) in enumerate(setup.models.items()):
+    for name, camera in setup.models.items():
         for seq in range(frames):
             t_ns = 1_000_000_000 + seq * PERIOD_NS + LATE_NS[name]
             uv = np.full((6, 2), 240.0)
@@ -56,9 +54,7 @@ def synthetic_run(frames: int = 40, **changes: object) -> SyntheticRun:
                 for m in range(6):
                     joints = hand_at(t_ns * 1e-9 + ROW_TIME_US * 1e-6 * float(uv[m, 1]))
                     points = RIGHT.marker_points(joints, MARKERS)
-                    seen = (
-                        camera.project(points) + caps.bias_px(joints, points, tuple(setup.models.values()))[c]
-                    )
+                    seen = camera.project(points) + cap_bias_px(joints, points, (camera,))[0]
                     rows.append(seen[m])
                 uv = np.stack(rows)
             messages.append(detections(name, seq, t_ns, uv))

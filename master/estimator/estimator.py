@@ -30,7 +30,7 @@ from master.estimator.update import (
     Workspace,
     epoch,
 )
-from master.fabrik.cap_views import CapTables
+from master.fabrik.caps import CapTables
 from master.fabrik.estimate import SolvedHand
 from master.ik.attached import Attached
 

@@ -22,7 +22,7 @@ from common.kernels import inlined, kernel
 from master.estimator.cameras import CameraArrays, project
 from master.estimator.kinematics import Scratch
 from master.estimator.matrices import inverse_3
-from master.fabrik.cap_views import CapTables
+from master.fabrik.caps import CapTables
 
 _POLE = 0.05  # least sine of the angle between finger and sight of the slopes of the tables
 _BEHIND = 1e4  # half chi square of a marker behind a camera that sees it

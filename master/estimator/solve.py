@@ -30,7 +30,7 @@ from master.estimator.kinematics import (
 from master.estimator.matrices import cholesky, copy, substitute
 from master.estimator.priors import Habits
 from master.estimator.residuals import Observations, marker_rows
-from master.fabrik.cap_views import CapTables
+from master.fabrik.caps import CapTables
 
 MAX_ITERATIONS = 25
 _FIRST_DAMPING, _MOST_DAMPING = 1e-3, 1e6

@@ -7,13 +7,13 @@ Kalbfleisch measures u_left - u_right [px] on the images as they are, not rectif
     affine    x = a / D + x0                              fitted; a = f B, x0 = yaw misalignment as disparity
 
 Every law maps both ways and gives its own sensitivity |dD/dx|, of which the error budget is made. The full
-stereo model is `master.stereo.triangulate`.
+stereo model is `master.fabrik.rays`.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from math import isfinite, pi, tan
+from math import isfinite, pi, sqrt, tan
 from typing import Protocol
 
 import numpy as np
@@ -270,3 +270,34 @@ def error_budget(
 def tolerable_skew_s(share: float, baseline_m: float, speed_m_s: float) -> float:
     """Time between the two exposures [s] that costs `share` of the depth at a sideways speed: share B / v, any D."""
     return share * baseline_m / speed_m_s
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationResidual:
+    """What a calibration is known to leave, as its provenance says.
+
+    Attributes:
+        rays_px: RMS reprojection error of the cameras together [px]: a bound on what lens and pose are wrong by at one
+            place. How much of it was the noise of the corners cannot be told afterwards.
+        law: Relative error of the depth law, standard deviation.
+    """
+
+    rays_px: float = 0.0
+    law: float = 0.0
+
+    @classmethod
+    def of(cls, rig: RigCalibration) -> "CalibrationResidual":
+        """What the rig's file states; 0 where it states nothing, as for files typed in by hand."""
+        rays = rig.provenance.get("T_rig_camera")
+        law = None if rig.depth_model == "stereo" else rig.provenance.get(rig.depth_model)
+        left = {} if law is None else law.residual
+        mean_percent = left.get("leave_one_out_mean_percent", left.get("mean_percent", 0.0))
+        return cls(
+            rays_px=0.0 if rays is None else rays.residual.get("rms_px", 0.0),
+            law=1e-2
+            * mean_percent
+            * sqrt(pi / 2),  # of a mean of absolute errors that are normally distributed
+        )
+
+
+EXACT = CalibrationResidual()

@@ -12,7 +12,7 @@ before the law is asked. On the axis, and for parallel cameras without distortio
 which the right camera must see the marker is tabulated: a marker whose rows disagree is two things, and dropped.
 
 A camera sees the side of a painted finger tip that faces it, so the centroid is up to half a radius off that of the
-cap; by how much follows from the direction in which the finger pointed a moment ago (`master.stereo.caps`).
+cap; by how much follows from the direction in which the finger pointed a moment ago (`master.fabrik.caps`).
 
 Covariance by the derivatives: along the sight |dD/dx| sigma_x, across it D sigma_u / f, and what the law's fit left;
 and by how far the point moves where the finger points elsewhere within one standard deviation.
@@ -26,10 +26,10 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 from common.kernels import kernel
-from master.fabrik.cap_views import CapTables, hidden_part, seen_shift
+from master.fabrik.cap_views import hidden_part, seen_shift
+from master.fabrik.caps import CAPS, CapTables
 from master.fabrik.depth import AffineDisparity, PowerLaw, disparity_on_axis
 from master.fabrik.estimate import MarkerPositions, SolvedHand
-from master.stereo.caps import CapModel
 
 GRID = 48  # cells of the table along each side of the image
 _DEPTHS_M = np.array([0.35, 0.45, 0.6, 0.8, 1.1])
@@ -38,8 +38,6 @@ _ANYHOW_RAD = (
     1.0  # standard deviation of the direction of a finger that shows its end, from that to the cameras
 )
 _ANYHOW_M2 = (4e-3) ** 2  # of a cap's seen centroid while nothing tells where the finger points
-_RELIEF_M2 = (0.4e-3) ** 2  # a flat marker on a back that is not flat
-_RADIUS = 0.1  # relative error of a profile's radii
 
 
 class DisparityTables(NamedTuple):
@@ -263,7 +261,8 @@ def triangulate(
     """
     ray, point, off, aim = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     bias, shown, tilted = np.empty((2, 2)), np.empty(2), np.empty((2, 3))
-    whole, variance, by = np.empty(2), np.empty(2), np.empty((3, 3))
+    whole, variance, by = np.empty((1, 2)), np.empty(2), np.empty((3, 3))
+    seen_px2, scale_m = np.empty(2), np.empty(2)
     for m in range(uv.shape[1]):
         points[m, :] = np.nan
         cov[m, :, :] = np.nan
@@ -271,14 +270,14 @@ def triangulate(
         apart[m] = False
         if not np.isfinite(uv[0, m, 0] + uv[0, m, 1] + uv[1, m, 0] + uv[1, m, 1]):
             continue
-        whole[:] = 0.0
+        whole[0, 0] = whole[0, 1] = 0.0
         row = caps.row[m]
         known = row >= 0 and np.isfinite(ahead[m, 0])
         z, rows = place_centroids(tables, uv[0, m, 0], uv[0, m, 1], uv[1, m, 0], uv[1, m, 1], ray, point)
         if not np.isfinite(z):
             continue
         if known:
-            cap_bias(tables, caps, row, ahead[m], point, bias, whole)
+            cap_bias(tables, caps, row, ahead[m], point, bias, whole[0])
             for k in range(3):
                 aim[k] = point[k]
             z, rows = place_centroids(
@@ -293,7 +292,7 @@ def triangulate(
             if not np.isfinite(z):  # so near that what is seen of the cap is no disparity
                 continue
             for k in range(3):
-                by[k, 0] = _RADIUS * (point[k] - aim[k])
+                by[k, 0] = CAPS.radius_share * (point[k] - aim[k])
             for a in range(3):
                 points[m, a] = point[a]
                 for b in range(3):
@@ -308,7 +307,7 @@ def triangulate(
                     aim[k] /= sqrt(length)
                 cap_bias(tables, caps, row, aim, point, bias, shown)
                 for c in range(2):
-                    whole[c] = max(whole[c], shown[c])
+                    whole[0, c] = max(whole[0, c], shown[c])
                 off[:] = np.nan
                 place_centroids(
                     tables,
@@ -323,13 +322,14 @@ def triangulate(
                     for b in range(3):
                         cov[m, a, b] += (off[a] - points[m, a]) * (off[b] - points[m, b])
         else:
-            spread2 = _ANYHOW_M2 if row >= 0 else _RELIEF_M2
+            spread2 = _ANYHOW_M2 if row >= 0 else CAPS.relief_m**2
             for a in range(3):
                 points[m, a] = point[a]
                 for b in range(3):
                     cov[m, a, b] = spread2 if a == b else 0.0
-        radius = float(caps.radius_m[row]) if row >= 0 else 0.0
-        hidden_part(area_px2[:, m], z / tables.focal_px, whole, radius, variance)
+        for c in range(2):
+            seen_px2[c], scale_m[c] = area_px2[c, m], z / tables.focal_px[c]
+        hidden_part(caps, row, seen_px2, scale_m, whole, 1, variance)
         rows2 = tables.row_sigma_px * tables.row_sigma_px + sigma_px[0, m] ** 2 + sigma_px[1, m] ** 2
         if rows * rows > tables.row_limit * (rows2 + variance[0] + variance[1]):
             points[m, :] = np.nan
@@ -349,7 +349,7 @@ def triangulate(
                     left2 * (by[a, 0] * by[b, 0] + by[a, 1] * by[b, 1]) + right2 * by[a, 2] * by[b, 2]
                 )
                 cov[m, a, b] += noise[m, a, b] + law2 * ray[a] * ray[b]
-        # A point is placed with its covariance, and where its depth is determined (`master.stereo.triangulate`).
+        # A point is placed with its covariance, and where its depth is determined (`master.fabrik.rays`).
         if not 4.0 * (cov[m, 0, 0] + cov[m, 1, 1] + cov[m, 2, 2]) < z * z or not np.isfinite(cov[m].sum()):
             points[m, :] = np.nan
             cov[m, :, :] = np.nan
@@ -387,9 +387,9 @@ class Triangulate(Protocol):
 class DepthTriangulator:
     """Triangulates the markers of a rig by its depth law. Holds no state."""
 
-    def __init__(self, tables: DisparityTables, caps: CapModel) -> None:
+    def __init__(self, tables: DisparityTables, caps: CapTables) -> None:
         """Triangulate these markers with this pair."""
-        self._tables, self._caps, self._views = tables, caps, CapTables.of(caps)
+        self._tables, self._caps = tables, caps
 
     def __call__(
         self,
@@ -407,8 +407,8 @@ class DepthTriangulator:
         if hand is not None:
             ahead, tilt = self._caps.pointing(hand, age_s)
         elif not as_seen:
-            ahead[self._caps.on_finger], tilt[:] = -self._tables.R[:, 2], _ANYHOW_RAD**2 * np.eye(3)
+            ahead[self._caps.row >= 0], tilt[:] = -self._tables.R[:, 2], _ANYHOW_RAD**2 * np.eye(3)
         points, cov = np.empty((count, 3)), np.empty((count, 3, 3))
         noise, apart = np.empty((count, 3, 3)), np.empty(count, np.bool_)
-        triangulate(self._tables, self._views, uv, sigma_px, area_px2, ahead, tilt, points, cov, noise, apart)
-        return MarkerPositions(points, cov, noise, apart)
+        triangulate(self._tables, self._caps, uv, sigma_px, area_px2, ahead, tilt, points, cov, noise, apart)
+        return MarkerPositions(points, cov, noise, apart, np.zeros(uv.shape[:2], np.bool_))

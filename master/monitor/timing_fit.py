@@ -26,8 +26,8 @@ import numpy as np
 from scipy.special import ndtr, stdtrit
 
 from common.arrays import Bool, Float, Int
+from master.fabrik.intersection import RAYS
 from master.monitor.timing_evidence import Evidence
-from master.stereo.misfit import RIG_PX
 
 TENTHS = 10  # of a block, the shortest batches
 MISFIT_FLOOR_PX, DISTANCE_FLOOR_M = 0.2, 1e-3
@@ -148,7 +148,7 @@ def fit_offset(blocks: Float) -> TimeOffset | None:
         return None
     sigma, count = max([scatter[0], *(of for of in scatter[1:] if of[1] >= _LONG_BATCHES_AT_LEAST)])
     sigma *= float(stdtrit(count - 1.0, _THREE_SIGMA)) / 3.0
-    sigma = hypot(sigma, sqrt(2.0) * RIG_PX * float(beside.sum()) / total)
+    sigma = hypot(sigma, sqrt(2.0) * RAYS.rig_px * float(beside.sum()) / total)
     return TimeOffset(offset * 1e9, sigma * 1e9, count)
 
 

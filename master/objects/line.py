@@ -23,6 +23,8 @@ from common.camera_model import CameraModel
 from common.geometry import matrix_to_quaternion
 from common.messages import MarkerDetections, ObjectPose, ObjectSource, TagDetections
 from common.object_profile import ObjectProfile
+from master.estimator.cameras import CameraArrays
+from master.fabrik.depth import CalibrationResidual
 from master.fabrik.one_euro import OneEuroParameters
 from master.objects.chosen import Chosen, sighted_now
 from master.objects.course import Course, unheeded
@@ -34,8 +36,6 @@ from master.objects.motion import Motion
 from master.objects.start import poses_of_beads, poses_of_tags
 from master.objects.steady import Steady
 from master.objects.window import Window, Windows
-from master.stereo.place import CalibrationResidual
-from master.stereo.triangulate import Triangulator
 
 # What light does to a ball's centroid beyond what a slave says, and to a corner.
 _BEAD_FLOOR_PX, _CORNER_FLOOR_PX = 0.08, 0.03
@@ -80,7 +80,7 @@ class ObjectLine:
         least_px = np.where(self._features.radius_m > 0.0, _BEAD_FLOOR_PX, _CORNER_FLOOR_PX)
         floor_px = np.maximum(CalibrationResidual.of(rig).rays_px, least_px)
         self._fit = PoseFit(self._cameras, self._features.points, self._features.radius_m, floor_px)
-        self._triangulator = Triangulator.of(self._cameras) if len(models) > 1 else None
+        self._arrays = CameraArrays.of(self._cameras)
         self._hidden = Hidden(self._features, self._cameras)
         middle = self._features.points.mean(axis=0) if len(self._features.points) else np.zeros(3)
         self._steady = Steady(middle, OneEuroParameters.of(rig.filter))
@@ -210,8 +210,8 @@ class ObjectLine:
         """Poses (4, 4) that the nearest frames suggest."""
         sighted = sighted_now(window, self._features)
         poses = poses_of_tags(sighted, self._features, self._cameras)[:8]
-        if self._triangulator is not None and self._features.beads >= 3:
-            poses += poses_of_beads(sighted, self._features, self._triangulator)
+        if len(self._cameras) > 1 and self._features.beads >= 3:
+            poses += poses_of_beads(sighted, self._features, self._arrays)
         return poses
 
     def _held(self, window: Window, predicted: Motion | None) -> ObjectPose:

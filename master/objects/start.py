@@ -16,8 +16,9 @@ from common.arrays import Float, Int
 from common.camera_model import CameraModel
 from common.geometry import fit_rigid, invert, rigid
 from common.object_profile import tag_corners
+from master.estimator.cameras import CameraArrays
+from master.fabrik.intersection import triangulate
 from master.objects.features import Features
-from master.stereo.triangulate import Triangulator
 
 _NEAR_S = 0.012  # frames of several cameras that are taken for one moment without bringing them there
 _DISTANCE_M, _DISTANCE_SHARE = 8e-3, 0.08  # by which distances between beads may be wrong
@@ -132,9 +133,9 @@ def _shift(turned: Float, xy: Float) -> Float:
     )
 
 
-def poses_of_beads(sighted: Sequence[Sighted], features: Features, triangulator: Triangulator) -> list[Float]:
+def poses_of_beads(sighted: Sequence[Sighted], features: Features, cameras: CameraArrays) -> list[Float]:
     """Poses `T_rig_object` (4, 4) of three beads or more whose distances are right, the best first."""
-    places = [_points(sighted, bead, triangulator) for bead in range(features.beads)]
+    places = [_points(sighted, bead, cameras) for bead in range(features.beads)]
     seen = [bead for bead, found in enumerate(places) if len(found)]
     poses: list[tuple[float, Float]] = []
     for triple in list(combinations(seen, 3))[:_TRIPLES]:
@@ -151,17 +152,17 @@ def poses_of_beads(sighted: Sequence[Sighted], features: Features, triangulator:
     return [T for _, T in poses[:_POSES]]
 
 
-def _points(sighted: Sequence[Sighted], bead: int, triangulator: Triangulator) -> Float:
+def _points(sighted: Sequence[Sighted], bead: int, cameras: CameraArrays) -> Float:
     """Where a bead may be (K, 3) [m], rig frame: of all choices of its places, those whose rays meet."""
     views = [seen for seen in sighted if seen.feature == bead]
     if len(views) < 2:
         return np.empty((0, 3))
     choices = list(product(*(range(len(seen.uv)) for seen in views)))[:_COMBINATIONS]
-    uv = np.full((len(triangulator.cameras), len(choices), 2), np.nan)
+    uv = np.full((len(cameras.scale), len(choices), 2), np.nan)
     for seen, chosen in zip(views, np.array(choices, np.int64).T, strict=True):
         uv[seen.camera] = seen.uv[chosen, 0]
-    found = triangulator.triangulate(uv, _SIGMA_PX)
-    return found.points[found.residual_px < _MISS_PX]
+    found = triangulate(cameras, uv, _SIGMA_PX)
+    return found.points_m[found.residual_px < _MISS_PX]
 
 
 def _sides(points: Float) -> Float:

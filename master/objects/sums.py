@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from master.stereo.misfit import RIG_PX
+from master.fabrik.intersection import RAYS
 
 _FRESH, _FRESH_PX = 0.7, 0.1  # as in `master.fabrik.carry`
 _SOFT_2 = 9.0  # square of the deviation in sigmas at which a feature counts half ... a quarter
@@ -84,7 +84,8 @@ class Sums:
     def weigh(self, miss: Float, lag_2: Float) -> tuple[Float, Float, float]:
         """Chi square per number measured of the feature of each observation (n,), its weight (n,), and the cost.
 
-        The weight forgives what a bad calibration leaves (`RIG_PX`), the cost only what this one is known to leave.
+        The weight forgives what a bad calibration leaves (`RaySettings.rig_px`), the cost only what this one is
+        known to leave.
 
         Args:
             miss: (n, 2) by which the observations miss the pose [px].
@@ -93,7 +94,7 @@ class Sums:
         total = self._total + lag_2
         squared = 0.5 * np.vecdot(miss, miss)
         mean = np.bincount(self._whole, squared / total) / self._whole_size
-        forgiven = np.bincount(self._whole, squared / (total + RIG_PX**2)) / self._whole_size
+        forgiven = np.bincount(self._whole, squared / (total + RAYS.rig_px**2)) / self._whole_size
         weight = (1.0 + forgiven / _SOFT_2) ** -2.0
         cost = float((self._numbers * mean / (1.0 + mean / _SOFT_2)).sum())
         return mean[self._whole], weight[self._whole], cost

@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from common.arrays import Bool, Float
+from common.arrays import Float
 from common.camera_model import CameraModel
 from master.fabrik.estimate import MarkerPositions, SolvedHand
 from master.stereo.caps import TURN_RAD_S, CapLook, CapModel
@@ -48,11 +48,9 @@ class Located(MarkerPositions):
 
     Attributes:
         repeated: (M, 3, 3) [m^2] what is to be added to `cov_m2` for a fit that starts at the same hand.
-        left_out: (C, M) sightings without which rays of three or more cameras meet.
     """
 
     repeated: Float
-    left_out: Bool
 
 
 class CapLocator:
@@ -126,7 +124,7 @@ class CapLocator:
             left_out = odd_camera(self._place, caps_uv, sure_px, apart)
             placed.points[apart], cov[apart] = np.nan, np.nan
         repeated = tilted * (self._unsure(hand, age_s) - 1.0)[:, None, None]
-        return Located(placed.points, cov, placed.cov, apart, repeated, left_out)
+        return Located(placed.points, cov, placed.cov, apart, left_out, repeated)
 
     def _alike(self, gain: Float, sigma_px: Float, doubt_px: Float) -> Float:
         """What it changes in covariances (M, 3, 3) that cameras err alike, as if the marker were elsewhere.

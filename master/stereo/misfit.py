@@ -6,44 +6,12 @@ line. What exceeds the quantile that noise exceeds once in a million is not one 
 deviations for two cameras).
 """
 
-from math import erfc, exp, gamma, sqrt
-
 import numpy as np
 
 from common.arrays import Float
+from master.fabrik.intersection import RAYS
 
-RIG_PX = 0.85
-"""Standard deviation per axis of what lens, mount and calibration leave at one marker: two sure cameras may miss each
-other by 6 px before a marker is dropped. Cheap lenses fit to about half a pixel, and a mount gives way when touched."""
-_ONE_IN = 1e-6
-
-
-def chi_square_survival(x: float, degrees: int) -> float:
-    """Probability that chi square exceeds `x` (Abramowitz & Stegun, 26.4.4 and 26.4.5)."""
-    if degrees % 2:
-        tail, first = erfc(sqrt(x / 2)), 1.5
-        count = (degrees - 1) // 2
-    else:
-        tail, first = 0.0, 1.0
-        count = degrees // 2
-    terms = ((x / 2) ** (first - 1 + i) / gamma(first + i) for i in range(count))
-    return tail + exp(-x / 2) * sum(terms)
-
-
-def chi_square_quantile(exceeded: float, degrees: int) -> float:
-    """The value that chi square exceeds with probability `exceeded`, to 1e-9."""
-    low, high = 0.0, 1.0
-    while chi_square_survival(high, degrees) > exceeded:
-        high *= 2.0
-    while high - low > 1e-9:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if chi_square_survival(middle, degrees) > exceeded else (low, middle)
-    return high
-
-
-def limits(cameras: int) -> Float:
-    """Largest misfit of one point by the number of cameras that see it, (cameras + 1,) ; inf below two."""
-    return np.array([np.inf] * 2 + [chi_square_quantile(_ONE_IN, 2 * n - 3) for n in range(2, cameras + 1)])
+RIG_PX = RAYS.rig_px
 
 
 def misfit_of_rays(error_px2: Float, sigma_px: Float) -> Float:

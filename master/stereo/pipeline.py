@@ -19,6 +19,7 @@ from common.camera_model import CameraModel
 from common.hand_model import HandModel
 from common.messages import HandPose, MarkerDetections, restamped
 from master.fabrik.blob_bias import LensShift
+from master.fabrik.depth import EXACT, CalibrationResidual
 from master.fabrik.estimate import HandEstimate, MarkerPositions
 from master.fabrik.solver import FabrikSolver
 from master.fabrik.sync import FrameSet
@@ -30,7 +31,7 @@ from master.ik.tracker import HandTracker, TrackedHand, pose_of
 from master.stereo.caps import CapModel
 from master.stereo.drift import DepthDrift
 from master.stereo.locate import CapLocator, Located
-from master.stereo.place import EXACT, CalibrationResidual, Placement, ray_covariance
+from master.stereo.place import Placement, ray_covariance
 from master.stereo.rivals import RivalChooser
 from master.stereo.whereabouts import HandBelief, Past
 
@@ -278,10 +279,10 @@ class MarkerPipeline:
         """Count markers whose rays do not meet, and cameras that were left out."""
         self._count("apart", found.apart)
         self.counts["epipolar_misfits"] += int(found.apart.sum())
-        if isinstance(found, Located) and found.left_out.any():
+        if found.left_out.any():
             self._count_left_out(found, instant)
 
-    def _count_left_out(self, found: Located, instant: FrameSet) -> None:
+    def _count_left_out(self, found: MarkerPositions, instant: FrameSet) -> None:
         """Count what was left out of each camera, and instants at which that is most of what it sees."""
         sees = np.isfinite(instant.uv[..., 0]) & np.isfinite(found.points_m[:, 0])
         mostly = found.left_out.sum(axis=1) > 0.5 * sees.sum(axis=1)

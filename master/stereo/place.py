@@ -1,14 +1,14 @@
 """From pixels to points by the rays of all cameras, and whether the rays of each marker meet."""
 
 from dataclasses import dataclass
-from math import pi, sqrt
 
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.calibration import RigCalibration
 from common.camera_model import CameraModel
-from master.stereo.misfit import limits, misfit_of_rays
+from master.fabrik.depth import EXACT, CalibrationResidual
+from master.fabrik.intersection import limits_of
+from master.stereo.misfit import misfit_of_rays
 from master.stereo.triangulate import Triangulator
 
 
@@ -36,37 +36,6 @@ class Placed:
         return (np.isfinite(uv[..., 0]).sum(axis=0) >= 2) & ~met
 
 
-@dataclass(frozen=True, slots=True)
-class CalibrationResidual:
-    """What a calibration is known to leave, as its provenance says.
-
-    Attributes:
-        rays_px: RMS reprojection error of the cameras together [px]: a bound on what lens and pose are wrong by at one
-            place. How much of it was the noise of the corners cannot be told afterwards.
-        law: Relative error of the depth law, standard deviation.
-    """
-
-    rays_px: float = 0.0
-    law: float = 0.0
-
-    @classmethod
-    def of(cls, rig: RigCalibration) -> "CalibrationResidual":
-        """What the rig's file states; 0 where it states nothing, as for files typed in by hand."""
-        rays = rig.provenance.get("T_rig_camera")
-        law = None if rig.depth_model == "stereo" else rig.provenance.get(rig.depth_model)
-        left = {} if law is None else law.residual
-        mean_percent = left.get("leave_one_out_mean_percent", left.get("mean_percent", 0.0))
-        return cls(
-            rays_px=0.0 if rays is None else rays.residual.get("rms_px", 0.0),
-            law=1e-2
-            * mean_percent
-            * sqrt(pi / 2),  # of a mean of absolute errors that are normally distributed
-        )
-
-
-EXACT = CalibrationResidual()
-
-
 class Placement:
     """Triangulates by the cameras of one rig. Holds no state between calls."""
 
@@ -79,7 +48,7 @@ class Placement:
         """
         self._cameras, self._residual = cameras, residual
         self._triangulator = Triangulator.of(cameras)
-        self._limits = limits(len(cameras))
+        self._limits = limits_of(len(cameras))
 
     def __call__(self, uv: Float, sigma_px: Float) -> Placed:
         """Place markers seen at (C, M, 2) [px] with standard deviations (C, M) [px]; NaN: not seen."""

@@ -18,16 +18,16 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from scipy.special import chdtri
 
 from common.arrays import Bool, Float, Int
 from common.camera_model import CameraModel
-from master.stereo.misfit import chi_square_quantile
 from master.stereo.place import Placement
 
-CLEARLY = chi_square_quantile(0.01, 1)
+CLEARLY = float(chdtri(1, 0.01))
 """By how much of chi square a combination must be better for each slave it overrules: 1 in 100 by chance, 6.6."""
 _PAST = 1.5 * CLEARLY  # more than one slave, less than two
-_TOO_FAR = {degrees: chi_square_quantile(1e-6, degrees) for degrees in (2, 3)}
+_TOO_FAR = {degrees: float(chdtri(degrees, 1e-6)) for degrees in (2, 3)}
 _RIVAL_CAMERAS = 5  # 32 combinations; cameras with a rival beyond these are left out for that marker
 _SAME_M = 0.02  # combinations whose points are nearer are one thing
 

@@ -11,8 +11,16 @@ from common.hand_model import WRIST
 from common.messages import HandPose, MarkerDetections
 from master.rig import RigSetup, build_pipeline
 from master.stages import StageTimes
-from master.stereo.caps import CapModel
-from tests.hand_helpers import MARKERS, RIGHT, camera_file, cap_areas_px2, detections, palm, rig_file
+from tests.hand_helpers import (
+    MARKERS,
+    RIGHT,
+    camera_file,
+    cap_areas_px2,
+    cap_bias_px,
+    detections,
+    palm,
+    rig_file,
+)
 
 BACK = MARKERS.index("back")
 ANGLES = np.radians(
@@ -39,9 +47,9 @@ def solved(rig: RigCalibration, T_rig_palm: Float) -> list[HandPose]:
     """Poses of a resting hand; only the first pair sees the marker on its back."""
     setup = RigSetup.of(rig, {name: camera_file(name, 60.0, 0.0) for name in rig.cameras}, RIGHT)
     joints = RIGHT.forward(T_rig_palm, ANGLES)
-    points, caps = RIGHT.marker_points(joints, MARKERS), CapModel(RIGHT, MARKERS)
+    points = RIGHT.marker_points(joints, MARKERS)
     models = tuple(setup.models.values())
-    bias, area = caps.bias_px(joints, points, models), cap_areas_px2(joints, models)
+    bias, area = cap_bias_px(joints, points, models), cap_areas_px2(joints, models)
     messages: list[MarkerDetections] = []
     for seq in range(6):
         for c, (name, camera) in enumerate(setup.models.items()):

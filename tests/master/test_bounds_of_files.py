@@ -12,8 +12,9 @@ import pytest
 from common.calibration import CameraCalibration, RigCalibration, parse
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
+from master.estimator.cameras import CameraArrays
 from master.fabrik.depth import depth_law
-from master.stereo.triangulate import Triangulator
+from master.fabrik.intersection import triangulate
 from tests.common.file_values import bounds_of, edited
 
 TREE = Path(__file__).resolve().parents[2] / "calib_json"
@@ -31,8 +32,8 @@ def use(rig: RigCalibration, camera: CameraCalibration) -> None:
     u, v = np.meshgrid(np.linspace(-w, 2 * w, 7), np.linspace(-h, 2 * h, 7))  # one picture beyond each border
     uv = np.stack([u.ravel(), v.ravel()], axis=-1)
     with np.errstate(all="raise", under="ignore"):
-        Triangulator.of(models).triangulate(np.stack([uv, uv - (10.0, 0.0)]))
-        Triangulator.of(models * 3).triangulate(np.stack([uv, uv - (10.0, 0.0)] * 3))
+        triangulate(CameraArrays.of(models), np.stack([uv, uv - (10.0, 0.0)]))
+        triangulate(CameraArrays.of(models * 3), np.stack([uv, uv - (10.0, 0.0)] * 3))
         for model in ("power_law", "affine_disparity"):
             try:
                 law = depth_law(msgspec.structs.replace(rig, depth_model=model), models)

@@ -15,8 +15,16 @@ from common.messages import HandPose, MarkerDetections, decode, encode
 from master.rig import RigSetup, build_pipeline
 from master.solve import fingers_of
 from master.stages import StageTimes
-from master.stereo.caps import CapModel
-from tests.hand_helpers import MARKERS, RIGHT, camera_file, detections, natural_angles, palm, rig_file
+from tests.hand_helpers import (
+    MARKERS,
+    RIGHT,
+    camera_file,
+    cap_views,
+    detections,
+    natural_angles,
+    palm,
+    rig_file,
+)
 from tests.synthetic_run import SyntheticRun, hand_at, setup_of, synthetic_run
 
 FREE = tuple(f"cube-{k}" for k in range(18))
@@ -137,7 +145,7 @@ def test_a_marker_on_a_bone_beside_that_of_the_finger_tip_counts_for_the_hand(so
         tuple(setup.models.values()),
     )
     points = model.marker_points(truth, names)
-    bias = CapModel(model, names).bias_px(truth, points, cameras)
+    bias = cap_views(model, names, truth, points, cameras)[0]
     told = [
         detections(name, k, 1_000_000_000 + k * 16_666_667, setup.models[name].project(points) + bias[c])
         for k in range(8)

@@ -8,12 +8,21 @@ from common.arrays import Bool, Float
 from common.calibration import RigCalibration
 from common.geometry import rigid
 from common.messages import HandPose, MarkerDetections
+from master.fabrik.caps import CapTables
+from master.fabrik.estimate import MarkerPositions
+from master.fabrik.rays import RayTriangulator
 from master.rig import build_pipeline
 from master.stages import StageTimes
-from master.stereo.caps import CapModel
-from master.stereo.odd_camera import odd_camera
-from master.stereo.place import Placement
-from tests.hand_helpers import MARKERS, RIGHT, camera_models, cap_areas_px2, detections, palm, rig_file
+from tests.hand_helpers import (
+    MARKERS,
+    RIGHT,
+    camera_models,
+    cap_areas_px2,
+    cap_bias_px,
+    detections,
+    palm,
+    rig_file,
+)
 from tests.synthetic_run import setup_of
 
 AT = {
@@ -51,9 +60,7 @@ def messages(names: tuple[str, ...], swapped: str = "") -> list[MarkerDetections
     """Frames of a hand at rest, 0.1 px of noise; one camera may take the index for the ring and the other way round."""
     setup, rng = setup_of(rig(names)), np.random.default_rng(6)
     cameras = tuple(setup.models.values())
-    seen = np.stack([c.project(TRUTH) for c in cameras]) + CapModel(RIGHT, MARKERS).bias_px(
-        HAND, TRUTH, cameras
-    )
+    seen = np.stack([c.project(TRUTH) for c in cameras]) + cap_bias_px(HAND, TRUTH, cameras)
     area = cap_areas_px2(HAND, cameras)
     if swapped:
         c = names.index(swapped)
@@ -118,9 +125,14 @@ def test_nothing_is_left_out_where_rays_meet_or_two_cameras_disagree() -> None:
 # -- which one it is ---------------------------------------------------------------------------------------------
 
 
+def located(file: RigCalibration, uv: Float) -> MarkerPositions:
+    """Flat markers, as they are seen."""
+    place = RayTriangulator(tuple(camera_models(file).values()), CapTables.flat(uv.shape[1]))
+    return place(uv, np.full(uv.shape[:2], 0.1), np.full(uv.shape[:2], np.nan), None, 0.0)
+
+
 def odd(file: RigCalibration, uv: Float) -> Bool:
-    place, sigma = Placement(tuple(camera_models(file).values())), np.full(uv.shape[:2], 0.1)
-    return odd_camera(place, uv, sigma, place(uv, sigma).apart(uv))
+    return located(file, uv).left_out
 
 
 def images(names: tuple[str, ...], seed: int, count: int = 300) -> Float:
@@ -157,8 +169,7 @@ def test_of_three_side_by_side_one_that_is_off_sideways_is_not_told() -> None:
     row = rig_file(THREE)
     uv = np.stack([camera.project(TRUTH) for camera in camera_models(row).values()])
     uv[1, :, 0] += 15.0
-    place, sigma = Placement(tuple(camera_models(row).values())), np.full(uv.shape[:2], 0.1)
-    assert place(uv, sigma).apart(uv).all()
+    assert located(row, uv).apart.all()
     assert not odd(row, uv).any()
     uv[1] += [-15.0, 15.0]  # up or down it is
     assert odd(row, uv)[1].all()

@@ -22,10 +22,9 @@ from common.zenoh_bus import ZenohBus
 from master.live import LiveSettings, run_live
 from master.rig import RigSetup, load_setup
 from master.stages import StageTimes
-from master.stereo.caps import CapModel
 from master.tuning import LivePipeline, RigFiles, RigTuning
 from slave.uplink import Uplink
-from tests.hand_helpers import MARKERS, RIGHT, camera_file, rig_file
+from tests.hand_helpers import MARKERS, RIGHT, camera_file, cap_bias_px, rig_file
 from tests.hand_helpers import detections as seen
 from tests.network_helpers import free_endpoint, free_udp_port, until
 from tests.synthetic_run import SyntheticRun, hand_at, setup_of, synthetic_run
@@ -293,12 +292,12 @@ class Master:
         self.sender.start()
 
     def _send(self, setup: RigSetup, stop: threading.Event) -> None:
-        caps, rng, seq = CapModel(RIGHT, MARKERS), np.random.default_rng(1), 0
+        rng, seq = np.random.default_rng(1), 0
         while not stop.wait(0.015):
             t_ns = time.monotonic_ns()
             joints = self.hand(t_ns)
             points = RIGHT.marker_points(joints, MARKERS)
-            bias = caps.bias_px(joints, points, tuple(setup.models.values()))
+            bias = cap_bias_px(joints, points, tuple(setup.models.values()))
             for c, (name, camera) in enumerate(setup.models.items()):
                 uv = camera.project(points) + bias[c] + rng.normal(0.0, self.sigma_px, (len(MARKERS), 2))
                 message: MarkerDetections = seen(name, seq, t_ns, uv)

@@ -17,8 +17,9 @@ from common.camera_model import CameraModel
 from common.geometry import invert, transform
 from master.calibrate.depth.fit import ideal_of
 from master.calibrate.depth.sweep import Sweep
+from master.estimator.cameras import CameraArrays
 from master.fabrik.depth import AffineDisparity, DepthLaw, ErrorBudget, PowerLaw, error_budget
-from master.stereo.triangulate import Triangulator
+from master.fabrik.intersection import triangulate
 
 Cameras = tuple[CameraModel, CameraModel]
 
@@ -110,8 +111,8 @@ def verify(sweep: Sweep, laws: Mapping[str, DepthLaw], cameras: Cameras | None, 
 
 def stereo_points(cameras: Cameras, uv: Float) -> Float:
     """Points (N, 3) [m] in the first camera's frame, from centroids (2, N, 2) [px]; NaN: not determined."""
-    found = Triangulator.of(cameras).triangulate(uv)
-    return transform(invert(cameras[0].T_rig_camera), found.points)
+    found = triangulate(CameraArrays.of(cameras), uv)
+    return transform(invert(cameras[0].T_rig_camera), found.points_m)
 
 
 def middle(cameras: Cameras) -> Float:

@@ -11,9 +11,11 @@ from common.calibration import RigCalibration
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.messages import HandPose, MarkerDetections
+from master.estimator.cameras import CameraArrays
 from master.fabrik.blob_bias import LensShift
+from master.fabrik.depth import CalibrationResidual
+from master.fabrik.intersection import triangulate
 from master.fabrik.sync import FrameSet, FrameSync
-from master.stereo.place import CalibrationResidual, Placement
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,8 +80,8 @@ def seen_by(
     """
     rows = rows_of(rig, names)
     cameras = tuple(models.values())
-    sync = FrameSync(dict(models), dict(frame_rate_hz), len(rig.markers))
-    shift, place = LensShift(cameras), Placement(cameras, CalibrationResidual.of(rig))
+    sync, shift = FrameSync(dict(models), dict(frame_rate_hz), len(rig.markers)), LensShift(cameras)
+    arrays, rays_px = CameraArrays.of(cameras), CalibrationResidual.of(rig).rays_px
     late_ns = {camera: round(1e3 * us) for camera, us in rig.stamp_offset_us.items()}
     moved = (replace(one, t_ns=one.t_ns + late_ns.get(one.camera, 0)) for one in messages)
     sets = [frames for one in moved for frames in sync.push(one)] + sync.flush()
@@ -87,11 +89,10 @@ def seen_by(
     for frames in sets:
         uv = shift.centres(frames.uv, frames.area) if shift.any else frames.uv
         uv, sigma = _clear(frames, uv)[:, rows], frames.sigma_px[:, rows]
-        placed = place(uv, sigma)
-        wrong = placed.apart(uv)
+        found = triangulate(arrays, uv, sigma, rays_px)
         times.append(frames.t_ns)
-        points.append(np.where(wrong[:, None], np.nan, placed.points))
-        covs.append(placed.cov)
+        points.append(np.where(found.apart[:, None], np.nan, found.points_m))
+        covs.append(found.cov_m2)
     return _seen(tuple(names), times, points, covs)
 
 

@@ -15,12 +15,12 @@ from common.hand_calibration import Couplings
 from common.hand_model import HandModel
 from common.message_parts import MAX_PICTURE
 from common.messages import HandPose, MarkerDetections, decode, encode
+from master.fabrik.caps import CapTables
 from master.fabrik.depth import PowerLaw
 from master.fabrik.triangulate import DepthTriangulator, disparity_tables
 from master.rig import build_pipeline
 from master.rig_pipeline import line_of
 from master.stages import StageTimes
-from master.stereo.caps import CapModel
 from tests.hand_helpers import LEFT, MARKERS, RIGHT
 from tests.synthetic_run import SyntheticRun, synthetic_run
 
@@ -89,7 +89,7 @@ def test_whatever_senders_say_nothing_raises_and_the_hand_comes_back(
 @pytest.mark.parametrize("law", [PowerLaw(37.5, -1.0), PowerLaw(45.4, -1.035)])
 def test_a_point_is_placed_with_its_covariance_or_not_at_all(law: PowerLaw, run: SyntheticRun) -> None:
     """Also where it is nearer to the cameras than a cap is large, and where nothing is known of the hand's tilt."""
-    cameras, caps = tuple(run.setup.models.values()), CapModel(RIGHT, MARKERS)
+    cameras, caps = tuple(run.setup.models.values()), CapTables.of(RIGHT, MARKERS)
     place = DepthTriangulator(disparity_tables(cameras, law, 0.01, 1e6, 1e9), caps)
     solver, rng, placed = line_of(run.setup, StageTimes()), np.random.default_rng(9), 0
     hands = [hand.solution for message in run.messages[:20] for hand in solver.push(message)]

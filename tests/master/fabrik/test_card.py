@@ -18,8 +18,7 @@ from master.fabrik.triangulate import DepthTriangulator
 from master.ik.tracker import HandTracker, TrackedHand
 from master.rig import RigSetup, build_pipeline, load_setup
 from master.stages import StageTimes
-from master.stereo.caps import CapModel
-from tests.hand_helpers import detections, natural_angles, palm
+from tests.hand_helpers import cap_views, detections, natural_angles, palm
 from tests.synthetic_run import SyntheticRun, synthetic_run
 
 FRAMES = 30
@@ -28,14 +27,14 @@ FRAMES = 30
 def shipped(root: Path, rig: str) -> tuple[RigSetup, list[MarkerDetections]]:
     """The shipped rig, and what its two cameras see of a hand that moves; both at once."""
     setup = load_setup(root / "calib_json", rig)
-    model, caps = setup.hand, CapModel(setup.hand, setup.rig.markers)
+    model = setup.hand
     cameras, angles = tuple(setup.models.values()), natural_angles(np.random.default_rng(1))
     messages: list[MarkerDetections] = []
     for k in range(FRAMES):
         at = np.array([0.04 + 0.03 * np.sin(0.1 * k), 0.08, 0.6])
         joints = model.forward(palm(at_m=at), model.clamp(angles + 0.1 * np.sin(0.1 * k)))
         points = model.marker_points(joints, setup.rig.markers)
-        bias = caps.bias_px(joints, points, cameras)
+        bias = cap_views(model, setup.rig.markers, joints, points, cameras)[0]
         for c, (name, camera) in enumerate(setup.models.items()):
             uv = camera.project(points) + bias[c]
             if k % 5 == 4:

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from master.fabrik.depth import depth_law, law_misfit
+from master.estimator.cameras import CameraArrays
+from master.fabrik.caps import CapTables
+from master.fabrik.depth import CalibrationResidual, depth_law, law_misfit
+from master.fabrik.intersection import RAYS, limits_of, triangulate
 from master.fabrik.triangulate import DepthTriangulator, disparity_tables
 from master.rig import RigSetup, load_setup
-from master.stereo.caps import CapModel
-from master.stereo.misfit import RIG_PX, limits
-from master.stereo.place import CalibrationResidual
-from master.stereo.triangulate import Triangulator
 
 SHIPPED = ("desk", "desk-fabrik", "desk-back3", "desk-cube", "desk-tracker", "desk-wand")
 
@@ -30,7 +29,8 @@ def test_law_and_places_agree_as_the_estimator_asks(name: str, root: Path) -> No
 def test_depth_by_the_law_is_that_of_both_rays_within_3_mm_in_the_volume(sigma_px: float, root: Path) -> None:
     setup = load_setup(root / "calib_json", "desk")
     points, uv = _seen(setup, np.random.default_rng(3), sigma_px)
-    by_law, by_rays = _by_law(setup, uv), Triangulator.of(list(setup.models.values())).triangulate(uv).points
+    by_law = _by_law(setup, uv)
+    by_rays = triangulate(CameraArrays.of(list(setup.models.values())), uv).points_m
     off_m = (by_law - by_rays)[:, 2]  # the frame is the left camera's
     assert len(points) > 500
     assert np.isfinite(off_m).all()
@@ -56,14 +56,14 @@ def _by_law(setup: RigSetup, uv: Float) -> Float:
     law = depth_law(rig, cameras)
     assert law is not None
     tables = disparity_tables(
-        cameras, law, CalibrationResidual.of(rig).law, float(2.0**0.5 * RIG_PX), float(limits(2)[2])
+        cameras, law, CalibrationResidual.of(rig).law, float(2.0**0.5 * RAYS.rig_px), float(limits_of(2)[2])
     )
-    triangulate, most = DepthTriangulator(tables, CapModel(setup.hand, rig.markers)), len(rig.markers)
+    by_depth, most = DepthTriangulator(tables, CapTables.of(setup.hand, rig.markers)), len(rig.markers)
     parts: list[Float] = []
     for start in range(0, uv.shape[1], most):
         part = np.ascontiguousarray(uv[:, start : start + most])
         sigma_px = np.full(part.shape[:2], 0.1)
         parts.append(
-            triangulate(part, sigma_px, np.full(part.shape[:2], np.nan), None, 0.0, as_seen=True).points_m
+            by_depth(part, sigma_px, np.full(part.shape[:2], np.nan), None, 0.0, as_seen=True).points_m
         )
     return np.concatenate(parts)

@@ -6,13 +6,11 @@ import pytest
 from common.arrays import Float
 from common.camera_model import CameraModel
 from common.geometry import axis_rotation, rigid
-from common.hand_model import TIPS
-from master.fabrik.cap_views import CapTables, hidden_part
+from master.fabrik.caps import CapTables
 from master.fabrik.depth import AffineDisparity, PowerLaw, disparity_on_axis
 from master.fabrik.estimate import SolvedHand
 from master.fabrik.triangulate import DepthTriangulator, disparity_tables, place_centroids
-from master.stereo.caps import CapModel
-from tests.hand_helpers import MARKERS, RIGHT, cap_areas_px2, natural_angles, palm
+from tests.hand_helpers import MARKERS, RIGHT, cap_areas_px2, cap_bias_px, natural_angles, palm
 
 DISTORTED = np.array([0.105, -0.21, 0.0006, -0.0009, 0.05])
 SIGMA = np.full((2, 6), 0.1)
@@ -34,14 +32,14 @@ MADE_BY_HAND = (
     camera(1, axis_rotation(0, 0.025) @ TURNED, (0.085, 0.001, 0.0), DISTORTED),
 )
 PINHOLE = AffineDisparity(500.0 * 0.075, 0.0)
-FLAT = CapModel(RIGHT, ("a", "b", "c", "d", "e", "f"))  # on no hand: what is seen of them is their centroid
-CAPS = CapModel(RIGHT, MARKERS)
+FLAT = CapTables.flat(6)  # on no hand: what is seen of them is their centroid
+CAPS = CapTables.of(RIGHT, MARKERS)
 
 
 def triangulator(
     cameras: tuple[CameraModel, ...],
     law: PowerLaw | AffineDisparity = PINHOLE,
-    caps: CapModel = FLAT,
+    caps: CapTables = FLAT,
     law_error: float = 0.0,
 ) -> DepthTriangulator:
     return DepthTriangulator(disparity_tables(cameras, law, law_error, ROWS_PX, LIMIT), caps)
@@ -114,7 +112,7 @@ def test_what_the_fit_of_the_law_left_is_part_of_the_covariance_along_the_sight(
 def test_caps_of_a_known_hand_are_where_it_has_them() -> None:
     known = hand(natural_angles(np.random.default_rng(4)))
     points = RIGHT.marker_points(known.joints, MARKERS)
-    uv = seen(EXACT, points) + CAPS.bias_px(known.joints, points, EXACT)
+    uv = seen(EXACT, points) + cap_bias_px(known.joints, points, EXACT)
     whole = cap_areas_px2(known.joints, EXACT)
     near = triangulator(EXACT, caps=CAPS)(uv, SIGMA, whole, known, 0.0)
     blind = triangulator(EXACT, caps=CAPS)(uv, SIGMA, whole, None, 0.0)
@@ -129,28 +127,12 @@ def test_a_hand_that_points_elsewhere_is_covered_by_what_its_tilt_is_unsure_by()
         angles = natural_angles(rng)
         true = hand(angles)
         points = RIGHT.marker_points(true.joints, MARKERS)
-        uv = seen(EXACT, points) + CAPS.bias_px(true.joints, points, EXACT)
+        uv = seen(EXACT, points) + cap_bias_px(true.joints, points, EXACT)
         believed = hand(RIGHT.clamp(angles + rng.normal(0.0, tilt / np.sqrt(3.0), (5, 4))), tilt)
         found = place(uv, SIGMA, cap_areas_px2(true.joints, EXACT), believed, 0.0)
         off = (found.points_m - points)[:5]
         squared += np.vecdot(off, np.linalg.solve(found.cov_m2[:5], off[..., None])[..., 0]).tolist()
     assert 0.9 < np.mean(np.array(squared) < 7.81)
-
-
-def test_a_cap_that_shows_less_than_it_must_is_doubted_as_by_the_cap_model() -> None:
-    known = hand()
-    points, whole = RIGHT.marker_points(known.joints, MARKERS), cap_areas_px2(known.joints, EXACT)
-    rng, views = np.random.default_rng(6), CapTables.of(CAPS)
-    look = CAPS.look(-known.joints.rotation[TIPS][None, :, :, 2], points, EXACT)
-    distance = np.stack([np.linalg.norm(points - one.centre, axis=1) for one in EXACT])
-    for _ in range(50):
-        area = whole * rng.uniform(0.2, 1.1, whole.shape)
-        expected = CAPS.doubt_px(area, points, EXACT, look.whole_m2)
-        for m in range(6):
-            scale_m, found = distance[:, m] / 500.0, np.empty(2)
-            radius = float(views.radius_m[views.row[m]]) if views.row[m] >= 0 else 0.0
-            hidden_part(area[:, m], scale_m, look.whole_m2[0, :, m], radius, found)
-            np.testing.assert_allclose(np.sqrt(found), expected[:, m], rtol=1e-6, atol=1e-9)
 
 
 def test_rows_that_disagree_are_two_things() -> None:

@@ -11,13 +11,37 @@ from common.arrays import Float
 from common.camera_model import CameraModel
 from common.frame_recording import open_recording
 from common.hand_model import HandJoints
-from master.stereo.caps import CapModel, cap_surface
-from master.stereo.triangulate import Triangulator
-from tests.hand_helpers import MARKERS, RIGHT, camera_models, natural_angles, palm, rendered, rig_file
+from master.estimator.cameras import CameraArrays
+from master.fabrik.cap_views import TILTED, hidden_part, tilted
+from master.fabrik.caps import CapTables, cap_surface
+from master.fabrik.intersection import triangulate
+from tests.hand_helpers import (
+    MARKERS,
+    RIGHT,
+    camera_models,
+    cap_bias_px,
+    cap_views,
+    natural_angles,
+    palm,
+    rendered,
+    rig_file,
+)
 
 CAMERAS = tuple(camera_models(rig_file()).values())
-CAPS = CapModel(RIGHT, MARKERS)
+CAPS = CapTables.of(RIGHT, MARKERS)
 RADIUS_M = 0.038 * 0.19  # index tip of the generated hand; its cap's centroid lies 0.15 of it ahead
+
+
+def hidden_px(area_px2: Float, points: Float, whole_m2: Float, caps: CapTables = CAPS) -> Float:
+    """Standard deviation (C, M) [px] that occlusion adds, of areas (C, M) and whole ones (T, C, M)."""
+    away = np.stack([np.linalg.norm(points - camera.centre, axis=1) for camera in CAMERAS])
+    out = np.empty_like(area_px2)
+    for m in range(area_px2.shape[1]):
+        found, scale_m = np.empty(len(CAMERAS)), away[:, m] / 500.0
+        area, whole = np.ascontiguousarray(area_px2[:, m]), np.ascontiguousarray(whole_m2[..., m])
+        hidden_part(caps, int(caps.row[m]), area, scale_m, whole, len(whole_m2), found)
+        out[:, m] = np.sqrt(found)
+    return out
 
 
 def pointing(rotation: Float) -> HandJoints:
@@ -44,9 +68,7 @@ def test_a_cap_more_pointed_than_half_a_sphere_is_taken_for_one() -> None:
 
 def test_a_cap_seen_from_its_end_has_no_bias_sideways() -> None:
     points = np.tile([0.0, 0.0, 0.5], (6, 1))
-    bias = CAPS.bias_px(
-        pointing(np.eye(3)), points, CAMERAS
-    )  # -z, the finger's end, looks at the left camera
+    bias = cap_bias_px(pointing(np.eye(3)), points, CAMERAS)  # -z, the finger's end, looks at the left camera
     np.testing.assert_allclose(bias[0], 0.0, atol=1e-9)
     assert (np.abs(bias[1, :5, 0]) > 0.01).all()  # the right one sees it from the side
 
@@ -60,7 +82,7 @@ def test_a_cap_seen_from_the_side_is_seen_behind_its_centroid() -> None:
         [[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
     )  # -z of the joint is +x of the rig
     points = np.tile([0.0, 0.0, 0.5], (6, 1))
-    bias = CAPS.bias_px(pointing(to_the_right), points, CAMERAS)[0, 1]
+    bias = cap_bias_px(pointing(to_the_right), points, CAMERAS)[0, 1]
     # What is seen lies nearer by up to a radius, which on the axis moves nothing.
     np.testing.assert_allclose(bias, [expected_px, 0.0], rtol=0.05, atol=1e-6)
     assert expected_px == pytest.approx(-0.654, abs=1e-3)
@@ -69,19 +91,28 @@ def test_a_cap_seen_from_the_side_is_seen_behind_its_centroid() -> None:
 def test_a_flat_marker_and_one_not_found_have_no_bias() -> None:
     points = np.tile([0.02, 0.01, 0.5], (6, 1))
     points[2] = np.nan
-    bias = CAPS.bias_px(pointing(np.eye(3)), points, CAMERAS)
+    bias = cap_bias_px(pointing(np.eye(3)), points, CAMERAS)
     np.testing.assert_array_equal(bias[:, 5], 0.0)
     np.testing.assert_array_equal(bias[:, 2], 0.0)
     assert (np.abs(bias[:, 0]).max(axis=-1) > 0).all()
 
 
-def test_markers_without_caps_need_no_correction() -> None:
-    back = CapModel(RIGHT, ("back",))
-    points = np.array([[0.0, 0.0, 0.5]])
-    np.testing.assert_array_equal(back.bias_px(pointing(np.eye(3)), points, CAMERAS), np.zeros((2, 1, 2)))
-    np.testing.assert_array_equal(
-        back.doubt_px(np.full((2, 1), 3.0), points, CAMERAS, np.zeros((1, 2, 1))), np.zeros((2, 1))
-    )
+def test_markers_without_caps_have_no_tables_and_the_same_hand_has_its_own_once() -> None:
+    back = CapTables.of(RIGHT, ("back", "cube"))
+    assert back.row.tolist() == [-1, -1]
+    assert len(back.looks) == len(back.radius_m) == 0
+    points = np.array([[0.0, 0.0, 0.5]] * 2)
+    np.testing.assert_array_equal(hidden_px(np.full((2, 2), 3.0), points, np.zeros((1, 2, 2)), back), 0.0)
+    assert CapTables.of(RIGHT, MARKERS) is CAPS
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_marker_that_shows_nothing_at_all_is_hidden_and_no_error() -> None:
+    points = np.tile([0.0375, 0.0, 0.5], (6, 1))
+    found = hidden_px(np.zeros((2, 6)), points, np.full((1, 2, 6), 2e-4))
+    radius = RADIUS_M * 500.0 / np.linalg.norm(points[0] - CAMERAS[0].centre)
+    np.testing.assert_allclose(found[:, 1], radius)
+    np.testing.assert_array_equal(found[:, 5], 0.0)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -89,29 +120,27 @@ def test_a_bias_is_never_larger_than_a_finger_tip(seed: int) -> None:
     rng = np.random.default_rng(seed)
     joints = RIGHT.forward(palm(rng.uniform(-180, 180, 3)), natural_angles(rng))
     points = rng.uniform([-0.1, -0.1, 0.3], [0.1, 0.1, 1.0], (6, 3))
-    bias_m = CAPS.bias_px(joints, points, CAMERAS) * points[:, 2:] / 500.0
+    bias_m = cap_bias_px(joints, points, CAMERAS) * points[:, 2:] / 500.0
     assert (np.linalg.norm(bias_m, axis=-1) < 1.3 * RIGHT.radius_m.max()).all()
 
 
-def test_a_sliver_of_a_cap_is_doubted_and_a_whole_one_is_not() -> None:
+def test_a_sliver_of_a_cap_is_hidden_and_a_whole_one_is_not() -> None:
     points = np.tile([0.0, 0.0, 0.5], (6, 1))
     whole_m2 = (2 * 1.7 + np.pi / 2 - 1) * RADIUS_M**2  # from the side: half a disc, and the paint behind it
     whole_px2 = whole_m2 * (500.0 / 0.5) ** 2
     area = np.array([[whole_px2] * 6, [0.1 * whole_px2] * 6])
     expected_m2 = np.full((1, 2, 6), whole_m2)
-    doubt = CAPS.doubt_px(area, points, CAMERAS, expected_m2)
+    found = hidden_px(area, points, expected_m2)
     away = np.linalg.norm(points[1] - CAMERAS[1].centre)
     expected = (1 - 0.1 * (away / 0.5) ** 2) * RADIUS_M * 500.0 / away
-    assert doubt[1, 1] == pytest.approx(expected)
-    assert doubt[0, 1] == pytest.approx(0.2 * expected * away / 0.5)  # what hides it there may reach in here
+    assert found[1, 1] == pytest.approx(expected)
+    assert found[0, 1] == pytest.approx(0.2 * expected * away / 0.5)  # what hides it there may reach in here
     alone = np.array([[np.nan] * 6, 0.4 * area[0]])
-    assert CAPS.doubt_px(alone, points, CAMERAS, expected_m2)[1, 1] > 0.4 * RADIUS_M * 500.0 / away
+    assert hidden_px(alone, points, expected_m2)[1, 1] > 0.4 * RADIUS_M * 500.0 / away
     # One that both see alike may be a smaller cap, as far as a radius may be wrong.
-    both = CAPS.doubt_px(
-        0.4 * area[:1] * np.array([[1.0], [(0.5 / away) ** 2]]), points, CAMERAS, expected_m2
-    )
+    both = hidden_px(0.4 * area[:1] * np.array([[1.0], [(0.5 / away) ** 2]]), points, expected_m2)
     np.testing.assert_allclose(both[:, 1], 0.5 * RADIUS_M * 500.0 / np.array([0.5, away]))
-    nowhere = CAPS.doubt_px(np.full((2, 6), np.nan), points, CAMERAS, expected_m2)
+    nowhere = hidden_px(np.full((2, 6), np.nan), points, expected_m2)
     np.testing.assert_array_equal(nowhere, np.zeros((2, 6)))
 
 
@@ -120,33 +149,37 @@ def test_a_cap_of_another_radius_is_whole_and_one_that_two_cameras_see_unlike_is
     expected_m2 = np.stack([np.full((2, 6), 2e-4), np.full((2, 6), 3e-4)])  # as its direction may be
     px2_m2 = (500.0 / float(np.linalg.norm(points[0] - CAMERAS[0].centre))) ** 2
     smaller = np.full((2, 6), 0.81 * 2e-4 * px2_m2)  # a radius smaller by a tenth
-    np.testing.assert_array_equal(CAPS.doubt_px(smaller, points, CAMERAS, expected_m2)[:, :5], 0.0)
+    np.testing.assert_array_equal(hidden_px(smaller, points, expected_m2)[:, :5], 0.0)
     smaller[1] *= 0.75
-    doubt = CAPS.doubt_px(smaller, points, CAMERAS, expected_m2)[:, 1]
-    np.testing.assert_allclose(doubt, np.array([0.05, 0.25]) * RADIUS_M * np.sqrt(px2_m2))
+    found = hidden_px(smaller, points, expected_m2)[:, 1]
+    np.testing.assert_allclose(found, np.array([0.05, 0.25]) * RADIUS_M * np.sqrt(px2_m2))
     turned = expected_m2 * np.array([[[1.0], [1.0]], [[1.0], [0.75]]])  # or it points away from one of them
-    np.testing.assert_array_equal(CAPS.doubt_px(1.1 * smaller / 0.75, points, CAMERAS, turned)[:, 1], 0.0)
+    np.testing.assert_array_equal(hidden_px(1.1 * smaller / 0.75, points, turned)[:, 1], 0.0)
 
 
 def test_a_cap_shows_a_disc_from_its_end_and_its_whole_length_from_the_side() -> None:
     points = np.tile([0.0, 0.0, 0.5], (6, 1))
-    towards = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    shown = CAPS.look(np.repeat(towards[:, None], 5, axis=1), points, CAMERAS).whole_m2[:, 0, 1]
+    shown: list[float] = []
+    for ahead in ([0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]):
+        rotation = np.zeros((3, 3))
+        rotation[:, 2] = np.negative(ahead)
+        shown.append(cap_views(RIGHT, MARKERS, pointing(rotation), points, CAMERAS)[1][0, 1])
     np.testing.assert_allclose(shown[0], np.pi * RADIUS_M**2, rtol=0.01)
     np.testing.assert_allclose(shown[1], (np.pi / 2 + 2 * 0.7) * RADIUS_M**2, rtol=0.01)
     assert shown[2] == pytest.approx(0.0, abs=1e-12)  # behind the finger
 
 
-def test_a_sure_pose_is_not_tilted_and_an_unsure_one_about_its_own() -> None:
-    joints = pointing(np.eye(3))
-    sure = CAPS.tilted(joints, np.zeros((5, 3, 3)))
-    np.testing.assert_allclose(sure, np.broadcast_to([0.0, 0.0, -1.0], (7, 5, 3)), atol=1e-12)
-    sd = np.array([0.2, 0.05])
-    tilted = CAPS.tilted(joints, np.broadcast_to(np.diag([*sd**2, 0.0]), (5, 3, 3)))
-    np.testing.assert_allclose(np.linalg.norm(tilted, axis=-1), 1.0)
-    np.testing.assert_allclose(
-        np.sqrt((tilted[1:, :, :2] ** 2).mean(axis=0)), np.broadcast_to(sd, (5, 2)), rtol=0.05
-    )
+def test_a_sure_pose_is_not_tilted_and_an_uncertain_one_about_its_own() -> None:
+    R, sd = np.eye(3)[None], np.array([0.2, 0.05])
+    sure, unsure = np.empty((TILTED, 3)), np.empty((TILTED, 3))
+    tilted(0, R, np.zeros((1, 3, 3)), 0.0, sure)
+    np.testing.assert_allclose(sure, np.broadcast_to([0.0, 0.0, -1.0], (TILTED, 3)), atol=1e-12)
+    tilted(0, R, np.diag([*sd**2, 0.0])[None], 0.0, unsure)
+    np.testing.assert_allclose(np.linalg.norm(unsure, axis=-1), 1.0)
+    np.testing.assert_allclose(np.sqrt((unsure[1:, :2] ** 2).mean(axis=0)), sd, rtol=0.05)
+    old = np.empty((TILTED, 3))
+    tilted(0, R, np.zeros((1, 3, 3)), 0.1**2, old)  # its age alone
+    np.testing.assert_allclose(np.sqrt((old[1:, :2] ** 2).mean(axis=0)), [0.1, 0.1], rtol=0.05)
 
 
 @pytest.mark.parametrize("name", ["static", "flex90"])
@@ -156,14 +189,14 @@ def test_the_correction_brings_rendered_silhouettes_to_their_caps(datasets: Path
     manifest = open_recording(folder).manifest
     rig = manifest.marker_rig()
     cameras = tuple(CameraModel.of(manifest.cameras[c], rig.camera_pose(c)) for c in rig.cameras)
-    caps, triangulator = CapModel(model, MARKERS), Triangulator.of(cameras)
+    arrays = CameraArrays.of(cameras)
     with np.load(folder / "truth.npz") as truth:
         uv, clear, centroid = truth["uv_ref"], truth["frac_ref"].min(axis=1) > 0.9, truth["paint_centroid"]
     error_mm: dict[str, list[float]] = {"plain": [], "corrected": []}
     for row in range(len(uv)):
-        plain = triangulator.triangulate(uv[row]).points
-        bias = caps.bias_px(model.forward(T[row], angles[row]), plain, cameras)
-        corrected = triangulator.triangulate(uv[row] - bias).points
+        plain = triangulate(arrays, uv[row]).points_m
+        bias = cap_views(model, MARKERS, model.forward(T[row], angles[row]), plain, cameras)[0]
+        corrected = triangulate(arrays, uv[row] - bias).points_m
         fingers = clear[row] & (np.arange(6) < 5)
         for key, points in (("plain", plain), ("corrected", corrected)):
             error_mm[key] += list(1e3 * np.linalg.norm(points - centroid[row], axis=1)[fingers])
@@ -172,14 +205,14 @@ def test_the_correction_brings_rendered_silhouettes_to_their_caps(datasets: Path
     assert np.median(error_mm["corrected"]) < 1.0
 
 
-def test_a_flat_marker_is_doubted_where_another_camera_sees_much_more_of_it() -> None:
+def test_a_flat_marker_is_uncertain_where_another_camera_sees_much_more_of_it() -> None:
     points = np.tile([0.0375, 0.0, 0.5], (6, 1))  # as far from one camera as from the other
     whole, nothing = np.full(6, 500.0), np.zeros((1, 2, 6))
-    alike = CAPS.doubt_px(np.stack([whole, 0.7 * whole]), points, CAMERAS, nothing)
+    alike = hidden_px(np.stack([whole, 0.7 * whole]), points, nothing)
     np.testing.assert_array_equal(
         alike[:, 5], 0.0
     )  # side by side: all of a pair's sightings stay as they are
-    aslant = CAPS.doubt_px(np.stack([whole, 0.2 * whole]), points, CAMERAS, nothing)
+    aslant = hidden_px(np.stack([whole, 0.2 * whole]), points, nothing)
     np.testing.assert_allclose(aslant[:, 5], [0.0, 0.8 * 0.5 * np.sqrt(500.0)])
-    alone = CAPS.doubt_px(np.stack([np.full(6, np.nan), 0.2 * whole]), points, CAMERAS, nothing)
+    alone = hidden_px(np.stack([np.full(6, np.nan), 0.2 * whole]), points, nothing)
     np.testing.assert_array_equal(alone[:, 5], 0.0)

@@ -5,11 +5,10 @@ import pytest
 
 from common.arrays import Float
 from common.camera_model import CameraModel
+from master.estimator.cameras import CameraArrays
+from master.estimator.gate import SETTINGS, Association, Prior, among, associate
 from master.rig_pipeline import line_of
 from master.stages import StageTimes
-from master.stereo.place import Placement
-from master.stereo.rivals import Belief, Chosen, RivalChooser
-from master.stereo.whereabouts import HandBelief, Past
 from tests.hand_helpers import (
     MARKERS,
     RIGHT,
@@ -27,8 +26,10 @@ SIGMA_PX = 0.1
 MARKER = np.array([0.02, 0.01, 0.5])
 MUG = np.array([0.12, -0.06, 0.6])  # seen at another row
 IN_ROW = np.array([-0.05, 0.012, 0.6])  # seen at the rows of the marker: on its epipolar line
-NO_IDEA = Belief(np.full((1, 3), np.nan), np.full((1, 3, 3), np.nan))
 NOWHERE = np.array([np.nan, np.nan])
+Spot = tuple[Float | None, float]
+"""A place [m], None: nowhere; and how uncertain it is [m]."""
+NO_IDEA: Spot = (None, np.nan)
 
 
 def seen(cameras: tuple[CameraModel, ...], *points: Float | None, seed: int = 0) -> Float:
@@ -39,18 +40,25 @@ def seen(cameras: tuple[CameraModel, ...], *points: Float | None, seed: int = 0)
 
 
 def choose(
-    cameras: tuple[CameraModel, ...],
-    first: Float,
-    second: Float,
-    past: Belief = NO_IDEA,
-    hand: Belief = NO_IDEA,
-) -> Chosen:
+    cameras: tuple[CameraModel, ...], first: Float, second: Float, past: Spot = NO_IDEA, hand: Spot = NO_IDEA
+) -> Association:
+    """Associate markers of which each has the same past and prediction."""
     sigmas = [np.where(np.isnan(uv[..., 0]), np.nan, SIGMA_PX) for uv in (first, second)]
-    return RivalChooser(cameras, Placement(cameras))(first, sigmas[0], second, sigmas[1], hand, past)
+    count = first.shape[1]
+
+    def rows(place: Float | None) -> Float:
+        return np.tile(np.full(3, np.nan) if place is None else place, (count, 1))
+
+    age_s = np.full(count, (past[1] - SETTINGS.place_m) / SETTINGS.speed_m_s)
+    model = hand[1] ** 2 - SETTINGS.model_m**2
+    prior = Prior(rows(hand[0]), np.tile(model * np.eye(3), (count, 1, 1)))
+    area = np.where(np.isnan(first[..., 0]), np.nan, 400.0)
+    pixels = first, sigmas[0], area
+    return associate(CameraArrays.of(cameras), pixels, (second, sigmas[1]), prior, (rows(past[0]), age_s))
 
 
-def near(point: Float, spread_m: float = 0.02) -> Belief:
-    return Belief(point[None], spread_m**2 * np.eye(3)[None])
+def near(point: Float, spread_m: float = 0.02) -> Spot:
+    return point, spread_m
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -139,14 +147,13 @@ def test_one_camera_alone_goes_by_the_expected_place() -> None:
     np.testing.assert_array_equal(choose(PAIR, first, second).uv, first)  # no idea: the slave's choice
     np.testing.assert_array_equal(choose(PAIR, first, second, near(MARKER)).uv, second)
     np.testing.assert_array_equal(choose(PAIR, second, first, near(MARKER)).uv, second)
-    assert choose(PAIR, first, second, NO_IDEA, near(np.array([-0.15, 0.1, 0.5]))).dropped.all()
+    assert choose(PAIR, first, second, hand=near(np.array([-0.15, 0.1, 0.5]))).dropped.all()
 
 
 def test_other_markers_are_passed_on_untouched() -> None:
     first = np.concatenate([seen(PAIR, MUG, MARKER), seen(PAIR, MARKER, MUG), seen(PAIR, None, MUG)], axis=1)
     second = np.concatenate([seen(PAIR, MARKER, None), *[np.full((2, 1, 2), np.nan)] * 2], axis=1)
-    no_idea = Belief(np.full((3, 3), np.nan), np.full((3, 3, 3), np.nan))
-    chosen = choose(PAIR, first, second, no_idea, no_idea)
+    chosen = choose(PAIR, first, second)
     np.testing.assert_array_equal(chosen.uv[:, 1:], first[:, 1:])
     assert chosen.taken.tolist() == [True, False, False]
 
@@ -165,46 +172,43 @@ def test_many_cameras_in_doubt_are_chosen_from_the_first_five_and_the_rest() -> 
 # -- where a marker is expected -------------------------------------------------------------------------------------
 
 
-def points(*rows: Float | None) -> Float:
-    return np.array([np.full(3, np.nan) if row is None else row for row in rows])
+def test_a_past_that_is_too_old_says_nothing() -> None:
+    first, second = seen(PAIR, IN_ROW, MARKER), seen(PAIR, MARKER, None)
+    assert choose(PAIR, first, second, near(MARKER, 0.05)).taken.all()
+    assert not choose(PAIR, first, second, near(MARKER, SETTINGS.forget_s + 0.02)).taken.any()
 
 
-def test_a_marker_is_expected_where_it_was_and_what_is_old_is_forgotten() -> None:
-    past = Past(3)
-    assert np.isnan(past.at(0).points).all()
-    past.saw(0, points(MUG, IN_ROW, None))
-    past.saw(20_000_000, points(None, MARKER, None))
-    belief = past.at(40_000_000)
-    np.testing.assert_array_equal(belief.points, points(MUG, MARKER, None))
-    # 1 cm, and 1 m/s for 40 and 20 ms
-    np.testing.assert_allclose(belief.cov[:2, 0, 0], [0.05**2, 0.03**2])
-    assert np.isnan(past.at(510_000_000).points[0]).all()
-    assert np.isfinite(past.at(510_000_000).points[1]).all()
+def test_a_second_place_has_no_area_and_a_first_one_keeps_its_own() -> None:
+    chosen = choose(PAIR, seen(PAIR, MUG, MARKER), seen(PAIR, MARKER, None))
+    np.testing.assert_array_equal(chosen.area_px2[:, 0], [np.nan, 400.0])
 
 
-def test_a_hand_that_the_others_show_has_each_marker_within_its_covariance() -> None:
-    """Natural hands, one finger in doubt: what is believed of it covers where it is, and is no wider than a hand."""
+def test_a_prediction_by_the_other_markers_covers_where_the_marker_is() -> None:
+    """Natural hands, one finger ambiguous: the prediction with its floor covers it, and is no wider than a hand."""
     rng = np.random.default_rng(3)
-    line, believe = line_of(setup_of(rig_file()), StageTimes()), HandBelief(RIGHT, MARKERS, np.arange(6))
-    squared: list[float] = []
+    line, squared = line_of(setup_of(rig_file()), StageTimes()), list[float]()
     for trial in range(40):
-        doubtful = trial % 6
+        m = trial % 6
         true = RIGHT.marker_points(RIGHT.forward(palm(rng.uniform(-20, 20, 3)), natural_angles(rng)), MARKERS)
         clear = true.copy()
-        clear[doubtful] = np.nan
-        belief = believe(line.solve_once(clear, small_cov(), np.full((2, 6), 100.0)), clear)
-        off = true[doubtful] - belief.points[doubtful]
-        squared.append(float(off @ np.linalg.solve(belief.cov[doubtful], off)))
-        assert np.sqrt(np.trace(belief.cov[doubtful])) < 0.2
+        clear[m] = np.nan
+        hand = line.solve_once(clear, small_cov(), np.full((2, 6), 100.0))
+        assert hand is not None
+        joint = RIGHT.mount(MARKERS[m]).joint
+        cov = hand.cov_m2[0 if joint is None else joint] + SETTINGS.model_m**2 * np.eye(3)
+        off = true[m] - RIGHT.marker_points(hand.joints, MARKERS)[m]
+        squared.append(float(off @ np.linalg.solve(cov, off)))
+        assert np.sqrt(np.trace(cov)) < 0.2
     assert (
         np.median(squared) < 2.4
-    )  # the median of chi square with three degrees: the belief is rather too wide
+    )  # the median of chi-square with three degrees: the prior is rather too wide
     assert max(squared) < 30.7
 
 
 def test_without_a_hand_its_markers_are_expected_together_and_others_nowhere() -> None:
-    believe = HandBelief(RIGHT, ("thumb", "cube", "back"), np.array([0, 2]))
-    assert np.isnan(believe(None, points(None, MUG, None)).points).all()
-    belief = believe(None, points(MARKER, MUG, None))
-    np.testing.assert_array_equal(belief.points, points(MARKER, None, MARKER))
-    np.testing.assert_allclose(belief.cov[0], 0.01 * np.eye(3))
+    nowhere = np.full(3, np.nan)
+    on_hand = np.array([0, 2])
+    assert np.isnan(among(np.array([nowhere, MUG, nowhere]), on_hand).points_m).all()
+    prior = among(np.array([MARKER, MUG, nowhere]), on_hand)
+    np.testing.assert_array_equal(prior.points_m, [MARKER, nowhere, MARKER])
+    np.testing.assert_allclose(prior.cov_m2[0], 0.01 * np.eye(3))

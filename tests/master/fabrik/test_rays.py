@@ -1,6 +1,12 @@
 """Tests of covariances: what noise, tilt, calibration and depth laws contribute, against worked numbers and spread."""
 
+import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from inspect import isfunction
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,16 +16,27 @@ from common.calibration import Provenance
 from common.camera_model import CameraModel
 from common.geometry import rigid
 from common.hand_model import TIPS, HandJoints
+from master.fabrik.caps import CAPS, CapTables
+from master.fabrik.depth import CalibrationResidual
+from master.fabrik.estimate import MarkerPositions
+from master.fabrik.rays import RayTriangulator
+from master.fabrik.rays import locate as kernel_of_rays
 from master.ik.hand import HandSolution
-from master.stereo.caps import TURN_RAD_S, CapModel
-from master.stereo.locate import CapLocator, Located
-from master.stereo.place import CalibrationResidual, Placement
-from tests.hand_helpers import MARKERS, RIGHT, camera_models, natural_angles, palm, rig_file
+from tests.hand_helpers import (
+    MARKERS,
+    RIGHT,
+    camera_models,
+    cap_areas_px2,
+    cap_bias_px,
+    natural_angles,
+    palm,
+    rig_file,
+)
 
 RIG = rig_file()
 CAMERAS = tuple(camera_models(RIG).values())
 FOUR = tuple(camera_models(rig_file(("a", "b", "c", "d"))).values())
-CAPS = CapModel(RIGHT, MARKERS)
+TABLES = CapTables.of(RIGHT, MARKERS)
 UNSTATED = np.full((2, 6), np.nan)  # px^2: without areas nothing is known to be hidden
 SIGMA = np.full((2, 6), 0.1)
 
@@ -35,16 +52,19 @@ def hand(tilt_rad: float, joints: HandJoints | None = None) -> HandSolution:
 
 
 def locate(
-    known: HandSolution | None, uv: Float, age_s: float = 0.0, place: Placement | None = None
-) -> Located:
-    locator = CapLocator(CAMERAS, CAPS, place or Placement(CAMERAS))
-    return locator(uv, SIGMA, UNSTATED, known, age_s)
+    known: HandSolution | None,
+    uv: Float,
+    age_s: float = 0.0,
+    sigma_px: Float = SIGMA,
+    area_px2: Float = UNSTATED,
+) -> MarkerPositions:
+    return RayTriangulator(CAMERAS, TABLES)(uv, sigma_px, area_px2, known, age_s)
 
 
 def seen(joints: HandJoints) -> tuple[Float, Float]:
     """Cap centroids (6, 3) and what the cameras see of them (2, 6, 2)."""
     points = RIGHT.marker_points(joints, MARKERS)
-    return points, np.stack([c.project(points) for c in CAMERAS]) + CAPS.bias_px(joints, points, CAMERAS)
+    return points, np.stack([c.project(points) for c in CAMERAS]) + cap_bias_px(joints, points, CAMERAS)
 
 
 def centroid_errors(rng: np.random.Generator, sigma_px: float = 0.1) -> Float:
@@ -61,7 +81,6 @@ def test_a_known_hand_gives_its_caps_back() -> None:
         found.points_m, points, atol=2e-4
     )  # caps are looked at from where they roughly are
     assert not found.apart.any()
-    np.testing.assert_allclose(found.repeated, 0.0, atol=1e-15)
 
 
 def test_the_covariance_is_the_spread_of_the_errors_that_unsure_tilts_make() -> None:
@@ -92,8 +111,7 @@ def test_errors_that_cameras_have_alike_move_a_point_and_not_its_depth() -> None
     known = hand(0.0)
     _, uv = seen(known.joints)
     found = np.array([locate(known, uv + centroid_errors(rng)).points_m for _ in range(2000)])
-    locator = CapLocator(CAMERAS, CAPS, Placement(CAMERAS))
-    claimed = locate(known, uv).cov_m2 - locator(uv, 1e-3 * SIGMA, UNSTATED, known, 0.0).cov_m2
+    claimed = locate(known, uv).cov_m2 - locate(known, uv, 0.0, 1e-3 * SIGMA).cov_m2
     spread = np.array([np.cov(found[:, m].T) for m in range(6)])
     np.testing.assert_allclose(
         np.diagonal(claimed, axis1=1, axis2=2), np.diagonal(spread, axis1=1, axis2=2), rtol=0.12
@@ -104,15 +122,11 @@ def test_errors_that_cameras_have_alike_move_a_point_and_not_its_depth() -> None
 
 def test_cameras_share_nothing_of_a_cap_that_is_partly_hidden() -> None:
     known = hand(0.0)
-    points, uv = seen(known.joints)
-    whole = CAPS.look(-known.joints.rotation[TIPS][None, :, :, 2], points, CAMERAS).whole_m2[0]
-    away = np.stack([np.linalg.norm(points - camera.centre, axis=1) for camera in CAMERAS])
-    area = whole * (500.0 / away) ** 2
+    uv, area = seen(known.joints)[1], cap_areas_px2(known.joints, CAMERAS)
     area[:, 5] = np.nan
     covered = area.copy()
     covered[1, 3] *= 0.5
-    locator = CapLocator(CAMERAS, CAPS, Placement(CAMERAS))
-    before, after = (locator(uv, SIGMA, seen_px2, known, 0.0) for seen_px2 in (area, covered))
+    before, after = (locate(known, uv, 0.0, SIGMA, seen_px2) for seen_px2 in (area, covered))
     assert (before.cov_m2 - before.noise_m2)[3, 2, 2] < 0.0
     assert (after.cov_m2 - after.noise_m2)[3, 2, 2] > 0.0
     np.testing.assert_allclose(np.delete(after.cov_m2, 3, axis=0), np.delete(before.cov_m2, 3, axis=0))
@@ -123,7 +137,7 @@ def test_covariances_stay_positive_whoever_sees_a_marker_and_however_surely(
     cameras: tuple[CameraModel, ...],
 ) -> None:
     rng = np.random.default_rng(8)
-    locator = CapLocator(cameras, CAPS, Placement(cameras))
+    locator = RayTriangulator(cameras, TABLES)
     points = RIGHT.marker_points(hand(0.0).joints, MARKERS)
     for _ in range(100):
         uv = np.stack([camera.project(points) for camera in cameras])
@@ -140,21 +154,9 @@ def test_an_unsure_pose_widens_most_along_the_sight_and_age_adds_to_it() -> None
     sure, unsure = locate(hand(0.0), uv), locate(hand(0.2), uv)
     more = np.sqrt(np.diagonal(unsure.cov_m2 - sure.cov_m2, axis1=1, axis2=2)[:5])
     assert (more[:, 2] > 2.0 * more[:, :2].max(axis=1)).all()
-    old, turned = locate(hand(0.0), uv, 0.02), locate(hand(0.02 * TURN_RAD_S), uv)
+    old, turned = locate(hand(0.0), uv, 0.02), locate(hand(0.02 * CAPS.turn_rad_s), uv)
     size = [np.trace(found.cov_m2[:5] - sure.cov_m2[:5], axis1=1, axis2=2) for found in (old, turned)]
     np.testing.assert_allclose(*size, rtol=0.05)
-
-
-def test_a_fit_is_told_of_the_motion_that_it_believes_in() -> None:
-    """Here the fit's walk makes a variance 100 dt^2 times as large: at 0.1 s it is doubled."""
-    _, uv = seen(hand(0.0).joints)
-    known, age_s = hand(0.3), 0.1
-    found = locate(known, uv, age_s)
-    tilted = found.cov_m2 - locate(hand(0.0), uv).cov_m2
-    ours = 2 * 0.3**2 + 2 * (TURN_RAD_S * age_s) ** 2
-    fits = 2 * 0.3**2 + 100.0 * age_s**2 * 2 * 0.3**2
-    np.testing.assert_allclose(found.repeated[:5], (fits / ours - 1.0) * tilted[:5], rtol=0.05, atol=1e-9)
-    np.testing.assert_array_equal(found.repeated[5], 0.0)
 
 
 def test_without_a_hand_a_cap_may_point_anywhere() -> None:
@@ -175,38 +177,111 @@ def test_without_a_hand_a_cap_may_point_anywhere() -> None:
     assert np.mean(inside) > 0.9
 
 
-def test_more_cameras_and_better_ones_make_a_point_surer() -> None:
-    points = np.tile([0.1, 0.02, 0.5], (6, 1))
-    uv = np.stack([camera.project(points) for camera in FOUR])
-    place = Placement(FOUR)
-    sd: list[float] = []
-    for cameras in (2, 3, 4):
-        some = np.where(np.arange(4)[:, None, None] < cameras, uv, np.nan)
-        sd.append(float(np.sqrt(place(some, np.full((4, 6), 0.1)).cov[0, 2, 2])))
-    assert sd[0] > sd[1] > sd[2]
-    vague = np.full((4, 6), 0.1)
-    vague[2:] = 50.0  # two that hardly tell anything: as good as two cameras
-    assert np.sqrt(place(uv, vague).cov[0, 2, 2]) == pytest.approx(sd[0], rel=0.01)
-
-
 def provenance(**residual: float) -> Provenance:
     return Provenance(date="2026-11-21T12:00:00Z", tool="test", data=("here",), residual=residual)
 
 
-def test_what_a_calibration_leaves_is_part_of_the_covariance() -> None:
+def test_what_a_calibration_leaves_is_what_its_file_states() -> None:
     rig = rig_file(provenance={"T_rig_camera": provenance(rms_px=0.3)})
     assert CalibrationResidual.of(RIG) == CalibrationResidual()
     left = CalibrationResidual.of(rig)
     assert left == CalibrationResidual(rays_px=0.3)
-    uv = seen(hand(0.0).joints)[1]
-    exact, real = Placement(CAMERAS)(uv, SIGMA), Placement(CAMERAS, left)(uv, SIGMA)
-    np.testing.assert_allclose(real.cov, exact.cov * (0.1**2 + 0.3**2) / 0.1**2, rtol=1e-6)
-    np.testing.assert_allclose(real.misfit, exact.misfit, atol=1e-12)  # that has its own allowance
 
 
-def test_covariances_turn_with_the_rig() -> None:
+def test_points_and_covariances_turn_with_the_rig() -> None:
     turn = rigid(palm(np.array([30.0, -20.0, 70.0]))[:3, :3], np.array([1.0, 2.0, 3.0]))
     moved = tuple(replace(c, T_rig_camera=turn @ c.T_rig_camera) for c in CAMERAS)
-    uv = seen(hand(0.0).joints)[1]
-    here, there = Placement(CAMERAS)(uv, SIGMA).cov, Placement(moved)(uv, SIGMA).cov
-    np.testing.assert_allclose(there, turn[:3, :3] @ here @ turn[:3, :3].T, rtol=1e-6, atol=1e-14)
+    known, R = hand(0.1), turn[:3, :3]
+    joints = replace(known.joints, rotation=R @ known.joints.rotation)
+    turned = replace(known, joints=joints, tilt_cov_rad2=R @ known.tilt_cov_rad2 @ R.T)
+    uv = seen(known.joints)[1]
+    here, there = locate(known, uv), RayTriangulator(moved, TABLES)(uv, SIGMA, UNSTATED, turned, 0.0)
+    np.testing.assert_allclose(there.points_m, here.points_m @ R.T + turn[:3, 3], atol=1e-9)
+    np.testing.assert_allclose(there.cov_m2, R @ here.cov_m2 @ R.T, rtol=1e-6, atol=1e-12)
+
+
+def test_what_is_seen_of_a_flat_marker_is_its_centroid_within_the_relief() -> None:
+    points, uv = seen(hand(0.0).joints)
+    found = locate(hand(0.3), uv)
+    np.testing.assert_allclose(found.points_m[5], points[5], atol=1e-9)
+    np.testing.assert_allclose(
+        found.cov_m2[5] - found.noise_m2[5], locate(hand(0.0), uv).cov_m2[5] - found.noise_m2[5]
+    )
+
+
+def test_as_seen_the_correction_is_uncertainty_alone() -> None:
+    _, uv = seen(hand(0.0).joints)
+    place = RayTriangulator(CAMERAS, TABLES)
+    found, corrected = (place(uv, SIGMA, UNSTATED, None, 0.0, as_seen=flag) for flag in (True, False))
+    plain = place.triangulate(uv, 0.1)
+    np.testing.assert_allclose(found.points_m, plain.points_m, atol=1e-7)
+    moved = np.linalg.norm(corrected.points_m - found.points_m, axis=1)[:5]
+    assert (moved > 1e-3).all()
+    assert (np.sqrt(np.trace(found.cov_m2[:5], axis1=1, axis2=2)) > moved).all()
+
+
+def test_nan_stays_with_its_own_marker_and_camera() -> None:
+    known, place = hand(0.1), RayTriangulator(FOUR, TABLES)
+    points = RIGHT.marker_points(known.joints, MARKERS)
+    uv = np.stack([c.project(points) for c in FOUR])
+    sigma, area = np.full((4, 6), 0.1), cap_areas_px2(known.joints, FOUR)
+    whole = place(uv, sigma, area, known, 0.0)
+    uv[:, 1] = np.nan
+    uv[1:, 2] = np.nan
+    uv[0, 3, 1] = np.nan
+    sigma[2, 4] = np.nan
+    found = place(uv, sigma, area, known, 0.0)
+    assert np.isnan(found.points_m).all(axis=1).tolist() == [False, True, True, False, False, False]
+    assert np.isnan(found.cov_m2).any(axis=(1, 2)).tolist() == [False, True, True, False, False, False]
+    assert not found.apart.any()
+    np.testing.assert_array_equal(found.points_m[[0, 5]], whole.points_m[[0, 5]])
+    assert np.abs(found.points_m - whole.points_m)[[3, 4]].max() < 1e-3
+
+
+def test_the_camera_that_sees_less_of_a_cap_counts_less() -> None:
+    known = hand(0.0)
+    uv, area = seen(known.joints)[1], cap_areas_px2(known.joints, CAMERAS)
+    uv[1, 3, 1] += 4.0
+    covered = area.copy()
+    covered[1, 3] *= 0.4
+    even, uneven = (locate(known, uv, 0.0, SIGMA, px2) for px2 in (area, covered))
+    rows = [np.stack([c.project(found.points_m[3]) for c in CAMERAS])[:, 1] for found in (even, uneven)]
+    wanted = uv[0, 3, 1] - cap_bias_px(known.joints, even.points_m, CAMERAS)[0, 3, 1]
+    assert abs(rows[1][0] - wanted) < 0.1 * abs(rows[0][0] - wanted)
+
+
+def example() -> dict[str, object]:
+    """Points, covariances and flags of markers that four cameras see, some of them wrongly, in three kinds of call."""
+    known, rng, found = hand(0.1), np.random.default_rng(12), list[list[float]]()
+    points = RIGHT.marker_points(known.joints, MARKERS)
+    place = RayTriangulator(FOUR, TABLES, 0.2)
+    uv = np.stack([c.project(points) for c in FOUR]) + rng.normal(0.0, 0.1, (4, 6, 2))
+    uv[1, 2] += [0.0, 30.0]
+    uv[:3, 4] = np.nan
+    sigma, area = np.full((4, 6), 0.1), cap_areas_px2(known.joints, FOUR) * rng.uniform(0.4, 1.0, (4, 6))
+    for one, as_seen in ((known, False), (None, False), (None, True)):
+        out = place(uv, sigma, area, one, 0.02, as_seen=as_seen)
+        for values in (out.points_m, 1e3 * out.cov_m2, 1e3 * out.noise_m2, out.apart, out.left_out):
+            found.append(values.ravel().astype(np.float64).tolist())
+    return {"plain": isfunction(kernel_of_rays), "found": found}
+
+
+def test_plain_python_finds_the_same_points() -> None:
+    root = Path(__file__).resolve().parents[3]
+    code = "import json; from tests.master.fabrik.test_rays import example; print(json.dumps(example()))"
+    printed = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": str(root)},
+        cwd=root,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    plain, compiled = json.loads(printed.stdout), example()
+    assert plain["plain"]
+    assert not compiled["plain"]
+    found = compiled["found"]
+    assert isinstance(found, list)
+    assert sum(found[4]) == 1.0  # the knocked sighting
+    for one, other in zip(plain["found"], found, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)

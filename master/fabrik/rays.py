@@ -1,0 +1,299 @@
+"""Locate markers by the rays of all cameras, corrected for how caps look.
+
+What a camera sees of a cap is not its centroid; the difference follows from the direction in which the finger points,
+which is itself uncertain. So a point's covariance has these parts:
+
+    centroids     noise, occlusion and time, each camera's own              gain diag(sigma^2) gain'
+    common        part of the noise is the same in all cameras              moves the point, not its depth
+    direction     one finger is tilted for all cameras alike                spread of six tilted hands
+    radius        of the profile                                            a tenth of the whole correction
+    relief        of a flat marker: the back of a hand is not flat          0.4 mm
+    calibration   its reprojection error                                    added to each centroid
+
+Tilt matters most along the line of sight: two cameras see a finger that points at one of them from different sides, so
+a degree of tilt moves the two centroids apart, and the distance with them. Cameras side by side see the same cap in the
+same light, so that its rim and its shading mislead them alike: most of a whole cap's error is one of place. What
+occludes a part of a cap, or comes of time, is each camera's own.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.camera_model import CameraModel
+from common.kernels import inner, kernel
+from master.estimator.cameras import CameraArrays, project
+from master.fabrik.cap_views import (
+    ANY,
+    TILTED,
+    Views,
+    any_direction,
+    appearance,
+    hidden_part,
+    tilted,
+    views_of,
+)
+from master.fabrik.caps import CAPS, CapTables
+from master.fabrik.estimate import MarkerPositions, SolvedHand
+from master.fabrik.intersection import (
+    RAYS,
+    Rays,
+    Triangulation,
+    chi_square,
+    limits_of,
+    linear,
+    observe,
+    outlier,
+    rays_of,
+    refine,
+    triangulate,
+)
+
+_FEWEST = 3  # cameras of which one may be an outlier
+
+
+class _Hand(NamedTuple):
+    """Directions of the K caps.
+
+    Attributes:
+        known: False: a cap may point anywhere where it is seen.
+        as_seen: What is seen of a marker is taken for its centroid, and the whole correction for uncertainty.
+        R: (K, 3, 3) rotations of the tip joints, rig frame.
+        tilt_rad2: (K, 3, 3) covariance of their directions.
+        turned_rad2: Variance that their age adds.
+    """
+
+    known: bool
+    as_seen: bool
+    R: Float
+    tilt_rad2: Float
+    turned_rad2: float
+
+
+@inner
+def _covariance(
+    cameras: CameraArrays,
+    caps: CapTables,
+    row: int,
+    count: int,
+    shared: float,
+    rays: Rays,
+    views: Views,
+    cov: Float,
+) -> None:
+    """Write the covariance (3, 3) of a refined point: all parts (see the module)."""
+    moved, gain = views.moved, np.empty((3, 2))
+    step, both = np.zeros((3, 3)), np.zeros((3, 3))  # of the point by a common step; gain gain'
+    for t in range(count):
+        for i in range(3):
+            moved[t, i] = 0.0
+    for c in range(rays.weight.shape[0]):
+        if rays.weight[c] == 0.0 or not project(cameras, c, rays.point, rays.seen, rays.J):
+            continue
+        for i in range(3):
+            for axis in range(2):
+                gain[i, axis] = 0.0
+                for k in range(3):
+                    gain[i, axis] += rays.weight[c] * rays.cov[i, k] * rays.J[axis, k]
+        for i in range(3):
+            for t in range(count):
+                moved[t, i] += gain[i, 0] * views.bias[t, c, 0] + gain[i, 1] * views.bias[t, c, 1]
+            for j in range(3):
+                step[i, j] += gain[i, 0] * cameras.R[c, 0, j] + gain[i, 1] * cameras.R[c, 1, j]
+                both[i, j] += gain[i, 0] * gain[j, 0] + gain[i, 1] * gain[j, 1]
+    for i in range(3):
+        for j in range(3):
+            common = step[i, 0] * step[j, 0] + step[i, 1] * step[j, 1] + step[i, 2] * step[j, 2] - both[i, j]
+            total = rays.cov[i, j] + shared * common + CAPS.radius_share**2 * moved[0, i] * moved[0, j]
+            for t in range(1, count):
+                total += (moved[t, i] - moved[0, i]) * (moved[t, j] - moved[0, j]) / (count - 1)
+            cov[i, j] = total + (CAPS.relief_m**2 if row < 0 and i == j else 0.0)
+
+
+@inner
+def _correct(
+    cameras: CameraArrays,
+    caps: CapTables,
+    hand: _Hand,
+    rays_px: float,
+    row: int,
+    rays: Rays,
+    views: Views,
+) -> tuple[int, float]:
+    """Take the caps' bias from the centroids and weigh them by what is hidden.
+
+    Returns:
+        Directions that the cap may have, and the variance [px^2] that all cameras have in common.
+    """
+    count = TILTED if hand.known else ANY
+    if row < 0:
+        count = 1
+    elif hand.known:
+        tilted(row, hand.R, hand.tilt_rad2, hand.turned_rad2, views.aim)
+    else:
+        any_direction(cameras, rays.point, views.aim)
+    appearance(cameras, caps, row, count, rays, views)
+    hidden_part(caps, row, views.area, views.scale, views.whole, count, views.hidden)
+    shared = RAYS.common_px * RAYS.common_px
+    occluded = False
+    for c in range(rays.weight.shape[0]):
+        if hand.as_seen:
+            views.bias[0, c, 0] = views.bias[0, c, 1] = 0.0
+        if rays.weight[c] == 0.0:
+            continue
+        shared = min(shared, rays.variance[c])
+        occluded = occluded or views.hidden[c] > 0.0
+        rays.uv[c, 0] -= views.bias[0, c, 0]
+        rays.uv[c, 1] -= views.bias[0, c, 1]
+        rays.variance[c] += views.hidden[c]
+        rays.weight[c] = 1.0 / (rays.variance[c] + rays_px * rays_px)
+    return count, 0.0 if occluded else RAYS.common * shared
+
+
+@inner
+def _place(
+    cameras: CameraArrays,
+    caps: CapTables,
+    hand: _Hand,
+    rays_px: float,
+    observed: Float,
+    left_out: Bool,
+    m: int,
+    rays: Rays,
+    views: Views,
+) -> tuple[int, bool, int, float]:
+    """Triangulate marker m by the cameras that are not left out.
+
+    Returns:
+        How many see it; whether its point is determined; and as `_correct`.
+    """
+    seen = observe(cameras, observed, left_out, rays_px, m, rays)
+    if seen < 2 or not linear(cameras, rays):
+        return seen, False, 1, 0.0
+    for c in range(observed.shape[0]):
+        views.area[c] = observed[c, m, 3] if rays.weight[c] > 0.0 else np.nan
+    count, shared = _correct(cameras, caps, hand, rays_px, caps.row[m], rays, views)
+    return seen, refine(cameras, rays), count, shared
+
+
+@kernel
+def locate(
+    cameras: CameraArrays,
+    caps: CapTables,
+    rays_px: float,
+    limits: Float,
+    known: bool,
+    as_seen: bool,
+    R: Float,
+    tilt_rad2: Float,
+    turned_rad2: float,
+    observed: Float,
+    points: Float,
+    cov: Float,
+    noise: Float,
+    apart: Bool,
+    left_out: Bool,
+) -> None:
+    """Locate M markers with covariance.
+
+    Args:
+        cameras, caps: Of the rig.
+        rays_px: Standard deviation per axis that the calibration leaves.
+        limits: (C + 1,) most chi-square by the number of cameras.
+        known, as_seen, R, tilt_rad2, turned_rad2: Directions of the caps, as of `_Hand`.
+        observed: (C, M, 4) u, v, sigma [px], area [px^2]; NaN: not seen.
+        points, cov, noise: (M, 3), (M, 3, 3), (M, 3, 3) written as of `MarkerPositions`.
+        apart: (M,) written: two cameras or more see it, but their rays do not meet.
+        left_out: (C, M) written: outliers, without which they do.
+    """
+    hand = _Hand(known, as_seen, R, tilt_rad2, turned_rad2)
+    rays, views = rays_of(observed.shape[0]), views_of(observed.shape[0])
+    for m in range(observed.shape[1]):
+        for c in range(observed.shape[0]):
+            left_out[c, m] = False
+        seen, placed, count, shared = _place(cameras, caps, hand, rays_px, observed, left_out, m, rays, views)
+        meets = placed and chi_square(rays) <= limits[seen]
+        if seen >= _FEWEST and not meets:
+            odd = outlier(cameras, limits[seen - 1], rays)
+            if odd >= 0:
+                left_out[odd, m] = True
+                seen, placed, count, shared = _place(
+                    cameras, caps, hand, rays_px, observed, left_out, m, rays, views
+                )
+                meets = placed and chi_square(rays) <= limits[seen]
+                left_out[odd, m] = meets
+        apart[m] = seen >= 2 and not meets
+        if meets:
+            _covariance(cameras, caps, caps.row[m], count, shared, rays, views, cov[m])
+        for i in range(3):
+            points[m, i] = rays.point[i] if meets else np.nan
+            for j in range(3):
+                noise[m, i, j] = rays.cov[i, j] if meets else np.nan
+                if not meets:
+                    cov[m, i, j] = np.nan
+
+
+class RayTriangulator:
+    """Triangulates the markers of a rig by rays. Holds no state."""
+
+    def __init__(self, cameras: Sequence[CameraModel], caps: CapTables, rays_px: float = 0.0) -> None:
+        """Triangulate these markers with these cameras.
+
+        Args:
+            cameras: In the order of the observations' first axis.
+            caps: The markers.
+            rays_px: Standard deviation per axis that the calibration leaves.
+
+        Raises:
+            ValueError: Fewer than two cameras.
+        """
+        if len(cameras) < 2:
+            raise ValueError(f"triangulation needs two cameras or more, not {len(cameras)}")
+        self._cameras, self._caps, self._rays_px = CameraArrays.of(cameras), caps, rays_px
+        self._limits = limits_of(len(cameras))
+        self._unknown = np.zeros((len(caps.radius_m), 3, 3))
+
+    def __call__(
+        self,
+        uv: Float,
+        sigma_px: Float,
+        area_px2: Float,
+        hand: SolvedHand | None,
+        age_s: float,
+        *,
+        as_seen: bool = False,
+    ) -> MarkerPositions:
+        """As `Triangulate`."""
+        cameras, count = uv.shape[:2]
+        observed = np.empty((cameras, count, 4))
+        observed[..., :2], observed[..., 2], observed[..., 3] = uv, sigma_px, area_px2
+        R = tilt = self._unknown
+        if hand is not None:
+            R, tilt = hand.joints.rotation[self._caps.joint], hand.tilt_cov_rad2[self._caps.finger]
+        points, cov = np.empty((count, 3)), np.empty((count, 3, 3))
+        noise, apart = np.empty((count, 3, 3)), np.empty(count, np.bool_)
+        left_out = np.empty((cameras, count), np.bool_)
+        locate(
+            self._cameras,
+            self._caps,
+            self._rays_px,
+            self._limits,
+            hand is not None,
+            as_seen,
+            R,
+            tilt,
+            (CAPS.turn_rad_s * age_s) ** 2,
+            observed,
+            points,
+            cov,
+            noise,
+            apart,
+            left_out,
+        )
+        return MarkerPositions(points, cov, noise, apart, left_out)
+
+    def triangulate(self, uv: Float, sigma_px: float | Float = 0.1) -> Triangulation:
+        """Triangulate markers as they are seen (`master.fabrik.intersection`)."""
+        return triangulate(self._cameras, uv, sigma_px, self._rays_px)
