@@ -9,6 +9,8 @@ from common.arrays import Bool, Code, Float, Int
 from common.camera_model import CameraModel
 from common.geometry import fit_rigid
 from common.hand_model import HandJoints, HandModel
+from common.kernels import bound, boxed
+from master.estimator.attached import Attached
 from master.estimator.cameras import CameraArrays
 from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.parameters import HandParameters
@@ -26,13 +28,12 @@ from master.estimator.update import (
     TRACK,
     TRACKED_ON,
     Estimate,
-    Start,
+    Model,
     Workspace,
     epoch,
 )
 from master.fabrik.caps import CapTables
 from master.fabrik.estimate import SolvedHand
-from master.ik.attached import Attached
 
 _BENDS_RAD = (0.1, 0.7, 1.3)  # of the PIP, from which a search afresh begins: open to closed
 _MCP_PER_PIP = 0.6
@@ -46,7 +47,7 @@ _SOMEWHERE_M = 0.1  # about each axis: a hand that is known no better than this 
 ON_MARKERS, ON_OTHERS, BY_MARKERS = 1, 2, 16
 _FIRST_MARKER = 8  # bit
 _EYE = np.eye(3)
-_NO_T, _NONE = np.eye(4), frozenset[int]()
+_NONE = frozenset[int]()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,7 +190,25 @@ class Estimator:
         self._bit = 1 << np.arange(_FIRST_MARKER, _FIRST_MARKER + count)
         self._finger_of_free = self.parameters.free // 4
         self._turn: Float | None = None
-        self._out, self._numbers = Estimate.empty(), settings.record()
+        self._out = Estimate.empty()
+        self._model = Model(
+            boxed(self._rig.hand),
+            boxed(settings.record()),
+            self._rig.mounts,
+            self._rig.cameras,
+            self._rig.caps,
+        )
+        self._boxed_state, self._boxed_space = boxed(self.state), boxed(self._space)
+        self._kernel = bound(
+            epoch,
+            self._model,
+            self._habits_of(_NONE),
+            self._boxed_state,
+            self._observed,
+            self._blank,
+            self._boxed_space,
+            boxed(self._out),
+        )
 
     @property
     def known(self) -> bool:
@@ -203,7 +222,7 @@ class Estimator:
 
     def push(self, at: Epoch) -> Fitted:
         """Fit one epoch."""
-        observed, sensed = self._observed, at.sensed
+        observed, sensed, task = self._observed, at.sensed, self._space.task
         count = observe_rays(at.uv, at.variance_px2, at.own_m2, self._on_hand, observed)
         seen, rays = observed.seen, (observed.weight > 0.0).sum(axis=0)
         back = bool((seen & self._on_palm).any())
@@ -215,113 +234,92 @@ class Estimator:
             numbers += 3.0 * int(sensed.told.sum())
         by_markers = count >= _PALM_BY or (count == _PALM_BY - 1 and back)
         palm_shown = by_markers or (sure and count > 0)
-        now = _Now(at, shown, palm_shown, numbers, self._enough(at, back, sure))
-        known = self.recent(at.t_ns)
+        task.t_ns[0], task.shown[:], task.palm_shown[0], task.numbers[0] = at.t_ns, shown, palm_shown, numbers
+        known, enough = self.recent(at.t_ns), self._enough(at, back, sure)
         self._believe(at, back, rays, known=known)
         out = Estimate.empty()
-        solved, anew = known and self._track(now, out), False
-        if not solved and now.enough:
-            self._begin(now)
-            self._epoch(
-                TAKE_OVER, now, self._habits_of(_NONE), Start(_NO_T, self._natural, False, False), _EYE, out
-            )
+        solved, anew = known and self._track(at, out, may_leave=enough), False
+        if not solved and enough:
+            self._begin(at)
+            self._run(TAKE_OVER, self._habits_of(_NONE), out)
             solved, anew = True, known
         self._turn = None if sensed is None else sensed.rotation
         if count > 0 or (sensed is not None and bool(sensed.told.any()) and self._knows_place()):
             self.state.seen_ns[0] = at.t_ns
-        rests = self._rests(now, rays, by_markers=by_markers)
+        rests = self._rests(at, rays, palm_shown=palm_shown, by_markers=by_markers)
         return self._fitted(at.t_ns, out, rests, anew=anew) if solved else _unknown(rests)
 
-    def _track(self, now: "_Now", out: Estimate) -> bool:
+    def _track(self, at: Epoch, out: Estimate, *, may_leave: bool) -> bool:
         """Go on from the state; False: another hand of this epoch takes its place, or there is none."""
-        start, may_leave = now.epoch.start, now.enough
-        T, x = _NO_T, self._natural
-        if start is not None:
-            T, x = start.T_rig_palm, self.parameters.of_angles(start.angles_rad)
-        turned, then = _EYE, self._turn
-        if now.epoch.sensed is not None and now.epoch.sensed.rotation is not None and then is not None:
-            turned = now.epoch.sensed.rotation @ then.T
+        start, sensed, task = at.start, at.sensed, self._space.task
+        task.turned[:] = _EYE
+        if sensed is not None and sensed.rotation is not None and self._turn is not None:
+            task.turned[:] = sensed.rotation @ self._turn.T
         while True:
-            other = Start(T, x, start is not None, may_leave)
-            said = self._epoch(TRACK, now, self._habits_of(_NONE), other, turned, out)
+            task.may_leave[0] = may_leave and start is not None
+            if start is not None:
+                task.palm[:], task.x[:] = start.T_rig_palm, self.parameters.of_angles(start.angles_rad)
+            said = self._run(TRACK, self._habits_of(_NONE), out)
             if said == TRACKED_ON:
                 return True
-            if said == LOST:
-                return False
             wrong = float(self._space.found.wrong[0])
-            if wrong > self.settings.misled + self._begin(now):
+            if said == LOST or wrong > self.settings.misled + self._begin(at):
                 return False
             may_leave = False  # nothing is better: keep what was found
 
-    def _begin(self, now: "_Now") -> float:
+    def _begin(self, at: Epoch) -> float:
         """Fit without the state, from the other hand or from several starts; return chi square of the markers.
 
         A finger between two that show is rather bent as they are: no hand curls it alone. But straight it would show.
         """
-        shown = frozenset(np.flatnonzero(now.shown).tolist())
+        shown = frozenset(np.flatnonzero(self._space.task.shown).tolist())
         like = frozenset(f for f in (2, 3) if f not in shown and {f - 1, f + 1} <= shown)
-        chi2 = self._begin_with(now, shown, like)
+        chi2 = self._begin_with(at, shown, like)
         angles = self.parameters.angles(self._space.found.x)
         straight = frozenset(f for f in like if angles[f, 1:].sum() < self.settings.shows_rad)
-        return self._begin_with(now, shown, like - straight) if straight else chi2
+        return self._begin_with(at, shown, like - straight) if straight else chi2
 
-    def _begin_with(self, now: "_Now", shown: frozenset[int], like: frozenset[int]) -> float:
+    def _begin_with(self, at: Epoch, shown: frozenset[int], like: frozenset[int]) -> float:
         """As `_begin`, while the hidden fingers of `like` are bent as their neighbours."""
-        apart, belief, found = frozenset(range(5)) - shown - like, self._space.belief, self._space.found
+        apart, space = frozenset(range(5)) - shown - like, self._space
+        belief, found, task, start = space.belief, space.found, space.task, at.start
         fingers = np.isin(np.arange(5), list(apart))
         belief.own_w2[:], belief.own[:] = curled(self.parameters, self.settings, fingers)
         habits = self._habits_of(apart)
-        start = now.epoch.start
         try:
             if start is not None:
-                shows = now.shown[self._finger_of_free]
+                shows = task.shown[self._finger_of_free] > 0
                 x = np.where(shows, self.parameters.of_angles(start.angles_rad), self._natural)
-                chi2 = self._fit(now, habits, start.T_rig_palm, self._as_sensed(x, now.epoch.sensed))
-                if (
-                    found.steps[0] < MAX_ITERATIONS
-                    and not (found.surprise[: len(self._on_hand)] > self.settings.explained).any()
-                ):
+                task.palm[:], task.x[:] = start.T_rig_palm, self._as_sensed(x, at.sensed)
+                chi2 = self._run(BEGIN, habits, self._out)
+                surprise = found.surprise[: len(self._on_hand)]
+                if found.steps[0] < MAX_ITERATIONS and not (surprise > self.settings.explained).any():
                     return chi2
-            best, cost = None, np.inf
-            for T, x in self._starts(now):
-                here = self._epoch(ROUGH, now, habits, Start(T, x, True, False), _EYE, self._out)
-                if here < cost:
-                    best, cost = (T, x), here
-            assert best is not None
-            return self._fit(now, habits, *best)
+            ends = list[tuple[float, Float, Float]]()
+            for T, x in self._starts(at):
+                task.palm[:], task.x[:] = T, x
+                ends.append((self._run(ROUGH, habits, self._out), task.palm.copy(), task.x.copy()))
+            _, task.palm[:], task.x[:] = min(ends, key=lambda end: end[0])
+            return self._run(BEGIN, habits, self._out)
         finally:
             belief.own_w2[:] = 0.0
 
-    def _fit(self, now: "_Now", habits: Habits, T: Float, x: Float) -> float:
-        return self._epoch(
-            BEGIN, now, habits, Start(np.ascontiguousarray(T), x, True, False), _EYE, self._out
-        )
-
-    def _epoch(
-        self, what: int, now: "_Now", habits: Habits, start: Start, turned: Float, out: Estimate
-    ) -> float:
-        """The kernel, with all that is the same."""
-        return epoch(
-            what,
-            self._rig,
-            self._numbers,
+    def _run(self, what: int, habits: Habits, out: Estimate) -> float:
+        """The kernel, for what is in the task."""
+        self._space.task.what[0] = what
+        return self._kernel(
+            self._model,
             habits,
-            self.state,
-            now.epoch.t_ns,
+            self._boxed_state,
             self._observed,
-            now.shown,
-            now.palm_shown,
-            now.numbers,
-            turned,
-            start,
             self._blank,
-            self._space,
-            out,
+            self._boxed_space,
+            boxed(out),
         )
 
-    def _starts(self, now: "_Now") -> list[tuple[Float, Float]]:
+    def _starts(self, epoch: Epoch) -> list[tuple[Float, Float]]:
         """Three hands, open to closed, each laid on the markers as a rigid body."""
-        epoch, sensed = now.epoch, now.epoch.sensed
+        sensed = epoch.sensed
         placed = np.isfinite(epoch.points_m[self._on_hand, 0])
         weight = np.where(self._finger[placed] >= 0, 1.0, _PALM_WEIGHT)
         observed = epoch.points_m[self._on_hand][placed]
@@ -361,7 +359,7 @@ class Estimator:
         belief.depth_w2[0] = 0.0
         if known and rays.max() == 1:
             alone = self._rig.cameras.centre[(self._observed.weight > 0.0).sum(axis=1).argmax()]
-            sight = self.state.T[:3, 3] - alone
+            sight = self.state.palm[:3, 3] - alone
             belief.sight[:] = sight / np.sqrt(sight @ sight)
             belief.depth_w2[0] = self.settings.held_depth_m**-2.0
         belief.sensed_known[0] = 0.0 if sensed is None else 1.0
@@ -403,15 +401,15 @@ class Estimator:
         x = np.linalg.solve(habits.normal[0], habits.pull[0])
         return np.minimum(np.maximum(x, self.parameters.low), self.parameters.high)
 
-    def _rests(self, now: "_Now", rays: Int, *, by_markers: bool) -> Int:
+    def _rests(self, at: Epoch, rays: Int, *, palm_shown: bool, by_markers: bool) -> Int:
         """What thumb ... little and the palm rest on now (6,), as of `Fitted`."""
-        seen, sensed = self._observed.seen, now.epoch.sensed
+        seen, sensed = self._observed.seen, at.sensed
         rests = np.zeros(6, np.int64)
         rests[:5] = ON_MARKERS * (self._carries & seen).any(axis=1)
         rests[:5] += BY_MARKERS * (self._carries & (rays > 1)).any(axis=1)
         if sensed is not None:
             rests[:5] += ON_OTHERS * np.where(sensed.told, sensed.level, 0)
-        if now.palm_shown:
+        if palm_shown:
             rests[5] = (ON_MARKERS | BY_MARKERS) if by_markers else ON_OTHERS
             rests[5] += int(seen @ self._bit)
         return rests
@@ -422,9 +420,9 @@ class Estimator:
             (t_ns - int(self.state.seen_ns[0])) * 1e-9 <= self.settings.forget_s,
         )
         hand = FittedHand(
-            T_rig_palm=out.T,
+            T_rig_palm=out.palm,
             angles_rad=out.angles.reshape(5, 4),
-            joints=HandJoints(out.position, out.rotation, out.T),
+            joints=HandJoints(out.position, out.rotation, out.palm),
             cov_m2=out.cov,
             tilt_cov_rad2=out.tilt,
             tilt_walk_rad2_s2=np.zeros((5, 3, 3)),
@@ -443,17 +441,6 @@ class Estimator:
             rests,
             anew,
         )
-
-
-@dataclass(frozen=True, slots=True)
-class _Now:
-    """An epoch, and what is measured at it: fingers (5,), the palm, how many numbers, and enough for a hand alone."""
-
-    epoch: Epoch
-    shown: Bool
-    palm_shown: bool
-    numbers: float
-    enough: bool
 
 
 def _unknown(rests: Int) -> Fitted:

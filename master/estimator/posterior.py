@@ -44,7 +44,7 @@ class Posterior:
     """A hand by one epoch.
 
     Attributes:
-        T, x: (4, 4) palm, (n,) free angles.
+        palm, x: (4, 4) palm, (n,) free angles.
         cov: (N, N) of turn [rad], shift [m], rig axes, and free angles [rad], by this instant alone.
         surprise: (M,) chi square of each marker.
         cost: (1,) half the sum of squares, of the likelier hypothesis.
@@ -54,7 +54,7 @@ class Posterior:
         wrong: (1,) chi square of the markers, where another hand explains them better.
     """
 
-    T: Float
+    palm: Float
     x: Float
     cov: Float
     surprise: Float
@@ -70,7 +70,7 @@ class Posterior:
         N = 6 + n
         return record(
             cls,
-            T=(4, 4),
+            palm=(4, 4),
             x=n,
             cov=(N, N),
             surprise=markers,
@@ -101,7 +101,7 @@ class Room:
 
     start_T: Float  # (4, 4)
     start_x: Float  # (n,)
-    T: Float  # (2, 4, 4)
+    palm: Float  # (2, 4, 4)
     x: Float  # (2, n)
     gradient: Float  # (2, N)
     normal: Float  # (2, N, N)
@@ -130,7 +130,7 @@ class Room:
             cls,
             start_T=(4, 4),
             start_x=n,
-            T=(2, 4, 4),
+            palm=(2, 4, 4),
             x=(2, n),
             gradient=(2, N),
             normal=(2, N, N),
@@ -167,7 +167,7 @@ def _solve_each(
     """Search under each hypothesis from one start; return the steps of the first."""
     steps = 0
     for h in range(habits.constant.shape[0]):
-        T_h, x_h, gradient, normal = room.T[h], room.x[h], room.gradient[h], room.normal[h]
+        T_h, x_h, gradient, normal = room.palm[h], room.x[h], room.gradient[h], room.normal[h]
         copy(T, T_h)
         for i in range(x.shape[0]):
             x_h[i] = x[i]
@@ -252,7 +252,7 @@ def _covariance(
                 room.cov[i, j] = 1.0 / rig.hand.anywhere[i] if i == j else 0.0
         return 1.0
     inverse(room.L, N, room.work, room.cov)
-    past = past_cost(belief, room.T[h], room.x[h], room.search.off)
+    past = past_cost(belief, room.palm[h], room.x[h], room.search.off)
     chi2 = 2.0 * (room.cost[h] - past - room.apart[h] - _least(habits, belief, h, room))
     free = max(numbers - 6.0, 0.0)
     scale = max((settings.claimed + max(chi2, 0.0)) / (settings.claimed + free), 1.0)
@@ -289,9 +289,9 @@ def _mix(
         if share == 0.0:
             continue
         if h != best:
-            turn_between(room.T[h], room.T[best], room.search.J, room.off[h])
+            turn_between(room.palm[h], room.palm[best], room.search.J, room.off[h])
             for i in range(3):
-                room.off[h, 3 + i] = room.T[h, i, 3] - room.T[best, i, 3]
+                room.off[h, 3 + i] = room.palm[h, i, 3] - room.palm[best, i, 3]
             for i in range(n):
                 room.off[h, 6 + i] = room.x[h, i] - room.x[best, i]
         out.scale[0] += share * _covariance(rig, settings, habits, belief, h, numbers, room)
@@ -314,17 +314,17 @@ def _mix(
 @inlined
 def _ends(rig: Rig, h: int, room: Room) -> None:
     """Write where the step of a hypothesis brings the markers, to room.here (M, 3), as if on straight lines."""
-    markers_of(rig.hand, rig.mounts, room.T[h], room.x[h], room.search.rows, room.here)
+    markers_of(rig.hand, rig.mounts, room.palm[h], room.x[h], room.search.rows, room.here)
     moves = False
     for i in range(room.mean.shape[0]):
         room.search.step[i] = _LITTLE * room.step[h, i]
         moves = moves or room.step[h, i] != 0.0
     if not moves:
         return
-    rotate_by(room.search.step, room.T[h], room.search.T)
+    rotate_by(room.search.step, room.palm[h], room.search.palm)
     for i in range(room.x.shape[1]):
         room.search.x[i] = room.x[h, i] + room.search.step[6 + i]
-    markers_of(rig.hand, rig.mounts, room.search.T, room.search.x, room.search.rows, room.there)
+    markers_of(rig.hand, rig.mounts, room.search.palm, room.search.x, room.search.rows, room.there)
     for m in range(rig.mounts.finger.shape[0]):
         for i in range(3):
             room.here[m, i] += (room.there[m, i] - room.here[m, i]) / _LITTLE
@@ -359,7 +359,7 @@ def _onto(
                 for i in range(3):
                     between.point[m, i] += room.share[h] * room.here[m, i]
     search = room.search
-    rotate_by(room.mean, room.T[best], out.T)
+    rotate_by(room.mean, room.palm[best], out.palm)
     for i in range(n):
         out.x[i] = room.x[best, i] + room.mean[6 + i]
     linearise(
@@ -368,7 +368,7 @@ def _onto(
         blank.belief,
         between,
         0,
-        out.T,
+        out.palm,
         out.x,
         search.gradient,
         search.normal,
@@ -380,8 +380,8 @@ def _onto(
             room.A[i, j] = search.normal[i, j] + settings.stiff * room.normal[best, i, j]
     if cholesky(room.A, N, room.L):
         substitute(room.L, N, search.step)
-        copy(out.T, search.T)
-        rotate_by(search.step, search.T, out.T)
+        copy(out.palm, search.palm)
+        rotate_by(search.step, search.palm, out.palm)
         for i in range(n):
             out.x[i] += search.step[6 + i]
     for i in range(n):
@@ -408,7 +408,7 @@ def posterior(
 
     Args:
         rig, settings, habits, belief, observed: What is known.
-        T, x: (4, 4), (n,) where both searches begin.
+        palm, x: (4, 4), (n,) where both searches begin.
         natural, counts: Probability of a natural hand a moment ago, and what that counts, 0 ... 1.
         numbers: How many numbers are measured.
         blank, room: Room.
@@ -425,7 +425,7 @@ def posterior(
     if moves:
         _onto(rig, settings, observed, blank, best, room, out)
     else:
-        copy(room.T[best], out.T)
+        copy(room.palm[best], out.palm)
         for i in range(x.shape[0]):
             out.x[i] = room.x[best, i]
     for m in range(rig.mounts.finger.shape[0]):

@@ -109,7 +109,7 @@ class Search:
     L: Float  # (N, N)
     step: Float  # (N,)
     down: Float  # (N,)
-    T: Float  # (4, 4)
+    palm: Float  # (4, 4)
     x: Float  # (n,)
     off: Float  # (6,)
     q: Float  # (3 + n,)
@@ -132,7 +132,7 @@ class Search:
             L=(N, N),
             step=N,
             down=N,
-            T=(4, 4),
+            palm=(4, 4),
             x=n,
             off=6,
             q=3 + n,
@@ -311,7 +311,7 @@ def linearise(
     Args:
         rig, habits, belief, observed: What is known.
         h: Hypothesis.
-        T, x: (4, 4), (n,) the hand.
+        palm, x: (4, 4), (n,) the hand.
         gradient, normal: Written.
         search: Room.
     """
@@ -437,7 +437,7 @@ def descend(
     Args:
         rig, habits, belief, observed, h: What is known, and the hypothesis.
         tolerance, share: A search ends where a step gains less than tolerance and that share of the cost.
-        T, x: (4, 4), (n,) where it begins, inside the limits, and then where it ended.
+        palm, x: (4, 4), (n,) where it begins, inside the limits, and then where it ended.
         gradient, normal: Written: (N,), (N, N) there, or before the last step.
         search: Room.
     """
@@ -451,16 +451,16 @@ def descend(
         if hoped < 0.0:
             damping, growth = damping * growth, 2.0 * growth
             continue
-        rotate_by(search.step, T, search.T)
+        rotate_by(search.step, T, search.palm)
         for i in range(n):
             search.x[i] = min(max(x[i] + search.step[6 + i], hand.low[i]), hand.high[i])
         if damping <= _FIRST_DAMPING and hoped < little:
-            copy(search.T, T)
+            copy(search.palm, T)
             for i in range(n):
                 x[i] = search.x[i]
             break
         there = linearise(
-            rig, habits, belief, observed, h, search.T, search.x, search.gradient, search.normal, search
+            rig, habits, belief, observed, h, search.palm, search.x, search.gradient, search.normal, search
         )
         gain = cost - there
         if not gain > 0.0:
@@ -468,7 +468,7 @@ def descend(
             continue
         damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain / hoped - 1.0) ** 3), 1e-9)
         growth, cost = 2.0, there
-        copy(search.T, T)
+        copy(search.palm, T)
         copy(search.normal, normal)
         for i in range(n):
             x[i] = search.x[i]

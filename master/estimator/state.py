@@ -37,7 +37,7 @@ class HandState:
         seen_ns: (1,) when anything of it was measured last.
         placed_ns: (1,) when two cameras, or a depth law, placed a marker of it last.
         told_ns: (6,) when each finger, and the palm, was measured last.
-        T, x, angles: (4, 4) palm, (n,) free and (20,) all angles [rad].
+        palm, x, angles: (4, 4) palm, (n,) free and (20,) all angles [rad].
         rates: (20,) [rad/s].
         cov: (N, N) of turn [rad], shift [m], rig axes, and free angles [rad].
         natural: (1,) probability that it obeys habits.
@@ -52,7 +52,7 @@ class HandState:
     seen_ns: Int
     placed_ns: Int
     told_ns: Int
-    T: Float
+    palm: Float
     x: Float
     angles: Float
     rates: Float
@@ -76,7 +76,7 @@ class HandState:
             seen_ns=("i8", 1),
             placed_ns=("i8", 1),
             told_ns=("i8", 6),
-            T=(4, 4),
+            palm=(4, 4),
             x=n,
             angles=20,
             rates=20,
@@ -220,7 +220,7 @@ def predict(
     for i in range(3):
         belief.palm_w2[i] = 1.0 / (settings.palm_walk_rad_s * age_s) ** 2
         belief.palm_w2[3 + i] = 1.0 / (settings.palm_walk_m_s * age_s) ** 2
-    copy(state.T, belief.palm)
+    copy(state.palm, belief.palm)
 
 
 @inner
@@ -254,9 +254,9 @@ def grow(
     if palm_shown:
         squared = 0.0
         for i in range(3):
-            step = T[i, 3] - state.T[i, 3]
+            step = T[i, 3] - state.palm[i, 3]
             for j in range(3):
-                step += (T[i, j] - state.T[i, j]) * hand.rest_m[0, j]
+                step += (T[i, j] - state.palm[i, j]) * hand.rest_m[0, j]
             squared += step * step
         state.lost_s[0] = 0.0
         share = 1.0 - exp(-dt_s / settings.speed_memory_s)  # a short step is mostly noise

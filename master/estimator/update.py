@@ -1,12 +1,14 @@
 """Kernels of one epoch: predict, fit, and take over what it says into the state."""
 
 from math import acos, cos, exp, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from common.arrays import Bool, Code, Float
-from common.kernels import constant, inlined, inner, kernel, record
+from common.arrays import Bool, Code, Float, Int
+from common.kernels import inlined, inner, kernel, record
 from common.messages import Source
+from master.estimator.cameras import CameraArrays
 from master.estimator.certainty import Certainty, add_arcs, linear, only_limits, surer, tilts
+from master.estimator.hand_tables import Mounts
 from master.estimator.kinematics import angles_of, chains, clamp, joints, marker_point
 from master.estimator.matrices import copy, inverse_3
 from master.estimator.posterior import Blank, Posterior, Room, posterior
@@ -15,9 +17,10 @@ from master.estimator.residuals import Observations, marker_rows
 from master.estimator.settings import Settings
 from master.estimator.solve import Belief, Rig, Search, descend
 from master.estimator.state import NEVER_NS, PALM_PART, HandState, Hidden, forget, grow, predict
+from master.fabrik.caps import CapTables
 
 _QUANTILE_95 = 7.815  # chi square of three numbers
-TRACK, BEGIN, ROUGH, TAKE_OVER = constant(0), constant(1), constant(2), constant(3)
+TRACK, BEGIN, ROUGH, TAKE_OVER = 0, 1, 2, 3
 TRACKED_ON, LOST, MISLED = 0.0, 1.0, 2.0
 _SOLVED, _MEASURED, _HELD = int(Source.SOLVED), int(Source.MEASURED), int(Source.HELD)
 
@@ -26,14 +29,14 @@ class Estimate:
     """A hand at one epoch, as kernels write it.
 
     Attributes:
-        T, angles: (4, 4) palm, (20,) all angles [rad].
+        palm, angles: (4, 4) palm, (20,) all angles [rad].
         position, rotation: (26, 3) [m], (26, 3, 3), rig frame.
         cov: (26, 3, 3) [m^2] of the joints.
         tilt: (5, 3, 3) [rad^2] of the last phalanges' directions, by this instant alone.
         tracked: (26,), and `source` (26,) as of `HandPose`.
     """
 
-    T: Float
+    palm: Float
     angles: Float
     position: Float
     rotation: Float
@@ -47,7 +50,7 @@ class Estimate:
         """Room for one."""
         return record(
             cls,
-            T=(4, 4),
+            palm=(4, 4),
             angles=20,
             position=(26, 3),
             rotation=(26, 3, 3),
@@ -58,9 +61,51 @@ class Estimate:
         )
 
 
-class Workspace:
-    """Room for all kernels of one hand, and what is believed at the epoch."""
+class Task:
+    """What is to be done at an epoch.
 
+    Attributes:
+        what: (1,) TRACK, BEGIN, ROUGH or TAKE_OVER.
+        t_ns: (1,) the epoch.
+        shown: (5,) fingers that are measured.
+        palm_shown: (1,) whether something tells where the palm is.
+        numbers: (1,) how many numbers are measured.
+        turned: (3, 3) by how much sensors say that the palm has turned since.
+        palm, x: (4, 4), (n,) another hand of the epoch, inside the limits.
+        may_leave: (1,) whether there is one, and it may take the place of the state.
+    """
+
+    what: Int
+    t_ns: Int
+    shown: Bool
+    palm_shown: Bool
+    numbers: Float
+    turned: Float
+    palm: Float
+    x: Float
+    may_leave: Bool
+
+    @classmethod
+    def empty(cls, n: int) -> "Task":
+        """Room for one."""
+        return record(
+            cls,
+            what=("i8", 1),
+            t_ns=("i8", 1),
+            shown=("u1", 5),
+            palm_shown=("u1", 1),
+            numbers=1,
+            turned=(3, 3),
+            palm=(4, 4),
+            x=n,
+            may_leave=("u1", 1),
+        )
+
+
+class Workspace:
+    """Room for all kernels of one hand, what is to be done, and what is believed at the epoch."""
+
+    task: Task
     belief: Belief
     hidden: Hidden
     found: Posterior
@@ -72,6 +117,7 @@ class Workspace:
         """Allocate it."""
         return record(
             cls,
+            task=Task.empty(n),
             belief=Belief.none(n),
             hidden=Hidden.none(n),
             found=Posterior.empty(n, markers),
@@ -177,7 +223,7 @@ def _take_over(
     dt_s = (t_ns - state.t_ns[0]) * 1e-9
     lost = not palm_shown
     if goes_on:
-        grow(hand, settings, state, dt_s, found.T, palm_shown, hidden)
+        grow(hand, settings, state, dt_s, found.palm, palm_shown, hidden)
         share = 1.0 - exp(-dt_s / settings.rate_memory_s)
         for a in range(20):
             rate = (work.angles[a] - state.angles[a]) / dt_s
@@ -198,15 +244,15 @@ def _take_over(
         copy(space.room.A, state.cov)
     else:
         copy(found.cov, state.cov)
-    chains(hand, found.T, work.angles, work.R, work.P)
-    joints(hand, found.T, work.R, work.P, out.position, out.rotation)
-    linear(hand, found.T, state.cov, work, room, out.cov)
-    tilts(hand, found.T, found.cov, work, room, out.tilt)
+    chains(hand, found.palm, work.angles, work.R, work.P)
+    joints(hand, found.palm, work.R, work.P, out.position, out.rotation)
+    linear(hand, found.palm, state.cov, work, room, out.cov)
+    tilts(hand, found.palm, found.cov, work, room, out.tilt)
     best = 0 if space.room.share[0] >= space.room.share[1] else 1
     add_arcs(
         rig,
         settings,
-        found.T,
+        found.palm,
         state.cov,
         observed.seen,
         space.room.information[best],
@@ -220,8 +266,8 @@ def _take_over(
             state.told_ns[f] = t_ns
     if palm_shown:
         state.told_ns[PALM_PART] = t_ns
-    copy(found.T, state.T)
-    copy(found.T, out.T)
+    copy(found.palm, state.palm)
+    copy(found.palm, out.palm)
     for a in range(20):
         out.angles[a] = state.angles[a] = work.angles[a]
     for c in range(n):
@@ -229,65 +275,51 @@ def _take_over(
     _judge(rig, settings, state, t_ns, shown, observed, out)
 
 
-class Start(NamedTuple):
-    """Another hand of an epoch, or where a search begins.
+class Model(NamedTuple):
+    """What is the same at every epoch; the hand and the settings in their arrays (`common.kernels.boxed`)."""
 
-    Attributes:
-        T, x: (4, 4), (n,) inside the limits.
-        known: Whether there is any.
-        may_leave: Whether it may take the place of the state.
-    """
-
-    T: Float
-    x: Float
-    known: bool
-    may_leave: bool
+    hand: Any
+    settings: Any
+    mounts: Mounts
+    cameras: CameraArrays
+    caps: CapTables
 
 
 @kernel
 def epoch(
-    what: int,
-    rig: Rig,
-    settings: Settings,
+    model: Model,
     habits: Habits,
-    state: HandState,
-    t_ns: int,
+    boxed_state: Any,
     observed: Observations,
-    shown: Bool,
-    palm_shown: bool,
-    numbers: float,
-    turned: Float,
-    start: Start,
     blank: Blank,
-    space: Workspace,
-    out: Estimate,
+    boxed_space: Any,
+    boxed_out: Any,
 ) -> float:
-    """Do one of four things at an epoch. One kernel, for each compiles all that it calls.
+    """Do one of four things at an epoch, as `space.task` says: one kernel, for each compiles all that it calls.
 
     TRACK       fit from the state and take it over
-    BEGIN       fit from `start`, without the state: what is found is in `space.found`
-    ROUGH       search roughly from `start`, in place, under the widest hypothesis
+    BEGIN       fit from the start, without the state: what is found is in `space.found`
+    ROUGH       search roughly from the start, in place, under the widest hypothesis
     TAKE_OVER   take over what BEGIN found
 
     Args:
-        what: Which.
-        rig, settings, habits: What is the same at every epoch.
-        state: Of the epoch before; of this one, once it is taken over.
-        t_ns: The epoch.
+        model, habits: What is the same at every epoch.
+        boxed_state: (1,) `HandState` of the epoch before; of this one, once it is taken over.
         observed: What is measured.
-        shown: (5,) fingers that are measured.
-        palm_shown: Whether something tells where the palm is.
-        numbers: How many numbers are measured.
-        turned: (3, 3) by how much sensors say that the palm has turned since.
-        start: Another hand.
-        blank, space: Room; what is believed beside the past is in `space.belief`.
-        out: Written, where the epoch is taken over.
+        blank: Room.
+        boxed_space: (1,) `Workspace`, with the task; what is believed beside the past is in its `belief`.
+        boxed_out: (1,) `Estimate`, written where the epoch is taken over.
 
     Returns:
-        Of TRACK: TRACKED_ON; LOST where no motion explains the markers, but `start` does; MISLED where it explains them
-        better than what is found. With the latter two the state is as it was. Of BEGIN: chi square of the markers. Of
-        ROUGH: the cost.
+        Of TRACK: TRACKED_ON; LOST where no motion explains the markers, but the start does; MISLED where it explains
+        them better than what is found. With the latter two the state is as it was. Of BEGIN: chi square of the markers.
+        Of ROUGH: the cost.
     """
+    state, space, out, settings = boxed_state[0], boxed_space[0], boxed_out[0], model.settings[0]
+    rig = Rig(model.hand[0], model.mounts, model.cameras, model.caps)
+    task = space.task
+    what, t_ns, palm_shown = task.what[0], task.t_ns[0], task.palm_shown[0] > 0
+    shown, numbers, may_leave = task.shown, task.numbers[0], task.may_leave[0] > 0
     belief, found, room = space.belief, space.found, space.room
     search = room.search
     if what == TAKE_OVER:
@@ -304,8 +336,8 @@ def epoch(
             widest,
             settings.rough,
             settings.tolerance_share,
-            start.T,
-            start.x,
+            task.palm,
+            task.x,
             room.gradient[0],
             room.normal[0],
             search,
@@ -314,25 +346,25 @@ def epoch(
     natural, counts, other = 0.5, 0.0, 0.0
     if what == BEGIN:
         forget(belief)
-        copy(start.T, room.start_T)
-        for c in range(start.x.shape[0]):
-            room.start_x[c] = start.x[c]
+        copy(task.palm, room.start_T)
+        for c in range(task.x.shape[0]):
+            room.start_x[c] = task.x[c]
     else:
         dt_s = (t_ns - state.t_ns[0]) * 1e-9
-        if start.known and start.may_leave:
-            other = chi_square(rig, observed, start.T, start.x, 0.0, search) + settings.misled
+        if may_leave:
+            other = chi_square(rig, observed, task.palm, task.x, 0.0, search) + settings.misled
             walked_m = settings.palm_walk_m_s * dt_s
-            if chi_square(rig, observed, state.T, state.x, walked_m, search) > other:
+            if chi_square(rig, observed, state.palm, state.x, walked_m, search) > other:
                 return LOST
         predict(rig.hand, settings, state, t_ns, shown, palm_shown, space.hidden, belief)
         for i in range(3):
             for j in range(3):
                 belief.palm[i, j] = 0.0
                 for k in range(3):
-                    belief.palm[i, j] += turned[i, k] * state.T[k, j]
+                    belief.palm[i, j] += task.turned[i, k] * state.palm[k, j]
         natural, counts = state.natural[0], exp(-dt_s / settings.habit_memory_s)
         copy(belief.palm, room.start_T)
-        for c in range(start.x.shape[0]):
+        for c in range(task.x.shape[0]):
             room.start_x[c] = state.x[c]
     posterior(
         rig,
@@ -349,11 +381,11 @@ def epoch(
         room,
         found,
     )
-    explained = chi_square(rig, observed, found.T, found.x, 0.0, search)
+    explained = chi_square(rig, observed, found.palm, found.x, 0.0, search)
     if what == BEGIN:
         return explained
     found.wrong[0] = explained
-    if start.known and start.may_leave and explained > other:
+    if may_leave and explained > other:
         return MISLED
     _take_over(rig, settings, state, t_ns, True, shown, palm_shown, observed, space, out)
     return TRACKED_ON

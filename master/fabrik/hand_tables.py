@@ -6,8 +6,8 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.hand_model import CHAINS, HandModel
+from master.estimator.attached import Attached
 from master.estimator.parameters import HandParameters
-from master.ik.attached import Attached
 
 
 class HandTables(NamedTuple):

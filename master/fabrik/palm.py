@@ -10,12 +10,12 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.geometry import fit_rigid
 from common.hand_model import HandJoints, HandModel
+from master.estimator.attached import Attached
 from master.estimator.parameters import HandParameters
 from master.estimator.small_matrices import inverse
 from master.fabrik.hand_tables import HandTables, Mounts
 from master.fabrik.kinematics import covariances, pose
 from master.fabrik.palm_kernel import PalmPrior, fit, informations
-from master.ik.attached import Attached
 from master.ik.hand import EXPLAINED, determined
 from master.ik.hidden import HiddenFingers
 from master.ik.priors import AnglePrior, Priors, hidden_belief

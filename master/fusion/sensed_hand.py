@@ -24,8 +24,8 @@ import numpy as np
 from common.arrays import Bool, Code, Float
 from common.geometry import matrix_to_rotation_vector
 from common.hand_model import HandModel
+from master.estimator.attached import Attached
 from master.estimator.parameters import HandParameters
-from master.ik.attached import Attached
 from master.ik.palm import Orientation, turn_of_vector
 
 _ANGLES, _TURN = 4, 3

@@ -25,8 +25,8 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.geometry import skew
 from common.hand_model import CHAINS, HandModel
+from master.estimator.attached import Attached
 from master.estimator.parameters import HandParameters
-from master.ik.attached import Attached
 from master.ik.hand import HandSolution
 
 _STRAIGHT_RAD = np.radians(3.0)  # a turn by less is straight: 0.2 mm off the tangent at the far end of a hand

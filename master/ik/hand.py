@@ -16,10 +16,10 @@ from common.arrays import Bool, Float, Int
 from common.geometry import fit_rigid, skew
 from common.hand_model import CHAINS, HandModel
 from common.messages import Level
+from master.estimator.attached import Attached
 from master.estimator.parameters import HandParameters
 from master.fabrik.estimate import SolvedHand
 from master.fusion.sensed_hand import SensedHand
-from master.ik.attached import Attached
 from master.ik.hand_problem import ENOUGH, MAX_ITERATIONS, HandProblem, Minimum
 from master.ik.mixture import Mixture
 from master.ik.palm import Facing, Orientation, PalmPrior

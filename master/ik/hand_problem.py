@@ -13,9 +13,9 @@ import numpy as np
 from common.arrays import Float, Int
 from common.geometry import rotation_vector_to_matrix, skew
 from common.hand_model import HandModel
+from master.estimator.attached import Attached
 from master.estimator.parameters import HandParameters
 from master.fusion.sensed_hand import SensedFree
-from master.ik.attached import Attached
 from master.ik.palm import Facing, Orientation, PalmPrior
 from master.ik.priors import AnglePrior
 from master.ik.within import mean_within

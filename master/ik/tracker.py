@@ -18,10 +18,10 @@ from common.calibration import Volume
 from common.geometry import matrix_to_quaternion
 from common.hand_model import CHAINS, METACARPALS, PALM, TIPS, WRIST, HandModel
 from common.messages import HandPose, Source
+from master.estimator.attached import Attached
 from master.fabrik.estimate import HandEstimate, SolvedHand
 from master.fusion.sensed_hand import MarkerCheck, SensedHand
 from master.ik.arcs import Arcs
-from master.ik.attached import Attached
 from master.ik.doubt import JointDoubt
 from master.ik.hand import EXPLAINED, HandSolution, HandSolver, determined, seen_markers
 from master.ik.hidden import FingerMemory

@@ -5,9 +5,9 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.geometry import rotation_vector_to_matrix
 from common.hand_model import CHAINS, TIPS, WRIST, HandModel
+from master.estimator.attached import Attached
 from master.estimator.parameters import HandParameters
 from master.ik.arcs import Arcs
-from master.ik.attached import Attached
 from master.ik.hand import HandSolution, HandSolver
 from tests.hand_helpers import FACING, LEFT, MARKERS, RIGHT, natural_angles, palm, small_cov
 

@@ -16,8 +16,8 @@ from common.geometry import rigid, rotation_vector_to_matrix
 from common.hand_model import CHAINS, TIPS, HandModel
 from common.hand_presets import preset_couplings, preset_limits
 from common.hand_profiles import generated_profile
+from master.estimator.attached import Attached
 from master.estimator.parameters import HandParameters
-from master.ik.attached import Attached
 from master.ik.hand import HandSolution, HandSolver
 from master.ik.hand_problem import HandProblem
 from master.ik.palm import Facing, Orientation, PalmPrior

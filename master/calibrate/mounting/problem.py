@@ -47,8 +47,8 @@ from master.calibrate.mounting.unknown import (
     believed,
 )
 from master.calibrate.mounting.wrists import bends, bends_by_turn
+from master.estimator.attached import Attached
 from master.estimator.parameters import HandParameters
-from master.ik.attached import Attached
 from master.ik.hand_problem import HandProblem, moved
 from master.ik.priors import AnglePrior, Priors
 

@@ -6,11 +6,11 @@ import pytest
 from common.arrays import Float
 from common.geometry import rotation_vector_to_matrix
 from common.hand_model import HandModel
+from master.estimator.attached import Attached
 from master.estimator.small_matrices import factor, inverse, inverse_3, substitute
 from master.fabrik.kinematics import covariances
 from master.fabrik.palm import Palm, PalmFitter
 from master.fabrik.palm_kernel import PalmPrior, facing_of, linearise, rotate_by, targets_of
-from master.ik.attached import Attached
 from tests.hand_helpers import FACING, LEFT, MARKERS, RIGHT, natural_angles, palm, small_cov
 
 SEEN = np.ones(6, np.bool_)
