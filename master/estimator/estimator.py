@@ -9,7 +9,7 @@ from common.arrays import Bool, Code, Float, Int
 from common.camera_model import CameraModel
 from common.geometry import fit_rigid
 from common.hand_model import CHAINS, HandJoints, HandModel
-from common.kernels import bound, boxed
+from common.kernels import bound, boxed, fields
 from common.messages import Source
 from master.estimator.attached import Attached
 from master.estimator.cameras import CameraArrays
@@ -226,6 +226,7 @@ class Estimator:
             self._rig.caps,
         )
         self._boxed_state, self._boxed_space = boxed(self.state), boxed(self._space)
+        self._now, self._at = fields(self.state), fields(self._space)
         self._kernel = bound(
             epoch,
             self._model,
@@ -240,11 +241,11 @@ class Estimator:
     @property
     def known(self) -> bool:
         """Whether there is a hand to go on from."""
-        return bool(self.state.known[0])
+        return bool(self._now.known[0])
 
     def recent(self, t_ns: int) -> bool:
         """Whether the state still says anything at `t_ns`."""
-        age_s = (t_ns - int(self.state.t_ns[0])) * 1e-9
+        age_s = (t_ns - int(self._now.t_ns[0])) * 1e-9
         return self._continuous and self.known and 0.0 < age_s <= self.settings.forget_s
 
     def pose(self, T: Float, angles_rad: Float) -> tuple[HandJoints, Float]:
@@ -257,7 +258,7 @@ class Estimator:
 
     def push(self, at: Epoch) -> Fitted:
         """Fit one epoch."""
-        observed, sensed, task = self._observed, at.sensed, self._space.task
+        observed, sensed, task = self._observed, at.sensed, self._at.task
         count = self._observe(at)
         seen, rays = observed.seen, (observed.weight > 0.0).sum(axis=0) + 2 * observed.placed
         back = bool((seen & self._on_palm).any())
@@ -278,7 +279,7 @@ class Estimator:
         if (
             solved
             and sensed is not None
-            and (weighed := sensed.weighed(out.angles.reshape(5, 4))) is not None
+            and (weighed := sensed.weighed(fields(out).angles.reshape(5, 4))) is not None
         ):
             self._boxed_state[:], sensed = before, weighed
             at = replace(at, sensed=sensed)
@@ -286,7 +287,7 @@ class Estimator:
             solved, anew = self._solve(at, out, known=known, enough=enough)
         self._turn = None if sensed is None else sensed.rotation
         if count > 0 or (sensed is not None and bool(sensed.told.any()) and self._knows_place()):
-            self.state.seen_ns[0] = at.t_ns
+            self._now.seen_ns[0] = at.t_ns
         rests = self._rests(at, rays, palm_shown=palm_shown, by_markers=by_markers)
         return self._fitted(at, out, rests, anew=anew) if solved else _unknown(rests)
 
@@ -295,8 +296,8 @@ class Estimator:
         if known and self._only_natural and enough:
             before = self._boxed_state.copy()
             self._track(at, out, may_leave=False)
-            surprise = self._space.found.surprise[: len(self._on_hand)]
-            wrong = float(self._space.found.wrong[0])
+            surprise = self._at.found.surprise[: len(self._on_hand)]
+            wrong = float(self._at.found.wrong[0])
             if not (surprise > self.settings.explained).any():
                 return True, False
             self._boxed_state[:] = before
@@ -323,7 +324,7 @@ class Estimator:
 
     def _track(self, at: Epoch, out: Estimate, *, may_leave: bool) -> bool:
         """Go on from the state; False: another hand of this epoch takes its place, or there is none."""
-        start, sensed, task = at.start, at.sensed, self._space.task
+        start, sensed, task = at.start, at.sensed, self._at.task
         task.turned[:] = _EYE
         if sensed is not None and sensed.rotation is not None and self._turn is not None:
             task.turned[:] = sensed.rotation @ self._turn.T
@@ -334,7 +335,7 @@ class Estimator:
             said = self._run(TRACK, self._with_laser(self._habits_of(_NONE), sensed), out)
             if said == TRACKED_ON:
                 return True
-            wrong = float(self._space.found.wrong[0])
+            wrong = float(self._at.found.wrong[0])
             if said == LOST or wrong > self.settings.misled + self._begin(at):
                 return False
             may_leave = False  # nothing is better: keep what was found
@@ -344,16 +345,16 @@ class Estimator:
 
         A finger between two that show is rather bent as they are: no hand curls it alone. But straight it would show.
         """
-        shown = frozenset(np.flatnonzero(self._space.task.shown).tolist())
+        shown = frozenset(np.flatnonzero(self._at.task.shown).tolist())
         like = frozenset(f for f in (2, 3) if f not in shown and {f - 1, f + 1} <= shown)
         chi2 = self._begin_with(at, shown, like)
-        angles = self.parameters.angles(self._space.found.x)
+        angles = self.parameters.angles(self._at.found.x)
         straight = frozenset(f for f in like if angles[f, 1:].sum() < self.settings.shows_rad)
         return self._begin_with(at, shown, like - straight) if straight else chi2
 
     def _begin_with(self, at: Epoch, shown: frozenset[int], like: frozenset[int]) -> float:
         """As `_begin`, while the hidden fingers of `like` are bent as their neighbours."""
-        apart, space = frozenset(range(5)) - shown - like, self._space
+        apart, space = frozenset(range(5)) - shown - like, self._at
         belief, found, task, start = space.belief, space.found, space.task, at.start
         fingers = np.isin(np.arange(5), list(apart))
         belief.own_w2[:], belief.own[:] = curled(self.parameters, self.settings, fingers)
@@ -378,7 +379,7 @@ class Estimator:
 
     def _run(self, what: int, habits: Habits, out: Estimate) -> float:
         """The kernel, for what is in the task."""
-        self._space.task.what[0] = what
+        self._at.task.what[0] = what
         return self._kernel(
             self._model,
             habits,
@@ -403,7 +404,7 @@ class Estimator:
                 T = np.eye(4)
                 T[:3, :3] = sensed.rotation
                 T[:3, 3] = np.average(observed - expected @ sensed.rotation.T, axis=0, weights=weight)
-            elif self._space.belief.facing_w2[0] > 0.0:
+            elif self._at.belief.facing_w2[0] > 0.0:
                 # A point above the wrist stands for "the back of the hand faces the cameras".
                 above = expected.mean(axis=0) + np.array([0.0, _ABOVE_M, 0.0])
                 towards = observed.mean(axis=0) + _ABOVE_M * epoch.facing
@@ -425,13 +426,13 @@ class Estimator:
 
     def _believe(self, epoch: Epoch, back: bool, rays: Int, *, known: bool) -> None:
         """Write what is believed beside the past and habits."""
-        belief, sensed = self._space.belief, epoch.sensed
+        belief, sensed = self._at.belief, epoch.sensed
         belief.facing[:] = epoch.facing
         belief.facing_w2[0] = self.settings.facing_rad**-2.0 if back else 0.0
         belief.depth_w2[0] = 0.0
         if known and rays.max() == 1:
             alone = self._rig.cameras.centre[(self._observed.weight > 0.0).sum(axis=1).argmax()]
-            sight = self.state.palm[:3, 3] - alone
+            sight = self._now.palm[:3, 3] - alone
             belief.sight[:] = sight / np.sqrt(sight @ sight)
             belief.depth_w2[0] = self.settings.held_depth_m**-2.0
         belief.sensed_known[0] = 0.0 if sensed is None else 1.0
@@ -452,14 +453,17 @@ class Estimator:
             return len(points) > 0
         if len(points) < 2:
             return False
-        _, extent, axes = np.linalg.svd(points - points.mean(axis=0))
+        off = points - points.mean(axis=0)
+        if len(points) > 2 and _surely_spread(off):
+            return True
+        _, extent, axes = np.linalg.svd(off)
         if len(points) > 2 and extent[1] > _SPREAD_M:
             return True
         return back and bool(extent[0] > _LENGTH_M and abs(axes[0] @ epoch.facing) < _ACROSS)
 
     def _knows_place(self) -> bool:
         """Whether it is still known where the hand is, when nothing but its fingers is told."""
-        return self.known and float(np.trace(self.state.cov[3:6, 3:6])) < 3.0 * _SOMEWHERE_M**2
+        return self.known and float(np.trace(self._now.cov[3:6, 3:6])) < 3.0 * _SOMEWHERE_M**2
 
     def _habits_of(self, unlike: frozenset[int]) -> Habits:
         """Habits while some fingers are bent unlike the others; each of the 32 sets is worked out once."""
@@ -494,8 +498,8 @@ class Estimator:
         return rests
 
     def _fitted(self, at: Epoch, out: Estimate, rests: Int, *, anew: bool) -> Fitted:
-        found, sensed = self._space.found, at.sensed
-        recent = (at.t_ns - int(self.state.seen_ns[0])) * 1e-9 <= self.settings.forget_s
+        found, sensed, out = self._at.found, at.sensed, fields(out)
+        recent = (at.t_ns - int(self._now.seen_ns[0])) * 1e-9 <= self.settings.forget_s
         if sensed is not None:  # a tip that is measured stays so
             by_others = CHAINS[sensed.told & (rests[:5] & ON_MARKERS == 0)]
             out.source[by_others] = Source.WRIST
@@ -521,6 +525,14 @@ class Estimator:
             anew,
             sensed,
         )
+
+
+def _surely_spread(off: Float) -> bool:
+    """Whether points (N, 3) [m] about their mean are plainly not in one line: without what a decomposition takes."""
+    length2 = np.vecdot(off, off)
+    along = off @ off[length2.argmax()]
+    aside2 = length2 - along * along / length2.max()
+    return float(aside2.max()) > (4.0 * _SPREAD_M) ** 2
 
 
 def _unknown(rests: Int) -> Fitted:
