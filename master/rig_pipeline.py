@@ -89,7 +89,6 @@ def _estimator(
         setup.hand,
         setup.rig.markers,
         markers,
-        CapTables.of(setup.hand, markers),
         continuous=continuous,
         natural=natural,
         settings=settings,

@@ -199,8 +199,20 @@ def linear(hand: HandTables, T: Float, cov: Float, work: Scratch, room: Certaint
 
 
 @inner
-def tilts(hand: HandTables, T: Float, cov: Float, work: Scratch, room: Certainty, tilt: Float) -> None:
-    """Write the covariances of the last phalanges' directions (5, 3, 3) [rad^2]; `work` as `chains` left it."""
+def tilts(
+    hand: HandTables,
+    settings: Settings,
+    T: Float,
+    cov: Float,
+    work: Scratch,
+    room: Certainty,
+    tilt: Float,
+    walk: Float,
+) -> None:
+    """Write the covariances of the last phalanges' directions (5, 3, 3) [rad^2], and how fast they walk (5,).
+
+    `work` as `chains` left it; of the walk the trace [rad^2/s^2].
+    """
     for f in range(5):
         squared = 0.0
         for i in range(3):
@@ -215,6 +227,11 @@ def tilts(hand: HandTables, T: Float, cov: Float, work: Scratch, room: Certainty
             room.at[a] = a if a < 6 else hand.first[f] + a
             for i in range(3):
                 room.J[a, i] = 0.0 if 3 <= a < 6 else room.J[a, i]
+        walk[f] = 0.0
+        for a in range(6 + count):
+            rate = settings.palm_walk_rad_s if a < 3 else settings.walk_rad_s
+            for i in range(3):
+                walk[f] += (rate * room.J[a, i]) ** 2
         _project(cov, 6 + count, room, tilt[f])
 
 

@@ -34,7 +34,6 @@ from master.estimator.update import (
     Workspace,
     epoch,
 )
-from master.fabrik.caps import CapTables
 from master.fabrik.estimate import SolvedHand
 
 _BENDS_RAD = (0.1, 0.7, 1.3)  # of the PIP, from which a search afresh begins: open to closed
@@ -62,7 +61,7 @@ class Epoch:
         cov_m2: (A, 3, 3) covariances of these, where they are what is measured; None: the centroids are.
         uv: (C, A, 2) [px] centroids of all markers of the rig; NaN: not seen, or gated out.
         variance_px2: (C, A) of each camera's own errors; NaN: not to be used.
-        common_m2: (A,) variance of what all cameras see alike.
+        own_m2: (A, 3, 3) covariance of what is wrong with each marker itself, beside bones.
         facing: (3,) unit vector from the hand to the cameras that see its back.
         sensed: What other sensors say of the palm's turn and of angles; None: nothing.
         start: Another hand of this epoch; None: there is none.
@@ -74,7 +73,7 @@ class Epoch:
     cov_m2: Float | None = None
     uv: Float | None = None
     variance_px2: Float | None = None
-    common_m2: Float | None = None
+    own_m2: Float | None = None
     sensed: "Sensed | None" = None
     start: SolvedHand | None = None
 
@@ -169,7 +168,6 @@ class Estimator:
         model: HandModel,
         markers: tuple[str, ...],
         hand_markers: tuple[str, ...],
-        caps: CapTables,
         *,
         continuous: bool = True,
         natural: bool = False,
@@ -182,7 +180,6 @@ class Estimator:
             model: The hand.
             markers: Names in the order of every marker array.
             hand_markers: Those of them that are on this hand.
-            caps: Of the hand's markers, in that order.
             continuous: False: every epoch is an unrelated pose, nothing is remembered.
             natural: Whether the hand is taken to obey habits, and begins anew where markers are unexplained: the fit
                 of the card's line, which has no other hand to begin from.
@@ -195,7 +192,7 @@ class Estimator:
         self.parameters = HandParameters.of(model)
         self._on_hand = np.array([markers.index(name) for name in hand_markers], np.int64)
         mounts = Mounts.of(model, hand_markers)
-        self._rig = Rig(HandTables.of(model, self.parameters), mounts, CameraArrays.of(cameras), caps)
+        self._rig = Rig(HandTables.of(model, self.parameters), mounts, CameraArrays.of(cameras))
         n, count = len(self.parameters.free), len(hand_markers)
         self._observed = Observations.empty(len(cameras), count)
         self._space = Workspace.empty(n, _capacity(count))
@@ -205,9 +202,6 @@ class Estimator:
         self._habits: dict[frozenset[int], Habits] = {}
         self._finger = mounts.finger
         self._on_palm = np.array([model.mount(name).joint is None for name in hand_markers])
-        self._own_m2 = np.tile(settings.bones_m**2 * _EYE, (len(markers), 1, 1))
-        flat = [markers.index(name) for name in hand_markers if model.mount(name).finger is None]
-        self._own_m2[flat] += settings.relief_m**2 * _EYE
         self._carries = self._finger == np.arange(5)[:, None]  # (5, M)
         bent = np.zeros((len(_BENDS_RAD), 5, 4))
         bent[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (_MCP_PER_PIP, 1.0))[:, None]
@@ -223,7 +217,6 @@ class Estimator:
             boxed(settings.record()),
             self._rig.mounts,
             self._rig.cameras,
-            self._rig.caps,
         )
         self._boxed_state, self._boxed_space = boxed(self.state), boxed(self._space)
         self._now, self._at = fields(self.state), fields(self._space)
@@ -318,8 +311,8 @@ class Estimator:
             return observe_points(points, cov, bones_m2, self._observed)
         assert at.uv is not None
         assert at.variance_px2 is not None
-        assert at.common_m2 is not None
-        own = at.common_m2[:, None, None] * _EYE + self._own_m2
+        assert at.own_m2 is not None
+        own = at.own_m2 + self.settings.bones_m**2 * _EYE
         return observe_rays(at.uv, at.variance_px2, own, self._on_hand, self._observed)
 
     def _track(self, at: Epoch, out: Estimate, *, may_leave: bool) -> bool:
@@ -509,6 +502,7 @@ class Estimator:
             joints=HandJoints(out.position, out.rotation, out.palm),
             cov_m2=out.cov,
             tilt_cov_rad2=out.tilt,
+            tilt_walk_rad2_s2=out.tilt_walk,
             alone=found.cov.copy(),
             x=found.x.copy(),
             scale=float(found.scale[0]),
