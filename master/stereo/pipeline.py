@@ -23,10 +23,10 @@ from master.fabrik.depth import EXACT, CalibrationResidual
 from master.fabrik.estimate import HandEstimate, MarkerPositions
 from master.fabrik.solver import FabrikSolver
 from master.fabrik.sync import FrameSet
+from master.fusion.orientation import OrientationTrack
 from master.fusion.sensed_hand import SensedHand
 from master.ik.hand import HandSolution
 from master.ik.hand_one_euro import HandOneEuro
-from master.ik.orientation import OrientationTrack
 from master.ik.tracker import HandTracker, TrackedHand, pose_of
 from master.stereo.caps import CapModel
 from master.stereo.drift import DepthDrift
