@@ -9,7 +9,7 @@ from common.arrays import Float
 from common.messages import MarkerDetections
 from master.__main__ import main
 from master.ik.tracker import TrackedHand, pose_of
-from master.stereo.pipeline import MarkerPipeline, SolvedPose
+from master.estimator.pipeline import MarkerPipeline, SolvedPose
 
 _NOTHING = TrackedHand(
     None, np.zeros(26, bool), np.zeros(26, bool), np.zeros(26, np.uint8), np.zeros(6, np.int64)

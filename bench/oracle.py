@@ -20,7 +20,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from bench import oracle_recorded, oracle_scenes
 from bench.oracle_compare import compare, plain, table
 from bench.oracle_freeze import Piece, freeze
 from bench.oracle_truth import FROZEN, sets_of
@@ -134,6 +133,8 @@ def _absent(data: Path) -> str:
 
 def _makers(data: Path) -> tuple[dict[str, Maker], dict[str, Maker]]:
     """What makes each set: those of simulation, and those of the data folder."""
+    from bench import oracle_recorded, oracle_scenes  # only to freeze: these draw pictures
+
     simulated: dict[str, Maker] = {name: partial(oracle_scenes.scenes, name) for name in oracle_scenes.SCENES}
     simulated |= {"held": oracle_scenes.held, "room": oracle_scenes.in_room}
     recorded: dict[str, Maker] = {

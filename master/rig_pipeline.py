@@ -11,27 +11,25 @@ from common.arrays import Float
 from common.errors import CalibrationError
 from common.geometry import cross
 from common.messages import Detections
+from master.estimator.estimator import Estimator
+from master.estimator.pipeline import MarkerPipeline, OtherSensors, SolvedPose, Stage
+from master.estimator.settings import DEFAULT, Settings
+from master.estimator.smooth import HandOneEuro
 from master.fabrik.caps import CapTables
 from master.fabrik.compile import log_if_slow
 from master.fabrik.depth import LAW_MISFIT, CalibrationResidual, depth_law, law_contradicts, law_misfit
 from master.fabrik.intersection import RAYS, limits_of
 from master.fabrik.one_euro import OneEuroParameters, PointFilter
-from master.fabrik.palm import PalmFitter
 from master.fabrik.rays import RayTriangulator
 from master.fabrik.solver import FabrikSolver
 from master.fabrik.sync import FrameSync
 from master.fabrik.triangulate import DepthTriangulator, Triangulate, disparity_tables
 from master.fusion.pipeline import FusedPipeline, WristSide
 from master.hurry import never
-from master.ik.hand_one_euro import HandOneEuro
-from master.ik.tracker import HandTracker
 from master.rig_setup import RigSetup
-from master.stereo.caps import CapModel
-from master.stereo.locate import CapLocator
-from master.stereo.pipeline import MarkerPipeline, OtherSensors, SolvedPose, Stage
-from master.stereo.place import Placement
 from master.wrist.pipeline import WristPipeline
 
+_ANY_CURL = DEFAULT._replace(curled_rad=100.0)  # a finger that is not seen may be bent anyhow
 _MOUNTED_RAD = np.radians(0.5)  # standard deviation of the pitch of cameras mounted by eye
 _LEAD_M_S = 0.12  # of a palm, and of a finger on it, when another sensor takes over: 4 mm a frame at 60 Hz
 
@@ -72,6 +70,32 @@ def _hand_filter(setup: RigSetup) -> HandOneEuro:
     return HandOneEuro(setup.hand, setup.hand_markers, OneEuroParameters.of(setup.rig.filter), lead_m_s)
 
 
+def _rays(setup: RigSetup) -> RayTriangulator | None:
+    """Triangulation by the rays of all cameras; None: there is one."""
+    cameras = tuple(setup.models.values())
+    if len(cameras) < 2:
+        return None
+    caps = CapTables.of(setup.hand, setup.rig.markers)
+    return RayTriangulator(cameras, caps, CalibrationResidual.of(setup.rig).rays_px)
+
+
+def _estimator(
+    setup: RigSetup, *, continuous: bool, natural: bool = False, settings: Settings = DEFAULT
+) -> Estimator:
+    """The estimator of a rig's hand; arguments as of `Estimator`."""
+    markers = setup.hand_markers
+    return Estimator(
+        tuple(setup.models.values()),
+        setup.hand,
+        setup.rig.markers,
+        markers,
+        CapTables.of(setup.hand, markers),
+        continuous=continuous,
+        natural=natural,
+        settings=settings,
+    )
+
+
 def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> FabrikSolver:
     """The card's line of a marker rig.
 
@@ -88,10 +112,8 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
     residual = CalibrationResidual.of(rig)
     law = depth_law(rig, cameras)
     triangulate: Triangulate
-    if law is None and rig.solver == "fabrik":
+    if law is None:
         triangulate = RayTriangulator(cameras, CapTables.of(setup.hand, rig.markers), residual.rays_px)
-    elif law is None:
-        triangulate = CapLocator(cameras, CapModel(setup.hand, rig.markers), Placement(cameras, residual))
     else:
         if contradiction := law_contradicts(rig, cameras):
             raise CalibrationError(
@@ -111,7 +133,8 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
         sync=FrameSync(setup.models, rates, len(rig.markers), policy=rig.pairing, continuous=continuous),
         triangulate=triangulate,
         one_euro=_point_filter(setup) if continuous else None,
-        palm=PalmFitter(setup.hand, setup.hand_markers),
+        palm=_estimator(setup, continuous=continuous, natural=True),
+        once=_estimator(setup, continuous=False, natural=True, settings=_ANY_CURL),
         stage=stage,
     )
     with log_if_slow():
@@ -156,9 +179,10 @@ def build_pipeline(
         setup.hand,
         rig.markers,
         line=line_of(setup, stage, continuous=continuous),
-        residual=CalibrationResidual.of(rig),
-        tracker=HandTracker(setup.hand, setup.hand_markers, continuous=continuous) if refine else None,
-        steady=_hand_filter(setup) if continuous and refine else None,
+        rays=_rays(setup),
+        rays_px=CalibrationResidual.of(rig).rays_px,
+        estimator=_estimator(setup, continuous=continuous) if refine else None,
+        smooth=_hand_filter(setup) if continuous and refine else None,
         stamp_offset_us=rig.stamp_offset_us,
         volume=rig.volume,
         imu=rig.imu,

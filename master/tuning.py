@@ -23,11 +23,11 @@ from common.calibration_parts import Part
 from common.errors import CalibrationError, PhalanxError
 from common.messages import Detections, Name
 from common.watching import WatchedFiles
+from master.estimator.pipeline import SolvedPose, Stage
 from master.hurry import never
 from master.needs_restart import refuse_other_hands, refuse_restart
 from master.rig import Pipeline, RigSetup, load_setups, pipeline_of
 from master.rig_objects import gestures_file
-from master.stereo.pipeline import SolvedPose, Stage
 from master.world import World
 
 _WARM_FRAMES = 6  # of each camera: tracks need two, and the shipped 1 € filter has settled after 0.1 s

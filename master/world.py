@@ -28,13 +28,13 @@ from common.messages import (
     WristDetections,
 )
 from master.app import Solved
+from master.estimator.pipeline import SolvedPose, Stage
 from master.gestures.recogniser import GestureRecogniser
 from master.link_senders import Taken
 from master.objects.contact import ContactWatch
 from master.objects.line import SolvedObject
 from master.rig import RigSetup, pipeline_of
 from master.stages import StageTimes
-from master.stereo.pipeline import SolvedPose, Stage
 from master.tracked_object import TrackedObject
 
 _NAME = 64  # characters of a name in `Health`

@@ -1,22 +1,24 @@
 """The estimator: a hand at each epoch, predicted from the one before and fitted to what is measured."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from common.arrays import Bool, Code, Float, Int
 from common.camera_model import CameraModel
 from common.geometry import fit_rigid
-from common.hand_model import HandJoints, HandModel
+from common.hand_model import CHAINS, HandJoints, HandModel
 from common.kernels import bound, boxed
+from common.messages import Source
 from master.estimator.attached import Attached
 from master.estimator.cameras import CameraArrays
 from master.estimator.hand_tables import HandTables, Mounts
+from master.estimator.kinematics import Scratch, pose
 from master.estimator.parameters import HandParameters
 from master.estimator.posterior import Blank
 from master.estimator.priors import Habits, curled, habits_of
-from master.estimator.residuals import Observations, observe_rays
+from master.estimator.residuals import Observations, observe_points, observe_rays
 from master.estimator.settings import DEFAULT, Settings
 from master.estimator.solve import MAX_ITERATIONS, Rig
 from master.estimator.state import HandState
@@ -56,23 +58,25 @@ class Epoch:
 
     Attributes:
         t_ns: When.
-        uv: (C, A, 2) [px] centroids of all markers of the rig; NaN: not seen, or gated out.
-        variance_px2: (C, A) of each camera's own errors.
-        own_m2: (A, 3, 3) of what is wrong with each marker itself.
         points_m: (A, 3) where rays place the markers; NaN: they do not.
+        cov_m2: (A, 3, 3) covariances of these, where they are what is measured; None: the centroids are.
+        uv: (C, A, 2) [px] centroids of all markers of the rig; NaN: not seen, or gated out.
+        variance_px2: (C, A) of each camera's own errors; NaN: not to be used.
+        common_m2: (A,) variance of what all cameras see alike.
         facing: (3,) unit vector from the hand to the cameras that see its back.
         sensed: What other sensors say of the palm's turn and of angles; None: nothing.
         start: Another hand of this epoch; None: there is none.
     """
 
     t_ns: int
-    uv: Float
-    variance_px2: Float
-    own_m2: Float
     points_m: Float
     facing: Float
-    sensed: "Sensed | None"
-    start: SolvedHand | None
+    cov_m2: Float | None = None
+    uv: Float | None = None
+    variance_px2: Float | None = None
+    common_m2: Float | None = None
+    sensed: "Sensed | None" = None
+    start: SolvedHand | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,10 +85,13 @@ class Sensed:
 
     Attributes:
         rotation: (3, 3) palm -> rig about which turns count; None: only angles are known.
-        sure: Whether it says about every axis how the palm lies.
+        sure: Whether it is known about every axis how the palm lies.
         information, pull, constant: (3 + n, 3 + n), (3 + n,) and a number, of turn and free angles.
         told: (5,) fingers that are told, and `level` (5,) from what (`Level`).
         angles: (n,) the angles of those, where a search may begin.
+        lit: Columns of the PIPs of fingers that a laser point alone tells: they bend as their knuckles do.
+        weighed: The same with fingers counting less that a hand of angles (5, 4) contradicts; None: there are none.
+        belief: Where it is from.
     """
 
     rotation: Float | None
@@ -95,6 +102,17 @@ class Sensed:
     told: Bool
     level: Code
     angles: Float
+    lit: Int = field(default_factory=lambda: np.zeros(0, np.int64))
+    weighed: "Callable[[Float], Sensed | None]" = lambda _: None
+    belief: object = None
+
+    @classmethod
+    def turn(cls, rotation: Float, information: Float, n: int, *, sure: bool) -> "Sensed":
+        """Of the palm's rotation (3, 3) alone, with information (3, 3) [1/rad^2] about it."""
+        both = np.zeros((3 + n, 3 + n))
+        both[:3, :3] = information
+        none, level = np.zeros(5, np.bool_), np.zeros(5, np.uint8)
+        return cls(rotation, sure, both, np.zeros(3 + n), 0.0, none, level, np.zeros(n))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,20 +142,22 @@ class Fitted:
     """What the estimator says at an epoch.
 
     Attributes:
-        hand: None: nothing is known of it.
+        solution: The hand; None: nothing is known of it.
         valid, tracked, source: (26,) as of `HandPose`.
         rests: (6,) what thumb ... little and the palm rest on now; 0: on nothing. Equal numbers are equal grounds: for
             a finger the sum of `ON_MARKERS`, `BY_MARKERS` where its own is placed, and `ON_OTHERS` by its level; for
             the palm one of the former and which markers are seen.
         anew: The hand of a moment ago was wrong: nothing of it is in this one.
+        sensed: What other sensors said, as the fit took it; None: nothing.
     """
 
-    hand: FittedHand | None
+    solution: FittedHand | None
     valid: Bool
     tracked: Bool
     source: Code
     rests: Int
-    anew: bool
+    anew: bool = False
+    sensed: "Sensed | None" = None
 
 
 class Estimator:
@@ -152,6 +172,7 @@ class Estimator:
         caps: CapTables,
         *,
         continuous: bool = True,
+        natural: bool = False,
         settings: Settings = DEFAULT,
     ) -> None:
         """Prepare.
@@ -163,6 +184,8 @@ class Estimator:
             hand_markers: Those of them that are on this hand.
             caps: Of the hand's markers, in that order.
             continuous: False: every epoch is an unrelated pose, nothing is remembered.
+            natural: Whether the hand is taken to obey habits, and begins anew where markers are unexplained: the fit
+                of the card's line, which has no other hand to begin from.
             settings: Every number that tunes it.
 
         Raises:
@@ -178,9 +201,13 @@ class Estimator:
         self._space = Workspace.empty(n, _capacity(count))
         self._blank = Blank.of(n, len(cameras), count)
         self.state = HandState.unknown(n)
-        self._habits = {_NONE: habits_of(model, self.parameters, settings)}
+        self._only_natural = natural
+        self._habits: dict[frozenset[int], Habits] = {}
         self._finger = mounts.finger
         self._on_palm = np.array([model.mount(name).joint is None for name in hand_markers])
+        self._own_m2 = np.tile(settings.bones_m**2 * _EYE, (len(markers), 1, 1))
+        flat = [markers.index(name) for name in hand_markers if model.mount(name).finger is None]
+        self._own_m2[flat] += settings.relief_m**2 * _EYE
         self._carries = self._finger == np.arange(5)[:, None]  # (5, M)
         bent = np.zeros((len(_BENDS_RAD), 5, 4))
         bent[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (_MCP_PER_PIP, 1.0))[:, None]
@@ -190,7 +217,7 @@ class Estimator:
         self._bit = 1 << np.arange(_FIRST_MARKER, _FIRST_MARKER + count)
         self._finger_of_free = self.parameters.free // 4
         self._turn: Float | None = None
-        self._out = Estimate.empty()
+        self._out, self._scratch = Estimate.empty(), Scratch.empty()
         self._model = Model(
             boxed(self._rig.hand),
             boxed(settings.record()),
@@ -220,11 +247,19 @@ class Estimator:
         age_s = (t_ns - int(self.state.t_ns[0])) * 1e-9
         return self._continuous and self.known and 0.0 < age_s <= self.settings.forget_s
 
+    def pose(self, T: Float, angles_rad: Float) -> tuple[HandJoints, Float]:
+        """Joints and markers (M, 3) [m], rig frame, of a palm (4, 4) and angles (5, 4) [rad]."""
+        position, rotation = np.empty((26, 3)), np.empty((26, 3, 3))
+        places = np.empty((len(self._on_hand), 3))
+        hand, mounts, work = self._model.hand, self._model.mounts, boxed(self._scratch)
+        pose(hand, mounts, np.ascontiguousarray(T), angles_rad.reshape(20), work, position, rotation, places)
+        return HandJoints(position, rotation, T), places
+
     def push(self, at: Epoch) -> Fitted:
         """Fit one epoch."""
         observed, sensed, task = self._observed, at.sensed, self._space.task
-        count = observe_rays(at.uv, at.variance_px2, at.own_m2, self._on_hand, observed)
-        seen, rays = observed.seen, (observed.weight > 0.0).sum(axis=0)
+        count = self._observe(at)
+        seen, rays = observed.seen, (observed.weight > 0.0).sum(axis=0) + 2 * observed.placed
         back = bool((seen & self._on_palm).any())
         sure = sensed is not None and sensed.sure
         shown = (self._carries & seen).any(axis=1)
@@ -238,16 +273,53 @@ class Estimator:
         known, enough = self.recent(at.t_ns), self._enough(at, back, sure)
         self._believe(at, back, rays, known=known)
         out = Estimate.empty()
-        solved, anew = known and self._track(at, out, may_leave=enough), False
-        if not solved and enough:
-            self._begin(at)
-            self._run(TAKE_OVER, self._habits_of(_NONE), out)
-            solved, anew = True, known
+        before = None if sensed is None else self._boxed_state.copy()
+        solved, anew = self._solve(at, out, known=known, enough=enough)
+        if (
+            solved
+            and sensed is not None
+            and (weighed := sensed.weighed(out.angles.reshape(5, 4))) is not None
+        ):
+            self._boxed_state[:], sensed = before, weighed
+            at = replace(at, sensed=sensed)
+            self._believe(at, back, rays, known=known)
+            solved, anew = self._solve(at, out, known=known, enough=enough)
         self._turn = None if sensed is None else sensed.rotation
         if count > 0 or (sensed is not None and bool(sensed.told.any()) and self._knows_place()):
             self.state.seen_ns[0] = at.t_ns
         rests = self._rests(at, rays, palm_shown=palm_shown, by_markers=by_markers)
-        return self._fitted(at.t_ns, out, rests, anew=anew) if solved else _unknown(rests)
+        return self._fitted(at, out, rests, anew=anew) if solved else _unknown(rests)
+
+    def _solve(self, at: Epoch, out: Estimate, *, known: bool, enough: bool) -> tuple[bool, bool]:
+        """Fit an epoch and take it over; return whether there is a hand, and whether the one before was wrong."""
+        if known and self._only_natural and enough:
+            before = self._boxed_state.copy()
+            self._track(at, out, may_leave=False)
+            surprise = self._space.found.surprise[: len(self._on_hand)]
+            wrong = float(self._space.found.wrong[0])
+            if not (surprise > self.settings.explained).any():
+                return True, False
+            self._boxed_state[:] = before
+            known = wrong <= self.settings.misled + self._begin(at)
+        if known and self._track(at, out, may_leave=enough):
+            return True, False
+        if not enough:
+            return False, False
+        self._begin(at)
+        self._run(TAKE_OVER, self._habits_of(_NONE), out)
+        return True, known
+
+    def _observe(self, at: Epoch) -> int:
+        """Write the rows of an epoch; return how many markers have any."""
+        if at.cov_m2 is not None:
+            bones_m2 = self.settings.bones_m**2
+            points, cov = at.points_m[self._on_hand], at.cov_m2[self._on_hand]
+            return observe_points(points, cov, bones_m2, self._observed)
+        assert at.uv is not None
+        assert at.variance_px2 is not None
+        assert at.common_m2 is not None
+        own = at.common_m2[:, None, None] * _EYE + self._own_m2
+        return observe_rays(at.uv, at.variance_px2, own, self._on_hand, self._observed)
 
     def _track(self, at: Epoch, out: Estimate, *, may_leave: bool) -> bool:
         """Go on from the state; False: another hand of this epoch takes its place, or there is none."""
@@ -259,7 +331,7 @@ class Estimator:
             task.may_leave[0] = may_leave and start is not None
             if start is not None:
                 task.palm[:], task.x[:] = start.T_rig_palm, self.parameters.of_angles(start.angles_rad)
-            said = self._run(TRACK, self._habits_of(_NONE), out)
+            said = self._run(TRACK, self._with_laser(self._habits_of(_NONE), sensed), out)
             if said == TRACKED_ON:
                 return True
             wrong = float(self._space.found.wrong[0])
@@ -285,7 +357,7 @@ class Estimator:
         belief, found, task, start = space.belief, space.found, space.task, at.start
         fingers = np.isin(np.arange(5), list(apart))
         belief.own_w2[:], belief.own[:] = curled(self.parameters, self.settings, fingers)
-        habits = self._habits_of(apart)
+        habits = self._with_laser(self._habits_of(apart), at.sensed)
         try:
             if start is not None:
                 shows = task.shown[self._finger_of_free] > 0
@@ -392,8 +464,15 @@ class Estimator:
     def _habits_of(self, unlike: frozenset[int]) -> Habits:
         """Habits while some fingers are bent unlike the others; each of the 32 sets is worked out once."""
         if unlike not in self._habits:
-            self._habits[unlike] = habits_of(self.model, self.parameters, self.settings, unlike)
+            habits = habits_of(self.model, self.parameters, self.settings, unlike)
+            self._habits[unlike] = habits.natural() if self._only_natural else habits
         return self._habits[unlike]
+
+    def _with_laser(self, habits: Habits, sensed: "Sensed | None") -> Habits:
+        """Habits where a laser point alone tells some PIPs: a natural hand has no belief about these by themselves."""
+        if sensed is None or not len(sensed.lit) or self.model.mcp_per_pip is None:
+            return habits
+        return habits.without(sensed.lit, self.settings.pip_mean_rad, self.settings.pip_rad)
 
     def _likeliest(self) -> Float:
         """Free angles (n,) of the natural hand."""
@@ -414,18 +493,18 @@ class Estimator:
             rests[5] += int(seen @ self._bit)
         return rests
 
-    def _fitted(self, t_ns: int, out: Estimate, rests: Int, *, anew: bool) -> Fitted:
-        found, recent = (
-            self._space.found,
-            (t_ns - int(self.state.seen_ns[0])) * 1e-9 <= self.settings.forget_s,
-        )
+    def _fitted(self, at: Epoch, out: Estimate, rests: Int, *, anew: bool) -> Fitted:
+        found, sensed = self._space.found, at.sensed
+        recent = (at.t_ns - int(self.state.seen_ns[0])) * 1e-9 <= self.settings.forget_s
+        if sensed is not None:  # a tip that is measured stays so
+            by_others = CHAINS[sensed.told & (rests[:5] & ON_MARKERS == 0)]
+            out.source[by_others] = Source.WRIST
         hand = FittedHand(
             T_rig_palm=out.palm,
             angles_rad=out.angles.reshape(5, 4),
             joints=HandJoints(out.position, out.rotation, out.palm),
             cov_m2=out.cov,
             tilt_cov_rad2=out.tilt,
-            tilt_walk_rad2_s2=np.zeros((5, 3, 3)),
             alone=found.cov.copy(),
             x=found.x.copy(),
             scale=float(found.scale[0]),
@@ -440,6 +519,7 @@ class Estimator:
             out.source,
             rests,
             anew,
+            sensed,
         )
 
 

@@ -7,11 +7,12 @@ moves by a x (point - o).
 """
 
 from math import cos, sin, sqrt
+from typing import Any
 
 import numpy as np
 
 from common.arrays import Float
-from common.kernels import inlined, inner, record
+from common.kernels import inlined, inner, kernel, record
 from master.estimator.hand_tables import HandTables, Mounts
 
 
@@ -320,3 +321,29 @@ def turn_between(A: Float, B: Float, c: Float, out: Float) -> None:
         length = sqrt(max(0.5 * (1.0 + c[k, k]), 1e-12))
         for i in range(3):
             out[i] = np.pi * (length if i == k else 0.25 * (c[i, k] + c[k, i]) / length)
+
+
+@kernel
+def pose(
+    boxed_hand: Any,
+    mounts: Mounts,
+    T: Float,
+    angles: Float,
+    boxed_work: Any,
+    position: Float,
+    rotation: Float,
+    out: Float,
+) -> None:
+    """Write joints and markers of a palm (4, 4) and all angles (20,) [rad], rig frame.
+
+    Args:
+        boxed_hand, mounts: The hand (`common.kernels.boxed`) and its markers.
+        T, angles: Its pose.
+        boxed_work: Scratch.
+        position, rotation, out: Written: (26, 3) [m], (26, 3, 3), markers (M, 3) [m].
+    """
+    hand, work = boxed_hand[0], boxed_work[0]
+    chains(hand, T, angles, work.R, work.P)
+    joints(hand, T, work.R, work.P, position, rotation)
+    for m in range(mounts.finger.shape[0]):
+        marker_point(mounts, m, T, work.R, work.P, out[m])

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.arrays import Bool, Float
+from common.arrays import Bool, Float, Int
 from common.hand_model import HandModel
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT, Settings
@@ -35,6 +35,14 @@ class Habits(NamedTuple):
     pull: Float
     constant: Float
     log_density: Float
+
+    def without(self, columns: Int, mean: float, sigma: float) -> "Habits":
+        """The same, but the first hypothesis without its belief about each of these angles by itself."""
+        normal, pull, constant = self.normal.copy(), self.pull.copy(), self.constant.copy()
+        normal[0, columns, columns] -= 1.0 / sigma**2
+        pull[0, columns] -= mean / sigma**2
+        constant[0] -= 0.5 * len(columns) * (mean / sigma) ** 2
+        return Habits(normal, pull, constant, self.log_density)
 
     def natural(self) -> "Habits":
         """Those of the first hypothesis alone."""

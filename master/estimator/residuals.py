@@ -251,6 +251,8 @@ def observe_points(point: Float, cov: Float, own_m2: float, observed: Observatio
                 total += cov[m, i, j]
         seen = np.isfinite(total)
         observed.seen[m], observed.placed[m] = seen, seen
+        for c in range(observed.weight.shape[0]):
+            observed.weight[c, m] = 0.0
         if seen:
             inverse_3(cov[m], own, observed.information[m])
             count += 1

@@ -136,9 +136,10 @@ def chi_square(
     chains(rig.hand, T, work.angles, work.R, work.P)
     total = 0.0
     for m in range(mounts.finger.shape[0]):
-        if not observed.seen[m] or observed.placed[m]:
+        if not observed.seen[m]:
             continue
-        f, own, kept = mounts.finger[m], observed.own[m], search.J
+        f, kept = mounts.finger[m], search.J
+        own = observed.information[m] if observed.placed[m] else observed.own[m]
         marker_point(mounts, m, T, work.R, work.P, work.point)
         for i in range(3):
             work.ahead[i] = -work.R[f, mounts.level[m], i, 2] if f >= 0 else 0.0
@@ -196,10 +197,35 @@ def _judge(
         f, rays = rig.mounts.finger[m], 0
         for c in range(observed.uv.shape[0]):
             rays += 1 if observed.weight[c, m] > 0.0 else 0
-        if f >= 0 and rays > 1 and rig.mounts.level[m] == 3:
+        if f >= 0 and (rays > 1 or observed.placed[m]) and rig.mounts.level[m] == 3:
             for joint in range(26):
                 if hand.finger[joint] == f and hand.level[joint] == 3:
                     out.source[joint] = _MEASURED
+
+
+@inner
+def _drift(
+    settings: Settings, state: HandState, t_ns: int, observed: Observations, belief: Belief, out: Estimate
+) -> None:
+    """Add how far a hand may have drifted along the sight while one camera alone saw it.
+
+    Perspective tells the depth of a hand to centimetres only, and the fit is as sure of it as of the last epoch's.
+    """
+    placed, seen = False, False
+    for m in range(observed.seen.shape[0]):
+        rays = 0
+        for c in range(observed.uv.shape[0]):
+            rays += 1 if observed.weight[c, m] > 0.0 else 0
+        placed, seen = placed or observed.placed[m] or rays > 1, seen or observed.seen[m]
+    if placed or state.placed_ns[0] == NEVER_NS:
+        state.placed_ns[0] = t_ns
+    if placed or not seen:
+        return
+    sigma_m = min(settings.drift_m_s * (t_ns - state.placed_ns[0]) * 1e-9, settings.drift_most_m)
+    for joint in range(26):
+        for i in range(3):
+            for j in range(3):
+                out.cov[joint, i, j] += sigma_m * sigma_m * belief.sight[i] * belief.sight[j]
 
 
 @inner
@@ -260,6 +286,7 @@ def _take_over(
         room,
         out.cov,
     )
+    _drift(settings, state, t_ns, observed, space.belief, out)
     state.t_ns[0], state.known[0], state.natural[0] = t_ns, True, found.natural[0]
     for f in range(5):
         if shown[f]:

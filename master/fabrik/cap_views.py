@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from common.arrays import Float
-from common.kernels import inner, kernel
+from common.kernels import kernel
 from master.estimator.cameras import CameraArrays, project
 from master.fabrik.caps import CAPS, CapTables
 from master.fabrik.intersection import Rays
@@ -198,7 +198,7 @@ def hidden_part(
             out[c] = (max(out[c], CAPS.reach * most) * caps.radius_m[row] / scale_m[c]) ** 2
 
 
-@inner
+@kernel
 def views_of(count: int) -> Views:
     """Return room for a number of cameras."""
     return Views(
@@ -212,7 +212,7 @@ def views_of(count: int) -> Views:
     )
 
 
-@inner
+@kernel
 def appearance(
     cameras: CameraArrays, caps: CapTables, row: int, count: int, rays: Rays, views: Views
 ) -> None:

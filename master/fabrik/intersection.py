@@ -98,7 +98,7 @@ class Rays(NamedTuple):
     J: Float
 
 
-@inner
+@kernel
 def rays_of(count: int) -> Rays:
     """Return room for a number of cameras."""
     return Rays(

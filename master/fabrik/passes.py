@@ -1,7 +1,7 @@
 """Kernels of one iteration of FABRIK: aim, backward pass, forward pass."""
 
 from common.arrays import Float
-from common.kernels import inner
+from common.kernels import inner, kernel
 from master.fabrik.chain_arrays import (
     BONE,
     KIND,
@@ -47,7 +47,7 @@ def aim(chain: ChainArrays, end: Vector, goal: Vector, angles: Float) -> None:
     put_angles(chain, angles, ROOT, fit(limits, arm, rotate_back(turn, goal), now))
 
 
-@inner
+@kernel
 def backward_pass(
     chain: ChainArrays, positions: Float, orientations: Float, angles: Float, goal: Vector, places: Float
 ) -> None:
@@ -85,7 +85,7 @@ def _turned(orientation: Matrix, bone: Vector, wanted: Vector) -> Matrix:
     return product(between(rotate(orientation, bone), wanted), orientation)
 
 
-@inner
+@kernel
 def _pointed(chain: ChainArrays, k: int, now: Matrix, angles: Float, wanted: Vector) -> Matrix:
     """Orientation of link k whose bone points as wanted.
 

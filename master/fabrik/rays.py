@@ -17,13 +17,14 @@ occludes a part of a cap, or comes of time, is each camera's own.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from common.arrays import Bool, Float
 from common.camera_model import CameraModel
-from common.kernels import inner, kernel
+from common.kernels import kernel
 from master.estimator.cameras import CameraArrays, project
 from master.fabrik.cap_views import (
     ANY,
@@ -72,7 +73,7 @@ class _Hand(NamedTuple):
     turned_rad2: float
 
 
-@inner
+@kernel
 def _covariance(
     cameras: CameraArrays,
     caps: CapTables,
@@ -112,7 +113,7 @@ def _covariance(
             cov[i, j] = total + (CAPS.relief_m**2 if row < 0 and i == j else 0.0)
 
 
-@inner
+@kernel
 def _correct(
     cameras: CameraArrays,
     caps: CapTables,
@@ -152,7 +153,7 @@ def _correct(
     return count, 0.0 if occluded else RAYS.common * shared
 
 
-@inner
+@kernel
 def _place(
     cameras: CameraArrays,
     caps: CapTables,
@@ -195,6 +196,8 @@ def locate(
     noise: Float,
     apart: Bool,
     left_out: Bool,
+    variance: Float,
+    common: Float,
 ) -> None:
     """Locate M markers with covariance.
 
@@ -207,6 +210,8 @@ def locate(
         points, cov, noise: (M, 3), (M, 3, 3), (M, 3, 3) written as of `MarkerPositions`.
         apart: (M,) written: two cameras or more see it, but their rays do not meet.
         left_out: (C, M) written: outliers, without which they do.
+        variance: (C, M) written: [px^2] of each camera's own errors; NaN: not seen, or not to be used.
+        common: (M,) written: [m^2] variance of what all cameras see alike.
     """
     hand = _Hand(known, as_seen, R, tilt_rad2, turned_rad2)
     rays, views = rays_of(observed.shape[0]), views_of(observed.shape[0])
@@ -227,12 +232,35 @@ def locate(
         apart[m] = seen >= 2 and not meets
         if meets:
             _covariance(cameras, caps, caps.row[m], count, shared, rays, views, cov[m])
+        common[m] = 0.0
+        for c in range(observed.shape[0]):
+            used = rays.weight[c] > 0.0 and not apart[m]
+            own = rays.variance[c] + rays_px * rays_px - (shared if meets else 0.0)
+            variance[c, m] = own if used else np.nan
+            if meets and used:
+                squared = 0.0
+                for i in range(3):
+                    squared += (rays.point[i] - cameras.centre[c, i]) ** 2
+                common[m] += shared * squared / (cameras.scale[c] ** 2 * seen)
         for i in range(3):
             points[m, i] = rays.point[i] if meets else np.nan
             for j in range(3):
                 noise[m, i, j] = rays.cov[i, j] if meets else np.nan
                 if not meets:
                     cov[m, i, j] = np.nan
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RayPositions(MarkerPositions):
+    """Markers placed by rays, with what each ray is worth.
+
+    Attributes:
+        variance_px2: (C, M) per axis, of each camera's own errors; NaN: not seen, an outlier, or rays do not meet.
+        common_m2: (M,) variance of what all cameras see alike.
+    """
+
+    variance_px2: Float
+    common_m2: Float
 
 
 class RayTriangulator:
@@ -264,7 +292,7 @@ class RayTriangulator:
         age_s: float,
         *,
         as_seen: bool = False,
-    ) -> MarkerPositions:
+    ) -> "RayPositions":
         """As `Triangulate`."""
         cameras, count = uv.shape[:2]
         observed = np.empty((cameras, count, 4))
@@ -275,6 +303,7 @@ class RayTriangulator:
         points, cov = np.empty((count, 3)), np.empty((count, 3, 3))
         noise, apart = np.empty((count, 3, 3)), np.empty(count, np.bool_)
         left_out = np.empty((cameras, count), np.bool_)
+        variance, common = np.empty((cameras, count)), np.empty(count)
         locate(
             self._cameras,
             self._caps,
@@ -291,8 +320,10 @@ class RayTriangulator:
             noise,
             apart,
             left_out,
+            variance,
+            common,
         )
-        return MarkerPositions(points, cov, noise, apart, left_out)
+        return RayPositions(points, cov, noise, apart, left_out, variance, common)
 
     def triangulate(self, uv: Float, sigma_px: float | Float = 0.1) -> Triangulation:
         """Triangulate markers as they are seen (`master.fabrik.intersection`)."""

@@ -15,15 +15,13 @@ from common.camera_model import CameraModel
 from common.geometry import rigid
 from common.hand_model import CHAINS, METACARPALS, PALM, TIPS, WRIST, HandModel
 from common.messages import MarkerDetections, Source
+from master.estimator.estimator import Epoch, Estimator, Fitted
 from master.fabrik.estimate import HandEstimate, SolvedHand
 from master.fabrik.finger import Finger
 from master.fabrik.one_euro import PointFilter
-from master.fabrik.palm import Palm, PalmFitter
-from master.fabrik.palm_kernel import facing_of, targets_of
 from master.fabrik.sync import FrameSet, FrameSync
+from master.fabrik.targets import facing_of, targets_of
 from master.fabrik.triangulate import Triangulate
-from master.ik.hand import EXPLAINED
-from master.ik.hidden import FingerMemory, HiddenFingers
 
 Stage = Callable[[str], AbstractContextManager[None]]
 FORGET_S = 0.5  # after this long without markers nothing is known of the hand any more
@@ -32,10 +30,7 @@ _FIT_M2 = (3e-3) ** 2  # of a finger's marker as the palm's fit has it
 _DRIFT_M_S = 0.3  # of a hand that is held
 _PALM_JOINTS = np.array([PALM, WRIST, *METACARPALS])
 _PALM_MARKERS = 3
-_NATURAL = 1.0  # the line knows no hand without habits
 _AWAY = rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))  # a hand before a camera at the origin
-_NO_WALK = np.zeros((5, 3, 3))
-_ANYWHERE = HiddenFingers(np.zeros((5, 4)), np.full(5, np.inf), np.zeros(5), np.ones(5))
 
 
 class FabrikSolver:
@@ -51,7 +46,8 @@ class FabrikSolver:
         sync: FrameSync,
         triangulate: Triangulate,
         one_euro: PointFilter | None,
-        palm: PalmFitter,
+        palm: Estimator,
+        once: Estimator,
         stage: Stage = lambda name: nullcontext(),
     ) -> None:
         """Join the parts.
@@ -64,11 +60,12 @@ class FabrikSolver:
             sync: Brings cameras to one instant.
             triangulate: Centroids to points by the rig's depth model.
             one_euro: Filter of the points; None: instants are unrelated, nothing is filtered or remembered.
-            palm: Fits the palm from the hand's markers.
+            palm: Fits the palm, with the angles that go best with it, from the hand's markers.
+            once: The same without memory; fingers that are not seen may be anywhere natural.
             stage: Opens a timer by stage name.
         """
         self._model, self.sync, self.triangulate = model, sync, triangulate
-        self._one_euro, self._palm, self._stage = one_euro, palm, stage
+        self._one_euro, self._palm, self._once, self._stage = one_euro, palm, once, stage
         self.on_hand = np.array([markers.index(name) for name in hand_markers], np.int64)
         self._centres = np.array([camera.centre for camera in cameras.values()])
         self._focal_px = np.array([camera.matrix[0, 0] for camera in cameras.values()])
@@ -83,9 +80,7 @@ class FabrikSolver:
         self._fingers = {
             m: (f, Finger.of(model, f, mounts[m].offset_m, _ON_TARGET_M)) for f, m in at_tips.items()
         }
-        self._memory = FingerMemory(model)
         self._last: SolvedHand | None = None
-        self._last_palm: Palm | None = None
         self._last_ns = -(2**62)
 
     @property
@@ -114,8 +109,6 @@ class FabrikSolver:
         last, age_s = self._recent(frames.t_ns)
         seen_as, seen_age_s = (last, age_s) if near is None else (near, near_age_s)
         pixels = frames.uv, frames.sigma_px, frames.area
-        if last is None:
-            self._memory = FingerMemory(self._model)
         with self._stage("triangulate"):
             markers = self.triangulate(*pixels, seen_as, seen_age_s)
             if seen_as is None:
@@ -126,10 +119,10 @@ class FabrikSolver:
             if self._one_euro is not None:
                 smooth = self._one_euro.push(frames.t_ns, smooth, markers.noise_m2)
         with self._stage("fabrik"):
-            points, cov = smooth[self.on_hand], markers.cov_m2[self.on_hand]
-            out = HandEstimate.unseen(frames.t_ns, markers, smooth, self.towards(points, frames.area))
-            palm = self._fit(frames.t_ns, points, cov, out.facing, last, age_s)
-            return self._estimate(out, points, cov, palm)
+            facing = self.towards(smooth[self.on_hand], frames.area)
+            out = HandEstimate.unseen(frames.t_ns, markers, smooth, facing)
+            palm = self._palm.push(Epoch(frames.t_ns, smooth, facing, cov_m2=markers.cov_m2))
+            return self._estimate(out, smooth[self.on_hand], markers.cov_m2[self.on_hand], palm)
 
     def solve_once(self, points: Float, cov: Float, area_px2: Float) -> SolvedHand | None:
         """Solve from points alone and remember nothing.
@@ -143,27 +136,25 @@ class FabrikSolver:
         Returns:
             The hand; None: the points are too few.
         """
-        points, cov = points[self.on_hand], cov[self.on_hand]
-        facing = self.towards(points, area_px2) if self._shows_back(points) else None
-        palm = self._palm(points, cov, facing, hidden=_ANYWHERE)
-        return None if palm is None else self._hand_of(palm)
+        facing = self.towards(points[self.on_hand], area_px2)
+        return self._once.push(Epoch(0, points, facing, cov_m2=cov)).solution
 
     def rehearse(self) -> None:
         """Call every kernel once, so that none is compiled while a hand is tracked."""
         self.sync.at(0)
-        bent = np.full((5, 4), 0.2)
-        _, places = self._palm.pose(_AWAY, self._model.clamp(bent))
+        angles = self._model.clamp(np.full((5, 4), 0.2))
+        _, places = self._palm.pose(_AWAY, angles)
         points, cov = np.full((self._count, 3), np.nan), np.full((self._count, 3, 3), np.nan)
-        points[self.on_hand], cov[self.on_hand] = places @ _AWAY[:3, :3].T + _AWAY[:3, 3], 1e-6 * np.eye(3)
+        points[self.on_hand], cov[self.on_hand] = places, 1e-6 * np.eye(3)
         seen = np.ones((len(self._centres), self._count))
         first = self.solve_once(points, cov, seen)
         self.triangulate(100.0 * np.stack([seen, seen], axis=-1), seen, seen, first, 0.0)
-        if first is not None:
-            for m, (f, finger) in self._fingers.items():
-                for aside_m in (0.0, 0.1):  # with and without a search
-                    finger.solve(places[m] + aside_m, first.angles_rad[f])
-            out = np.empty_like(places)
-            targets_of(points[self.on_hand], cov[self.on_hand], _AWAY, places, _FIT_M2, out)
+        targets = np.empty_like(places)
+        targets_of(places, cov[self.on_hand], _AWAY, places, _FIT_M2, targets)
+        for m, (f, finger) in self._fingers.items():
+            for aside_m in (0.0, 0.1):  # with and without a search
+                finger.solve(targets[m] + aside_m, angles[f])
+        self.sync.at(0)
 
     def _recent(self, t_ns: int) -> tuple[SolvedHand | None, float]:
         """The last hand, if it still says anything, and how long ago it held [s]."""
@@ -171,21 +162,6 @@ class FabrikSolver:
         if not self.continuous or self._last is None or not 0.0 < age_s <= FORGET_S:
             return None, 0.0
         return self._last, age_s
-
-    def _fit(
-        self, t_ns: int, points: Float, cov: Float, towards: Float, last: SolvedHand | None, age_s: float
-    ) -> Palm | None:
-        """Fit the palm to the hand's points (H, 3) [m]; `last` as of `_recent`."""
-        facing = towards if self._shows_back(points) else None
-        if last is None:
-            return self._palm(points, cov, facing)
-        shown = frozenset(self._finger_of[np.isfinite(points[:, 0])].tolist()) - {-1}
-        hidden = self._memory.belief(t_ns, self._last_ns, last.angles_rad, _NATURAL, shown)
-        return self._palm(points, cov, facing, self._last_palm, age_s, hidden)
-
-    def _shows_back(self, points: Float) -> bool:
-        """Whether a marker on the back is placed."""
-        return bool(np.isfinite(points[self._on_palm, 0]).any())
 
     def towards(self, points: Float, area_px2: Float) -> Float:
         """Return the unit vector (3,) to the cameras that see most of the back.
@@ -196,45 +172,38 @@ class FabrikSolver:
         facing_of(points, area_px2[:, self._back], self._centres, self._focal_px, out)
         return out
 
-    def _hand_of(self, palm: Palm) -> SolvedHand:
-        """The hand as the palm's fit has it."""
-        angles = self._model.clamp(self._palm.parameters.angles(palm.x))
-        joints, _ = self._palm.pose(palm.T, angles)
-        return SolvedHand(palm.T, angles, joints, *self._palm.covariances(palm), _NO_WALK)
-
-    def _estimate(self, out: HandEstimate, points: Float, cov: Float, palm: Palm | None) -> HandEstimate:
+    def _estimate(self, out: HandEstimate, points: Float, cov: Float, palm: Fitted) -> HandEstimate:
         """Bring a palm's fingers onto their markers; without a palm hold the last hand."""
         last, age_s = self._recent(out.t_ns)
-        if palm is None:
+        fit, placed = palm.solution, np.isfinite(points[:, 0])
+        if fit is None or not placed.any():
             out.valid[:] = last is not None
             return out if last is None else replace(out, solution=_drifted(last, age_s))
-        fitted = self._palm.parameters.angles(palm.x)
-        before, places = self._palm.pose(palm.T, fitted)
-        targets, angles = np.empty_like(places), fitted.copy()
-        targets_of(points, cov, palm.T, places, _FIT_M2, targets)
+        T, angles = fit.T_rig_palm, fit.angles_rad.copy()
+        _, fitted = self._palm.pose(T, angles)
+        targets = np.empty_like(fitted)
+        targets_of(points, cov, T, fitted, _FIT_M2, targets)
         for m, (f, finger) in self._fingers.items():
             if isfinite(targets[m, 0]):
                 out.residual_m[f], out.iterations[f], out.reached[f] = finger.solve(targets[m], angles[f])
         angles = self._model.clamp(angles)
-        joints, _ = self._palm.pose(palm.T, angles)
-        joint_cov, tilt = self._palm.covariances(palm)
-        off = joints.position_m - before.position_m
-        joint_cov += off[:, :, None] * off[:, None, :]
-        hand = SolvedHand(palm.T, angles, joints, joint_cov, tilt, _NO_WALK)
-        self._judge(out, palm, np.isfinite(points[:, 0]))
-        if last is not None:
-            self._memory.moved(last.angles_rad, angles, age_s)
-        self._last, self._last_palm, self._last_ns = hand, palm, out.t_ns
+        joints, _ = self._palm.pose(T, angles)
+        off = joints.position_m - fit.joints.position_m
+        joint_cov = fit.cov_m2 + off[:, :, None] * off[:, None, :]
+        hand = SolvedHand(T, angles, joints, joint_cov, fit.tilt_cov_rad2)
+        self._judge(out, fit.surprise, placed)
+        self._last, self._last_ns = hand, out.t_ns
         return replace(out, solution=hand)
 
-    def _judge(self, out: HandEstimate, palm: Palm, placed: Bool) -> None:
+    def _judge(self, out: HandEstimate, surprise: Float, placed: Bool) -> None:
         """Write the bits of a solved hand; `placed`: (H,) which markers are.
 
         What they explain is tracked.
         """
         out.seen[self._finger_of[placed & self._on_finger]] = True
         explained = out.seen.copy()
-        explained[self._finger_of[(palm.surprise >= EXPLAINED) & self._on_finger]] = False
+        wrong = surprise >= self._palm.settings.explained
+        explained[self._finger_of[wrong & self._on_finger]] = False
         out.valid[:] = True
         out.source[CHAINS[out.seen]] = Source.SOLVED
         out.source[TIPS[out.seen]] = Source.MEASURED

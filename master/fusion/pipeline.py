@@ -1,6 +1,6 @@
 """One hand from marker cameras, a wrist device and its IMU: not a switch between them but one fit.
 
-`FusedPipeline` is a push machine without clock, socket or thread. Every pose is the marker line's (`master.stereo`),
+`FusedPipeline` is a push machine without clock, socket or thread. Every pose is the marker line's (`master.estimator`),
 with one belief more in its fit (`master.fusion.sensed_hand`), of two parts that share the doubt of the wrist's bend:
 
 - the fingers' angles as the wrist device has them, each with its covariance (`finger_track`),
@@ -14,6 +14,7 @@ hand is is held, with a doubt that grows.
 
 from collections import Counter
 from math import nan
+from typing import cast
 
 import msgspec
 import numpy as np
@@ -21,13 +22,13 @@ import numpy as np
 from common.arrays import Bool, Code, Float
 from common.messages import Detections, HandPose, WristDetections
 from common.wrist_bend import STRAIGHT
+from master.estimator.estimator import ON_MARKERS, Fitted
 from master.estimator.parameters import HandParameters
+from master.estimator.pipeline import MarkerPipeline, SolvedPose, Stage
 from master.fusion.finger_track import REACH_NS, FingerTrack
 from master.fusion.forearm import Forearm
 from master.fusion.sensed_hand import SensedHand
 from master.fusion.told_forearm import told_forearm
-from master.ik.tracker import ON_MARKERS, TrackedHand
-from master.stereo.pipeline import MarkerPipeline, SolvedPose, Stage
 from master.wrist.fingers import SeenFingers, WristFingers
 from master.wrist.setup import WristSetup
 
@@ -106,14 +107,15 @@ class WristSide:
             palm_bend,
         )
 
-    def solved(self, t_ns: int, hand: TrackedHand, told: SensedHand | None) -> None:
-        """As `OtherSensors.solved`: where markers tell how the palm lies, the forearm learns from the instant."""
+    def solved(self, t_ns: int, hand: Fitted) -> None:
+        """As `OtherSensors.solved`: where markers tell how the palm lies, the forearm learns from the epoch."""
         if hand.solution is None:
             return
         self._solved = t_ns, hand.solution.angles_rad
         if self.forearm is not None and hand.rests[5] & ON_MARKERS:
             bend, _cov = self.forearm.bend_at(t_ns)
-            self.forearm.saw(t_ns, told_forearm(hand.solution, bend, self._parameters))
+            sensed = None if hand.sensed is None else cast(SensedHand, hand.sensed.belief)
+            self.forearm.saw(t_ns, told_forearm(hand.solution, sensed, bend, self._parameters))
 
 
 class FusedPipeline:

@@ -21,14 +21,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from common.arrays import Bool, Code, Float
+from common.arrays import Bool, Code, Float, Int
 from common.geometry import matrix_to_rotation_vector
 from common.hand_model import HandModel
+from common.messages import Level
 from master.estimator.attached import Attached
+from master.estimator.estimator import Sensed
 from master.estimator.parameters import HandParameters
 from master.ik.palm import Orientation, turn_of_vector
 
-_ANGLES, _TURN = 4, 3
+_ANGLES, _TURN, _PIP = 4, 3, 2
 _FREEDOM = 4.0
 _SURPRISED = 9.5  # chi square of four numbers, 1 in 20: below it nothing is weighed down
 _BEND = 2
@@ -138,6 +140,35 @@ class SensedHand:
         means = y.reshape(-1) + by_free @ x - parameters.angles(x).reshape(-1)
         return SensedFree(self, by_free, means)
 
+    def for_fit(self, parameters: HandParameters, measured: Int) -> Sensed:
+        """The same as the estimator takes it.
+
+        Args:
+            parameters: The free angles.
+            measured: Fingers, any number of times, whose marker is placed.
+        """
+        free = self.of(parameters)
+        lit = self.told & (self.level == Level.FK)
+        lit[0] = False  # a thumb has other habits
+        lit[measured[measured >= 0]] = False
+        columns = np.flatnonzero(lit[parameters.free // _ANGLES] & (parameters.free % _ANGLES == _PIP))
+
+        def weighed(angles_rad: Float) -> Sensed | None:
+            less = self.weighed(angles_rad)
+            return None if less is None else less.for_fit(parameters, measured)
+
+        return Sensed(
+            None if self.palm is None else self.palm.rotation,
+            self.palm is not None and self.palm.sure,
+            *free.normal_equations(),
+            self.told,
+            self.level,
+            parameters.of_angles(np.nan_to_num(self.angles_rad)),
+            columns,
+            weighed,
+            self,
+        )
+
 
 class MarkerCheck:
     """Finds fingers that another sensor has elsewhere than their markers are; prepared for one hand and its markers."""
@@ -188,6 +219,19 @@ class SensedFree:
         by_angles = self.belief.information[:, _TURN:] @ self.by_free
         object.__setattr__(self, "_of_fingers", self.by_free.T @ by_angles[_TURN:])
         object.__setattr__(self, "_crossed", by_angles[:_TURN])
+
+    def normal_equations(self) -> tuple[Float, Float, float]:
+        """Information (3 + n, 3 + n), pull (3 + n,) and constant of the turn from the believed palm and the angles."""
+        W, n = self.belief.information, self.by_free.shape[1]
+        information, pull = np.zeros((_TURN + n, _TURN + n)), np.zeros(_TURN + n)
+        information[_TURN:, _TURN:] = self._of_fingers
+        weighed = W[:, _TURN:] @ self.means
+        pull[_TURN:] = self.by_free.T @ weighed[_TURN:]
+        if self.belief.palm is not None:
+            information[:_TURN, :_TURN] = W[:_TURN, :_TURN]
+            information[:_TURN, _TURN:], information[_TURN:, :_TURN] = self._crossed, self._crossed.T
+            pull[:_TURN] = weighed[:_TURN]
+        return information, pull, 0.5 * float(self.means @ weighed[_TURN:])
 
     def add_to(self, R: Float, x: Float, gradient: Float, normal: Float) -> Float:
         """The cost (...) of rotations (..., 3, 3) and free angles (..., n).

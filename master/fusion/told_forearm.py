@@ -20,9 +20,9 @@ import numpy as np
 
 from common.arrays import Float
 from common.geometry import rotation_vector_to_matrix
+from master.estimator.estimator import FittedHand
 from master.estimator.parameters import HandParameters
 from master.fusion.sensed_hand import SensedHand
-from master.ik.hand import HandSolution
 
 _TURN, _PALM, _ANGLES, _SIGHTS = 3, 6, 20, 22
 _EACH_RAD = radians(5.0)  # what one finger seems bent by, as by a wrist: a thumb alone tells no wrist
@@ -68,19 +68,22 @@ class ToldForearm:
         return rotation_vector_to_matrix(turn) @ self.R_rig_palm, cov[:_TURN, :_TURN]
 
 
-def told_forearm(hand: HandSolution, bend_rad: Float, parameters: HandParameters) -> ToldForearm:
+def told_forearm(
+    hand: FittedHand, sensed: SensedHand | None, bend_rad: Float, parameters: HandParameters
+) -> ToldForearm:
     """What the instant of a solved hand tells.
 
     Args:
         hand: The hand, solved with what other sensors said at that bend.
+        sensed: That, as the fit took it; None: nothing.
         bend_rad: (2,) the bend.
         parameters: Its free angles.
     """
     R, size = hand.T_rig_palm[:3, :3], len(hand.alone)
     normal, pull = np.zeros((size + 2, size + 2)), np.zeros(size + 2)
     normal[:size, :size] = np.linalg.inv(hand.alone)
-    if hand.others is not None:
-        belief = hand.others.of(parameters)
+    if sensed is not None:
+        belief = sensed.of(parameters)
         added, gradient = np.zeros((size, size)), np.zeros(size)
         belief.add_to(R, hand.x, gradient, added)
         without = normal[:size, :size] - added / hand.scale
@@ -89,7 +92,7 @@ def told_forearm(hand: HandSolution, bend_rad: Float, parameters: HandParameters
         by = np.zeros((_SIGHTS, size + 2))
         by[:_ANGLES, _PALM:size], by[_ANGLES:, size:] = belief.by_free, np.eye(2)
         off = np.concatenate([belief.by_free @ hand.x - belief.means, np.zeros(2)])
-        weighed = by.T @ _of_sights(hand.others) / hand.scale
+        weighed = by.T @ _of_sights(sensed) / hand.scale
         normal += weighed @ by
         pull -= weighed @ off
     told, rest = np.r_[:_TURN, size : size + 2], np.r_[_TURN:size]

@@ -304,7 +304,7 @@ def _bends(f: int, joints: Float, rotation: Float, T: Float, bend: Float) -> Non
         before = after
 
 
-@inner
+@kernel
 def _take_seen(markers: Float, caps: Float) -> None:
     """Put each cap where its marker is.
 

@@ -127,7 +127,7 @@ def _shares(joints: Float, radius: Float, a: int, a_end: int, b: int, b_end: int
     return s, t
 
 
-@inner
+@kernel
 def _turned_rad(f: int, joints: Float, cov: Float) -> float:
     """Return the standard deviation [rad] of the direction of a last bone.
 

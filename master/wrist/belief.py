@@ -2,8 +2,8 @@
 
 The laser gives two numbers of a finger and its pose has four. The other two come from habit: joints that bend together
 (`master.wrist.forward`). How far hands stray from that is in `master.estimator.settings`: a natural MCP by 14 degrees,
-a DIP by 15, each joint of the thumb by 20. What the laser says of a bent finger is the slope of its proximal bone, hence
-the MCP; a PIP is that divided by 0.54 and its doubt is large, which the covariance says:
+a DIP by 15, each joint of the thumb by 20. What the laser says of a bent finger is the slope of its proximal bone,
+hence the MCP; a PIP is that divided by 0.54 and its doubt is large, which the covariance says:
 
     information = G' R^-1 G + H      G (2, 4): how the point moves with each angle, R: how sure the point is, H: habits
 

@@ -21,8 +21,8 @@ from common.arrays import Bool, Float
 from common.hand_model import FINGERS
 from common.messages import Level, WristDetections
 from common.wrist_bend import STRAIGHT
+from master.estimator.pipeline import Stage
 from master.fabrik.one_euro import OneEuroParameters, PointFilter
-from master.stereo.pipeline import Stage
 from master.wrist.belief import AngleBelief, FingerAngles
 from master.wrist.bend_slope import BendSlope, SightWorth, near
 from master.wrist.bent import BentView, BentWrist

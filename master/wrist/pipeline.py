@@ -18,8 +18,8 @@ import numpy as np
 
 from common.arrays import Bool, Code, Float
 from common.messages import Source, WristDetections
+from master.estimator.pipeline import SolvedPose, Stage
 from master.estimator.settings import DEFAULT
-from master.stereo.pipeline import SolvedPose, Stage
 from master.wrist.belief import FingerAngles
 from master.wrist.fingers import FORGET_S, NEVER_NS, WristFingers, count
 from master.wrist.inverse import InverseModel

@@ -17,7 +17,7 @@ from master.needs_restart import refuse_restart
 from master.outputs.files import RunFiles, load_poses
 from master.rig import load_setup, pipeline_of
 from master.stages import StageTimes
-from master.stereo.pipeline import SolvedPose
+from master.estimator.pipeline import SolvedPose
 from master.time_watch import TimeWatch
 from master.tuning import LivePipeline, RigFiles, RigTuning
 from master.world import World

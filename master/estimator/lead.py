@@ -13,7 +13,7 @@ from math import exp
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from master.ik.tracker import BY_MARKERS
+from master.estimator.estimator import BY_MARKERS
 
 PLACE, TURN, ANGLES = slice(0, 3), slice(3, 6), slice(6, 26)
 PARTS: Int = np.repeat([5, 0, 1, 2, 3, 4], [6, 4, 4, 4, 4, 4])  # signal -> finger, or 5: the palm
@@ -36,11 +36,11 @@ class Lead:
         self._points_m = np.full((len(on_palm), 3), np.nan)
 
     def push(self, gap_s: float, rests: Int, shown: Float, solved: Float, points_m: Float) -> Float:
-        """What is to be added to the solved signals (26,) [m] (`master.ik.hand_one_euro`).
+        """What is to be added to the solved signals (26,) [m] (`master.estimator.smooth`).
 
         Args:
             gap_s: Time since the last; 0: there is none.
-            rests: (6,) as of `TrackedHand`.
+            rests: (6,) as of `Fitted`.
             shown, solved: (26,) what was shown last, what is solved now.
             points_m: (M, 3) the markers; NaN: not seen.
         """

@@ -23,8 +23,8 @@ of how far it is shown from where it is solved to be.
 
 A hand that was wrong a moment ago, as its tracker says, is shown at once where it is, and the filter begins anew.
 
-A hand that several kinds of sensors watch leaps more often, and is led in as `master.ik.lead` has it. A joint of it is
-not called tracked while it is shown more than 5 mm from where it is solved to be.
+A hand that several kinds of sensors watch leaps more often, and is led in as `master.estimator.lead` has it. A joint of
+it is not called tracked while it is shown more than 5 mm from where it is solved to be.
 
 Beside that the covariance is the solution's. Filtering takes noise away and adds lag; neither is in it.
 """
@@ -37,11 +37,10 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.geometry import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix, unskew
 from common.hand_model import CHAINS, MIDDLE_PROXIMAL, TIPS, HandJoints, HandModel
+from master.estimator.estimator import Fitted, FittedHand
+from master.estimator.lead import ANGLES, PARTS, PLACE, TURN, Lead
 from master.fabrik.noise import NoiseEstimator
 from master.fabrik.one_euro import OneEuro, OneEuroParameters
-from master.ik.hand import HandSolution
-from master.ik.lead import ANGLES, PARTS, PLACE, TURN, Lead
-from master.ik.tracker import TrackedHand
 
 LEAD_OVER_S = 0.1
 _GROUPS = (6, 4, 4, 4, 4, 4)  # the palm and each finger
@@ -57,7 +56,7 @@ class _Shown:
         noise: Measures the noise of the signals.
         smooth: The filter of the 26 signals: place (3), turn (3), angles (5, 4), all [m].
         t_ns: When.
-        rests: (6,) what the fingers, and the palm, rested on: `TrackedHand.rests`.
+        rests: (6,) what the fingers, and the palm, rested on: `Fitted.rests`.
         values: (26,) [m] the filtered signals.
         rotation: (3, 3) palm to rig, as filtered.
         offset: (26,) [m] what was shown less what was solved, when each part was last seen again.
@@ -124,7 +123,7 @@ class HandOneEuro:
         self._lead: Lead | None = None
         self._shown: _Shown | None = None
 
-    def push(self, t_ns: int, hand: TrackedHand, cov_m2: Float, points_m: Float | None = None) -> TrackedHand:
+    def push(self, t_ns: int, hand: Fitted, cov_m2: Float, points_m: Float | None = None) -> Fitted:
         """Filter palm, angles and joints of a hand; the rest of it stays.
 
         Args:
@@ -183,13 +182,13 @@ class HandOneEuro:
         if again.any():
             shown.leap(t_ns, again, solved)
 
-    def _begin(self, t_ns: int, solution: HandSolution, rests: Int) -> _Shown:
+    def _begin(self, t_ns: int, solution: FittedHand, rests: Int) -> _Shown:
         self._lead = None if self._lead_m_s is None else Lead(self._lead_m_s, self._on_palm)
         rotation, never = solution.T_rig_palm[:3, :3], np.zeros(6, np.int64)
         noise, smooth = NoiseEstimator(), OneEuro(self._parameters, _GROUPS)
         return _Shown(noise, smooth, t_ns, rests, np.zeros(26), rotation, np.zeros(26), never, t_ns)
 
-    def _signals(self, solution: HandSolution, shown: _Shown) -> Float:
+    def _signals(self, solution: FittedHand, shown: _Shown) -> Float:
         """What is filtered (26,) [m]."""
         rotation, angles = solution.T_rig_palm[:3, :3], solution.angles_rad.copy()
         angles[1:, 3] -= self._dip_per_pip * angles[1:, 2]

@@ -1,0 +1,302 @@
+"""The marker rig: centroids of all cameras at one epoch, the card's line, and the estimator that starts from it.
+
+`MarkerPipeline` is a push machine without clock, socket or thread: live and offline runs push the same messages
+and get the same poses. It is built from calibration by `master.rig`.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from math import nan
+from typing import Protocol
+
+import numpy as np
+
+from common.arrays import Bool, Float, Int
+from common.calibration import ImuCalibration, Volume
+from common.camera_model import CameraModel
+from common.hand_model import HandModel
+from common.messages import HandPose, MarkerDetections, restamped
+from master.estimator.cameras import CameraArrays
+from master.estimator.estimator import Epoch, Estimator, Fitted, Sensed
+from master.estimator.gate import Prior, among, associate
+from master.estimator.pose import pose_of
+from master.estimator.smooth import HandOneEuro
+from master.fabrik.blob_bias import LensShift
+from master.fabrik.estimate import HandEstimate, MarkerPositions, SolvedHand
+from master.fabrik.intersection import triangulate
+from master.fabrik.rays import RayPositions, RayTriangulator
+from master.fabrik.solver import FabrikSolver
+from master.fabrik.sync import FrameSet
+from master.fusion.orientation import OrientationTrack
+from master.fusion.sensed_hand import MarkerCheck, SensedHand
+
+Stage = Callable[[str], AbstractContextManager[None]]
+_NAME = 64  # characters of a name in `Health`
+_NEVER_NS = -(2**62)
+
+
+class OtherSensors(Protocol):
+    """What watches the same hand beside the cameras: a wrist device and its IMU (`master.fusion`)."""
+
+    def at(self, t_ns: int) -> SensedHand | None:
+        """What they say of the hand at an epoch; None: nothing."""
+        ...
+
+    def solved(self, t_ns: int, hand: Fitted) -> None:
+        """Learn from the hand as it was solved, with what they said in it."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class SolvedPose:
+    """A pose, and when the last frame that contributed to it was handed to its slave [ns]."""
+
+    pose: HandPose
+    ready_t_ns: int
+
+
+class MarkerPipeline:
+    """Push machine. Holds sync, line, estimator and filter, each with its own state, and where markers were last."""
+
+    def __init__(
+        self,
+        cameras: dict[str, CameraModel],
+        model: HandModel,
+        markers: tuple[str, ...],
+        *,
+        line: FabrikSolver,
+        rays: RayTriangulator | None,
+        rays_px: float = 0.0,
+        estimator: Estimator | None,
+        smooth: HandOneEuro | None = None,
+        stamp_offset_us: Mapping[str, float] | None = None,
+        volume: Volume | None = None,
+        imu: ImuCalibration | None = None,
+        others: OtherSensors | None = None,
+        counts: Counter[str] | None = None,
+        stage: Stage = lambda name: nullcontext(),
+        shed: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Join the parts.
+
+        Args:
+            cameras: In the rig's order.
+            model: The hand.
+            markers: Names in the order of every marker array.
+            line: Brings the cameras to one epoch, and solves it first.
+            rays: Places markers by the rays of all cameras; None: there is one camera.
+            rays_px: Standard deviation per axis that the calibration leaves.
+            estimator: Fits the hand to the pixels, from the line's hand; None: the line's hand is published.
+            smooth: Filters the fitted hand; None: frames are unrelated, nothing is filtered.
+            stamp_offset_us: Camera -> how much later its frames really are than their stamps; added to them.
+            volume: What the rig states, or None; joints say whether they lie in it.
+            imu: On the palm; its orientation is used where the rig says how it is mounted and how its world lies.
+            others: What else watches the hand; None: nothing does.
+            counts: Counted into; None: counts of its own.
+            stage: Opens a timer by stage name.
+            shed: Asked for each epoch whether it is left out, for newer ones wait (`master.hurry`).
+        """
+        self.model, self.markers = model, markers
+        self.counts: Counter[str] = Counter() if counts is None else counts
+        self._names, self._cameras = tuple(cameras), CameraArrays.of(tuple(cameras.values()))
+        self._line, self._rays, self._rays_px = line, rays, rays_px
+        self._estimator, self._smooth = estimator, smooth
+        self._lens_shift = LensShift(tuple(cameras.values()))
+        self._on_hand, self._hand_markers = line.on_hand, tuple(markers[int(m)] for m in line.on_hand)
+        joints = [model.mount(name).joint for name in self._hand_markers]
+        self._joint = np.array([0 if joint is None else joint for joint in joints])  # 0: the palm
+        self._finger_of = np.array(
+            [-1 if one is None else one for one in (model.mount(name).finger for name in self._hand_markers)]
+        )
+        self._elsewhere = MarkerCheck(model, self._hand_markers)
+        self._stage, self._volume, self._shed = stage, volume, shed
+        self._orientation = None if imu is None or not imu.placed else OrientationTrack(imu, self.counts)
+        self._others = others
+        self._last_ns = -(2**63)
+        self._late_ns = {name: round(1e3 * us) for name, us in (stamp_offset_us or {}).items()}
+        self._last: Fitted | None = None
+        self._was_m = np.full((len(markers), 3), np.nan)
+        self._was_ns: Int = np.full(len(markers), _NEVER_NS, np.int64)
+
+    def push(self, message: MarkerDetections) -> list[SolvedPose]:
+        """Take one camera's detections; return the poses they complete, oldest first."""
+        if late_ns := self._late_ns.get(message.camera):
+            message = restamped(message, t_ns=message.t_ns + late_ns)
+        with self._stage("pairing"):
+            sets = self._line.sync.push(message)
+        if self._line.sync.outdated:
+            self.counts["instants_outdated"] = self._line.sync.outdated
+        return self._solved(sets)
+
+    def blind(self, t_ns: int, ready_t_ns: int) -> SolvedPose | None:
+        """The pose at an epoch at which no camera saw anything, by what else watches the hand; None: it is past."""
+        shape = (len(self._names), len(self.markers))
+        unseen, nothing = np.full(shape, np.nan), np.full((*shape, 2), np.nan)
+        missing = np.ones(len(self._names), np.bool_)
+        poses = self._solved([FrameSet(t_ns, nothing, unseen, unseen, ready_t_ns, missing)])
+        return poses[0] if poses else None
+
+    def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
+        """Take what the IMU says of its own orientation (4,), for the epochs about `t_ns`."""
+        if self._orientation is None:
+            self.counts["orientation.unplaced"] += 1
+        else:
+            self._orientation.push(t_ns, orientation_wxyz, heading_sigma_rad)
+
+    def flush(self) -> list[SolvedPose]:
+        """At the end of a recording: the poses that still wait for a camera."""
+        return self._solved(self._line.sync.flush())
+
+    def _solved(self, sets: list[FrameSet]) -> list[SolvedPose]:
+        """Poses of epochs later than the last one; others are counted: cameras came back with old frames."""
+        poses: list[SolvedPose] = []
+        for frames in sets:
+            if frames.t_ns <= self._last_ns:
+                self.counts["instants_late"] += 1
+                continue
+            self._last_ns = frames.t_ns
+            if self._shed():
+                self.counts["instants_shed"] += 1
+                continue
+            poses.append(self._solve(frames))
+        return poses
+
+    def _solve(self, frames: FrameSet) -> SolvedPose:
+        t_ns, last, age_s = frames.t_ns, self._recent(frames.t_ns), 0.0
+        if last is not None:
+            age_s = (t_ns - int(self._estimator.state.t_ns[0])) * 1e-9 if self._estimator else 0.0
+        with self._stage("triangulate"):
+            if self._lens_shift.any:
+                frames = replace(frames, uv=self._lens_shift.centres(frames.uv, frames.area))
+            if frames.rival_uv is not None:
+                frames = self._associated(frames)
+        line = self._line.solve(frames, last, age_s)
+        hand: HandEstimate | Fitted = line
+        found = line.markers
+        if self._estimator is not None:
+            found = self._placed(frames, line, last, age_s)
+            hand = self._fitted(self._estimator, frames, line, found)
+        self._count_outliers(found, frames)
+        pose = pose_of(hand, self.model, t_ns, line.smooth_m, line.markers, self._volume)
+        if self._line.continuous:
+            placed = np.isfinite(line.markers.points_m[:, 0])
+            self._was_m[placed], self._was_ns[placed] = line.markers.points_m[placed], t_ns
+        self.counts["poses"] += 1
+        self.counts["outside_volume"] += int(not pose.inside_volume[pose.valid].all())
+        self.counts["instants_with_missing_camera"] += int(frames.missing.any())
+        return SolvedPose(pose, frames.ready_t_ns)
+
+    def _recent(self, t_ns: int) -> SolvedHand | None:
+        """The hand that was fitted last, if it still says anything."""
+        if self._estimator is None or self._last is None or not self._estimator.recent(t_ns):
+            return None
+        return self._last.solution
+
+    def _placed(
+        self, frames: FrameSet, line: HandEstimate, last: SolvedHand | None, age_s: float
+    ) -> MarkerPositions:
+        """The markers by the rays of all cameras; the line's own where it goes by these."""
+        if self._rays is None or isinstance(line.markers, RayPositions):
+            return line.markers
+        with self._stage("triangulate"):
+            near = last or line.solution
+            return self._rays(frames.uv, frames.sigma_px, frames.area, near, age_s, as_seen=near is None)
+
+    def _fitted(
+        self, estimator: Estimator, frames: FrameSet, line: HandEstimate, found: MarkerPositions
+    ) -> Fitted:
+        """The hand that explains the pixels of one epoch best."""
+        with self._stage("hand"):
+            variance, common = frames.sigma_px**2 + self._rays_px**2, np.zeros(len(self.markers))
+            if isinstance(found, RayPositions):
+                variance, common = found.variance_px2, found.common_m2
+            hand = estimator.push(
+                Epoch(
+                    frames.t_ns,
+                    found.points_m,
+                    line.facing,
+                    uv=frames.uv,
+                    variance_px2=variance,
+                    common_m2=common,
+                    sensed=self._sensed(estimator, frames.t_ns, line, found),
+                    start=line.solution if line.solved else None,
+                )
+            )
+            self._last = hand
+            if self._others is not None:
+                self._others.solved(frames.t_ns, hand)
+            if self._smooth is not None:
+                on_hand = self._on_hand
+                hand = self._smooth.push(frames.t_ns, hand, found.noise_m2[on_hand], found.points_m[on_hand])
+            return hand
+
+    def _sensed(
+        self, estimator: Estimator, t_ns: int, line: HandEstimate, found: MarkerPositions
+    ) -> Sensed | None:
+        """What other sensors say of the hand at an epoch."""
+        if self._orientation is not None:
+            near = self._recent(t_ns) or line.solution
+            turned = self._orientation.at(t_ns, near)
+            if turned is None:
+                return None
+            n = len(estimator.parameters.free)
+            return Sensed.turn(turned.rotation, turned.information, n, sure=turned.sure)
+        said = None if self._others is None else self._others.at(t_ns)
+        if said is None:
+            return None
+        points, cov = found.points_m[self._on_hand], found.cov_m2[self._on_hand]
+        if (last := self._recent(t_ns)) is not None:
+            wrong = self._elsewhere(said, last.T_rig_palm, points, cov)
+            said = said.without(wrong) if wrong.any() else said
+        return said.for_fit(estimator.parameters, self._finger_of[np.isfinite(points[:, 0])])
+
+    def _associated(self, frames: FrameSet) -> FrameSet:
+        """The epoch with one place for each marker."""
+        assert frames.rival_uv is not None
+        assert frames.rival_sigma_px is not None
+        in_doubt = np.isfinite(frames.rival_uv[..., 0]).any(axis=0)
+        if not in_doubt.any():  # an alternative was named in a frame nearby, and is not carried to this epoch
+            return replace(frames, rival_uv=None)
+        first = triangulate(self._cameras, frames.uv, frames.sigma_px, self._rays_px)
+        clear = np.where((in_doubt | first.apart)[:, None], np.nan, first.points_m)
+        others = self._line.solve_once(clear, first.cov_m2, frames.area)
+        chosen = associate(
+            self._cameras,
+            (frames.uv, frames.sigma_px, frames.area),
+            (frames.rival_uv, frames.rival_sigma_px),
+            among(clear, self._on_hand) if others is None else self._expected(others),
+            (self._was_m, (frames.t_ns - self._was_ns) * 1e-9),
+            self._rays_px,
+        )
+        self._count("rival", chosen.taken)
+        self._count("unclear", chosen.dropped)
+        return replace(frames, uv=chosen.uv, sigma_px=chosen.sigma_px, area=chosen.area_px2, rival_uv=None)
+
+    def _expected(self, hand: SolvedHand) -> Prior:
+        """Where a hand has the markers."""
+        points = np.full((len(self.markers), 3), np.nan)
+        cov = np.full((len(self.markers), 3, 3), np.nan)
+        points[self._on_hand] = self.model.marker_points(hand.joints, self._hand_markers)
+        cov[self._on_hand] = hand.cov_m2[self._joint]
+        return Prior(points, cov)
+
+    def _count(self, event: str, markers: Bool) -> None:
+        """Count an event of each of the markers (M,) by name."""
+        for m in np.flatnonzero(markers):
+            self.counts[f"{event}.{self.markers[m]}"[:_NAME]] += 1
+
+    def _count_outliers(self, found: MarkerPositions, frames: FrameSet) -> None:
+        """Count markers whose rays do not meet, and what is left out of each camera."""
+        if found.apart.any():
+            self._count("apart", found.apart)
+            self.counts["epipolar_misfits"] += int(found.apart.sum())
+        if not found.left_out.any():
+            return
+        sees = np.isfinite(frames.uv[..., 0]) & np.isfinite(found.points_m[:, 0])
+        mostly = found.left_out.sum(axis=1) > 0.5 * sees.sum(axis=1)
+        for c in np.flatnonzero(found.left_out.any(axis=1)):
+            self.counts[f"left_out.{self._names[c]}"[:_NAME]] += int(found.left_out[c].sum())
+            if mostly[c]:
+                self.counts[f"mostly_left_out.{self._names[c]}"[:_NAME]] += 1
