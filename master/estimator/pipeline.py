@@ -29,8 +29,8 @@ from master.fabrik.intersection import triangulate
 from master.fabrik.rays import RayPositions, RayTriangulator
 from master.fabrik.solver import FabrikSolver
 from master.fabrik.sync import FrameSet
+from master.fusion.orientation import OrientationTrack
 from master.fusion.sensed_hand import MarkerCheck, SensedHand
-from master.ik.orientation import OrientationTrack
 
 Stage = Callable[[str], AbstractContextManager[None]]
 _NAME = 64  # characters of a name in `Health`
