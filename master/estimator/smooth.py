@@ -43,8 +43,6 @@ from master.estimator.smoothing import REST, SIGNALS, WHOLE, Pose, Smoothing, sm
 from master.estimator.state import NEVER_NS
 from master.fabrik.one_euro import OneEuroParameters
 
-_NONE = np.empty(0)
-
 
 class HandOneEuro:
     """Push machine. Holds what was shown last, the filter, what is left of leaps (`Smoothing`)."""
@@ -104,13 +102,11 @@ class HandOneEuro:
         at = solution.joints
         solved = Pose(solution.T_rig_palm, solution.angles_rad, at.position_m, at.rotation, solution.cov_m2)
         shown, cov_m2 = Pose.empty(), np.ascontiguousarray(cov_m2)
-        lead, tracked, before, what = self._lead, hand.tracked, _NONE, WHOLE
-        if lead is not None:
-            before = self._values.copy()
-            if points_m is not None:
-                self._kernel(self._hand, self._state, SIGNALS, t_ns, rests, cov_m2, solved, shown)
-                self._signals += lead.push(gap_s, rests, before, self._signals, points_m)
-                what = REST
+        lead, tracked, before, what = self._lead, hand.tracked, self._values.copy(), WHOLE
+        if lead is not None and points_m is not None:
+            self._kernel(self._hand, self._state, SIGNALS, t_ns, rests, cov_m2, solved, shown)
+            self._signals += lead.push(gap_s, rests, before, self._signals, points_m)
+            what = REST
         off = self._kernel(self._hand, self._state, what, t_ns, rests, cov_m2, solved, shown)
         if lead is not None:
             lead.moved(gap_s, self._values - before)

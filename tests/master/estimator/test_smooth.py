@@ -255,3 +255,19 @@ def test_what_is_not_filtered_stays() -> None:
         assert shown.valid is solved.valid
         assert shown.source is solved.source
         assert shown.solution.surprise is solved.solution.surprise
+
+
+def test_a_hand_that_was_shown_stays_as_it_was() -> None:
+    estimator, smooth = machines()
+    hands: list[tuple[Fitted, Float]] = []
+    for k in range(4):
+        points = RIGHT.marker_points(
+            RIGHT.forward(palm(at_m=np.array([0.01 * k, 0.08, 0.5])), RELAXED), MARKERS
+        )
+        hand = smooth.push(k * DT_NS, estimator.push(Epoch(k * DT_NS, points, FACING, COV)), COV)
+        hands.append((hand, positions([hand])))
+    for hand, place in hands:
+        np.testing.assert_array_equal(positions([hand]), place)
+        solution = of([hand])[0]
+        forward = RIGHT.forward(solution.T_rig_palm, solution.angles_rad)
+        np.testing.assert_allclose(positions([hand])[0], forward.position_m, atol=1e-12)
