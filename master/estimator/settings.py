@@ -138,6 +138,11 @@ class Settings(NamedTuple):
     tracked_age_s: Annotated[
         float, Range("s", 0.0, 1.0, "how old the newest measurement of a TRACKED finger may be")
     ] = 0.05
+    # What is shown.
+    blend_s: Annotated[float, Range("s", 0.01, 1.0, "as long as a leap is seen as a motion")] = 0.1
+    elsewhere_m: Annotated[
+        float, Range("m", 1e-3, 0.1, "a joint shown farther from where it is solved to be is not TRACKED")
+    ] = 5e-3
     # The search.
     tolerance: Annotated[float, Range("half chi square", 1e-12, 1.0, "what a step may leave")] = 1e-7
     tolerance_share: Annotated[float, Range("1", 0.0, 0.1, "of the cost, likewise")] = 1e-4
