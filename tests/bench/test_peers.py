@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from bench import hand, ik, peers_mink, peers_scipy
-from bench.hand_draws import FACING_ROTATION, MARKERS, bench_model, draw
+from bench.hand_draws import FACING_ROTATION, MARKERS, bench_model, draw, seen
 from bench.hand_score import score
 from bench.peers_paper import Angles, PaperFingers, finger_solvers, tips_in_palm
 from bench.row import Row
+from bench.solved_hand import PointHand
 from common.arrays import Float
 from common.calibration import Couplings
 from common.geometry import quaternion_to_matrix, rotation_vector_to_matrix
@@ -81,7 +82,7 @@ def test_a_moving_hand_is_solved_in_every_way_and_a_fixed_palm_costs() -> None:
 
 
 def test_scipy_finds_the_hand_when_habits_are_the_truth_and_caps_are_exact() -> None:
-    way = peers_scipy.WholeHand.of(MODEL, hand._NOISE)
+    way = peers_scipy.WholeHand.of(MODEL, hand.NOISE)
     angles = MODEL.clamp(way.parameters.angles(way.mean))
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation_vector_to_matrix(np.array([0.2, -0.1, 0.3])) @ FACING_ROTATION, 0.1
@@ -91,6 +92,36 @@ def test_scipy_finds_the_hand_when_habits_are_the_truth_and_caps_are_exact() -> 
     found, bent = way.solve(caps, start, np.zeros((5, 4)))
     np.testing.assert_allclose(found, T, atol=1e-4)
     np.testing.assert_allclose(np.degrees(bent), np.degrees(angles), atol=0.1)
+
+
+def test_the_estimator_ends_where_scipy_ends_on_the_same_residuals() -> None:
+    count = 25
+    noise = hand.NOISE
+    way = peers_scipy.WholeHand.of(MODEL, noise)
+    solver = PointHand(MODEL, MARKERS, continuous=False, natural=True, faces=False)
+    truth = draw(MODEL, 21, count)
+    points, _ = seen(truth, noise, 21)
+    compared = 0
+    for k in range(count):
+        found = solver.push(k, points[k], noise.cov_m2).solution
+        assert found is not None
+        # A search from the truth, and one from what was found: the same minimum, or a worse one.
+        for T, angles in (
+            (truth.T_rig_palm[k], truth.angles_rad[k]),
+            (found.T_rig_palm, found.angles_rad),
+        ):
+            theirs, bent = way.solve(points[k], T, angles)
+            cost, least = (
+                0.5 * float(np.sum(np.square(way.residuals(palm, way.parameters.of_angles(x), points[k]))))
+                for palm, x in ((found.T_rig_palm, found.angles_rad), (theirs, bent))
+            )
+            assert cost < least * (1.0 + 2e-4) + 1e-6
+            if least < cost * (1.0 + 1e-3):
+                compared += 1
+                off = MODEL.forward(theirs, bent).position_m - found.joints.position_m
+                assert np.linalg.norm(off, axis=1).max() < 0.5e-3
+                assert np.degrees(np.abs(bent - found.angles_rad)).max() < 1.0
+    assert compared > 1.8 * count
 
 
 # -- mink -------------------------------------------------------------------------------------------------------
