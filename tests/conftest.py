@@ -40,6 +40,7 @@ _KERNELS = (
     "master/fabrik/*.py",
     "master/estimator/*.py",
     "master/gestures/*.py",
+    "tests/master/estimator/kernels.py",
 )
 
 
@@ -53,7 +54,7 @@ def pytest_configure(config: pytest.Config) -> None:
     if known.is_file() and known.read_text() == now:
         return
     if known.is_file():
-        for pattern in ("master/[efg]*", "common"):
+        for pattern in ("master/[efg]*", "common", "tests/master/estimator"):
             for code in ROOT.glob(f"{pattern}/__pycache__/*.nb[ci]"):
                 code.unlink(missing_ok=True)
     known.parent.mkdir(exist_ok=True)

@@ -1,17 +1,55 @@
-"""Tests of fingers that nobody sees: they go on a little, follow the others, and the doubt about them grows."""
+"""Tests of fingers that nobody sees: they go on a little, follow the others, and the uncertainty of them grows."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from common.arrays import Float
-from master.ik.hidden import COAST_S, STRAY_RAD, FingerMemory, HiddenFingers
+from common.kernels import boxed
+from master.estimator.hand_tables import HandTables
+from master.estimator.settings import DEFAULT
+from master.estimator.state import HandState, Hidden
 from tests.hand_helpers import RIGHT, within
+from tests.master.estimator.fitted import FREE, PARAMETERS, STEP_NS
+from tests.master.estimator.kernels import hide_at
 
-STEP_NS = 16_666_667
 ALL = frozenset({0, 1, 2, 3, 4})
 RING = 3
+TABLES, SETTINGS = HandTables.of(RIGHT, PARAMETERS), DEFAULT.record()
+
+
+@dataclass(frozen=True)
+class HiddenFingers:
+    """What is believed of fingers that nobody sees: (5, 4) [rad], (5,) [rad], (5,) [s]."""
+
+    angles_rad: Float
+    sigma_rad: Float
+    gone_s: Float
+
+
+class Memory:
+    """The state of a hand, of which only the angles are set."""
+
+    def __init__(self, natural: float = 1.0) -> None:
+        self.state = HandState.unknown(FREE)
+        self.state.natural[0] = natural
+
+    def moved(self, before_rad: Float, after_rad: Float, dt_s: float) -> None:
+        """Let the rates be those of a step, as the end of an epoch leaves them."""
+        rate = (after_rad - before_rad).reshape(20) / dt_s
+        share = 1.0 - np.exp(-dt_s / DEFAULT.rate_memory_s)
+        self.state.rates[:] += share * (rate - self.state.rates)
+
+    def belief(self, t_ns: int, last_ns: int, last_rad: Float, shown: frozenset[int]) -> HiddenFingers:
+        """Where fingers that are not shown are now, if the hand was like that a moment ago."""
+        hidden = Hidden.none(FREE)
+        self.state.angles[:], self.state.t_ns[0] = last_rad.reshape(20), last_ns
+        seen = np.isin(np.arange(5), list(shown))
+        boxes = boxed(TABLES), boxed(SETTINGS), boxed(self.state)
+        hide_at(*boxes, t_ns, seen, boxed(hidden))
+        return HiddenFingers(hidden.angles.reshape(5, 4), hidden.sigma.copy(), hidden.gone_s.copy())
 
 
 def bent(degrees: Float | float) -> Float:
@@ -29,13 +67,12 @@ def after(
     natural: float = 1.0,
 ) -> list[HiddenFingers]:
     """Beliefs while `gone` are hidden and the last pose is, frame by frame, that of `course_deg`."""
-    memory = FingerMemory(RIGHT)
+    memory = Memory(natural)
     for _ in range(10):
         memory.moved(bent(before_deg[0]), bent(before_deg[1]), STEP_NS * 1e-9)
     seen = ALL - gone
     return [
-        memory.belief((k + 1) * STEP_NS, k * STEP_NS, bent(pip), natural, seen)
-        for k, pip in enumerate(course_deg)
+        memory.belief((k + 1) * STEP_NS, k * STEP_NS, bent(pip), seen) for k, pip in enumerate(course_deg)
     ]
 
 
@@ -69,33 +106,33 @@ def test_with_all_hidden_a_finger_goes_on_for_a_moment(speed_deg_s: float) -> No
     step = speed_deg_s * STEP_NS * 1e-9
     course = [pip_deg(h) for h in after(ALL, [40.0] * 60, (40.0 - step, 40.0))]
     assert abs(course[1] - 40.0) > 0.5 * 2 * abs(step)
-    assert course[-1] - 40.0 == pytest.approx(COAST_S * speed_deg_s, rel=0.01)
+    assert course[-1] - 40.0 == pytest.approx(DEFAULT.coast_s * speed_deg_s, rel=0.01)
 
 
 def test_it_stops_where_the_others_stop() -> None:
     step = 200.0 * STEP_NS * 1e-9
     course = [pip_deg(h) for h in after(frozenset({RING}), [40.0] * 60, (40.0 - step, 40.0))]
-    assert max(course) < 40.0 + 0.2 * COAST_S * 200.0
+    assert max(course) < 40.0 + 0.2 * DEFAULT.coast_s * 200.0
 
 
-def test_doubt_grows_with_time_and_less_between_neighbours_that_show() -> None:
+def test_uncertainty_grows_with_time_and_less_between_neighbours_that_show() -> None:
     alone = np.array([h.sigma_rad[RING] for h in after(ALL, [40.0] * 200)])
     between = np.array([h.sigma_rad[RING] for h in after(frozenset({RING}), [40.0] * 200)])
     assert (np.diff(alone) > 0.0).all()
     assert (np.diff(between) > 0.0).all()
     assert (between < alone).all()
-    assert alone[-1] < 1.01 * STRAY_RAD
+    assert alone[-1] < 1.01 * DEFAULT.stray_rad
     # what is seen of the other three halves the variance, and more
     assert between[60] ** 2 < 0.5 * alone[60] ** 2
 
 
 def test_a_marker_that_returns_begins_a_new_time() -> None:
-    memory = FingerMemory(RIGHT)
+    memory = Memory()
     seen = ALL - {RING}
-    gone = [memory.belief((k + 1) * STEP_NS, k * STEP_NS, bent(40.0), 1.0, seen) for k in range(20)]
+    gone = [memory.belief((k + 1) * STEP_NS, k * STEP_NS, bent(40.0), seen) for k in range(20)]
     assert gone[-1].gone_s[RING] == pytest.approx(20 * STEP_NS * 1e-9)
-    assert memory.belief(21 * STEP_NS, 20 * STEP_NS, bent(40.0), 1.0, ALL).gone_s[RING] == 0.0
-    hidden = memory.belief(22 * STEP_NS, 21 * STEP_NS, bent(40.0), 1.0, seen)
+    assert memory.belief(21 * STEP_NS, 20 * STEP_NS, bent(40.0), ALL).gone_s[RING] == 0.0
+    hidden = memory.belief(22 * STEP_NS, 21 * STEP_NS, bent(40.0), seen)
     assert hidden.gone_s[RING] == pytest.approx(STEP_NS * 1e-9)
 
 
@@ -107,9 +144,9 @@ def test_nothing_that_is_believed_leaves_the_limits() -> None:
 
 def test_a_step_of_a_millisecond_throws_no_finger() -> None:
     """Instants follow that soon where another camera takes the lead; a degree of noise is no 1000 degrees a second."""
-    memory = FingerMemory(RIGHT)
+    memory = Memory()
     for _ in range(10):
         memory.moved(bent(40.0), bent(40.0), STEP_NS * 1e-9)
     memory.moved(bent(40.0), bent(41.5), 1e-3)
-    course = [memory.belief((k + 1) * STEP_NS, k * STEP_NS, bent(41.5), 1.0, frozenset()) for k in range(60)]
+    course = [memory.belief((k + 1) * STEP_NS, k * STEP_NS, bent(41.5), frozenset()) for k in range(60)]
     assert max(abs(pip_deg(hidden) - 41.5) for hidden in course) < 10.0

@@ -5,10 +5,11 @@ import pytest
 
 from common.arrays import Float
 from common.hand_model import TIPS
-from master.ik.hand import HandSolution, HandSolver
-from tests.hand_helpers import FACING, MARKERS, RIGHT, palm, small_cov
+from master.estimator.estimator import FittedHand
+from master.estimator.settings import DEFAULT
+from tests.hand_helpers import RIGHT, palm, small_cov
+from tests.master.estimator.fitted import estimator, fit, found, places, push
 
-SOLVER = HandSolver(RIGHT, MARKERS)
 NATURAL = np.radians([[8.0, 8.0, 10.0, 15.0]] + [[0.0, 15.0, 25.0, 50.0 / 3]] * 4)
 # two fingers straight, two bent, all far apart: against habits
 UNNATURAL = np.radians(
@@ -22,27 +23,22 @@ UNNATURAL = np.radians(
 )
 
 
-def solved(
-    angles: Float, last: HandSolution | None = None, dt_s: float = 0.0, gone: int | None = None
-) -> HandSolution:
-    points = RIGHT.marker_points(RIGHT.forward(palm(), angles), MARKERS)
+def solved(angles: Float, gone: int | None = None) -> FittedHand:
+    points = places(palm(), angles)
     if gone is not None:
         points[gone] = np.nan
-    found = SOLVER.solve(points, small_cov(), last, dt_s, None, FACING)
-    assert found is not None
-    return found
+    return found(fit(points, small_cov()))
 
 
-def tilt_deg(hand: HandSolution) -> Float:
+def tilt_deg(hand: FittedHand) -> Float:
     return np.degrees(np.sqrt(np.trace(hand.tilt_cov_rad2, axis1=1, axis2=2)))
 
 
 @pytest.mark.parametrize("dt_s", [0.002, 0.011, 0.1])
 def test_a_pose_that_is_held_makes_its_directions_no_surer(dt_s: float) -> None:
-    first = solved(NATURAL)
-    hand = first
-    for _ in range(20):
-        hand = solved(NATURAL, hand, dt_s)
+    machine, first = estimator(), solved(NATURAL)
+    for k in range(21):
+        hand = found(push(machine, round(k * dt_s * 1e9), places(palm(), NATURAL)).solution)
     np.testing.assert_allclose(tilt_deg(hand), tilt_deg(first), rtol=0.15)
 
 
@@ -64,22 +60,29 @@ def test_beliefs_that_contradict_each_other_are_no_news_of_the_instant() -> None
 def test_directions_err_as_much_as_is_claimed() -> None:
     """Over hands drawn from the habits themselves, squared errors over variances average to about 1."""
     rng = np.random.default_rng(5)
-    p, ratio = SOLVER.priors, list[Float]()
+    s, ratio = DEFAULT, list[Float]()
+    thumb = (
+        s.thumb_abduction_mean_rad,
+        s.thumb_flexion_mean_rad,
+        s.thumb_mcp_mean_rad,
+        s.thumb_ip_mean_rad,
+    )
     low, high = RIGHT.limits_rad[..., 0], RIGHT.limits_rad[..., 1]
     for _ in range(80):
         angles = np.empty((5, 4))
-        angles[0] = rng.normal(p.thumb_mean, p.thumb)
-        pip = p.pip_mean + rng.normal(0.0, 0.5 * p.pip) + rng.normal(0.0, 0.5 * p.neighbour_pip, 4)
+        angles[0] = rng.normal(thumb, s.thumb_rad)
+        pip = (
+            s.pip_mean_rad + rng.normal(0.0, 0.5 * s.pip_rad) + rng.normal(0.0, 0.5 * s.neighbour_pip_rad, 4)
+        )
         angles[1:, 2] = np.clip(pip, low[1:, 2], high[1:, 2])
-        angles[1:, 0] = rng.normal(0.0, p.abduction, 4)
-        angles[1:, 1] = (RIGHT.mcp_per_pip or 0.0) * angles[1:, 2] + rng.normal(0.0, p.natural_flexion, 4)
+        angles[1:, 0] = rng.normal(0.0, s.abduction_rad, 4)
+        angles[1:, 1] = (RIGHT.mcp_per_pip or 0.0) * angles[1:, 2] + rng.normal(0.0, s.natural_flexion_rad, 4)
         angles[1:, 3] = (RIGHT.dip_per_pip or 0.0) * angles[1:, 2]
         angles = np.clip(angles, low, high)
-        T = palm(np.degrees(rng.normal(0.0, p.facing / np.sqrt(2.0), 3)))
+        T = palm(np.degrees(rng.normal(0.0, s.facing_rad / np.sqrt(2.0), 3)))
         truth = RIGHT.forward(T, angles)
-        points = RIGHT.marker_points(truth, MARKERS) + rng.multivariate_normal(np.zeros(3), small_cov()[0], 6)
-        found = SOLVER.solve(points, small_cov(), None, 0.0, None, FACING)
-        assert found is not None
-        off = found.joints.rotation[TIPS][:, :, 2] - truth.rotation[TIPS][:, :, 2]
-        ratio.append((off**2).sum(axis=1) / np.trace(found.tilt_cov_rad2, axis1=1, axis2=2))
+        points = places(T, angles) + rng.multivariate_normal(np.zeros(3), small_cov()[0], 6)
+        hand = found(fit(points, small_cov()))
+        off = hand.joints.rotation[TIPS][:, :, 2] - truth.rotation[TIPS][:, :, 2]
+        ratio.append((off**2).sum(axis=1) / np.trace(hand.tilt_cov_rad2, axis1=1, axis2=2))
     assert 0.6 < np.mean(ratio) < 1.6

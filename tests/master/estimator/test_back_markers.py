@@ -8,9 +8,8 @@ from common.arrays import Float
 from common.back_markers import with_three_back_markers
 from common.hand_model import HandModel
 from common.hand_profiles import generated_profile
-from master.ik.hand import HandSolver
-from master.ik.hand_problem import Orientation
-from tests.hand_helpers import FACING, MARKERS, natural_angles, palm
+from tests.hand_helpers import MARKERS, natural_angles, palm
+from tests.master.estimator.fitted import fit, forgetful, palm_deg, turned
 
 MODELS = {
     side: HandModel.of(with_three_back_markers(generated_profile("made", side), "made-back3"))
@@ -23,7 +22,7 @@ NOISE_M, POSES, IMU_RAD = 1e-3, 60, np.radians(2.0)
 def palm_errors_deg(side: str, names: tuple[str, ...], *, imu: bool = False) -> Float:
     """Turn (N,) of the solved palm against the truth [deg]; the same poses and noise for all sets of markers."""
     model, rng = MODELS[side], np.random.default_rng(12)
-    solver, cov = HandSolver(model, names), np.tile(NOISE_M**2 * np.eye(3), (len(names), 1, 1))
+    machine, cov = forgetful(model, names), np.tile(NOISE_M**2 * np.eye(3), (len(names), 1, 1))
     errors: list[float] = []
     for _ in range(POSES):
         T = palm(rng.uniform(-35.0, 35.0, 3))
@@ -31,11 +30,8 @@ def palm_errors_deg(side: str, names: tuple[str, ...], *, imu: bool = False) -> 
         noise, turn = rng.normal(0.0, NOISE_M, (len(EIGHT), 3)), rng.normal(0.0, IMU_RAD, 3)
         points = model.marker_points(joints, EIGHT) + noise
         seen = points[[EIGHT.index(name) for name in names]]
-        told = Orientation(Rotation.from_rotvec(turn).as_matrix() @ T[:3, :3], IMU_RAD**2 * np.eye(3))
-        found = solver.solve(seen, cov, facing=FACING, orientation=told if imu else None)
-        assert found is not None
-        wrong = Rotation.from_matrix(found.T_rig_palm[:3, :3] @ T[:3, :3].T)
-        errors.append(float(np.degrees(wrong.magnitude())))
+        told = turned(Rotation.from_rotvec(turn).as_matrix() @ T[:3, :3], IMU_RAD**2 * np.eye(3))
+        errors.append(palm_deg(fit(seen, cov, by=machine, sensed=told if imu else None), T))
     return np.array(errors)
 
 

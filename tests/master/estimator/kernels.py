@@ -1,0 +1,121 @@
+"""Kernels that only other kernels call, made callable for tests."""
+
+from typing import Any
+
+from common.arrays import Bool, Float
+from common.kernels import kernel
+from master.estimator.cameras import CameraArrays, project
+from master.estimator.certainty import Certainty, add_arcs, linear, surer
+from master.estimator.kinematics import Scratch, angles_of, chains
+from master.estimator.priors import Habits
+from master.estimator.residuals import Observations, cap_shift, marker_rows
+from master.estimator.solve import Rig, linearise
+from master.estimator.state import grow, hide
+from master.estimator.truncated import mean_within
+from master.estimator.update import Model
+from master.fabrik.caps import CapTables
+
+__all__ = ["Certainty", "Scratch"]
+
+
+@kernel
+def project_at(cameras: CameraArrays, c: int, point: Float, uv: Float, J: Float) -> bool:
+    """`master.estimator.cameras.project`."""
+    return project(cameras, c, point, uv, J)
+
+
+@kernel
+def cap_shift_at(caps: CapTables, row: int, ahead: Float, back: Float, shift: Float, slope: Float) -> None:
+    """`master.estimator.residuals.cap_shift`."""
+    cap_shift(caps, row, ahead, back, shift, slope)
+
+
+@kernel
+def marker_rows_at(
+    cameras: CameraArrays,
+    caps: CapTables,
+    observed: Observations,
+    m: int,
+    point: Float,
+    ahead: Float,
+    boxed_work: Any,
+) -> tuple[float, float]:
+    """`master.estimator.residuals.marker_rows`; the record in its array."""
+    return marker_rows(cameras, caps, observed, m, point, ahead, boxed_work[0])
+
+
+@kernel
+def linearise_at(
+    model: Model,
+    habits: Habits,
+    boxed_belief: Any,
+    observed: Observations,
+    h: int,
+    T: Float,
+    x: Float,
+    gradient: Float,
+    normal: Float,
+    boxed_search: Any,
+) -> float:
+    """`master.estimator.solve.linearise`; records in their arrays."""
+    rig = Rig(model.hand[0], model.mounts, model.cameras, model.caps)
+    return linearise(rig, habits, boxed_belief[0], observed, h, T, x, gradient, normal, boxed_search[0])
+
+
+@kernel
+def mean_within_at(
+    boxed_hand: Any, normal: Float, gradient: Float, x: Float, boxed_cut: Any, mean: Float
+) -> None:
+    """`master.estimator.truncated.mean_within`; records in their arrays."""
+    mean_within(boxed_hand[0], normal, gradient, x, boxed_cut[0], mean)
+
+
+@kernel
+def surer_at(now: Float, past: Float, boxed_room: Any, out: Float) -> None:
+    """`master.estimator.certainty.surer`; the record in its array."""
+    surer(now, past, boxed_room[0], out)
+
+
+@kernel
+def hide_at(
+    boxed_hand: Any, boxed_settings: Any, boxed_state: Any, t_ns: int, shown: Bool, boxed_hidden: Any
+) -> None:
+    """`master.estimator.state.hide`; records in their arrays."""
+    hide(boxed_hand[0], boxed_settings[0], boxed_state[0], t_ns, shown, boxed_hidden[0])
+
+
+@kernel
+def grow_at(
+    boxed_hand: Any,
+    boxed_settings: Any,
+    boxed_state: Any,
+    dt_s: float,
+    T: Float,
+    palm_shown: bool,
+    boxed_hidden: Any,
+) -> None:
+    """`master.estimator.state.grow`; records in their arrays."""
+    grow(boxed_hand[0], boxed_settings[0], boxed_state[0], dt_s, T, palm_shown, boxed_hidden[0])
+
+
+@kernel
+def joint_covariances(
+    model: Model,
+    T: Float,
+    x: Float,
+    cov: Float,
+    seen: Bool,
+    information: Float,
+    boxed_work: Any,
+    boxed_room: Any,
+    straight: Float,
+    whole: Float,
+) -> None:
+    """Write the joints' covariances (26, 3, 3) [m^2] by derivatives alone, and with arcs."""
+    hand, settings, work, room = model.hand[0], model.settings[0], boxed_work[0], boxed_room[0]
+    rig = Rig(hand, model.mounts, model.cameras, model.caps)
+    angles_of(hand, x, work.angles, work.by)
+    chains(hand, T, work.angles, work.R, work.P)
+    linear(hand, T, cov, work, room, straight)
+    linear(hand, T, cov, work, room, whole)
+    add_arcs(rig, settings, T, cov, seen, information, work, room, whole)

@@ -1,0 +1,395 @@
+"""Tests of the fit of one epoch: exact recovery, limits under any input, a palm that turns, the covariance."""
+
+from functools import lru_cache
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.arrays import Float
+from common.calibration import Couplings
+from common.errors import CalibrationError
+from common.geometry import rigid, rotation_vector_to_matrix
+from common.hand_model import CHAINS, TIPS, HandModel
+from common.hand_presets import preset_couplings, preset_limits
+from common.hand_profiles import generated_profile
+from master.estimator.estimator import Estimator, Sensed
+from master.estimator.parameters import HandParameters
+from master.estimator.settings import DEFAULT, Settings
+from tests.hand_helpers import (
+    LEFT,
+    RIGHT,
+    any_rotation,
+    natural_angles,
+    palm,
+    small_cov,
+    within,
+)
+from tests.master.estimator.fitted import (
+    FREE,
+    PARAMETERS,
+    STEP_NS,
+    estimator,
+    fit,
+    forgetful,
+    found,
+    joint_mm,
+    palm_deg,
+    places,
+    push,
+    residual_m,
+    turned,
+)
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+@lru_cache
+def made(side: str, preset: str, coupled: bool) -> HandModel:
+    profile = generated_profile("made", side)
+    limits = preset_limits("K" if preset == "K" else "D")
+    couplings = preset_couplings("D") if coupled else Couplings(dip_per_pip=None)
+    return HandModel.of(msgspec.structs.replace(profile, limits_rad=limits, couplings=couplings))
+
+
+MODELS = {
+    "right K": made("right", "K", True),
+    "left D": made("left", "D", True),
+    "free": made("right", "K", False),
+}
+
+
+# -- finding the hand -------------------------------------------------------------------------------------------
+
+
+def believed(model: HandModel) -> tuple[Float, Settings]:
+    """A pose that every habit expects, and the settings with a thumb that can be like that."""
+    thumb = np.radians([8.0, 8.0, 12.0, 12.0]).tolist()
+    angles = np.zeros((5, 4))
+    pip = DEFAULT.pip_mean_rad
+    assert model.dip_per_pip is not None
+    assert model.mcp_per_pip is not None
+    angles[1:] = [0.0, model.mcp_per_pip * pip, pip, model.dip_per_pip * pip]
+    angles[0] = thumb
+    settings = DEFAULT
+    for joint, mean in zip(("abduction", "flexion", "mcp", "ip"), thumb, strict=True):
+        settings = settings.changed(f"thumb_{joint}_mean_rad", mean)
+    return angles, settings
+
+
+def expecting(model: HandModel) -> tuple[Float, Estimator]:
+    """A pose, and an estimator whose habits expect it."""
+    angles, settings = believed(model)
+    return angles, forgetful(model, settings=settings)
+
+
+@pytest.mark.parametrize("model", [RIGHT, LEFT], ids=["right", "left"])
+@given(seeds)
+@settings(max_examples=30)
+def test_a_hand_that_obeys_habits_is_found_exactly_in_any_orientation(model: HandModel, seed: int) -> None:
+    angles, machine = expecting(model)
+    rng = np.random.default_rng(seed)
+    T = rigid(any_rotation(rng), rng.normal(0.0, 0.5, 3))
+    points = places(T, angles, model)
+    hand = found(fit(points, small_cov(), by=machine, facing=T[:3, 1]))
+    assert joint_mm(hand, model.forward(T, angles).position_m).max() < 0.05
+    np.testing.assert_allclose(np.degrees(hand.angles_rad), np.degrees(angles), atol=0.1)
+    assert hand.surprise.sum() < 1e-3
+    assert residual_m(hand, points, model).max() < 1e-4
+
+
+def test_a_turned_palm_does_not_become_a_wrong_hand() -> None:
+    """A palm taken for fixed costs about 15 mm mean joint error for +-20 deg, an estimated one 3-4 mm."""
+    rng = np.random.default_rng(11)
+    ours: list[float] = []
+    theirs: list[float] = []
+    turns: list[float] = []
+    straight = turned(palm()[:3, :3], 1e-6 * np.eye(3))
+    for _ in range(120):
+        angles, turn = natural_angles(rng), rng.uniform(-20.0, 20.0, 3)
+        T = palm(turn)
+        truth = RIGHT.forward(T, angles).position_m
+        points = places(T, angles) + rng.normal(0.0, 1.0, (6, 3)) * [3e-4, 3e-4, 1e-3]
+        hand, assumed = (fit(points, small_cov(), sensed=one) for one in (None, straight))
+        ours.append(joint_mm(hand, truth)[1:].mean())
+        theirs.append(joint_mm(assumed, truth)[1:].mean())
+        turns.append(palm_deg(hand, T))
+    assert np.mean(ours) < 6.0
+    assert np.percentile(ours, 95) < 12.0
+    assert np.mean(theirs) > 2.0 * np.mean(ours)
+    assert np.median(turns) < 8.0
+
+
+@pytest.mark.parametrize("gone", range(6))
+def test_a_missing_marker_costs_its_own_finger_only(gone: int) -> None:
+    angles, machine = expecting(RIGHT)
+    points = places(palm(), angles)
+    points[gone] = np.nan
+    hand = found(fit(points, small_cov(), by=machine))
+    assert hand.surprise[gone] == 0.0
+    assert residual_m(hand, points)[np.arange(6) != gone].max() < 2e-3
+    tips = joint_mm(hand, RIGHT.forward(palm(), angles).position_m)[TIPS]
+    assert tips[np.arange(5) != gone].max() < 6.0
+
+
+def test_an_unseen_finger_is_believed_curled_and_not_flat() -> None:
+    points = places(palm(), np.zeros((5, 4)))
+    points[2] = np.nan
+    assert np.degrees(found(fit(points, small_cov())).angles_rad[2, 2]) > 60.0
+
+
+def test_what_another_sensor_says_of_an_unseen_finger_is_taken() -> None:
+    angles, _ = believed(RIGHT)
+    points = places(palm(), angles)
+    points[2] = np.nan
+    belief = angles.copy()
+    belief[2] = np.radians([0.0, 30.0, 40.0, 40.0 * 2 / 3])
+    x, own = PARAMETERS.of_angles(belief), PARAMETERS.free // 4 == 2
+    weight = np.concatenate([np.zeros(3), own / np.radians(1.0) ** 2])
+    pull, level = weight * np.concatenate([np.zeros(3), x]), np.zeros(5, np.uint8)
+    constant = 0.5 * float(pull[3:] @ x)
+    sensed = Sensed(None, False, np.diag(weight), pull, constant, np.arange(5) == 2, level, x)
+    hand = found(fit(points, small_cov(), sensed=sensed))
+    np.testing.assert_allclose(np.degrees(hand.angles_rad[2, 1:3]), [30.0, 40.0], atol=2.0)
+
+
+# -- too little, too strange ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("keep", "enough"),
+    [
+        ((), False),
+        ((5,), False),
+        ((1, 2), False),
+        ((1, 5), True),
+        ((1, 2, 3), True),
+        ((1, 2, 5), True),
+        ((0, 1, 2, 3, 4, 5), True),
+    ],
+)
+def test_fewer_than_needed_is_no_hand(keep: tuple[int, ...], enough: bool) -> None:
+    points = np.full((6, 3), np.nan)
+    points[list(keep)] = places(palm(), natural_angles(np.random.default_rng(1)))[list(keep)]
+    hand = fit(points, small_cov())
+    assert (hand is not None) is enough
+    if hand is not None:
+        assert within(RIGHT, hand.angles_rad)
+        assert np.isfinite(hand.cov_m2).all()
+
+
+def test_markers_in_one_line_do_not_fix_a_hand() -> None:
+    points = np.array([0.0, 0.1, 0.5]) + np.outer(np.linspace(0.0, 0.1, 6), [0.0, 0.0, 1.0])
+    # The line is the sight itself: which way the back of the hand looks does not turn the hand about it.
+    assert fit(points, small_cov()) is None
+    across = points[:, [2, 1, 0]]
+    assert fit(across, small_cov()) is not None
+    across[5] = np.nan  # without the back nothing faces the cameras
+    assert fit(across, small_cov()) is None
+
+
+def test_a_marker_without_a_covariance_is_not_seen() -> None:
+    points = places(palm(), natural_angles(np.random.default_rng(2)))
+    cov = small_cov()
+    cov[1, 0, 2] = np.nan
+    with_nan = found(fit(points, cov))
+    points[1] = np.nan
+    without = found(fit(points, small_cov()))
+    np.testing.assert_allclose(with_nan.joints.position_m, without.joints.position_m, atol=1e-3)
+    assert with_nan.surprise[1] == 0.0
+
+
+# SHORTFALL: whether markers fix a hand, and where a search begins, goes by points that no covariance goes with.
+@pytest.mark.xfail(strict=False, reason="a hand is begun from points of which none is measured")
+def test_markers_without_any_covariance_are_no_hand() -> None:
+    points = places(palm(), natural_angles(np.random.default_rng(2)))
+    assert fit(points, np.full((6, 3, 3), np.nan)) is None
+
+
+# SHORTFALL: one coordinate that is NaN, or infinite, stops the estimator with an error of the SVD.
+@pytest.mark.xfail(strict=False, raises=np.linalg.LinAlgError, reason="SVD of a point that is NaN in part")
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_point_that_is_nan_in_part_is_not_seen(value: float) -> None:
+    points = places(palm(), natural_angles(np.random.default_rng(2)))
+    points[1, 2] = value
+    part = found(fit(points, small_cov()))
+    points[1] = np.nan
+    np.testing.assert_allclose(
+        part.joints.position_m, found(fit(points, small_cov())).joints.position_m, atol=1e-3
+    )
+
+
+absurd = st.one_of(st.floats(-1.0, 1.0), st.floats(-1e6, 1e6), st.sampled_from([0.0, -1e6, 1e6, 1e12]))
+
+
+@given(
+    st.lists(absurd, min_size=18, max_size=18),
+    st.lists(st.sampled_from([0.0, 1e-12, 1e-3, 1.0, 1e6, np.nan]), min_size=6, max_size=6),
+    st.sets(st.integers(0, 5)),
+    st.sampled_from([None, 0.001, 0.016, 0.4]),
+)
+@settings(max_examples=150)
+def test_whatever_is_seen_the_hand_stays_inside_its_limits(
+    values: list[float], sigmas: list[float], unseen: set[int], dt_s: float | None
+) -> None:
+    points = np.array(values).reshape(6, 3)
+    points[list(unseen)] = np.nan
+    cov = np.array(sigmas)[:, None, None] ** 2 * np.eye(3)
+    machine, t_ns = estimator(), 10**9
+    if dt_s is not None:
+        push(machine, t_ns, places(palm(), natural_angles(np.random.default_rng(3))))
+        t_ns += round(dt_s * 1e9)
+    hand = push(machine, t_ns, points, cov).solution
+    assert hand is not None or dt_s is None
+    if hand is not None:
+        assert within(RIGHT, hand.angles_rad)
+        assert np.isfinite(hand.joints.position_m).all()
+        identity = hand.T_rig_palm[:3, :3] @ hand.T_rig_palm[:3, :3].T
+        np.testing.assert_allclose(identity, np.eye(3), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", MODELS)
+@given(seeds)
+@settings(max_examples=30)
+def test_limits_hold_near_a_hand_too(name: str, seed: int) -> None:
+    model, rng = MODELS[name], np.random.default_rng(seed)
+    angles = rng.uniform(model.limits_rad[..., 0], model.limits_rad[..., 1])
+    points = places(palm(rng.uniform(-60, 60, 3)), angles, model) + rng.normal(0.0, 0.02, (6, 3))
+    points[rng.random(6) < 0.2] = np.nan
+    hand = fit(points, small_cov(), by=forgetful(model))
+    if hand is not None:
+        assert within(model, hand.angles_rad)
+        if model.dip_per_pip is not None:
+            np.testing.assert_allclose(
+                hand.angles_rad[1:, 3], model.dip_per_pip * hand.angles_rad[1:, 2], atol=1e-12
+            )
+
+
+def test_a_marker_the_profile_does_not_mount_is_refused() -> None:
+    with pytest.raises(CalibrationError, match="'tail'"):
+        estimator(markers=("index", "tail"))
+
+
+# -- how sure -----------------------------------------------------------------------------------------------------
+
+
+@given(seeds, st.floats(1.5, 10.0))
+@settings(max_examples=30)
+def test_covariance_is_one_and_grows_with_that_of_the_markers(seed: int, factor: float) -> None:
+    rng = np.random.default_rng(seed)
+    points = places(palm(rng.uniform(-20, 20, 3)), natural_angles(rng))
+    fine, coarse = (found(fit(points, small_cov(s))) for s in (1e-3, 1e-3 * factor))
+    for cov in (fine.cov_m2, coarse.cov_m2):
+        np.testing.assert_allclose(cov, np.swapaxes(cov, 1, 2), atol=1e-12)
+        assert np.linalg.eigvalsh(cov).min() > -1e-15
+    total = [np.trace(hand.cov_m2[TIPS], axis1=1, axis2=2).sum() for hand in (fine, coarse)]
+    assert total[1] > total[0]
+
+
+def test_an_unseen_tip_is_less_sure_than_a_seen_one() -> None:
+    points = places(palm(), believed(RIGHT)[0])
+    both = found(fit(points, small_cov()))
+    points[3] = np.nan
+    without = found(fit(points, small_cov()))
+    sigma = [np.sqrt(np.trace(hand.cov_m2[TIPS[3]])) for hand in (both, without)]
+    assert sigma[0] < 3e-3
+    assert sigma[1] > 10e-3
+
+
+def test_the_error_is_as_large_as_the_covariance_says() -> None:
+    """Squared joint errors over their variances average to about 1 for hands drawn near the habits."""
+    rng = np.random.default_rng(4)
+    ratio: list[float] = []
+    for _ in range(60):
+        angles, T = natural_angles(rng), palm(rng.uniform(-20.0, 20.0, 3))
+        points = places(T, angles) + rng.multivariate_normal(np.zeros(3), small_cov()[0], 6)
+        hand = found(fit(points, small_cov()))
+        error = hand.joints.position_m - RIGHT.forward(T, angles).position_m
+        variance = np.trace(hand.cov_m2, axis1=1, axis2=2)
+        ratio.append(float(np.mean((error**2).sum(axis=1) / variance)))
+    assert 0.1 < np.mean(ratio) < 3.0
+
+
+def test_the_tilt_of_a_finger_end_lies_across_it() -> None:
+    hand = found(fit(places(palm(), natural_angles(np.random.default_rng(3))), small_cov()))
+    ends, starts = CHAINS[:, 3], CHAINS[:, 2]
+    along = hand.joints.position_m[ends] - hand.joints.position_m[starts]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    for f in range(5):
+        cov = hand.tilt_cov_rad2[f]
+        assert abs(along[f] @ cov @ along[f]) < 1e-9 < np.trace(cov)
+        assert np.degrees(np.sqrt(np.trace(cov))) < 40.0
+
+
+def test_covariances_of_joints_and_directions_are_those_of_numpy() -> None:
+    """Of a hand so sure that no joint moves on an arc."""
+    rng = np.random.default_rng(5)
+    T, angles = palm(np.array([10.0, -20.0, 5.0])), natural_angles(rng)
+    sharp = DEFAULT.changed("bones_m", 1e-4).changed("straight_rad", 1.0)
+    hand = found(fit(places(T, angles), small_cov(1e-4), by=forgetful(settings=sharp)))
+
+    def joints(step: Float) -> Float:
+        R = rotation_vector_to_matrix(step[:3]) @ hand.T_rig_palm[:3, :3]
+        T = rigid(R, hand.T_rig_palm[:3, 3] + step[3:6])
+        return RIGHT.forward(T, PARAMETERS.angles(hand.x + step[6:])).position_m
+
+    N = 6 + FREE
+    J = np.stack([(joints(1e-6 * e) - joints(-1e-6 * e)) / 2e-6 for e in np.eye(N)], axis=-1)
+    expected = J @ hand.alone @ J.swapaxes(1, 2)
+    np.testing.assert_allclose(hand.cov_m2, expected, atol=1e-5 * np.abs(expected).max())
+    ends, before = CHAINS[:, 3], CHAINS[:, 2]
+    p = hand.joints.position_m
+    turn = (J[ends] - J[before]) / np.linalg.norm(p[ends] - p[before], axis=1)[:, None, None]
+    expected = turn @ hand.alone @ turn.swapaxes(1, 2)
+    np.testing.assert_allclose(hand.tilt_cov_rad2, expected, atol=1e-5 * np.abs(expected).max())
+
+
+# -- where the search begins ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 20.0, 120.0, 180.0])
+@given(seeds)
+@settings(max_examples=8)
+def test_where_a_search_begins_does_not_tell_where_it_ends(turned_deg: float, seed: int) -> None:
+    """Nothing of a hand that may be near is believed: one that is not near leads to the same markers."""
+    rng = np.random.default_rng(seed)
+    T, cov = palm(), small_cov()
+    points = places(T, natural_angles(rng))
+    turn = rotation_vector_to_matrix(np.radians(turned_deg) * np.array([0.6, 0.8, 0.0]))
+    there = rigid(turn @ T[:3, :3], T[:3, 3] + 0.02)
+    other = found(fit(places(there, natural_angles(rng)), cov, facing=there[:3, 1]))
+    near, afresh = (found(fit(points, cov, start=start)) for start in (other, None))
+    assert near.surprise.sum() < afresh.surprise.sum() + 1.0
+    assert residual_m(near, points).max() < residual_m(afresh, points).max() + 1e-3
+
+
+@pytest.mark.parametrize("posture_deg", [5.0, 40.0, 80.0])
+def test_a_first_frame_is_found_from_several_starts_open_to_closed(posture_deg: float) -> None:
+    """Without any other hand: flat, half closed and closed hands, turned every way, explain their markers at once."""
+    rng, pip = np.random.default_rng(int(posture_deg)), np.radians(posture_deg)
+    angles = np.zeros((5, 4))
+    angles[0] = np.radians([8.0, 8.0, 12.0, 12.0])
+    angles[1:] = [0.0, 0.54 * pip, pip, pip * 2 / 3]
+    for _ in range(20):
+        T = palm(rng.uniform(-35.0, 35.0, 3))
+        points = places(T, angles)
+        hand = push(estimator(), STEP_NS, points)
+        assert residual_m(found(hand.solution), points).max() < 4e-3
+        assert palm_deg(hand.solution, T) < 25.0
+        assert joint_mm(hand.solution, RIGHT.forward(T, angles).position_m)[1:].mean() < 15.0
+        assert not hand.anew
+
+
+def test_a_first_frame_begins_from_the_line_s_hand_where_that_explains_it() -> None:
+    points = places(palm(), natural_angles(np.random.default_rng(7)))
+    afresh = found(fit(points, small_cov()))
+    begun = found(fit(points, small_cov(), start=afresh))
+    np.testing.assert_allclose(begun.joints.position_m, afresh.joints.position_m, atol=1e-3)
+    assert begun.steps <= afresh.steps
+
+
+def test_free_angles_are_those_of_the_parameters() -> None:
+    hand = found(fit(places(palm(), natural_angles(np.random.default_rng(8))), small_cov()))
+    np.testing.assert_allclose(HandParameters.of(RIGHT).angles(hand.x), hand.angles_rad, atol=1e-12)

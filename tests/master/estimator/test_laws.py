@@ -1,0 +1,344 @@
+"""Laws of the estimator's kernels: each derivative against finite differences, rows against plain algebra."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.arrays import Float
+from common.calibration import Couplings
+from common.camera_model import CameraModel
+from common.geometry import rigid, rotation_vector_to_matrix
+from common.hand_model import HandModel
+from common.hand_presets import preset_couplings, preset_limits
+from common.hand_profiles import generated_profile
+from common.kernels import boxed, constant
+from master.estimator.attached import Attached
+from master.estimator.cameras import CameraArrays
+from master.estimator.hand_tables import HandTables, Mounts
+from master.estimator.kinematics import Scratch
+from master.estimator.parameters import HandParameters
+from master.estimator.priors import habits_of
+from master.estimator.residuals import Observations
+from master.estimator.settings import DEFAULT
+from master.estimator.solve import Belief, Search
+from master.estimator.update import Model
+from master.fabrik.caps import CapTables
+from tests.hand_helpers import FACING, MARKERS, any_rotation, natural_angles, palm
+from tests.master.estimator.fitted import PAIR
+from tests.master.estimator.kernels import cap_shift_at, linearise_at, marker_rows_at, project_at
+
+seeds = st.integers(0, 2**32 - 1)
+LENS = np.array([-0.3, 0.12, 1e-3, -2e-3, -0.02])
+CAMERAS = (PAIR[0], replace(PAIR[1], distortion=LENS))
+H = 1e-6
+
+
+def made(side: str, preset: str, coupled: bool) -> HandModel:
+    profile = generated_profile("made", side)
+    limits = preset_limits("K" if preset == "K" else "D")
+    couplings = preset_couplings("D") if coupled else Couplings(dip_per_pip=None)
+    return HandModel.of(msgspec.structs.replace(profile, limits_rad=limits, couplings=couplings))
+
+
+MODELS = {
+    "right K": made("right", "K", True),
+    "left D": made("left", "D", True),
+    "free": made("right", "K", False),
+}
+
+
+# -- cameras and caps -----------------------------------------------------------------------------------------------
+
+
+@given(seeds)
+@settings(max_examples=40)
+def test_an_image_point_moves_with_the_point_as_the_jacobian_says(seed: int) -> None:
+    rng, arrays = np.random.default_rng(seed), CameraArrays.of(CAMERAS)
+    point = rng.uniform([-0.1, -0.1, 0.3], [0.2, 0.1, 0.9])
+    for c, camera in enumerate(CAMERAS):
+        uv, J, ends = np.empty(2), np.empty((2, 3)), np.empty((2, 2))
+        assert project_at(arrays, c, point, uv, J)
+        np.testing.assert_allclose(uv, camera.project(point), atol=1e-9)
+        for k in range(3):
+            for end, sign in enumerate((1.0, -1.0)):
+                project_at(arrays, c, point + sign * H * np.eye(3)[k], ends[end], np.empty((2, 3)))
+            np.testing.assert_allclose(J[:, k], (ends[0] - ends[1]) / (2 * H), rtol=1e-5, atol=1e-3)
+
+
+def test_a_point_behind_a_camera_is_not_projected() -> None:
+    uv, J = np.full(2, 7.0), np.full((2, 3), 7.0)
+    assert not project_at(CameraArrays.of(CAMERAS), 0, np.array([0.0, 0.0, -0.1]), uv, J)
+    assert (uv == 7.0).all()
+    assert (J == 7.0).all()
+
+
+@given(seeds)
+@settings(max_examples=60)
+def test_what_is_seen_of_a_cap_moves_with_its_direction_as_the_slope_says(seed: int) -> None:
+    """Within one cell of the tables, in every direction, also off the unit sphere along which none turns."""
+    rng, caps = np.random.default_rng(seed), CapTables.of(MODELS["right K"], MARKERS)
+    steps = caps.looks.shape[1] - 1
+    angle = (rng.integers(4, steps - 4) + rng.uniform(0.2, 0.8)) * np.pi / steps
+    R = any_rotation(rng)
+    back, ahead = R[:, 0].copy(), np.cos(angle) * R[:, 0] + np.sin(angle) * R[:, 1]
+    shift, slope, ends = np.empty(3), np.empty((3, 3)), np.empty((2, 3))
+    row = int(rng.integers(5))
+    cap_shift_at(caps, row, ahead, back, shift, slope)
+    assert 0.0 < np.linalg.norm(shift) < 0.01
+    for axis in R[:, 1:].T:  # turns of the finger
+        step = np.cross(axis, ahead) * 1e-5
+        for end, sign in enumerate((1.0, -1.0)):
+            cap_shift_at(caps, row, ahead + sign * step, back, ends[end], np.empty((3, 3)))
+        np.testing.assert_allclose(slope @ step, 0.5 * (ends[0] - ends[1]), atol=1e-5 * 1e-5)
+
+
+# -- rows of one marker ---------------------------------------------------------------------------------------------
+
+
+def observed_of(rng: np.random.Generator, points: Float, cameras: tuple[CameraModel, ...]) -> Observations:
+    """Rays of markers some pixels off, and what may be wrong with each marker itself."""
+    observed = Observations.empty(len(cameras), len(points))
+    for c, camera in enumerate(cameras):
+        observed.uv[c] = camera.project(points) + rng.normal(0.0, 3.0, (len(points), 2))
+    observed.weight[:] = rng.uniform(0.5, 4.0, observed.weight.shape)
+    for m in range(len(points)):
+        root = rng.normal(size=(3, 3))
+        observed.own[m] = 1e5 * (root @ root.T + np.eye(3))
+    observed.seen[:] = True
+    return observed
+
+
+@given(seeds)
+@settings(max_examples=30)
+def test_rows_of_a_marker_are_the_marginal_of_its_rays_over_what_is_wrong_with_it(seed: int) -> None:
+    """By place and direction: the normal equations of place, direction and shift, without the shift."""
+    rng = np.random.default_rng(seed)
+    caps, arrays = CapTables.of(MODELS["right K"], MARKERS), CameraArrays.of(CAMERAS)
+    point, work = rng.uniform([-0.1, -0.1, 0.4], [0.2, 0.1, 0.8]), Scratch.empty()
+    observed = observed_of(rng, np.tile(point, (6, 1)), CAMERAS)
+    for m in (1, 5):  # a cap; a flat marker
+        ahead = any_rotation(rng)[:, 0].copy()
+        cost, chi2 = marker_rows_at(arrays, caps, observed, m, point, ahead, boxed(work))
+        A, r, w = np.zeros((4, 9)), np.zeros(4), np.repeat(observed.weight[:, m], 2)
+        for c, camera in enumerate(CAMERAS):
+            back = (camera.centre - point) / np.linalg.norm(camera.centre - point)
+            shift, slope = np.zeros(3), np.zeros((3, 3))
+            if m == 1:
+                cap_shift_at(caps, int(caps.row[m]), ahead, back, shift, slope)
+            uv, J = np.empty(2), np.empty((2, 3))
+            project_at(arrays, c, point + shift, uv, J)
+            rows = slice(2 * c, 2 * c + 2)
+            A[rows, :3], A[rows, 3:6], A[rows, 6:] = J, J @ slope, J
+            r[rows] = uv - observed.uv[c, m]
+        normal, pull = A.T @ (w[:, None] * A), A.T @ (w * r)
+        normal[6:, 6:] += observed.own[m]
+        gain = normal[:6, 6:] @ np.linalg.inv(normal[6:, 6:])
+        scale = np.abs(normal[:6, :6]).max()
+        np.testing.assert_allclose(work.H, normal[:6, :6] - gain @ normal[6:, :6], atol=1e-9 * scale)
+        np.testing.assert_allclose(work.g, pull[:6] - gain @ pull[6:], atol=1e-9 * np.abs(pull).max())
+        least = 0.5 * (w @ r**2) - 0.5 * pull[6:] @ np.linalg.solve(normal[6:, 6:], pull[6:])
+        assert cost == pytest.approx(least, rel=1e-9)
+        assert 0.0 <= chi2 <= 2.0 * cost + 1e-9
+
+
+@given(seeds)
+@settings(max_examples=30)
+def test_the_gradient_of_a_marker_is_that_of_its_cost(seed: int) -> None:
+    """Of a flat marker exactly; how a cap's side changes as it shifts, 1 to 2 %, is left out."""
+    rng = np.random.default_rng(seed)
+    caps, arrays = CapTables.of(MODELS["right K"], MARKERS), CameraArrays.of(CAMERAS)
+    point, work = rng.uniform([-0.1, -0.1, 0.4], [0.2, 0.1, 0.8]), Scratch.empty()
+    observed = observed_of(rng, np.tile(point, (6, 1)), CAMERAS)
+    observed.own[:] = 1e15 * np.eye(3)  # nothing is wrong with the markers
+    for m, share in ((5, 1e-5), (1, 0.05)):
+        ahead = any_rotation(rng)[:, 0].copy()
+
+        def cost(step: Float, m: int = m, ahead: Float = ahead) -> float:
+            return marker_rows_at(arrays, caps, observed, m, point + step, ahead, boxed(Scratch.empty()))[0]
+
+        marker_rows_at(arrays, caps, observed, m, point, ahead, boxed(work))
+        numeric = np.array([(cost(H * e) - cost(-H * e)) / (2 * H) for e in np.eye(3)])
+        np.testing.assert_allclose(work.g[:3], numeric, atol=share * np.abs(numeric).max())
+
+
+def test_a_marker_that_many_cameras_see_is_no_surer_than_its_paint() -> None:
+    arrays, caps = CameraArrays.of(PAIR * 8), CapTables.of(MODELS["right K"], MARKERS)
+    observed, work = observed_of(np.random.default_rng(1), np.full((6, 3), 0.5), PAIR * 8), Scratch.empty()
+    observed.weight[:], observed.own[:] = 1e4, 1e6 * np.eye(3)
+    marker_rows_at(arrays, caps, observed, 5, np.full(3, 0.5), np.array([0.0, 0.0, 1.0]), boxed(work))
+    np.testing.assert_allclose(np.linalg.eigvalsh(work.H[:3, :3]), 1e6, rtol=1e-2)
+
+
+# -- the whole hand -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", MODELS)
+@given(seeds)
+@settings(max_examples=25)
+def test_points_move_with_the_angles_as_the_jacobian_says(name: str, seed: int) -> None:
+    model = MODELS[name]
+    parameters = HandParameters.of(model)
+    x = np.random.default_rng(seed).uniform(parameters.low, parameters.high)
+    for points in (Attached.markers(model, parameters, MARKERS), Attached.joints(model, parameters)):
+
+        def place(x: Float, points: Attached = points) -> Float:
+            return points.place(model.chains(parameters.angles(x)))
+
+        chains = model.chains(parameters.angles(x))
+        J = points.jacobian(chains, points.place(chains), x)
+        for k in range(len(x)):
+            e = H * np.eye(len(x))[k]
+            np.testing.assert_allclose(J[:, :, k], (place(x + e) - place(x - e)) / (2 * H), atol=1e-8)
+
+
+class Whole:
+    """A hand somewhere, of which nothing is believed or measured until it is said."""
+
+    def __init__(self, name: str, seed: int) -> None:
+        self.model, self.rng, self.h = MODELS[name], np.random.default_rng(seed), constant(seed % 2)
+        self.parameters = HandParameters.of(self.model)
+        n = self.n = len(self.parameters.free)
+        self.T, angles = palm(self.rng.uniform(-30.0, 30.0, 3)), natural_angles(self.rng)
+        low, high = self.parameters.low, self.parameters.high
+        self.x = np.clip(self.parameters.of_angles(angles), low + 0.02, high - 0.02)
+        self.points = self.model.marker_points(
+            self.model.forward(self.T, self.parameters.angles(self.x)), MARKERS
+        )
+        self.habits = habits_of(self.model, self.parameters)
+        self.belief, self.search = Belief.none(n), Search.empty(n, 16)
+        self.observed = Observations.empty(2, 6)
+        self.rig = Model(
+            boxed(HandTables.of(self.model, self.parameters)),
+            boxed(DEFAULT.record()),
+            Mounts.of(self.model, MARKERS),
+            CameraArrays.of(CAMERAS),
+            CapTables.of(self.model, MARKERS),
+        )
+
+    def cost(self, T: Float, x: Float) -> tuple[float, Float, Float]:
+        gradient, normal = np.empty(6 + self.n), np.empty((6 + self.n, 6 + self.n))
+        cost = linearise_at(
+            self.rig, self.habits, boxed(self.belief), self.observed, self.h, T, x, gradient, normal,
+            boxed(self.search),
+        )  # fmt: skip
+        return float(cost), gradient, normal
+
+    def check(self, share: float) -> None:
+        """The gradient against finite differences, to a share of its largest component."""
+
+        def cost(step: Float) -> float:
+            R = rotation_vector_to_matrix(step[:3]) @ self.T[:3, :3]
+            return self.cost(rigid(R, self.T[:3, 3] + step[3:6]), self.x + step[6:])[0]
+
+        _, gradient, normal = self.cost(self.T, self.x)
+        numeric = np.array([(cost(H * e) - cost(-H * e)) / (2 * H) for e in np.eye(6 + self.n)])
+        size = np.array([3, 3, self.n])  # turn, shift and angles have units of their own
+        largest = np.repeat([max(float(np.abs(part).max()), 1e-3) for part in
+                             np.split(numeric, np.cumsum(size)[:-1])], size)  # fmt: skip
+        np.testing.assert_array_less(np.abs(gradient - numeric), share * largest)
+        np.testing.assert_allclose(normal, normal.T, atol=1e-9 * np.abs(normal).max())
+        assert np.linalg.eigvalsh(normal).min() > -1e-9 * np.abs(normal).max()
+
+
+def silent(whole: Whole) -> None:
+    for table in whole.habits:
+        table[:] = 0.0
+
+
+def past(whole: Whole) -> None:
+    rng, belief = whole.rng, whole.belief
+    belief.own_w2[:], belief.own[:] = rng.uniform(0.0, 9.0, whole.n), rng.normal(size=whole.n)
+    belief.past_w2[:], belief.past[:] = rng.uniform(0.0, 9.0, whole.n), rng.normal(size=whole.n)
+    # Near the last pose the sine stands for the angle.
+    near = rotation_vector_to_matrix(rng.normal(0.0, 1e-3, 3)) @ whole.T[:3, :3]
+    belief.palm[:] = rigid(near, whole.T[:3, 3] + rng.normal(0.0, 0.01, 3))
+    belief.palm_w2[:] = np.repeat([20.0, 3e3], 3)
+    belief.sight[:], belief.depth_w2[0] = any_rotation(rng)[:, 0], 5e4
+
+
+def facing(whole: Whole) -> None:
+    whole.belief.facing[:], whole.belief.facing_w2[0] = FACING, 7.0
+
+
+def sensed(whole: Whole) -> None:
+    rng, belief = whole.rng, whole.belief
+    belief.turn[:] = rotation_vector_to_matrix(rng.normal(0.0, 0.8, 3)) @ whole.T[:3, :3]
+    root = rng.normal(size=(3 + whole.n, 3 + whole.n))
+    belief.sensed[:], belief.sensed_pull[:] = root @ root.T, rng.normal(size=3 + whole.n)
+    belief.sensed_constant[0], belief.sensed_known[0] = 3.0, 1.0
+
+
+def points(whole: Whole) -> None:
+    rng, observed = whole.rng, whole.observed
+    observed.seen[:] = observed.placed[:] = True
+    observed.point[:] = whole.points + rng.normal(0.0, 0.02, (6, 3))
+    root = rng.normal(0.0, 300.0, (6, 3, 3))
+    observed.information[:] = root @ root.swapaxes(1, 2)
+
+
+def flat_rays(whole: Whole) -> None:
+    """Rays of markers without a shape, with nothing wrong with themselves."""
+    rays(whole)
+    caps = whole.rig.caps
+    whole.rig = whole.rig._replace(caps=caps._replace(row=np.full_like(caps.row, -1)))
+    whole.observed.own[:] = 1e15 * np.eye(3)
+
+
+def rays(whole: Whole) -> None:
+    seen = observed_of(whole.rng, whole.points, CAMERAS)
+    for mine, theirs in zip(whole.observed, seen, strict=True):
+        mine[:] = theirs
+
+
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize(
+    ("what", "share"), [(past, 1e-4), (facing, 1e-6), (sensed, 1e-5), (points, 1e-5), (flat_rays, 1e-4)]
+)
+def test_the_gradient_of_each_kind_of_row_is_the_derivative_of_its_cost(
+    name: str, what: Callable[[Whole], None], share: float
+) -> None:
+    for seed in range(6):
+        whole = Whole(name, seed)
+        silent(whole)
+        what(whole)
+        whole.check(share)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_the_gradient_of_habits_is_the_derivative_of_their_cost(name: str) -> None:
+    for seed in range(6):
+        Whole(name, seed).check(1e-5)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_the_gradient_of_rays_on_caps_leaves_out_how_the_side_changes_with_the_place(name: str) -> None:
+    for seed in range(6):
+        whole = Whole(name, seed)
+        silent(whole)
+        rays(whole)
+        whole.observed.own[:] = 1e15 * np.eye(3)
+        whole.check(0.05)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_all_kinds_of_rows_add_up(name: str) -> None:
+    """Each by itself, with numbers drawn anew, and then all of them on one hand."""
+    whole, kinds = Whole(name, 3), (past, facing, sensed, points)
+    habits = whole.habits
+    _, total, _ = whole.cost(whole.T, whole.x)
+    for kind in kinds:
+        one = Whole(name, 3)
+        silent(one)
+        one.rng = np.random.default_rng(7)
+        kind(one)
+        total = total + one.cost(one.T, one.x)[1]
+        whole.rng = np.random.default_rng(7)
+        kind(whole)
+    assert whole.habits is habits
+    _, gradient, _ = whole.cost(whole.T, whole.x)
+    np.testing.assert_allclose(gradient, total, atol=1e-9 * np.abs(total).max())
