@@ -9,7 +9,6 @@ from common.camera_model import CameraModel
 from common.hand_model import HandModel
 from master.estimator.estimator import Epoch, Estimator, Fitted, Sensed
 from master.estimator.settings import DEFAULT, Settings
-from master.fabrik.caps import CapTables
 
 TOWARDS = np.array([0.0, 0.0, -1.0])  # from hands to cameras that look along the rig's +z
 _SURE_RAD = np.radians(15.0)  # better known than this about every axis, a rotation says how the palm lies
@@ -46,7 +45,6 @@ class PointHand:
             model,
             markers,
             markers,
-            CapTables.of(model, markers),
             continuous=continuous,
             natural=natural,
             settings=settings,

@@ -11,7 +11,6 @@ from common.hand_model import CHAINS, TIPS
 from master.estimator.estimator import Epoch, Estimator, Fitted, FittedHand
 from master.estimator.settings import DEFAULT
 from master.estimator.smooth import HandOneEuro
-from master.fabrik.caps import CapTables
 from master.fabrik.one_euro import OneEuroParameters
 from tests.hand_helpers import FACING, MARKERS, RIGHT, camera_models, palm, rig_file, within
 
@@ -24,7 +23,7 @@ CAMERAS = tuple(camera_models(rig_file()).values())
 
 def machines() -> tuple[Estimator, HandOneEuro]:
     """The estimator of a hand, and its filter."""
-    estimator = Estimator(CAMERAS, RIGHT, MARKERS, MARKERS, CapTables.of(RIGHT, MARKERS), natural=True)
+    estimator = Estimator(CAMERAS, RIGHT, MARKERS, MARKERS, natural=True)
     return estimator, HandOneEuro(RIGHT, MARKERS, SETTINGS)
 
 
