@@ -18,7 +18,7 @@ from common.geometry import rigid
 from common.hand_model import TIPS, HandJoints
 from master.fabrik.caps import CAPS, CapTables
 from master.fabrik.depth import CalibrationResidual
-from master.fabrik.estimate import MarkerPositions
+from master.fabrik.estimate import MarkerPositions, SolvedHand
 from master.fabrik.rays import RayTriangulator
 from master.fabrik.rays import locate as kernel_of_rays
 from tests.hand_helpers import (
