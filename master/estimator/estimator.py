@@ -220,6 +220,12 @@ class Estimator:
         )
         self._boxed_state, self._boxed_space = boxed(self.state), boxed(self._space)
         self._now, self._at = fields(self.state), fields(self._space)
+        nothing = np.full((len(cameras), len(markers), 2), np.nan)
+        own = np.zeros((len(markers), 3, 3))
+        observe_rays(
+            nothing, nothing[..., 0].copy(), own, self._on_hand, self._observed
+        )  # compiled now, not later
+        observe_points(own[self._on_hand, 0], own[self._on_hand], 0.0, self._observed)
         self._kernel = bound(
             epoch,
             self._model,
