@@ -10,7 +10,7 @@ import numpy as np
 # Kernels are straight code over small arrays: what LLVM finds beyond its first level takes three times as long to
 # compile, and makes them no faster. numba reads this when it is imported.
 for _name, _value in (("NUMBA_OPT", "1"), ("NUMBA_LOOP_VECTORIZE", "0"), ("NUMBA_SLP_VECTORIZE", "0")):
-    os.environ.setdefault(_name, _value)
+    os.environ[_name] = os.environ.get(_name, _value)
 import numba  # noqa: E402
 
 F = TypeVar("F", bound=Callable[..., Any])
