@@ -37,7 +37,7 @@ from master.estimator.settings import Settings
 from master.estimator.solve import Rig
 from master.estimator.state import Hidden
 
-_MOST = 8  # turns that count in arcs: the pivoted factor puts the largest first
+_MOST = 12  # turns that count in arcs: those of the palm, which moves all joints, then the largest
 
 
 class Certainty:
@@ -48,11 +48,11 @@ class Certainty:
     V: Float  # (N, N)
     work: Float  # (N, N)
     values: Float  # (N,)
-    turns: Float  # (8, N) columns of the factor, as rows
+    turns: Float  # (12, N) columns of the factor, as rows
     left: Float  # (N,)
-    w: Float  # (5, 4, 8, 3)
-    joint: Float  # (36, 26, 3) arcs of joints, by pair
-    marker: Float  # (36, 3 M) of markers, whitened
+    w: Float  # (5, 4, 12, 3)
+    joint: Float  # (78, 26, 3) arcs of joints, by pair
+    marker: Float  # (78, 3 M) of markers, whitened
     Jm: Float  # (3 M, N)
     gain: Float  # (N, 3 M)
     B: Float  # (3 M, 3 M)
@@ -247,9 +247,13 @@ def _turns(settings: Settings, cov: Float, room: Certainty) -> int:
     count = 0
     while count < _MOST:
         pivot = 0
-        for i in range(N):
+        for i in range(3):
             if left[i] > left[pivot]:
                 pivot = i
+        if not left[pivot] > settings.straight_rad**2:
+            for i in range(6, N):
+                if left[i] > left[pivot]:
+                    pivot = i
         if not left[pivot] > settings.straight_rad**2:
             break
         root, squared = sqrt(left[pivot]), 0.0
