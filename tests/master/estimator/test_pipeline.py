@@ -10,10 +10,10 @@ from common.arrays import Float
 from common.calibration import AffineDisparityCalibration, PowerLawCalibration
 from common.hand_model import CHAINS
 from common.messages import HandPose, MarkerDetections, Source
+from master.estimator.pipeline import MarkerPipeline
 from master.rig import RigSetup, build_pipeline
 from master.stages import StageTimes
 from master.stereo.drift import SPEED_M_S
-from master.estimator.pipeline import MarkerPipeline
 from tests.hand_helpers import MARKERS, RIGHT, detections
 from tests.synthetic_run import PERIOD_NS, SyntheticRun, hand_at, synthetic_run
 
