@@ -1,15 +1,26 @@
 """Tests of what joints are off their tangents: as much as drawn hands are, and nothing where a marker is seen."""
 
+from functools import lru_cache
+
 import numpy as np
 
 from common.arrays import Bool, Float
 from common.geometry import rotation_vector_to_matrix
 from common.hand_model import CHAINS, TIPS, WRIST, HandModel
+from common.kernels import boxed
 from master.estimator.attached import Attached
+from master.estimator.cameras import CameraArrays
+from master.estimator.certainty import Certainty
+from master.estimator.estimator import FittedHand
+from master.estimator.hand_tables import HandTables, Mounts
+from master.estimator.kinematics import Scratch
 from master.estimator.parameters import HandParameters
-from master.ik.arcs import Arcs
-from master.ik.hand import HandSolution, HandSolver
-from tests.hand_helpers import FACING, LEFT, MARKERS, RIGHT, natural_angles, palm, small_cov
+from master.estimator.settings import DEFAULT
+from master.estimator.update import Model
+from master.fabrik.caps import CapTables
+from tests.hand_helpers import LEFT, MARKERS, RIGHT, natural_angles, palm, small_cov
+from tests.master.estimator.fitted import PAIR, fit, forgetful, found, places
+from tests.master.estimator.kernels import joint_covariances
 
 BACK = MARKERS.index("back")
 NONE = np.zeros(6, bool)
@@ -17,52 +28,67 @@ REGION = 7.815
 DRAWS = 4000
 
 
-def solution(model: HandModel = RIGHT) -> HandSolution:
-    joints = model.forward(palm(), natural_angles(np.random.default_rng(3)))
-    found = HandSolver(model, MARKERS).solve(
-        model.marker_points(joints, MARKERS), small_cov(), None, 0.0, None, FACING
-    )
-    assert found is not None
-    return found
+@lru_cache
+def solution(model: HandModel = RIGHT) -> FittedHand:
+    points = places(palm(), natural_angles(np.random.default_rng(3)), model)
+    return found(fit(points, small_cov(), by=forgetful(model)))
 
 
-def arcs(found: HandSolution, cov: Float, seen: Bool, model: HandModel = RIGHT) -> Float:
-    return Arcs(model, HandParameters.of(model), MARKERS).covariance(found, cov, small_cov()[seen], seen)
+def covariances(hand: FittedHand, cov: Float, seen: Bool, model: HandModel = RIGHT) -> tuple[Float, Float]:
+    """Of the joints (26, 3, 3): by derivatives alone, and with arcs; markers that are seen hold their places."""
+    tables = HandTables.of(model, HandParameters.of(model))
+    caps, mounts = CapTables.of(model, MARKERS), Mounts.of(model, MARKERS)
+    rig = Model(boxed(tables), boxed(DEFAULT.record()), mounts, CameraArrays.of(PAIR), caps)
+    straight, whole = np.empty((26, 3, 3)), np.empty((26, 3, 3))
+    room, information = Certainty.empty(len(hand.x), 16), np.linalg.inv(small_cov())
+    T, scratch = hand.T_rig_palm, boxed(Scratch.empty())
+    joint_covariances(rig, T, hand.x, cov, seen, information, scratch, boxed(room), straight, whole)
+    return straight, whole
 
 
-def drawn(found: HandSolution, step: Float, model: HandModel = RIGHT) -> Float:
+def arcs(hand: FittedHand, cov: Float, seen: Bool, model: HandModel = RIGHT) -> Float:
+    """What arcs add (26, 3, 3)."""
+    straight, whole = covariances(hand, cov, seen, model)
+    return whole - straight
+
+
+def drawn(hand: FittedHand, step: Float, model: HandModel = RIGHT) -> Float:
     """Joints (T, 26, 3) [m] of hands that are off the found one by steps (T, 6 + n)."""
     parameters = HandParameters.of(model)
-    angles = parameters.angles(parameters.of_angles(found.angles_rad) + step[:, 6:])
-    R = rotation_vector_to_matrix(step[:, :3]) @ found.T_rig_palm[:3, :3]
+    angles = parameters.angles(hand.x + step[:, 6:])
+    R = rotation_vector_to_matrix(step[:, :3]) @ hand.T_rig_palm[:3, :3]
     local = Attached.joints(model, parameters).place(model.chains(angles))
-    return local @ np.swapaxes(R, 1, 2) + (found.T_rig_palm[:3, 3] + step[:, 3:6])[:, None]
+    return local @ np.swapaxes(R, 1, 2) + (hand.T_rig_palm[:3, 3] + step[:, 3:6])[:, None]
 
 
-def unsure(found: HandSolution, turn_rad: float, angle_rad: float) -> Float:
-    n = len(found.alone)
+def slopes(hand: FittedHand, model: HandModel = RIGHT) -> Float:
+    """How the joints move (26, 3, 6 + n), by finite differences."""
+    step = 1e-6 * np.eye(6 + len(hand.x))
+    return np.moveaxis(drawn(hand, step, model) - drawn(hand, -step, model), 0, 2) / 2e-6
+
+
+def unsure(hand: FittedHand, turn_rad: float, angle_rad: float) -> Float:
+    n = len(hand.alone)
     return np.diag(np.concatenate([np.full(3, turn_rad), np.full(3, 1e-4), np.full(n - 6, angle_rad)]) ** 2)
 
 
 def test_what_is_left_of_the_tangent_is_that_of_drawn_hands() -> None:
     for model in (RIGHT, LEFT):
-        found = solution(model)
-        cov = unsure(found, 0.3, 0.1)
+        hand = solution(model)
+        cov = unsure(hand, 0.3, 0.1)
         step = np.random.default_rng(1).multivariate_normal(np.zeros(len(cov)), cov, DRAWS)
-        tangent = found.joints.position_m + np.einsum("pin,tn->tpi", found.moved, step)
-        off = drawn(found, step, model) - tangent
+        tangent = hand.joints.position_m + np.einsum("pin,tn->tpi", slopes(hand, model), step)
+        off = drawn(hand, step, model) - tangent
         expected = np.einsum("tpi,tpj->pij", off, off) / DRAWS
         for joint in (*CHAINS[:, 0], *TIPS):
             size = np.trace(expected[joint])
-            np.testing.assert_allclose(
-                arcs(found, cov, NONE, model)[joint], expected[joint], atol=0.12 * size
-            )
+            np.testing.assert_allclose(arcs(hand, cov, NONE, model)[joint], expected[joint], atol=0.12 * size)
 
 
-def about_the_back(found: HandSolution) -> Float:
+def about_the_back(hand: FittedHand) -> Float:
     """A covariance (6 + n, 6 + n): the palm turns by 20 degrees about each axis, the marker on its back is seen."""
-    cov = unsure(found, np.radians(20.0), 1e-4)
-    arm = RIGHT.marker_points(found.joints, MARKERS)[BACK] - found.T_rig_palm[:3, 3]
+    cov = unsure(hand, np.radians(20.0), 1e-4)
+    arm = RIGHT.marker_points(hand.joints, MARKERS)[BACK] - hand.T_rig_palm[:3, 3]
     x, y, z = arm
     pulled = -np.array(
         [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
@@ -74,17 +100,20 @@ def about_the_back(found: HandSolution) -> Float:
 
 
 def test_a_palm_turns_on_arcs_about_the_marker_on_its_back() -> None:
-    found = solution()
-    cov = about_the_back(found)
+    hand = solution()
+    cov = about_the_back(hand)
     step = np.random.default_rng(1).multivariate_normal(np.zeros(len(cov)), cov, DRAWS)
-    place = RIGHT.marker_points(found.joints, MARKERS)[BACK]
-    arm = place - found.T_rig_palm[:3, 3]
+    place = RIGHT.marker_points(hand.joints, MARKERS)[BACK]
+    arm = place - hand.T_rig_palm[:3, 3]
     # Exactly about the marker, beside the millimetre that its place is unsure by.
     off_m = step[:, 3:6] + np.cross(step[:, :3], arm)
     step[:, 3:6] = arm + off_m - rotation_vector_to_matrix(step[:, :3]) @ arm
-    off = (drawn(found, step) - found.joints.position_m)[:, WRIST]
-    linear = found.moved[WRIST] @ cov @ found.moved[WRIST].T
-    claimed = linear + arcs(found, cov, np.arange(6) == BACK)[WRIST]
+    off = (drawn(hand, step) - hand.joints.position_m)[:, WRIST]
+    straight, whole = covariances(hand, cov, np.arange(6) == BACK)
+    linear, claimed = straight[WRIST], whole[WRIST]
+    np.testing.assert_allclose(
+        linear, slopes(hand)[WRIST] @ cov @ slopes(hand)[WRIST].T, rtol=1e-5, atol=1e-12
+    )
 
     def inside(region: Float) -> float:
         return float((np.vecdot(off, np.linalg.solve(region, off.T).T) < REGION).mean())
@@ -94,13 +123,13 @@ def test_a_palm_turns_on_arcs_about_the_marker_on_its_back() -> None:
 
 
 def test_tips_that_are_seen_stay_where_they_are() -> None:
-    found = solution()
-    far = np.trace(arcs(found, 4.0 * found.alone, NONE)[TIPS], axis1=1, axis2=2)
-    seen = np.trace(arcs(found, 4.0 * found.alone, np.ones(6, bool))[TIPS], axis1=1, axis2=2)
+    hand = solution()
+    far = np.trace(arcs(hand, 4.0 * hand.alone, NONE)[TIPS], axis1=1, axis2=2)
+    seen = np.trace(arcs(hand, 4.0 * hand.alone, np.ones(6, bool))[TIPS], axis1=1, axis2=2)
     assert (seen < 1.0e-3**2).all()
     assert (far > 9.0 * seen).all()
 
 
 def test_a_hand_that_is_sure_has_no_arcs() -> None:
-    found = solution()
-    assert not arcs(found, unsure(found, 0.01, 0.01), np.ones(6, bool)).any()
+    hand = solution()
+    assert not arcs(hand, unsure(hand, 0.01, 0.01), np.ones(6, bool)).any()
