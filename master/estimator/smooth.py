@@ -119,6 +119,7 @@ class HandOneEuro:
             joints=HandJoints(shown.position, shown.rotation, shown.palm),
             cov_m2=shown.cov if off else solution.cov_m2,
             tilt_cov_rad2=solution.tilt_cov_rad2,
+            tilt_walk_rad2_s2=solution.tilt_walk_rad2_s2,
             alone=solution.alone,
             x=solution.x,
             scale=solution.scale,
