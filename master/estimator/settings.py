@@ -134,7 +134,7 @@ class Settings(NamedTuple):
     ] = 0.5
     tracked_m: Annotated[
         float, Range("m", 0.002, 0.1, "half the largest axis of the 95 % region of a joint that is TRACKED")
-    ] = 0.025
+    ] = 0.020
     tracked_age_s: Annotated[
         float, Range("s", 0.0, 1.0, "how old the newest measurement of a TRACKED finger may be")
     ] = 0.05
