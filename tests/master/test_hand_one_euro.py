@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from master.ik.hand_one_euro import LEAD_OVER_S, HandOneEuro
 from scipy.spatial.transform import Rotation
 
 from common.arrays import Float
@@ -10,7 +11,6 @@ from common.geometry import rigid
 from common.hand_model import CHAINS, TIPS
 from master.fabrik.one_euro import OneEuroParameters
 from master.ik.hand import HandSolution
-from master.ik.hand_one_euro import LEAD_OVER_S, HandOneEuro
 from master.ik.tracker import HandTracker, TrackedHand
 from tests.hand_helpers import FACING, MARKERS, RIGHT, palm, within
 

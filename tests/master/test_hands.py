@@ -13,11 +13,11 @@ from common.arrays import Float
 from common.calibration import ImuCalibration, RigCalibration, load, save
 from common.errors import CalibrationError
 from common.messages import Detections, ImuSample, MarkerDetections
+from master.estimator.pipeline import SolvedPose
 from master.needs_restart import refuse_restart
 from master.outputs.files import RunFiles, load_poses
 from master.rig import load_setup, pipeline_of
 from master.stages import StageTimes
-from master.estimator.pipeline import SolvedPose
 from master.time_watch import TimeWatch
 from master.tuning import LivePipeline, RigFiles, RigTuning
 from master.world import World

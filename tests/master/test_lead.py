@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from master.ik.lead import Lead
 
 from common.arrays import Float
-from master.ik.lead import Lead
 
 STEP_S, SPEED = 1 / 60, 0.12
 ON_PALM = np.array([False, True])

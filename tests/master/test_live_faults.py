@@ -11,8 +11,8 @@ from common.clock import SystemClock
 from common.keys import new_key
 from common.messages import Command, Detections, WristDetections
 from common.zenoh_bus import ZenohBus
-from master.live import LiveSettings, run_live
 from master.estimator.pipeline import SolvedPose
+from master.live import LiveSettings, run_live
 from master.tuning import LivePipeline, RigFiles
 from slave.uplink import Uplink
 from tests.master.test_live import free_tcp_port

@@ -26,11 +26,11 @@ from common.messages import (
     TrackerPose,
 )
 from master.app import Observed, RunFigures, health, run
+from master.estimator.pipeline import SolvedPose
 from master.object_score import ObjectTruth, errors
 from master.outputs.told_files import ObjectPoses
 from master.rig import RigSetup, load_setups, pipeline_of, setups_of
 from master.stages import StageTimes
-from master.estimator.pipeline import SolvedPose
 from master.tracked_object import TrackedObject
 from master.world import World
 from tests.master.test_app import Collector, ScriptedClock, ScriptedSource
