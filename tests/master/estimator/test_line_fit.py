@@ -57,9 +57,8 @@ def test_the_pose_is_that_of_the_model_and_markers_are_where_it_mounts_them() ->
         np.testing.assert_allclose(joints.position_m, expected.position_m, atol=1e-12)
         np.testing.assert_allclose(joints.rotation, expected.rotation, atol=1e-12)
         attached = Attached.markers(model, HandParameters.of(model), MARKERS)
-        np.testing.assert_allclose(
-            at, attached.place(model.chains(angles)) @ palm()[:3, :3].T + palm()[:3, 3], atol=1e-12
-        )
+        rotated = attached.place(model.chains(angles)) @ palm()[:3, :3].T
+        np.testing.assert_allclose(at, rotated + palm()[:3, 3], atol=1e-12)
 
 
 def test_the_covariance_of_a_fit_holds_the_palm() -> None:
