@@ -14,17 +14,18 @@ from itertools import count
 
 import numpy as np
 
-from bench.real_motion import FACING, MARKERS, SIGMA_M, TOWARDS, held_poses, jitter
+from bench.hand_draws import MARKERS
+from bench.real_motion import FACING, SIGMA_M, held_poses, jitter
 from bench.row import Row
+from bench.solved_hand import PointHand
 from common.arrays import Float
 from common.calibration import FilterCalibration
 from common.geometry import rigid
 from common.hand_model import HandModel
 from common.hand_profiles import generated_profile
+from master.estimator.estimator import Fitted, FittedHand
+from master.estimator.smooth import HandOneEuro
 from master.fabrik.one_euro import OneEuro, OneEuroParameters, PointFilter
-from master.ik.hand import HandSolution
-from master.ik.hand_one_euro import HandOneEuro
-from master.ik.tracker import HandTracker, TrackedHand
 
 _ROUNDS = 9
 _SAMPLES = 400
@@ -133,25 +134,24 @@ def _limited(points: Float) -> Float:
     return np.array([machine.push(k * _PERIOD_NS, p[None], cov)[0] for k, p in enumerate(points)])
 
 
-def _solved(model: HandModel, speed_m_s: float, seed: int) -> list[TrackedHand]:
+def _solved(model: HandModel, speed_m_s: float, seed: int) -> list[Fitted]:
     """A relaxed hand that crosses the view, solved from caps with noise."""
     angles = held_poses(model)["relaxed"]
     at = np.tile([0.0, 0.08, 0.5], (_FRAMES, 1))
     at[:, 0] = speed_m_s * 1e-9 * _PERIOD_NS * (np.arange(_FRAMES) - _FRAMES / 2)
     noise = np.random.default_rng(seed).normal(0.0, SIGMA_M, (_FRAMES, len(MARKERS), 3))
-    tracker = HandTracker(model, MARKERS)
+    solver = PointHand(model, MARKERS)
     return [
-        tracker.push(
+        solver.push(
             k * _PERIOD_NS,
             model.marker_points(model.forward(rigid(FACING, place), angles), MARKERS) + noise[k],
             _COV,
-            TOWARDS,
         )
         for k, place in enumerate(at)
     ]
 
 
-def _settled(hands: list[TrackedHand]) -> list[HandSolution]:
+def _settled(hands: list[Fitted]) -> list[FittedHand]:
     return [hand.solution for hand in hands[_SETTLED:] if hand.solution is not None]
 
 

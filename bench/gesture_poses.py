@@ -22,18 +22,19 @@ import numpy as np
 from bench.gesture_recorded import leap_rows, static_rows
 from bench.gesture_rigs import rows as rigs
 from bench.gesture_told import Told, pose_of, told_of
+from bench.hand_draws import MARKERS
 from bench.row import Row, median_us
+from bench.solved_hand import PointHand
 from common.calibration import CameraCalibration, FilterCalibration, HandProfile, RigCalibration, load
 from common.geometry import matrix_to_quaternion
 from common.gesture_settings import default_gestures
 from common.hand_model import HandModel
 from common.messages import HandPose
 from common.sim.poses import StudyPoses
+from master.estimator.smooth import HandOneEuro
 from master.fabrik.one_euro import OneEuroParameters
 from master.gestures.features import FeatureExtractor
 from master.gestures.poses import PoseRecogniser
-from master.ik.hand_one_euro import HandOneEuro
-from master.ik.tracker import HandTracker
 from master.outputs.files import load_poses
 from master.study.one import TRIALS, Task, run_participant
 from master.study.participant import participant
@@ -42,7 +43,6 @@ from master.study.session import TRIALS as TRIALS_FILE
 from master.study.trials import read_trials
 
 CALIBRATION = Path(__file__).parent.parent / "calib_json"
-MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
 SIGMA_M = 1e-3
 _PERIOD_NS = 16_666_667
 _SEED, _PEOPLE, _WORN = 31, 12, 3
@@ -66,10 +66,8 @@ def people(numbers: Sequence[int] | range, seconds: float = 15.0) -> Told:
         who = participant(_SEED, number, wrist, usual)
         true, known = HandModel.of(who.hand), HandModel.of(who.measured)
         motion = StudyPoses(true, np.array([0.0, 0.0, 0.5]), _SEED + number)
-        tracker, smooth = (
-            HandTracker(known, MARKERS),
-            HandOneEuro(known, MARKERS, OneEuroParameters.of(FilterCalibration())),
-        )
+        solver = PointHand(known, MARKERS)
+        smooth = HandOneEuro(known, MARKERS, OneEuroParameters.of(FilterCalibration()))
         rng = np.random.default_rng([_SEED, number])
         poses: list[HandPose] = []
         for t_ns in range(0, round(1e9 * seconds), _PERIOD_NS):
@@ -78,7 +76,7 @@ def people(numbers: Sequence[int] | range, seconds: float = 15.0) -> Told:
             caps = caps + rng.normal(0.0, SIGMA_M, caps.shape)
             cov = np.tile(SIGMA_M**2 * np.eye(3), (len(MARKERS), 1, 1))
             facing = -state.T_rig_palm[:3, 3] / np.linalg.norm(state.T_rig_palm[:3, 3])
-            solved = smooth.push(t_ns, tracker.push(t_ns, caps, cov, facing), cov).solution
+            solved = smooth.push(t_ns, solver.push(t_ns, caps, cov, facing), cov).solution
             assert solved is not None
             place, turned = solved.joints.position_m, matrix_to_quaternion(solved.joints.rotation)
             poses.append(pose_of(known, t_ns, place, turned, solved.angles_rad))

@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from bench.gesture_told import pose_of, told_of
-from bench.real_motion import MARKERS, SIGMA_M, Recorded, recordings, wide_limits
+from bench.hand_draws import FACING_ROTATION, MARKERS
+from bench.real_motion import SIGMA_M, Recorded, recordings, wide_limits
 from bench.row import Row
+from bench.solved_hand import PointHand
 from common.arrays import Float
 from common.calibration import FilterCalibration
 from common.geometry import matrix_to_quaternion, rigid
@@ -17,15 +19,13 @@ from common.hand_model import CHAINS, HandModel
 from common.messages import HandPose
 from common.npz import read_npz
 from common.sim.motion import POSES
+from master.estimator.smooth import HandOneEuro
 from master.fabrik.one_euro import OneEuroParameters
-from master.ik.hand_one_euro import HandOneEuro
-from master.ik.tracker import HandTracker
 
 _ROOT = Path(__file__).parent.parent
 _PERIOD_NS = 16_666_667
 _FRAMES, _SEEDS = 12, 5
 _HIDDEN = np.cos(np.radians(75.0))
-_FACING = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
 MEANT: dict[str, str | None] = {
     "flat": "open_palm",
     "point": "pointing",
@@ -111,7 +111,7 @@ def agrees(name: str, fingers_m: Float) -> bool:
 
 def _static(model: HandModel, joints: Float, seed: int) -> str | None:
     """What is held after some frames of a pose (25, 4, 4) in the frame of its wrist, markers with noise."""
-    T = rigid(_FACING, np.array([0.0, 0.08, 0.5]))
+    T = rigid(FACING_ROTATION, np.array([0.0, 0.08, 0.5]))
     places = (joints[:, :3, 3] @ np.diag([-1.0, 1.0, -1.0])) @ T[:3, :3].T + T[:3, 3]
     tips = places[CHAINS[:, 3] - 1]
     caps = np.vstack([tips, T[:3, :3] @ model.mount("back").offset_m + T[:3, 3]])
@@ -121,7 +121,7 @@ def _static(model: HandModel, joints: Float, seed: int) -> str | None:
 
 
 def _shown(recorded: Recorded, model: HandModel, seed: int) -> list[HandPose]:
-    """A recording through tracker and filter; its back is hidden where it is turned away."""
+    """A recording through estimator and filter; its back is hidden where it is turned away."""
     R, p = recorded.T_rig_palm[:, :3, :3], recorded.T_rig_palm[:, :3, 3]
     back = (R @ model.mount("back").offset_m + p)[:, None]
     points = np.concatenate([recorded.in_rig()[:, 3::4], back], axis=1)
@@ -132,13 +132,13 @@ def _shown(recorded: Recorded, model: HandModel, seed: int) -> list[HandPose]:
 
 def _solved(model: HandModel, t_ns: list[int], points: Float, towards: Float, seed: int) -> list[HandPose]:
     """Poses of caps (T, 6, 3) [m] with noise added."""
-    tracker = HandTracker(model, MARKERS)
+    solver = PointHand(model, MARKERS)
     smooth = HandOneEuro(model, MARKERS, OneEuroParameters.of(FilterCalibration()))
     noisy = points + np.random.default_rng([seed, 17]).normal(0.0, SIGMA_M, points.shape)
     out: list[HandPose] = []
     for t, seen in zip(t_ns, noisy, strict=True):
         cov = np.where(np.isfinite(seen[:, :1, None]), SIGMA_M**2 * np.eye(3), np.nan)
-        hand = smooth.push(t, tracker.push(t, seen, cov, towards), cov).solution
+        hand = smooth.push(t, solver.push(t, seen, cov, towards), cov).solution
         assert hand is not None
         turned = matrix_to_quaternion(hand.joints.rotation)
         out.append(pose_of(model, t, hand.joints.position_m, turned, hand.angles_rad))

@@ -8,6 +8,7 @@ all directions alike and takes each habit for itself, and neither of the two kno
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 
@@ -16,16 +17,17 @@ from bench.hand_draws import FACING_ROTATION, MARKERS, Draw, Noise, bench_model,
 from bench.hand_score import Score, score
 from bench.peers_paper import Fingers, PaperFingers, closed_form, finger_solvers, fixed_palm, tips_in_palm
 from bench.row import Row
+from bench.solved_hand import PointHand
 from common.arrays import Float
 from common.geometry import rigid, rotation_vector_to_matrix
 from common.hand_model import HandModel
 from master.estimator.parameters import HandParameters
-from master.ik.hand import HandSolution, HandSolver
-from master.ik.priors import AnglePrior, Priors
+from master.estimator.priors import habits_of
+from master.estimator.settings import DEFAULT
 
 FRAMES = 240
 _PERIOD_S = 1 / 60
-_NOISE = Noise((0.15e-3, 0.15e-3, 1.0e-3))
+NOISE = Noise((0.15e-3, 0.15e-3, 1.0e-3))
 _SEED = 7
 _TURN_RAD = np.radians(20.0)
 _SLOW = {"scipy": 20, "mink": 4, "papers' way": 2}  # one frame in so many
@@ -40,7 +42,7 @@ def rows(frames: int = FRAMES) -> list[Row]:
     model = bench_model()
     truth = motion(model, frames)
     rng = np.random.default_rng(_SEED)
-    points = truth.caps_m + rng.normal(size=truth.caps_m.shape) * _NOISE.place_m
+    points = truth.caps_m + rng.normal(size=truth.caps_m.shape) * NOISE.place_m
     out: list[Row] = []
     us: dict[str, float] = {}
     for name, way in ways(model).items():
@@ -74,39 +76,32 @@ def ways(model: HandModel) -> dict[str, Way]:
     fingers = finger_solvers(model)
     habits = _Habits.of(model)
     out: dict[str, Way] = {
-        WARM: Ours(model, warm=True).push,
-        "whole hand, afresh": Ours(model, warm=False).push,
+        WARM: ours(model, warm=True),
+        "whole hand, afresh": ours(model, warm=False),
         "papers' way": _with_fixed_palm(model, PaperFingers(fingers).push),
         "closed form, fixed palm": _with_fixed_palm(model, lambda tips: closed_form(fingers, tips)),
     }
-    scipy = peers_scipy.WholeHand.of(model, _NOISE)
+    scipy = peers_scipy.WholeHand.of(model, NOISE)
     out["scipy"] = lambda points: scipy.solve(points, fixed_palm(model, points), habits.mean)
     if peers_mink.installed():
-        sigma = np.sqrt(np.square(_NOISE.place_m) + Priors().model_m ** 2)
+        sigma = np.sqrt(np.square(NOISE.place_m) + DEFAULT.bones_m**2)
         mink = peers_mink.MinkHand(model, weight=1.0 / sigma, posture=(habits.mean, habits.per_sigma))
         mink.begin(rigid(FACING_ROTATION, np.array([0.0, 0.0, 0.5])), habits.mean)
         out["mink"] = mink.push
     return out
 
 
-@dataclass(slots=True)
-class Ours:
-    """The whole-hand fit. Holds the last solution where it is `warm`."""
+def ours(model: HandModel, *, warm: bool) -> Way:
+    """The estimator on caps; `warm`: it goes on from the last hand."""
+    solver, clock = PointHand(model, MARKERS, continuous=warm, faces=False), count(1)
 
-    solver: HandSolver
-    warm: bool
-    last: HandSolution | None = None
-
-    def __init__(self, model: HandModel, *, warm: bool) -> None:
-        self.solver, self.warm, self.last = HandSolver(model, MARKERS), warm, None
-
-    def push(self, points_m: Float) -> Hand:
-        """The hand of caps (M, 3) [m]; NaN where there is none."""
-        found = self.solver.solve(points_m, _NOISE.cov_m2, self.last if self.warm else None, _PERIOD_S)
-        self.last = found
+    def way(points_m: Float) -> Hand:
+        found = solver.push(round(1e9 * _PERIOD_S * next(clock)), points_m, NOISE.cov_m2).solution
         if found is None:
             return np.full((4, 4), np.nan), np.full((5, 4), np.nan)
         return found.T_rig_palm, found.angles_rad
+
+    return way
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,11 +114,11 @@ class _Habits:
     @classmethod
     def of(cls, model: HandModel) -> "_Habits":
         parameters = HandParameters.of(model)
-        prior = AnglePrior.of(model, parameters, Priors(free=None))
-        cov: Float = np.asarray(np.linalg.inv(prior.normal[0]), np.float64)
+        habits = habits_of(model, parameters).natural()
+        cov: Float = np.asarray(np.linalg.inv(habits.normal[0]), np.float64)
         per_sigma = np.zeros(20)
         per_sigma[parameters.free] = 1.0 / np.sqrt(np.diagonal(cov))
-        return cls(model.clamp(parameters.angles(cov @ prior.pull[0])), per_sigma.reshape(5, 4))
+        return cls(model.clamp(parameters.angles(cov @ habits.pull[0])), per_sigma.reshape(5, 4))
 
 
 def _with_fixed_palm(model: HandModel, fingers: Fingers) -> Way:

@@ -20,10 +20,9 @@ from bench.hand_draws import FACING_ROTATION, MARKERS, Noise, bench_model, draw,
 from bench.hand_score import Score, score
 from bench.peers_paper import Fingers, PaperFingers, closed_form, finger_solvers, fixed_palm, tips_in_palm
 from bench.row import Row
+from bench.solved_hand import PointHand
 from common.arrays import Float
 from common.hand_model import HandModel
-from master.ik.hand import HandSolver
-from master.ik.palm import Orientation
 
 POSES = 2000
 BATCHES = 10
@@ -97,13 +96,13 @@ def whole_hands(
         noise: What the solver is told of them.
         rotation: Palm orientations (N, 3, 3), or None.
     """
-    solver = HandSolver(model, MARKERS)
+    solver = PointHand(model, MARKERS, continuous=False, faces=False)
     palms, angles = np.full((len(points_m), 4, 4), np.nan), np.full((len(points_m), 5, 4), np.nan)
     for k, p in enumerate(points_m):
-        told = None
+        turn = None
         if rotation is not None and noise.orientation_rad is not None:
-            told = Orientation(rotation[k], noise.orientation_rad**2 * np.eye(3))
-        found = solver.solve(p, noise.cov_m2, orientation=told)
+            turn = rotation[k], noise.orientation_rad**2 * np.eye(3)
+        found = solver.push(k, p, noise.cov_m2, turn=turn).solution
         if found is not None:
             palms[k], angles[k] = found.T_rig_palm, found.angles_rad
     return palms, angles

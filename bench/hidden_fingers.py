@@ -1,27 +1,36 @@
-"""How far a finger without a marker is from where it is believed, on exact motions: with its neighbours, and alone.
+"""How far a finger without a marker is from where it is solved to be, on exact motions: with its neighbours, and alone.
 
-Each of the four fingers is hidden in turn, every tenth of a second, while the others are seen exactly; what is believed
-of it (`master.ik.hidden`) is held against the truth. Scenes and random poses are of seeds that decided nothing.
+Each of the four fingers is hidden again and again, while the other markers and the palm's turn are measured almost
+exactly, and its solved angles are held against the truth. *Alone* is the same without any belief that fingers move
+together. Beside them stands the same finger while its marker is seen. Scenes and random poses are of seeds that
+decided nothing.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from bench.hand_draws import FACING_ROTATION, MARKERS
 from bench.joint_certainty import leap_recordings, motions
 from bench.row import Row
+from bench.solved_hand import PointHand
 from common.arrays import Float
 from common.calibration import HandProfile, load
+from common.geometry import rigid
 from common.hand_model import HandModel
 from common.sim.leap import load_leap
 from common.sim.motion import HandMotion
-from master.ik.hidden import FingerMemory
+from master.estimator.settings import DEFAULT
 
 _HAND = Path(__file__).parent.parent / "calib_json/hands/default-right.json"
 _SEEDS = (11, 12, 13)
-_HIDDEN_S = (0.1, 0.3, 0.6)
-_SECONDS, _RATE_HZ, _EVERY, _LEARN = 30.0, 60.0, 6, 6
+HIDDEN_S = (0.0, 0.1, 0.3, 0.6)  # 0: the marker is still seen
+_SECONDS, _RATE_HZ, _SEEN = 12.0, 60.0, 30  # frames before each time that it is hidden
+_STEPS = tuple(round(after_s * _RATE_HZ) for after_s in HIDDEN_S)
+_CYCLE = _SEEN + _STEPS[-1]
+_SIGMA_M, _SIGMA_RAD = 1e-4, 1e-3
 _GROUPS = {"standard scene": "simulated scenes", "study poses": "simulated scenes"}
 
 
@@ -37,45 +46,52 @@ def rows() -> Iterator[Row]:
         played["recorded motion"] = [(leap, load_leap(path, leap, np.zeros(3))) for path in recordings]
     for name, group in played.items():
         angles = [(model, angles_of(motion)) for model, motion in group]
-        for hidden_s in _HIDDEN_S:
-            together, alone = (
-                rms_deg([strayed_deg(model, a, hidden_s, natural) for model, a in angles])
-                for natural in (1.0, 0.0)
-            )
-            yield Row(
-                f"{name}, after {hidden_s:g} s", together, "deg", f"by its own motion alone {alone:.1f}"
-            )
+        together, alone = (
+            np.concatenate([strayed_deg(model, a, alike=alike) for model, a in angles], axis=1)
+            for alike in (True, False)
+        )
+        for k, after_s in enumerate(HIDDEN_S[1:], 1):
+            seen, own = rms_deg(together[0]), rms_deg(alone[k])
+            note = f"by its own motion alone {own:.1f}, while its marker is seen {seen:.1f}"
+            yield Row(f"{name}, after {after_s:g} s", rms_deg(together[k]), "deg", note)
 
 
 def angles_of(motion: HandMotion) -> Float:
-    """(T, 5, 4) [rad] once through a motion, or its first half minute."""
+    """(T, 5, 4) [rad] once through a motion, or its first seconds."""
     times = np.arange(0.0, min(motion.period_s, _SECONDS), 1.0 / _RATE_HZ)
     return np.array([motion.at(t).angles_rad for t in times.tolist()])
 
 
-def strayed_deg(model: HandModel, angles_rad: Float, hidden_s: float, natural: float) -> Float:
-    """Errors (N, 2) [deg] of flexion and PIP of angles (T, 5, 4) after a time without a marker.
+def strayed_deg(model: HandModel, angles_rad: Float, *, alike: bool) -> Float:
+    """Errors (K, N, 2) [deg] of flexion and PIP, at each of the times `HIDDEN_S` after the last marker of a finger.
 
     Args:
-        model: Whose limits hold.
-        angles_rad: The truth.
-        hidden_s: How long the marker has been gone.
-        natural: Probability to obey habits when it went: 1, the neighbours tell what they can; 0, nothing.
+        model: The hand.
+        angles_rad: (T, 5, 4) the truth, frame by frame.
+        alike: Whether fingers are believed to move together.
     """
-    count = round(hidden_s * _RATE_HZ)
-    off: list[Float] = []
-    for k in range(_LEARN, len(angles_rad) - count, _EVERY):
-        for finger in range(1, 5):
-            seen, memory = frozenset(range(5)) - {finger}, FingerMemory(model)
-            for before, after in zip(angles_rad[k - _LEARN : k], angles_rad[k - _LEARN + 1 :], strict=False):
-                memory.moved(before, after, 1.0 / _RATE_HZ)
-            memory.belief(0, 0, angles_rad[k], natural, seen)  # the marker goes
-            now = round(hidden_s * 1e9)
-            believed = memory.belief(now, now, angles_rad[k + count], natural, seen).angles_rad
-            off.append((believed - angles_rad[k + count])[finger, 1:3])
+    settings = DEFAULT
+    if not alike:
+        settings, model = DEFAULT.changed("alike", 0.0), replace(model, neighbours=False)
+    palm = rigid(FACING_ROTATION, np.array([0.0, 0.08, 0.5]))
+    places = model.marker_points(model.forward(np.tile(palm, (len(angles_rad), 1, 1)), angles_rad), MARKERS)
+    cov = np.tile(_SIGMA_M**2 * np.eye(3), (len(MARKERS), 1, 1))
+    turn = palm[:3, :3], _SIGMA_RAD**2 * np.eye(3)
+    off: list[list[Float]] = [[] for _ in HIDDEN_S]
+    for finger in range(1, 5):
+        solver = PointHand(model, MARKERS, settings=settings)
+        for k in range(len(places) // _CYCLE * _CYCLE):
+            points, hidden = places[k].copy(), k % _CYCLE - _SEEN + 1
+            if hidden > 0:
+                points[finger] = np.nan
+            hand = solver.push(round(k * 1e9 / _RATE_HZ), points, cov, turn=turn).solution
+            if hidden in _STEPS:
+                assert hand is not None
+                error = (hand.angles_rad - angles_rad[k])[finger, 1:3]
+                off[_STEPS.index(hidden)].append(error)
     return np.degrees(np.array(off))
 
 
-def rms_deg(errors: list[Float]) -> float:
-    """RMS of errors (N, 2) of several motions."""
-    return float(np.sqrt(np.mean(np.square(np.concatenate(errors)))))
+def rms_deg(errors: Float) -> float:
+    """RMS of errors (N, 2)."""
+    return float(np.sqrt(np.mean(np.square(errors))))

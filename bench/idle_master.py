@@ -5,22 +5,24 @@ The baseline of the live latency, with the options of the master: `python -m ben
 
 import numpy as np
 
-from common.arrays import Float
 from common.messages import MarkerDetections
 from master.__main__ import main
-from master.ik.tracker import TrackedHand, pose_of
+from master.estimator.estimator import Fitted
 from master.estimator.pipeline import MarkerPipeline, SolvedPose
+from master.estimator.pose import pose_of
+from master.fabrik.estimate import MarkerPositions
 
-_NOTHING = TrackedHand(
-    None, np.zeros(26, bool), np.zeros(26, bool), np.zeros(26, np.uint8), np.zeros(6, np.int64)
-)
+_UNKNOWN = np.zeros(26, np.bool_)
+_NOTHING = Fitted(None, _UNKNOWN, _UNKNOWN, np.zeros(26, np.uint8), np.zeros(6, np.int64))
 
 
 def pass_on(self: MarkerPipeline, message: MarkerDetections) -> list[SolvedPose]:
     """An empty pose for every message, in place of `MarkerPipeline.push`."""
-    nowhere: Float = np.full((len(message.area), 3), np.nan)
-    unknown = np.full((len(message.area), 3, 3), np.nan)
-    pose = pose_of(_NOTHING, self.model, message.t_ns, nowhere, nowhere, unknown)
+    count = len(message.area)
+    nowhere, unknown = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
+    apart, left_out = np.zeros(count, np.bool_), np.zeros((1, count), np.bool_)
+    markers = MarkerPositions(nowhere, unknown, unknown, apart, left_out)
+    pose = pose_of(_NOTHING, self.model, message.t_ns, nowhere, markers)
     return [SolvedPose(pose, message.ready_t_ns)]
 
 

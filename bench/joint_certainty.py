@@ -13,8 +13,10 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from bench.hand_draws import BACK, MARKERS
 from bench.played import solve, times_of, times_of_poses, watch
 from bench.row import Row
+from bench.solved_hand import TOWARDS, PointHand
 from common.arrays import Bool, Float
 from common.calibration import Couplings, HandProfile, load
 from common.hand_model import CHAINS, TIPS, HandModel
@@ -22,10 +24,8 @@ from common.sim.leap import load_leap
 from common.sim.motion import HandMotion, HandState, ScriptedMotion, base_pose, smooth_step
 from common.sim.poses import StudyPoses
 from common.sim.scenes import scene_by_name
-from master.ik.tracker import HandTracker
 from master.rig import RigSetup, load_setup
 
-MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
 _CALIBRATION = Path(__file__).parent.parent / "calib_json"
 _HAND = _CALIBRATION / "hands/default-right.json"
 _DATASETS = Path(os.environ.get("PHALANX_DATASETS", Path(__file__).parents[2] / "shared/datasets")).resolve()
@@ -33,8 +33,7 @@ _REGION = 7.815  # chi square, three degrees, 95 %
 NOISE_M = {"1 mm": (1e-3, 1e-3, 1e-3), "depth 4.5 mm": (0.3e-3, 0.3e-3, 4.5e-3)}
 SEEDS = (11, 12, 13, 14, 15, 16)  # what was decided by looking, was decided by 1 to 8
 _CENTRE = np.array([0.0, 0.0, 0.5])
-_TOWARDS = np.array([0.0, 0.0, -1.0])
-BACK, _EDGE_ON = MARKERS.index("back"), np.cos(np.radians(75.0))
+_EDGE_ON = np.cos(np.radians(75.0))
 _RATE_HZ, _SECONDS = 60.0, 16.0
 _CYCLE_S = 4.0
 _RENDERED_S = 12.0
@@ -134,22 +133,22 @@ def seen_by(seed: int, times_s: Float) -> Bool:
 
 
 def compared(model: HandModel, motion: HandMotion, sigma_m: tuple[float, ...], seed: int) -> Coverage:
-    """One motion pushed through the tracker, against its truth."""
+    """One motion pushed through the estimator, against its truth."""
     rng = np.random.default_rng([seed, 6])
     times = np.arange(round(_SECONDS * _RATE_HZ)) / _RATE_HZ
     begin_s = float(rng.uniform(0.0, min(motion.period_s, 60.0)))
     seen = seen_by(seed, times)
     cov = np.repeat(np.diag(np.square(sigma_m))[None], len(MARKERS), axis=0)
-    tracker, since = HandTracker(model, MARKERS), np.zeros(5)
+    solver, since = PointHand(model, MARKERS), np.zeros(5)
     parts: list[Coverage] = []
     for k, t in enumerate(times.tolist()):
         now = motion.at(begin_s + t)
         truth = model.forward(now.T_rig_palm, now.angles_rad)
         points = model.marker_points(truth, MARKERS) + rng.normal(size=(len(MARKERS), 3)) * sigma_m
-        if now.T_rig_palm[:3, 1] @ _TOWARDS < _EDGE_ON:  # its back is turned away
+        if now.T_rig_palm[:3, 1] @ TOWARDS < _EDGE_ON:  # its back is turned away
             seen[k, BACK] = False
         points[~seen[k]] = np.nan
-        hand = tracker.push(round(t * 1e9), points, cov, _TOWARDS)
+        hand = solver.push(round(t * 1e9), points, cov)
         since = np.where(seen[k, :5], 0.0, since + 1.0 / _RATE_HZ)
         if hand.solution is None or not hand.valid.all() or t < _SETTLED_S:
             continue

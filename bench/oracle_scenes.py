@@ -75,7 +75,8 @@ def truth_of(scene: Scene, seconds: float) -> Truth:
     since_ns: Int = np.arange(0, round((seconds + 0.1) * 1e9), STEP_NS)
     states = tuple(scene.motion.at(1e-9 * t) for t in since_ns.tolist())
     angles_rad = np.stack([state.angles_rad for state in states])
-    return Truth(START_NS + since_ns, scene.joints_of(states).position_m, angles_rad)
+    joints = scene.model.forward(np.stack([state.T_rig_palm for state in states]), angles_rad)
+    return Truth(START_NS + since_ns, joints.position_m, angles_rad)
 
 
 def held(seed: int = SEEDS[0]) -> Iterator[Piece]:

@@ -10,9 +10,10 @@ from common.arrays import Float
 from common.geometry import rigid, rotation_vector_to_matrix
 from common.hand_model import HandModel
 from master.estimator.parameters import HandParameters
+from master.estimator.priors import habits_of
+from master.estimator.settings import DEFAULT
 from master.fabrik.finger import FingerSolver
 from master.fabrik.rotations import Vector
-from master.ik.priors import AnglePrior, Priors
 
 _INSIDE_RAD = 1e-6  # it refuses a start on a bound, and bounds that leave no room
 _IN_MM = 1e3  # metres make its gradient tolerance end too early
@@ -60,11 +61,10 @@ class WholeHand:
     @classmethod
     def of(cls, model: HandModel, noise: Noise) -> "WholeHand":
         """For caps with this noise, and the default habits."""
-        priors = Priors(free=None)
         parameters = HandParameters.of(model)
-        prior = AnglePrior.of(model, parameters, priors)
-        normal, pull = prior.normal[0], prior.pull[0]
-        cov = noise.cov_m2 + priors.model_m**2 * np.eye(3)
+        habits = habits_of(model, parameters).natural()
+        normal, pull = habits.normal[0], habits.pull[0]
+        cov = noise.cov_m2 + DEFAULT.bones_m**2 * np.eye(3)
         return cls(
             model,
             parameters,
@@ -72,6 +72,12 @@ class WholeHand:
             np.asarray(np.linalg.cholesky(normal).T, np.float64),
             np.asarray(np.linalg.solve(normal, pull), np.float64),
         )
+
+    def residuals(self, T_rig_palm: Float, x: Float, points_m: Float) -> Float:
+        """Residuals [sigma] of a palm (4, 4) and free angles (n,) [rad]: caps (M, 3) [m], then habits."""
+        joints = self.model.forward(T_rig_palm, self.parameters.angles(x))
+        off = self.model.marker_points(joints, MARKERS) - points_m
+        return np.concatenate([(self.whiten @ off[..., None]).ravel(), self.rows @ (x - self.mean)])
 
     def solve(self, points_m: Float, T_rig_palm: Float, angles_rad: Float) -> tuple[Float, Float]:
         """Palm (4, 4) and angles (5, 4) [rad] for caps (M, 3) [m], from a palm and angles to start with."""
@@ -84,10 +90,7 @@ class WholeHand:
             return rigid(rotation_vector_to_matrix(v[:3]) @ R, v[3:6]), angles
 
         def residual(v: Float) -> Float:
-            T, x = hand(v)
-            joints = self.model.forward(T, self.parameters.angles(x))
-            off = self.model.marker_points(joints, MARKERS) - points_m
-            return np.concatenate([(self.whiten @ off[..., None]).ravel(), self.rows @ (x - self.mean)])
+            return self.residuals(*hand(v), points_m)
 
         inside = np.clip(self.parameters.of_angles(angles_rad), low + _INSIDE_RAD, high - _INSIDE_RAD)[room]
         start = np.concatenate([np.zeros(3), T_rig_palm[:3, 3], inside])

@@ -3,7 +3,7 @@
 **Motion**: the joints that the Leap recorded (`leapjs/*.npz`, model-based: bones are constant, the DIP bends as the
 PIP) are the truth themselves. A profile is made from the same joints (`common.hand_fitting`); its DIP is coupled 1 : 1,
 its limits are D, widened for fingers bent back up to 30 degrees, thumbs 20, and for 30 degrees of abduction (the little
-finger 45). Caps on the five tips and one on the back, 1 mm of noise, go through tracker and filter at the recorded
+finger 45). Caps on the five tips and one on the back, 1 mm of noise, go through estimator and filter at the recorded
 times. The cameras are where they see the back of the hand in the mean, and the cap there is hidden beyond 75 degrees.
 Wrist and metacarpals were not recorded; the error is the mean over the 20 recorded joints. Where a recorded hand
 changes its size, the recording is cut and each piece has a profile of its own.
@@ -22,7 +22,9 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import least_squares  # pyright: ignore[reportUnknownVariableType]
 
+from bench.hand_draws import FACING_ROTATION, MARKERS
 from bench.row import Row
+from bench.solved_hand import TOWARDS, PointHand
 from common.arrays import Float, Int
 from common.calibration import Couplings, FilterCalibration, FingerLimits, Limits
 from common.geometry import matrix_to_rotation_vector, rigid
@@ -31,12 +33,10 @@ from common.hand_model import CHAINS, FINGERS, HandModel
 from common.hand_profiles import generated_profile
 from common.npz import read_npz
 from common.sim.leap import KEYS, RIG_FROM_LEAP, palm_rotation
+from master.estimator.estimator import FittedHand
+from master.estimator.smooth import HandOneEuro
 from master.fabrik.one_euro import OneEuroParameters
-from master.ik.hand import HandSolution
-from master.ik.hand_one_euro import HandOneEuro
-from master.ik.tracker import HandTracker
 
-MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
 SIGMA_M = 1e-3
 _ROOT = Path(__file__).parent.parent
 _SIZE_M = 1e-4  # bones that differ by more belong to another hand
@@ -44,8 +44,7 @@ _SHORTEST_S = 0.5
 _HIDDEN = np.cos(np.radians(75.0))
 _FIXED = 40  # frames per recording in which the profile is judged without noise
 _PERIOD_NS = 16_666_667
-FACING = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])  # fingers up, back to the cameras
-TOWARDS = np.array([0.0, 0.0, -1.0])
+FACING = FACING_ROTATION  # fingers up, back to the cameras
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,7 +146,7 @@ def recordings(folder: Path) -> Iterator[Recorded]:
 
 
 def play(recorded: Recorded, model: HandModel, seed: int) -> Score:
-    """The recording through tracker and filter."""
+    """The recording through estimator and filter."""
     truth = recorded.in_rig()
     back = model.mount("back").offset_m
     points = np.concatenate(
@@ -160,7 +159,7 @@ def play(recorded: Recorded, model: HandModel, seed: int) -> Score:
     points[dorsal @ towards < _HIDDEN, 5] = np.nan
     solved, shown = _track(model, recorded.t_ns, points, towards)
 
-    def places(hands: list[HandSolution]) -> Float:
+    def places(hands: list[FittedHand]) -> Float:
         return np.array([hand.joints.position_m[CHAINS].reshape(20, 3) for hand in hands])
 
     pip = _pip_deg(places(shown)) - _pip_deg(truth)
@@ -187,16 +186,16 @@ def floor_m(recorded: Recorded, model: HandModel) -> Float:
 
 
 def _track(
-    model: HandModel, t_ns: Int, points: Float, towards: Float
-) -> tuple[list[HandSolution], list[HandSolution]]:
+    model: HandModel, t_ns: Int, points: Float, towards: Float = TOWARDS
+) -> tuple[list[FittedHand], list[FittedHand]]:
     """Solved and shown hands of caps (T, 6, 3) with 1 mm of noise."""
-    tracker = HandTracker(model, MARKERS)
+    solver = PointHand(model, MARKERS)
     smooth = HandOneEuro(model, MARKERS, OneEuroParameters.of(FilterCalibration()))
-    solved: list[HandSolution] = []
-    shown: list[HandSolution] = []
+    solved: list[FittedHand] = []
+    shown: list[FittedHand] = []
     for t, seen in zip(t_ns.tolist(), points, strict=True):
         cov = np.where(np.isfinite(seen[:, :1, None]), SIGMA_M**2 * np.eye(3), np.nan)
-        hand = tracker.push(t, seen, cov, towards)
+        hand = solver.push(t, seen, cov, towards)
         filtered = smooth.push(t, hand, cov)
         assert hand.solution is not None
         assert filtered.solution is not None
@@ -260,7 +259,7 @@ def held_poses(model: HandModel) -> dict[str, Float]:
     }
 
 
-def jitter(hands: list[HandSolution]) -> tuple[float, float, float]:
+def jitter(hands: list[FittedHand]) -> tuple[float, float, float]:
     """Standard deviations over time, RMS over joints: places [mm], angles [deg], turns [deg], all axes together."""
     places = np.array([hand.joints.position_m for hand in hands])
     angles = np.array([hand.angles_rad for hand in hands])
@@ -281,7 +280,7 @@ def _held_rows(seeds: int = 5, frames: int = 300, settled: int = 60) -> Iterator
         after: list[tuple[float, float, float]] = []
         for seed in range(seeds):
             noise = np.random.default_rng(seed).normal(0.0, SIGMA_M, (frames, 6, 3))
-            solved, shown = _track(model, t_ns, caps + noise, TOWARDS)
+            solved, shown = _track(model, t_ns, caps + noise)
             before.append(jitter(solved[settled:]))
             after.append(jitter(shown[settled:]))
         raw, left, worst = np.mean(before, axis=0), np.mean(after, axis=0), np.max(after, axis=0)
@@ -328,9 +327,8 @@ def _pose_error(model: HandModel, joints: Float, rng: np.random.Generator | None
     caps = np.vstack([truth[0, 3::4], T[:3, :3] @ model.mount("back").offset_m + T[:3, 3]])
     if rng is not None:
         caps = caps + rng.normal(0.0, SIGMA_M, caps.shape)
-    hand = HandTracker(model, MARKERS, continuous=False).push(
-        0, caps, np.tile(SIGMA_M**2 * np.eye(3), (6, 1, 1)), TOWARDS
-    )
+    cov = np.tile(SIGMA_M**2 * np.eye(3), (6, 1, 1))
+    hand = PointHand(model, MARKERS, continuous=False).push(0, caps, cov)
     assert hand.solution is not None
     found = hand.solution.joints.position_m[CHAINS].reshape(1, 20, 3)
     return np.abs(_pip_deg(found) - _pip_deg(truth))[0]

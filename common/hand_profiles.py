@@ -69,7 +69,7 @@ def generated_profile(name: str, side: str, hand_length_m: float = 0.19) -> Hand
         marker: MarkerMount(
             joint=joint,
             offset_m=(0.0, 0.0, -round(_CAP_AHEAD * radius[joint], 7)),
-            # Half a sphere and the cylinder that puts the centroid there, see `master.stereo.caps`.
+            # Half a sphere and the cylinder that puts the centroid there, see `master.fabrik.caps`.
             painted_m=round((2.0 - 2.0 * _CAP_AHEAD) * radius[joint], 7),
         )
         for marker, joint in _MARKER_JOINT.items()

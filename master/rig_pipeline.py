@@ -76,7 +76,10 @@ def _rays(setup: RigSetup) -> RayTriangulator | None:
     if len(cameras) < 2:
         return None
     caps = CapTables.of(setup.hand, setup.rig.markers)
-    return RayTriangulator(cameras, caps, CalibrationResidual.of(setup.rig).rays_px)
+    rays = RayTriangulator(cameras, caps, CalibrationResidual.of(setup.rig).rays_px)
+    nothing = np.full((len(cameras), len(setup.rig.markers)), np.nan)
+    rays(np.stack([nothing, nothing], axis=-1), nothing, nothing, None, 0.0)  # compiled now, not later
+    return rays
 
 
 def _estimator(
@@ -89,7 +92,6 @@ def _estimator(
         setup.hand,
         setup.rig.markers,
         markers,
-        CapTables.of(setup.hand, markers),
         continuous=continuous,
         natural=natural,
         settings=settings,
@@ -137,8 +139,7 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
         once=_estimator(setup, continuous=False, natural=True, settings=_ANY_CURL),
         stage=stage,
     )
-    with log_if_slow():
-        line.rehearse()
+    line.rehearse()
     return line
 
 
@@ -174,23 +175,24 @@ def build_pipeline(
             f"rig {rig.name!r}: solver 'fabrik' knows markers alone, but {beside} watches this hand too: set solver to"
             " 'estimator'"
         )
-    return MarkerPipeline(
-        setup.models,
-        setup.hand,
-        rig.markers,
-        line=line_of(setup, stage, continuous=continuous),
-        rays=_rays(setup),
-        rays_px=CalibrationResidual.of(rig).rays_px,
-        estimator=_estimator(setup, continuous=continuous) if refine else None,
-        smooth=_hand_filter(setup) if continuous and refine else None,
-        stamp_offset_us=rig.stamp_offset_us,
-        volume=rig.volume,
-        imu=rig.imu,
-        others=others,
-        counts=counts,
-        stage=stage,
-        shed=shed,
-    )
+    with log_if_slow():
+        return MarkerPipeline(
+            setup.models,
+            setup.hand,
+            rig.markers,
+            line=line_of(setup, stage, continuous=continuous),
+            rays=_rays(setup),
+            rays_px=CalibrationResidual.of(rig).rays_px,
+            estimator=_estimator(setup, continuous=continuous) if refine else None,
+            smooth=_hand_filter(setup) if continuous and refine else None,
+            stamp_offset_us=rig.stamp_offset_us,
+            volume=rig.volume,
+            imu=rig.imu,
+            others=others,
+            counts=counts,
+            stage=stage,
+            shed=shed,
+        )
 
 
 def pipeline_of(

@@ -208,7 +208,7 @@ Guard = Callable[[str, str], set[str]]
 
 # guard, file it is planted in, violation, and a neighbour that is allowed
 PLANTED: list[tuple[Guard, str, str, str]] = [
-    (wrong_side, "common/x.py", "def late():\n    from master.stereo import depth\n", "import common.clock"),
+    (wrong_side, "common/x.py", "def late():\n    from master.fabrik import depth\n", "import common.clock"),
     (wrong_side, "common/x.py", "import rerun as rr", "import re"),
     (wrong_side, "common/bus.py", "import zenoh", "import common.zenoh_bus"),
     (wrong_side, "slave/app.py", "from master import ingest", "from common import bus"),

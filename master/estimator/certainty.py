@@ -37,7 +37,7 @@ from master.estimator.settings import Settings
 from master.estimator.solve import Rig
 from master.estimator.state import Hidden
 
-_MOST = 8  # turns that count in arcs: the pivoted factor puts the largest first
+_MOST = 12  # turns that count in arcs: those of the palm, which moves all joints, then the largest
 
 
 class Certainty:
@@ -48,11 +48,11 @@ class Certainty:
     V: Float  # (N, N)
     work: Float  # (N, N)
     values: Float  # (N,)
-    turns: Float  # (8, N) columns of the factor, as rows
+    turns: Float  # (12, N) columns of the factor, as rows
     left: Float  # (N,)
-    w: Float  # (5, 4, 8, 3)
-    joint: Float  # (36, 26, 3) arcs of joints, by pair
-    marker: Float  # (36, 3 M) of markers, whitened
+    w: Float  # (5, 4, 12, 3)
+    joint: Float  # (78, 26, 3) arcs of joints, by pair
+    marker: Float  # (78, 3 M) of markers, whitened
     Jm: Float  # (3 M, N)
     gain: Float  # (N, 3 M)
     B: Float  # (3 M, 3 M)
@@ -199,8 +199,20 @@ def linear(hand: HandTables, T: Float, cov: Float, work: Scratch, room: Certaint
 
 
 @inner
-def tilts(hand: HandTables, T: Float, cov: Float, work: Scratch, room: Certainty, tilt: Float) -> None:
-    """Write the covariances of the last phalanges' directions (5, 3, 3) [rad^2]; `work` as `chains` left it."""
+def tilts(
+    hand: HandTables,
+    settings: Settings,
+    T: Float,
+    cov: Float,
+    work: Scratch,
+    room: Certainty,
+    tilt: Float,
+    walk: Float,
+) -> None:
+    """Write the covariances of the last phalanges' directions (5, 3, 3) [rad^2], and how fast they walk (5,).
+
+    `work` as `chains` left it; of the walk the trace [rad^2/s^2].
+    """
     for f in range(5):
         squared = 0.0
         for i in range(3):
@@ -215,6 +227,11 @@ def tilts(hand: HandTables, T: Float, cov: Float, work: Scratch, room: Certainty
             room.at[a] = a if a < 6 else hand.first[f] + a
             for i in range(3):
                 room.J[a, i] = 0.0 if 3 <= a < 6 else room.J[a, i]
+        walk[f] = 0.0
+        for a in range(6 + count):
+            rate = settings.palm_walk_rad_s if a < 3 else settings.walk_rad_s
+            for i in range(3):
+                walk[f] += (rate * room.J[a, i]) ** 2
         _project(cov, 6 + count, room, tilt[f])
 
 
@@ -230,9 +247,13 @@ def _turns(settings: Settings, cov: Float, room: Certainty) -> int:
     count = 0
     while count < _MOST:
         pivot = 0
-        for i in range(N):
+        for i in range(3):
             if left[i] > left[pivot]:
                 pivot = i
+        if not left[pivot] > settings.straight_rad**2:
+            for i in range(6, N):
+                if left[i] > left[pivot]:
+                    pivot = i
         if not left[pivot] > settings.straight_rad**2:
             break
         root, squared = sqrt(left[pivot]), 0.0

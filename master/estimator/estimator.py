@@ -9,7 +9,7 @@ from common.arrays import Bool, Code, Float, Int
 from common.camera_model import CameraModel
 from common.geometry import fit_rigid
 from common.hand_model import CHAINS, HandJoints, HandModel
-from common.kernels import bound, boxed
+from common.kernels import bound, boxed, fields
 from common.messages import Source
 from master.estimator.attached import Attached
 from master.estimator.cameras import CameraArrays
@@ -34,7 +34,6 @@ from master.estimator.update import (
     Workspace,
     epoch,
 )
-from master.fabrik.caps import CapTables
 from master.fabrik.estimate import SolvedHand
 
 _BENDS_RAD = (0.1, 0.7, 1.3)  # of the PIP, from which a search afresh begins: open to closed
@@ -62,7 +61,7 @@ class Epoch:
         cov_m2: (A, 3, 3) covariances of these, where they are what is measured; None: the centroids are.
         uv: (C, A, 2) [px] centroids of all markers of the rig; NaN: not seen, or gated out.
         variance_px2: (C, A) of each camera's own errors; NaN: not to be used.
-        common_m2: (A,) variance of what all cameras see alike.
+        own_m2: (A, 3, 3) covariance of what is wrong with each marker itself, beside bones.
         facing: (3,) unit vector from the hand to the cameras that see its back.
         sensed: What other sensors say of the palm's turn and of angles; None: nothing.
         start: Another hand of this epoch; None: there is none.
@@ -74,7 +73,7 @@ class Epoch:
     cov_m2: Float | None = None
     uv: Float | None = None
     variance_px2: Float | None = None
-    common_m2: Float | None = None
+    own_m2: Float | None = None
     sensed: "Sensed | None" = None
     start: SolvedHand | None = None
 
@@ -169,7 +168,6 @@ class Estimator:
         model: HandModel,
         markers: tuple[str, ...],
         hand_markers: tuple[str, ...],
-        caps: CapTables,
         *,
         continuous: bool = True,
         natural: bool = False,
@@ -182,7 +180,6 @@ class Estimator:
             model: The hand.
             markers: Names in the order of every marker array.
             hand_markers: Those of them that are on this hand.
-            caps: Of the hand's markers, in that order.
             continuous: False: every epoch is an unrelated pose, nothing is remembered.
             natural: Whether the hand is taken to obey habits, and begins anew where markers are unexplained: the fit
                 of the card's line, which has no other hand to begin from.
@@ -195,7 +192,7 @@ class Estimator:
         self.parameters = HandParameters.of(model)
         self._on_hand = np.array([markers.index(name) for name in hand_markers], np.int64)
         mounts = Mounts.of(model, hand_markers)
-        self._rig = Rig(HandTables.of(model, self.parameters), mounts, CameraArrays.of(cameras), caps)
+        self._rig = Rig(HandTables.of(model, self.parameters), mounts, CameraArrays.of(cameras))
         n, count = len(self.parameters.free), len(hand_markers)
         self._observed = Observations.empty(len(cameras), count)
         self._space = Workspace.empty(n, _capacity(count))
@@ -205,9 +202,6 @@ class Estimator:
         self._habits: dict[frozenset[int], Habits] = {}
         self._finger = mounts.finger
         self._on_palm = np.array([model.mount(name).joint is None for name in hand_markers])
-        self._own_m2 = np.tile(settings.bones_m**2 * _EYE, (len(markers), 1, 1))
-        flat = [markers.index(name) for name in hand_markers if model.mount(name).finger is None]
-        self._own_m2[flat] += settings.relief_m**2 * _EYE
         self._carries = self._finger == np.arange(5)[:, None]  # (5, M)
         bent = np.zeros((len(_BENDS_RAD), 5, 4))
         bent[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (_MCP_PER_PIP, 1.0))[:, None]
@@ -223,9 +217,15 @@ class Estimator:
             boxed(settings.record()),
             self._rig.mounts,
             self._rig.cameras,
-            self._rig.caps,
         )
         self._boxed_state, self._boxed_space = boxed(self.state), boxed(self._space)
+        self._now, self._at = fields(self.state), fields(self._space)
+        nothing = np.full((len(cameras), len(markers), 2), np.nan)
+        own = np.zeros((len(markers), 3, 3))
+        observe_rays(
+            nothing, nothing[..., 0].copy(), own, self._on_hand, self._observed
+        )  # compiled now, not later
+        observe_points(own[self._on_hand, 0], own[self._on_hand], 0.0, self._observed)
         self._kernel = bound(
             epoch,
             self._model,
@@ -240,11 +240,11 @@ class Estimator:
     @property
     def known(self) -> bool:
         """Whether there is a hand to go on from."""
-        return bool(self.state.known[0])
+        return bool(self._now.known[0])
 
     def recent(self, t_ns: int) -> bool:
         """Whether the state still says anything at `t_ns`."""
-        age_s = (t_ns - int(self.state.t_ns[0])) * 1e-9
+        age_s = (t_ns - int(self._now.t_ns[0])) * 1e-9
         return self._continuous and self.known and 0.0 < age_s <= self.settings.forget_s
 
     def pose(self, T: Float, angles_rad: Float) -> tuple[HandJoints, Float]:
@@ -257,7 +257,7 @@ class Estimator:
 
     def push(self, at: Epoch) -> Fitted:
         """Fit one epoch."""
-        observed, sensed, task = self._observed, at.sensed, self._space.task
+        observed, sensed, task = self._observed, at.sensed, self._at.task
         count = self._observe(at)
         seen, rays = observed.seen, (observed.weight > 0.0).sum(axis=0) + 2 * observed.placed
         back = bool((seen & self._on_palm).any())
@@ -278,7 +278,7 @@ class Estimator:
         if (
             solved
             and sensed is not None
-            and (weighed := sensed.weighed(out.angles.reshape(5, 4))) is not None
+            and (weighed := sensed.weighed(fields(out).angles.reshape(5, 4))) is not None
         ):
             self._boxed_state[:], sensed = before, weighed
             at = replace(at, sensed=sensed)
@@ -286,7 +286,7 @@ class Estimator:
             solved, anew = self._solve(at, out, known=known, enough=enough)
         self._turn = None if sensed is None else sensed.rotation
         if count > 0 or (sensed is not None and bool(sensed.told.any()) and self._knows_place()):
-            self.state.seen_ns[0] = at.t_ns
+            self._now.seen_ns[0] = at.t_ns
         rests = self._rests(at, rays, palm_shown=palm_shown, by_markers=by_markers)
         return self._fitted(at, out, rests, anew=anew) if solved else _unknown(rests)
 
@@ -295,8 +295,8 @@ class Estimator:
         if known and self._only_natural and enough:
             before = self._boxed_state.copy()
             self._track(at, out, may_leave=False)
-            surprise = self._space.found.surprise[: len(self._on_hand)]
-            wrong = float(self._space.found.wrong[0])
+            surprise = self._at.found.surprise[: len(self._on_hand)]
+            wrong = float(self._at.found.wrong[0])
             if not (surprise > self.settings.explained).any():
                 return True, False
             self._boxed_state[:] = before
@@ -317,13 +317,13 @@ class Estimator:
             return observe_points(points, cov, bones_m2, self._observed)
         assert at.uv is not None
         assert at.variance_px2 is not None
-        assert at.common_m2 is not None
-        own = at.common_m2[:, None, None] * _EYE + self._own_m2
+        assert at.own_m2 is not None
+        own = at.own_m2 + self.settings.bones_m**2 * _EYE
         return observe_rays(at.uv, at.variance_px2, own, self._on_hand, self._observed)
 
     def _track(self, at: Epoch, out: Estimate, *, may_leave: bool) -> bool:
         """Go on from the state; False: another hand of this epoch takes its place, or there is none."""
-        start, sensed, task = at.start, at.sensed, self._space.task
+        start, sensed, task = at.start, at.sensed, self._at.task
         task.turned[:] = _EYE
         if sensed is not None and sensed.rotation is not None and self._turn is not None:
             task.turned[:] = sensed.rotation @ self._turn.T
@@ -334,7 +334,7 @@ class Estimator:
             said = self._run(TRACK, self._with_laser(self._habits_of(_NONE), sensed), out)
             if said == TRACKED_ON:
                 return True
-            wrong = float(self._space.found.wrong[0])
+            wrong = float(self._at.found.wrong[0])
             if said == LOST or wrong > self.settings.misled + self._begin(at):
                 return False
             may_leave = False  # nothing is better: keep what was found
@@ -344,16 +344,16 @@ class Estimator:
 
         A finger between two that show is rather bent as they are: no hand curls it alone. But straight it would show.
         """
-        shown = frozenset(np.flatnonzero(self._space.task.shown).tolist())
+        shown = frozenset(np.flatnonzero(self._at.task.shown).tolist())
         like = frozenset(f for f in (2, 3) if f not in shown and {f - 1, f + 1} <= shown)
         chi2 = self._begin_with(at, shown, like)
-        angles = self.parameters.angles(self._space.found.x)
+        angles = self.parameters.angles(self._at.found.x)
         straight = frozenset(f for f in like if angles[f, 1:].sum() < self.settings.shows_rad)
         return self._begin_with(at, shown, like - straight) if straight else chi2
 
     def _begin_with(self, at: Epoch, shown: frozenset[int], like: frozenset[int]) -> float:
         """As `_begin`, while the hidden fingers of `like` are bent as their neighbours."""
-        apart, space = frozenset(range(5)) - shown - like, self._space
+        apart, space = frozenset(range(5)) - shown - like, self._at
         belief, found, task, start = space.belief, space.found, space.task, at.start
         fingers = np.isin(np.arange(5), list(apart))
         belief.own_w2[:], belief.own[:] = curled(self.parameters, self.settings, fingers)
@@ -378,7 +378,7 @@ class Estimator:
 
     def _run(self, what: int, habits: Habits, out: Estimate) -> float:
         """The kernel, for what is in the task."""
-        self._space.task.what[0] = what
+        self._at.task.what[0] = what
         return self._kernel(
             self._model,
             habits,
@@ -403,7 +403,7 @@ class Estimator:
                 T = np.eye(4)
                 T[:3, :3] = sensed.rotation
                 T[:3, 3] = np.average(observed - expected @ sensed.rotation.T, axis=0, weights=weight)
-            elif self._space.belief.facing_w2[0] > 0.0:
+            elif self._at.belief.facing_w2[0] > 0.0:
                 # A point above the wrist stands for "the back of the hand faces the cameras".
                 above = expected.mean(axis=0) + np.array([0.0, _ABOVE_M, 0.0])
                 towards = observed.mean(axis=0) + _ABOVE_M * epoch.facing
@@ -425,13 +425,13 @@ class Estimator:
 
     def _believe(self, epoch: Epoch, back: bool, rays: Int, *, known: bool) -> None:
         """Write what is believed beside the past and habits."""
-        belief, sensed = self._space.belief, epoch.sensed
+        belief, sensed = self._at.belief, epoch.sensed
         belief.facing[:] = epoch.facing
         belief.facing_w2[0] = self.settings.facing_rad**-2.0 if back else 0.0
         belief.depth_w2[0] = 0.0
         if known and rays.max() == 1:
             alone = self._rig.cameras.centre[(self._observed.weight > 0.0).sum(axis=1).argmax()]
-            sight = self.state.palm[:3, 3] - alone
+            sight = self._now.palm[:3, 3] - alone
             belief.sight[:] = sight / np.sqrt(sight @ sight)
             belief.depth_w2[0] = self.settings.held_depth_m**-2.0
         belief.sensed_known[0] = 0.0 if sensed is None else 1.0
@@ -452,14 +452,17 @@ class Estimator:
             return len(points) > 0
         if len(points) < 2:
             return False
-        _, extent, axes = np.linalg.svd(points - points.mean(axis=0))
+        off = points - points.mean(axis=0)
+        if len(points) > 2 and _surely_spread(off):
+            return True
+        _, extent, axes = np.linalg.svd(off)
         if len(points) > 2 and extent[1] > _SPREAD_M:
             return True
         return back and bool(extent[0] > _LENGTH_M and abs(axes[0] @ epoch.facing) < _ACROSS)
 
     def _knows_place(self) -> bool:
         """Whether it is still known where the hand is, when nothing but its fingers is told."""
-        return self.known and float(np.trace(self.state.cov[3:6, 3:6])) < 3.0 * _SOMEWHERE_M**2
+        return self.known and float(np.trace(self._now.cov[3:6, 3:6])) < 3.0 * _SOMEWHERE_M**2
 
     def _habits_of(self, unlike: frozenset[int]) -> Habits:
         """Habits while some fingers are bent unlike the others; each of the 32 sets is worked out once."""
@@ -494,8 +497,8 @@ class Estimator:
         return rests
 
     def _fitted(self, at: Epoch, out: Estimate, rests: Int, *, anew: bool) -> Fitted:
-        found, sensed = self._space.found, at.sensed
-        recent = (at.t_ns - int(self.state.seen_ns[0])) * 1e-9 <= self.settings.forget_s
+        found, sensed, out = self._at.found, at.sensed, fields(out)
+        recent = (at.t_ns - int(self._now.seen_ns[0])) * 1e-9 <= self.settings.forget_s
         if sensed is not None:  # a tip that is measured stays so
             by_others = CHAINS[sensed.told & (rests[:5] & ON_MARKERS == 0)]
             out.source[by_others] = Source.WRIST
@@ -505,6 +508,7 @@ class Estimator:
             joints=HandJoints(out.position, out.rotation, out.palm),
             cov_m2=out.cov,
             tilt_cov_rad2=out.tilt,
+            tilt_walk_rad2_s2=out.tilt_walk,
             alone=found.cov.copy(),
             x=found.x.copy(),
             scale=float(found.scale[0]),
@@ -521,6 +525,14 @@ class Estimator:
             anew,
             sensed,
         )
+
+
+def _surely_spread(off: Float) -> bool:
+    """Whether points (N, 3) [m] about their mean are plainly not in one line: without what a decomposition takes."""
+    length2 = np.vecdot(off, off)
+    along = off @ off[length2.argmax()]
+    aside2 = length2 - along * along / length2.max()
+    return float(aside2.max()) > (4.0 * _SPREAD_M) ** 2
 
 
 def _unknown(rests: Int) -> Fitted:

@@ -19,22 +19,16 @@ from master.estimator.hand_tables import HandTables, Mounts
 class Scratch:
     """Room for the intermediate results of kernels; holds nothing from one call to the next."""
 
-    back: Float  # (3,)
-    shift: Float  # (3,)
-    slope: Float  # (3, 3)
-    there: Float  # (3,)
     uv: Float  # (2,)
     J: Float  # (2, 3)
-    A: Float  # (2, 6)
     K: Float  # (3, 3)
     gain: Float  # (3,)
-    left: Float  # (6, 3)
-    gained: Float  # (6, 3)
-    H: Float  # (6, 6)
-    g: Float  # (6,)
+    left: Float  # (3, 3)
+    gained: Float  # (3, 3)
+    H: Float  # (3, 3)
+    g: Float  # (3,)
     by_place: Float  # (10, 3)
-    by_turn: Float  # (10, 3)
-    rows: Float  # (10, 6)
+    rows: Float  # (10, 3)
     angles: Float  # (20,)
     by: Float  # (20, 4)
     R: Float  # (5, 4, 3, 3)
@@ -48,22 +42,16 @@ class Scratch:
         """Allocate it."""
         return record(
             cls,
-            back=3,
-            shift=3,
-            slope=(3, 3),
-            there=3,
             uv=2,
             J=(2, 3),
-            A=(2, 6),
             K=(3, 3),
             gain=3,
-            left=(6, 3),
-            gained=(6, 3),
-            H=(6, 6),
-            g=6,
+            left=(3, 3),
+            gained=(3, 3),
+            H=(3, 3),
+            g=3,
             by_place=(10, 3),
-            by_turn=(10, 3),
-            rows=(10, 6),
+            rows=(10, 3),
             angles=20,
             by=(20, 4),
             R=(5, 4, 3, 3),

@@ -29,8 +29,8 @@ from master.fabrik.intersection import triangulate
 from master.fabrik.rays import RayPositions, RayTriangulator
 from master.fabrik.solver import FabrikSolver
 from master.fabrik.sync import FrameSet
+from master.fusion.orientation import OrientationTrack
 from master.fusion.sensed_hand import MarkerCheck, SensedHand
-from master.ik.orientation import OrientationTrack
 
 Stage = Callable[[str], AbstractContextManager[None]]
 _NAME = 64  # characters of a name in `Health`
@@ -209,17 +209,18 @@ class MarkerPipeline:
     ) -> Fitted:
         """The hand that explains the pixels of one epoch best."""
         with self._stage("hand"):
-            variance, common = frames.sigma_px**2 + self._rays_px**2, np.zeros(len(self.markers))
+            uv, variance = frames.uv, frames.sigma_px**2 + self._rays_px**2
+            own = np.zeros((len(self.markers), 3, 3))
             if isinstance(found, RayPositions):
-                variance, common = found.variance_px2, found.common_m2
+                uv, variance, own = found.uv, found.variance_px2, found.own_m2
             hand = estimator.push(
                 Epoch(
                     frames.t_ns,
                     found.points_m,
                     line.facing,
-                    uv=frames.uv,
+                    uv=uv,
                     variance_px2=variance,
-                    common_m2=common,
+                    own_m2=own,
                     sensed=self._sensed(estimator, frames.t_ns, line, found),
                     start=line.solution if line.solved else None,
                 )

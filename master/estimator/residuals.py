@@ -1,18 +1,17 @@
 """Kernels of what is measured: predicted values, residuals and their derivatives.
 
-A RAY row is where a camera would see a marker, minus where it did [px]. A camera sees the side of a painted finger end
-that faces it, so the centroid of what it sees is off that of the cap by a shift that follows from the direction in
-which the finger points: both, place and direction, are the body point's. A POINT row is a measured place [m].
+A RAY row is where a camera would see a marker, minus where it did [px], without what the side of a painted cap that it
+sees shifts its centroid by (`master.fabrik.rays`). A POINT row is a measured place [m].
 
-What is wrong with the marker itself, such as paint and bones, is seen by all cameras alike. It is a shift d of the
-marker with a covariance S, and is integrated out: with H, g the information and gradient of the rays,
+What is wrong with the marker itself, such as paint, bones and the side of a cap that is not known, is seen by all
+cameras. It is a shift d of the marker with a covariance S, and is integrated out: with H, g the information and
+gradient of the rays,
 
     H - H (H + S^-1)^-1 H,   g - H (H + S^-1)^-1 g,   cost - g' (H + S^-1)^-1 g / 2
 
 so a marker that one camera sees tells two numbers and one that sixteen see is no surer than its paint.
 """
 
-from math import acos, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -22,9 +21,7 @@ from common.kernels import inlined, kernel
 from master.estimator.cameras import CameraArrays, project
 from master.estimator.kinematics import Scratch
 from master.estimator.matrices import inverse_3
-from master.fabrik.caps import CapTables
 
-_POLE = 0.05  # least sine of the angle between finger and sight of the slopes of the tables
 _BEHIND = 1e4  # half chi square of a marker behind a camera that sees it
 _NOWHERE = 1.0  # [1/m^2] information about a marker that no row tells of
 
@@ -65,109 +62,39 @@ class Observations(NamedTuple):
 
 
 @inlined
-def cap_shift(caps: CapTables, row: int, ahead: Float, back: Float, shift: Float, slope: Float) -> None:
-    """Write the shift of a cap's seen centroid, and how it changes with the finger's direction.
-
-    With c the cosine between both directions, the shift is (F - c G) ahead + G back; F and G are tabulated.
-
-    Args:
-        caps, row: The cap.
-        ahead, back: (3,) unit vectors along the finger and to the eye.
-        shift, slope: Written: (3,) [m], (3, 3) [m].
-    """
-    cosine = ahead[0] * back[0] + ahead[1] * back[1] + ahead[2] * back[2]
-    cosine = min(max(cosine, -1.0), 1.0)
-    sine = max(sqrt(1.0 - cosine * cosine), _POLE)
-    last = caps.looks.shape[1] - 1
-    per_rad = last / np.pi
-    at = acos(cosine) * per_rad
-    low = min(int(at), last - 1)
-    part = at - low
-    f0, f1 = caps.looks[row, low, 0], caps.looks[row, low + 1, 0]
-    g0, g1 = caps.looks[row, low, 1], caps.looks[row, low + 1, 1]
-    f, g = (1.0 - part) * f0 + part * f1, ((1.0 - part) * g0 + part * g1) / sine
-    df = -(f1 - f0) * per_rad / sine  # by the cosine
-    dg = -((g1 - g0) * per_rad - cosine * g) / (sine * sine) if sine > _POLE else 0.0
-    along = f - cosine * g
-    for i in range(3):
-        shift[i] = along * ahead[i] + g * back[i]
-        for j in range(3):
-            by_cosine = (df - g - cosine * dg) * ahead[i] + dg * back[i]
-            slope[i, j] = by_cosine * back[j] + (along if i == j else 0.0)
-
-
-@inlined
-def _ray(
-    cameras: CameraArrays,
-    caps: CapTables,
-    observed: Observations,
-    c: int,
-    m: int,
-    point: Float,
-    ahead: Float,
-    work: Scratch,
-) -> float:
-    """Add one RAY row to information and gradient by place and direction; return half chi square."""
-    back, A, g, H = work.back, work.A, work.g, work.H
-    length = 0.0
-    for i in range(3):
-        back[i] = cameras.centre[c, i] - point[i]
-        length += back[i] * back[i]
-    length = sqrt(length)
-    row = caps.row[m]
-    for i in range(3):
-        back[i] /= length
-        work.there[i] = point[i]
-    if row >= 0:
-        cap_shift(caps, row, ahead, back, work.shift, work.slope)
-        for i in range(3):
-            work.there[i] += work.shift[i]
-    if not project(cameras, c, work.there, work.uv, work.J):
+def _ray(cameras: CameraArrays, observed: Observations, c: int, m: int, point: Float, work: Scratch) -> float:
+    """Add one RAY row to information and gradient by place; return half chi square."""
+    J, g, H = work.J, work.g, work.H
+    if not project(cameras, c, point, work.uv, J):
         return _BEHIND
-    for k in range(2):
-        for i in range(3):
-            A[k, i], A[k, 3 + i] = work.J[k, i], 0.0
-            if row >= 0:
-                for j in range(3):
-                    A[k, 3 + i] += work.J[k, j] * work.slope[j, i]
     w, r0, r1 = observed.weight[c, m], work.uv[0] - observed.uv[c, m, 0], work.uv[1] - observed.uv[c, m, 1]
-    for a in range(6 if row >= 0 else 3):
-        g[a] += w * (A[0, a] * r0 + A[1, a] * r1)
-        for b in range(a + 1):
-            H[a, b] += w * (A[0, a] * A[0, b] + A[1, a] * A[1, b])
-            H[b, a] = H[a, b]
+    for a in range(3):
+        g[a] += w * (J[0, a] * r0 + J[1, a] * r1)
+        for b in range(3):
+            H[a, b] += w * (J[0, a] * J[0, b] + J[1, a] * J[1, b])
     return 0.5 * w * (r0 * r0 + r1 * r1)
 
 
 @inlined
 def marker_rows(
-    cameras: CameraArrays,
-    caps: CapTables,
-    observed: Observations,
-    m: int,
-    point: Float,
-    ahead: Float,
-    work: Scratch,
+    cameras: CameraArrays, observed: Observations, m: int, point: Float, work: Scratch
 ) -> tuple[float, float]:
-    """Write information and gradient of one marker by its place and direction.
-
-    Into work.H (6, 6) and work.g (6,).
+    """Write information and gradient of one marker by its place, to work.H (3, 3) and work.g (3,).
 
     Args:
-        cameras, caps, observed, m: What is seen of which marker.
+        cameras, observed, m: What is seen of which marker.
         point: (3,) [m] where the hand has the marker, rig frame.
-        ahead: (3,) unit vector in which its finger points; not used of a marker on the palm.
         work: Written.
 
     Returns:
         Half chi square, and chi square of the place alone: without what rays that do not meet have between them.
     """
-    H, g, K, gain = work.H, work.g, work.K, work.gain
-    for a in range(6):
-        g[a] = 0.0
-        for b in range(6):
-            H[a, b] = 0.0
+    H, g, K, gain, left = work.H, work.g, work.K, work.gain, work.left
     cost = 0.0
+    for a in range(3):
+        g[a] = 0.0
+        for b in range(3):
+            H[a, b] = 0.0
     if observed.placed[m]:
         for i in range(3):
             for j in range(3):
@@ -177,7 +104,7 @@ def marker_rows(
         return cost, 2.0 * cost
     for c in range(observed.uv.shape[0]):
         if observed.weight[c, m] > 0.0:
-            cost += _ray(cameras, caps, observed, c, m, point, ahead, work)
+            cost += _ray(cameras, observed, c, m, point, work)
     for i in range(3):
         for j in range(3):
             K[i, j] = _NOWHERE if i == j else 0.0
@@ -189,15 +116,17 @@ def marker_rows(
     for i in range(3):
         gain[i] = K[i, 0] * g[0] + K[i, 1] * g[1] + K[i, 2] * g[2]
         shared += g[i] * gain[i]
-    left, gained = work.left, work.gained
-    for a in range(6):
-        for i in range(3):
-            left[a, i] = H[a, i]
-            gained[a, i] = H[a, 0] * K[0, i] + H[a, 1] * K[1, i] + H[a, 2] * K[2, i]
-    for a in range(6):
+        for j in range(3):
+            left[i, j] = H[i, j]
+    for a in range(3):
         g[a] -= left[a, 0] * gain[0] + left[a, 1] * gain[1] + left[a, 2] * gain[2]
-        for b in range(6):
-            H[a, b] -= gained[a, 0] * left[b, 0] + gained[a, 1] * left[b, 1] + gained[a, 2] * left[b, 2]
+        for k in range(3):
+            work.gained[a, k] = left[a, 0] * K[0, k] + left[a, 1] * K[1, k] + left[a, 2] * K[2, k]
+        for b in range(3):
+            total = 0.0
+            for k in range(3):
+                total += work.gained[a, k] * left[b, k]
+            H[a, b] -= total
     return cost - 0.5 * shared, max(whole - shared, 0.0)
 
 

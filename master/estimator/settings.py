@@ -69,10 +69,6 @@ class Settings(NamedTuple):
         float, Range("rad", 0.05, 1.5, "a marker on the back that is seen well faces the cameras")
     ] = radians(22.0)
     bones_m: Annotated[float, Range("m", 1e-4, 1e-2, "bones and caps are known to about 1 mm")] = 1.0e-3
-    relief_m: Annotated[
-        float, Range("m", 1e-5, 1e-2, "16 mm of paint on a back of 50 mm radius bulge by 0.6 mm")
-    ] = 0.4e-3
-    radius_share: Annotated[float, Range("1", 0.0, 1.0, "relative error of a profile's radii")] = 0.1
     # How far a hand that is seen moves in a time, as a random walk: wide, so that what is seen decides.
     walk_rad_s: Annotated[float, Range("rad/s", 0.5, 50.0, _HANDS)] = 8.0
     palm_walk_rad_s: Annotated[float, Range("rad/s", 0.1, 50.0, _HANDS)] = 3.0
@@ -142,6 +138,11 @@ class Settings(NamedTuple):
     tracked_age_s: Annotated[
         float, Range("s", 0.0, 1.0, "how old the newest measurement of a TRACKED finger may be")
     ] = 0.05
+    # What is shown.
+    blend_s: Annotated[float, Range("s", 0.01, 1.0, "as long as a leap is seen as a motion")] = 0.1
+    elsewhere_m: Annotated[
+        float, Range("m", 1e-3, 0.1, "a joint shown farther from where it is solved to be is not TRACKED")
+    ] = 5e-3
     # The search.
     tolerance: Annotated[float, Range("half chi square", 1e-12, 1.0, "what a step may leave")] = 1e-7
     tolerance_share: Annotated[float, Range("1", 0.0, 0.1, "of the cost, likewise")] = 1e-4

@@ -30,7 +30,6 @@ from master.estimator.kinematics import (
 from master.estimator.matrices import cholesky, copy, substitute
 from master.estimator.priors import Habits
 from master.estimator.residuals import Observations, marker_rows
-from master.fabrik.caps import CapTables
 
 MAX_ITERATIONS = 25
 _FIRST_DAMPING, _MOST_DAMPING = 1e-3, 1e6
@@ -43,7 +42,6 @@ class Rig(NamedTuple):
     hand: HandTables
     mounts: Mounts
     cameras: CameraArrays
-    caps: CapTables
 
 
 class Belief:
@@ -339,44 +337,27 @@ def _marker(
 ) -> float:
     """Add the rows of one marker; return their cost."""
     work, hand, mounts = search.rows, rig.hand, rig.mounts
-    f, level = mounts.finger[m], mounts.level[m]
+    f = mounts.finger[m]
     marker_point(mounts, m, T, work.R, work.P, work.point)
-    turns = f >= 0 and rig.caps.row[m] >= 0 and not observed.placed[m]
+    cost, search.surprise[m] = marker_rows(rig.cameras, observed, m, work.point, work)
+    search.apart[0] += cost - 0.5 * search.surprise[m]
     for i in range(3):
         work.arm[i] = work.point[i] - T[i, 3]
-        work.ahead[i] = -work.R[f, level, i, 2] if f >= 0 else 0.0
-    cost, search.surprise[m] = marker_rows(rig.cameras, rig.caps, observed, m, work.point, work.ahead, work)
-    size, start = 6, 0
-    palm_slopes(work.arm, work.by_place)
+        for j in range(3):
+            search.information[m, i, j] = work.H[i, j]
+    size, start, D = 6, 0, work.by_place
+    palm_slopes(work.arm, D)
     if f >= 0:
         start = hand.first[f]
         size += hand.first[f + 1] - start
-        finger_slopes(hand, work.by, T, work.R, work.P, f, level, work.point, False, work.by_place)
-    if turns:
-        palm_slopes(work.ahead, work.by_turn)
-        finger_slopes(hand, work.by, T, work.R, work.P, f, level, work.ahead, True, work.by_turn)
-    rows = 6 if turns else 3
+        finger_slopes(hand, work.by, T, work.R, work.P, f, mounts.level[m], work.point, False, D)
     for a in range(size):
-        shifted = 3 <= a < 6
-        for k in range(rows):
-            total = 0.0
-            for i in range(3):
-                total += work.by_place[a, i] * work.H[i, k]
-                if turns and not shifted:
-                    total += work.by_turn[a, i] * work.H[3 + i, k]
-            work.rows[a, k] = total
         ia = a if a < 6 else start + a
-        for i in range(3):
-            gradient[ia] += work.by_place[a, i] * work.g[i]
-            if turns and not shifted:
-                gradient[ia] += work.by_turn[a, i] * work.g[3 + i]
+        gradient[ia] += D[a, 0] * work.g[0] + D[a, 1] * work.g[1] + D[a, 2] * work.g[2]
+        for k in range(3):
+            work.rows[a, k] = D[a, 0] * work.H[0, k] + D[a, 1] * work.H[1, k] + D[a, 2] * work.H[2, k]
         for b in range(a + 1):
-            total = 0.0
-            for i in range(3):
-                total += work.rows[a, i] * work.by_place[b, i]
-            if turns and not 3 <= b < 6:
-                for i in range(3):
-                    total += work.rows[a, 3 + i] * work.by_turn[b, i]
+            total = work.rows[a, 0] * D[b, 0] + work.rows[a, 1] * D[b, 1] + work.rows[a, 2] * D[b, 2]
             ib = b if b < 6 else start + b
             normal[ia, ib] += total
             if a != b:

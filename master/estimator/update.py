@@ -17,7 +17,6 @@ from master.estimator.residuals import Observations, marker_rows
 from master.estimator.settings import Settings
 from master.estimator.solve import Belief, Rig, Search, descend
 from master.estimator.state import NEVER_NS, PALM_PART, HandState, Hidden, forget, grow, predict
-from master.fabrik.caps import CapTables
 
 _QUANTILE_95 = 7.815  # chi square of three numbers
 TRACK, BEGIN, ROUGH, TAKE_OVER = 0, 1, 2, 3
@@ -33,6 +32,7 @@ class Estimate:
         position, rotation: (26, 3) [m], (26, 3, 3), rig frame.
         cov: (26, 3, 3) [m^2] of the joints.
         tilt: (5, 3, 3) [rad^2] of the last phalanges' directions, by this instant alone.
+        tilt_walk: (5,) [rad^2/s^2] by how much their trace is expected to grow, by the time squared.
         tracked: (26,), and `source` (26,) as of `HandPose`.
     """
 
@@ -42,6 +42,7 @@ class Estimate:
     rotation: Float
     cov: Float
     tilt: Float
+    tilt_walk: Float
     tracked: Bool
     source: Code
 
@@ -56,6 +57,7 @@ class Estimate:
             rotation=(26, 3, 3),
             cov=(26, 3, 3),
             tilt=(5, 3, 3),
+            tilt_walk=5,
             tracked=("u1", 26),
             source=("u1", 26),
         )
@@ -138,11 +140,10 @@ def chi_square(
     for m in range(mounts.finger.shape[0]):
         if not observed.seen[m]:
             continue
-        f, kept = mounts.finger[m], search.J
+        kept = search.J
         own = observed.information[m] if observed.placed[m] else observed.own[m]
         marker_point(mounts, m, T, work.R, work.P, work.point)
         for i in range(3):
-            work.ahead[i] = -work.R[f, mounts.level[m], i, 2] if f >= 0 else 0.0
             for j in range(3):
                 kept[i, j], work.K[i, j] = own[i, j], 0.0
         if walked_m > 0.0:
@@ -150,7 +151,7 @@ def chi_square(
             for i in range(3):
                 own[i, i] += walked_m * walked_m
             inverse_3(own, work.K, own)
-        _, chi2 = marker_rows(rig.cameras, rig.caps, observed, m, work.point, work.ahead, work)
+        _, chi2 = marker_rows(rig.cameras, observed, m, work.point, work)
         copy(kept, own)
         total += chi2
     return total
@@ -273,7 +274,7 @@ def _take_over(
     chains(hand, found.palm, work.angles, work.R, work.P)
     joints(hand, found.palm, work.R, work.P, out.position, out.rotation)
     linear(hand, found.palm, state.cov, work, room, out.cov)
-    tilts(hand, found.palm, found.cov, work, room, out.tilt)
+    tilts(hand, settings, found.palm, found.cov, work, room, out.tilt, out.tilt_walk)
     best = 0 if space.room.share[0] >= space.room.share[1] else 1
     add_arcs(
         rig,
@@ -309,7 +310,6 @@ class Model(NamedTuple):
     settings: Any
     mounts: Mounts
     cameras: CameraArrays
-    caps: CapTables
 
 
 @kernel
@@ -343,7 +343,7 @@ def epoch(
         Of ROUGH: the cost.
     """
     state, space, out, settings = boxed_state[0], boxed_space[0], boxed_out[0], model.settings[0]
-    rig = Rig(model.hand[0], model.mounts, model.cameras, model.caps)
+    rig = Rig(model.hand[0], model.mounts, model.cameras)
     task = space.task
     what, t_ns, palm_shown = task.what[0], task.t_ns[0], task.palm_shown[0] > 0
     shown, numbers, may_leave = task.shown, task.numbers[0], task.may_leave[0] > 0

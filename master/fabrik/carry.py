@@ -15,7 +15,7 @@ the time adds in proportion to the marker's speed in the image.
 
 Where a slave named two places of a colour, the marker and its *rival*, it may have swapped them from one frame to the
 next, and a line from one thing to another is nowhere. The places of such a marker are first sorted into two tracks by
-nearness in the image. Which of the two is the marker is decided with the other cameras (`master.stereo.rivals`).
+nearness in the image. Which of the two is the marker is decided with the other cameras (`master.estimator.gate`).
 """
 
 from math import exp, hypot, inf, isfinite, isnan, log, nan, sqrt

@@ -5,9 +5,12 @@ differences of variance 6 s^2; of steps dt, k dt it is 2 (1 + k + k^2) s^2 where
 keeps a share p from sample to sample they show only 1 - 4/3 p + p^2 / 3.
 """
 
+from math import isnan
+
 import numpy as np
 
-from common.arrays import Float
+from common.arrays import Float, Int
+from common.kernels import kernel
 
 _MEMORY_S = 0.4  # a few swings of a trembling hand
 # A solved pose is a prior of the next, so its noise stays in part: of seven tenths, a quarter shows.
@@ -19,10 +22,8 @@ class NoiseEstimator:
 
     def __init__(self) -> None:
         """Nothing is known yet: the noise counts as none."""
-        self._sample: Float | None = None
-        self._step: Float | None = None
-        self._t_ns, self._dt_s = 0, 0.0
-        self._variance = np.zeros(1)
+        self._count, self._dt_s = np.zeros(2, np.int64), np.zeros(1)
+        self._past = np.empty((3, 0))
 
     def push(self, t_ns: int, values: Float, largest: Float) -> Float:
         """Variances (n,) of the noise of one sample, as those before it show.
@@ -33,14 +34,36 @@ class NoiseEstimator:
             largest: (n,) largest variances that their noise may have, for what is more is acceleration; NaN: not
                 known.
         """
-        known = np.fmin(self._variance, largest) / _SHOWN
-        if self._sample is not None:
-            dt_s, step = 1e-9 * (t_ns - self._t_ns), values - self._sample
-            if self._step is not None:
-                ratio = dt_s / self._dt_s
-                off = step - ratio * self._step
-                shown = off * off / (2.0 * (1.0 + ratio + ratio * ratio))
-                self._variance = self._variance + dt_s / (_MEMORY_S + dt_s) * (shown - self._variance)
-            self._step, self._dt_s = step, dt_s
-        self._sample, self._t_ns = values, t_ns
+        if self._count[0] == 0:
+            self._past = np.zeros((3, len(values)))
+        known = np.empty(len(values))
+        measure(t_ns, values, largest, self._count, self._dt_s, self._past, known)
         return known
+
+
+@kernel
+def measure(
+    t_ns: int, values: Float, largest: Float, count: Int, dt_s: Float, past: Float, known: Float
+) -> None:
+    """Write the variances (n,) of the noise of one sample, and take it in.
+
+    Args:
+        t_ns, values, largest: As of `NoiseEstimator.push`.
+        count: (2,) how many samples came, and the time of the last [ns]; changed, as is all that follows.
+        dt_s: (1,) length of the last step.
+        past: (3, n) last sample and step, and variance that shows.
+        known: (n,) written.
+    """
+    passed_s = 1e-9 * (t_ns - count[1])
+    ratio = passed_s / dt_s[0] if count[0] > 1 else 0.0
+    for i in range(values.shape[0]):
+        step, variance = values[i] - past[0, i], past[2, i]
+        smaller = largest[i] < variance or isnan(variance)
+        known[i] = (largest[i] if smaller else variance) / _SHOWN
+        if count[0] > 1:
+            off = step - ratio * past[1, i]
+            shown = off * off / (2.0 * (1.0 + ratio + ratio * ratio))
+            past[2, i] += passed_s / (_MEMORY_S + passed_s) * (shown - variance)
+        past[0, i], past[1, i] = values[i], step
+    dt_s[0] = passed_s
+    count[0], count[1] = count[0] + 1, t_ns

@@ -50,7 +50,7 @@ from common.kernels import kernel
 # rest is light and shape, which stay.
 FRESH = 0.25
 _QUANTILE = 9.0  # chi-square, one degree of freedom, 99.7 %: what is beyond is motion
-_NEVER = -(2**63)
+UNSEEN_NS = -(2**63)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +87,11 @@ class OneEuroParameters:
         """What a rig file says [Hz, m, s]."""
         return cls(settings.min_cutoff_hz, settings.beta, settings.d_cutoff_hz, jitter=settings.jitter_m)
 
+    def array(self) -> Float:
+        """The settings (5,) as `filter_step` takes them."""
+        rates = (self.min_cutoff_hz, self.beta, self.d_cutoff_hz)
+        return np.array([*rates, self.restart_gap_s, self.jitter**2])
+
 
 class OneEuro:
     """Push machine; holds each signal's filtered value, speed and last time."""
@@ -102,15 +107,7 @@ class OneEuro:
         self.late = 0
         self._groups = groups
         self._t_ns: int | None = None
-        self._settings = np.array(
-            [
-                parameters.min_cutoff_hz,
-                parameters.beta,
-                parameters.d_cutoff_hz,
-                parameters.restart_gap_s,
-                parameters.jitter**2,
-            ]
-        )
+        self._settings = parameters.array()
         self._shape: tuple[int, ...] = ()
         self._unknown = self._x = self._speed = self._last = np.empty(0)
         self._seen_ns: Int = np.empty(0, np.int64)
@@ -145,7 +142,7 @@ class OneEuro:
 
     def _step(self, t_ns: int, values: Float, variance: Float) -> Float:
         out = np.empty(len(values))
-        _step(
+        filter_step(
             t_ns,
             values,
             variance,
@@ -170,7 +167,7 @@ class OneEuro:
         self._group = np.repeat(np.arange(len(sizes)), sizes)
         self._fastest = np.zeros((len(sizes), 2))
         self._x, self._speed, self._unknown = np.zeros(n), np.zeros(n), np.full(n, nan)
-        self._seen_ns = np.full(n, _NEVER)
+        self._seen_ns = np.full(n, UNSEEN_NS)
 
 
 class PointFilter:
@@ -206,7 +203,7 @@ def _flat(values: Float) -> Float:
 
 
 @kernel
-def _step(
+def filter_step(
     t_ns: int,
     values: Float,
     variance: Float,
@@ -223,7 +220,7 @@ def _step(
     Args:
         t_ns: Later than that of the last sample.
         values, variance: (N,) as of `OneEuro.push`.
-        settings: (5,) min_cutoff_hz, beta, d_cutoff_hz, restart_gap_s, jitter squared.
+        settings: (5,) min_cutoff_hz, beta, d_cutoff_hz, restart_gap_s, jitter squared: `OneEuroParameters.array`.
         group: (N,) number of each signal's group.
         fastest: (G, 2) scratch: speed of each group, and the largest u squared.
         x, speed, seen_ns: (N,) state, changed.
@@ -235,7 +232,7 @@ def _step(
         out[i] = nan
         if not isfinite(values[i]):
             continue
-        dt = 1e-9 * (t_ns - seen_ns[i]) if seen_ns[i] != _NEVER else inf
+        dt = 1e-9 * (t_ns - seen_ns[i]) if seen_ns[i] != UNSEEN_NS else inf
         if dt > restart_gap:
             x[i], speed[i], seen_ns[i] = values[i], 0.0, t_ns
             out[i] = values[i]

@@ -64,6 +64,8 @@ class _Hand(NamedTuple):
         R: (K, 3, 3) rotations of the tip joints, rig frame.
         tilt_rad2: (K, 3, 3) covariance of their directions.
         turned_rad2: Variance that their age adds.
+        at: (K, 3) [m] about where they are.
+        walked: (K,) by how much more their tilt may have grown to a fit that starts there; as a share of its variance.
     """
 
     known: bool
@@ -71,6 +73,8 @@ class _Hand(NamedTuple):
     R: Float
     tilt_rad2: Float
     turned_rad2: float
+    at: Float
+    walked: Float
 
 
 @kernel
@@ -82,9 +86,14 @@ def _covariance(
     shared: float,
     rays: Rays,
     views: Views,
+    walked: float,
     cov: Float,
+    own: Float,
 ) -> None:
-    """Write the covariance (3, 3) of a refined point: all parts (see the module)."""
+    """Write the covariance (3, 3) of a refined point: all parts (see the module); and of them what rays do not show.
+
+    `walked`: as of `_Hand`.
+    """
     moved, gain = views.moved, np.empty((3, 2))
     step, both = np.zeros((3, 3)), np.zeros((3, 3))  # of the point by a common step; gain gain'
     for t in range(count):
@@ -107,10 +116,13 @@ def _covariance(
     for i in range(3):
         for j in range(3):
             common = step[i, 0] * step[j, 0] + step[i, 1] * step[j, 1] + step[i, 2] * step[j, 2] - both[i, j]
-            total = rays.cov[i, j] + shared * common + CAPS.radius_share**2 * moved[0, i] * moved[0, j]
+            shape = CAPS.radius_share**2 * moved[0, i] * moved[0, j]
+            shape += CAPS.relief_m**2 if row < 0 and i == j else 0.0
+            tilt = 0.0
             for t in range(1, count):
-                total += (moved[t, i] - moved[0, i]) * (moved[t, j] - moved[0, j]) / (count - 1)
-            cov[i, j] = total + (CAPS.relief_m**2 if row < 0 and i == j else 0.0)
+                tilt += (moved[t, i] - moved[0, i]) * (moved[t, j] - moved[0, j]) / (count - 1)
+            cov[i, j] = rays.cov[i, j] + shared * common + shape + tilt
+            own[i, j] = shape + (1.0 + walked) * tilt
 
 
 @kernel
@@ -180,6 +192,33 @@ def _place(
 
 
 @kernel
+def _lone(
+    cameras: CameraArrays,
+    caps: CapTables,
+    hand: _Hand,
+    rays_px: float,
+    row: int,
+    area: Float,
+    rays: Rays,
+    views: Views,
+) -> None:
+    """Take the cap's bias from the centroid of a single camera, as the hand has the cap.
+
+    Its uncertain tilt is that camera's own error.
+    """
+    for i in range(3):
+        rays.point[i] = hand.at[row, i]
+    for c in range(rays.weight.shape[0]):
+        views.area[c] = area[c] if rays.weight[c] > 0.0 else np.nan
+    count, _ = _correct(cameras, caps, hand, rays_px, row, rays, views)
+    for c in range(rays.weight.shape[0]):
+        for t in range(1, count):
+            for axis in range(2):
+                off = views.bias[t, c, axis] - views.bias[0, c, axis]
+                rays.variance[c] += off * off / (2.0 * (count - 1))
+
+
+@kernel
 def locate(
     cameras: CameraArrays,
     caps: CapTables,
@@ -190,14 +229,17 @@ def locate(
     R: Float,
     tilt_rad2: Float,
     turned_rad2: float,
+    at: Float,
+    walked: Float,
     observed: Float,
     points: Float,
     cov: Float,
     noise: Float,
     apart: Bool,
     left_out: Bool,
+    uv: Float,
     variance: Float,
-    common: Float,
+    own: Float,
 ) -> None:
     """Locate M markers with covariance.
 
@@ -205,15 +247,14 @@ def locate(
         cameras, caps: Of the rig.
         rays_px: Standard deviation per axis that the calibration leaves.
         limits: (C + 1,) most chi-square by the number of cameras.
-        known, as_seen, R, tilt_rad2, turned_rad2: Directions of the caps, as of `_Hand`.
+        known, as_seen, R, tilt_rad2, turned_rad2, at, walked: Directions of the caps, as of `_Hand`.
         observed: (C, M, 4) u, v, sigma [px], area [px^2]; NaN: not seen.
         points, cov, noise: (M, 3), (M, 3, 3), (M, 3, 3) written as of `MarkerPositions`.
         apart: (M,) written: two cameras or more see it, but their rays do not meet.
         left_out: (C, M) written: outliers, without which they do.
-        variance: (C, M) written: [px^2] of each camera's own errors; NaN: not seen, or not to be used.
-        common: (M,) written: [m^2] variance of what all cameras see alike.
+        uv, variance, own: Written, as of `RayPositions`.
     """
-    hand = _Hand(known, as_seen, R, tilt_rad2, turned_rad2)
+    hand = _Hand(known, as_seen, R, tilt_rad2, turned_rad2, at, walked)
     rays, views = rays_of(observed.shape[0]), views_of(observed.shape[0])
     for m in range(observed.shape[1]):
         for c in range(observed.shape[0]):
@@ -230,19 +271,28 @@ def locate(
                 meets = placed and chi_square(rays) <= limits[seen]
                 left_out[odd, m] = meets
         apart[m] = seen >= 2 and not meets
+        row = caps.row[m]
+        for i in range(3):
+            for j in range(3):
+                own[m, i, j] = 0.0
         if meets:
-            _covariance(cameras, caps, caps.row[m], count, shared, rays, views, cov[m])
-        common[m] = 0.0
+            much = walked[row] if known and row >= 0 else 0.0
+            _covariance(cameras, caps, row, count, shared, rays, views, much, cov[m], own[m])
+        elif seen == 1 and known and row >= 0:
+            _lone(cameras, caps, hand, rays_px, row, observed[:, m, 3], rays, views)
+        common = 0.0
         for c in range(observed.shape[0]):
             used = rays.weight[c] > 0.0 and not apart[m]
-            own = rays.variance[c] + rays_px * rays_px - (shared if meets else 0.0)
-            variance[c, m] = own if used else np.nan
+            alone = rays.variance[c] + rays_px * rays_px - (shared if meets else 0.0)
+            variance[c, m] = alone if used else np.nan
+            uv[c, m, 0], uv[c, m, 1] = rays.uv[c, 0], rays.uv[c, 1]
             if meets and used:
                 squared = 0.0
                 for i in range(3):
                     squared += (rays.point[i] - cameras.centre[c, i]) ** 2
-                common[m] += shared * squared / (cameras.scale[c] ** 2 * seen)
+                common += shared * squared / (cameras.scale[c] ** 2 * seen)
         for i in range(3):
+            own[m, i, i] += common
             points[m, i] = rays.point[i] if meets else np.nan
             for j in range(3):
                 noise[m, i, j] = rays.cov[i, j] if meets else np.nan
@@ -255,12 +305,15 @@ class RayPositions(MarkerPositions):
     """Markers placed by rays, with what each ray is worth.
 
     Attributes:
+        uv: (C, M, 2) [px] centroids without the bias of the caps; NaN: not seen.
         variance_px2: (C, M) per axis, of each camera's own errors; NaN: not seen, an outlier, or rays do not meet.
-        common_m2: (M,) variance of what all cameras see alike.
+        own_m2: (M, 3, 3) covariance of what is wrong with the markers themselves: what all cameras see alike, the tilt
+            and the radius of caps; as large as a fit that starts from the same hand must believe.
     """
 
+    uv: Float
     variance_px2: Float
-    common_m2: Float
+    own_m2: Float
 
 
 class RayTriangulator:
@@ -298,12 +351,21 @@ class RayTriangulator:
         observed = np.empty((cameras, count, 4))
         observed[..., :2], observed[..., 2], observed[..., 3] = uv, sigma_px, area_px2
         R = tilt = self._unknown
+        at, walked = self._unknown[:, 0], self._unknown[:, 0, 0]
         if hand is not None:
             R, tilt = hand.joints.rotation[self._caps.joint], hand.tilt_cov_rad2[self._caps.finger]
+            at = hand.joints.position_m[self._caps.joint]
+            # A fit believes that fingers move as fast as its priors allow. Told of less than it believes itself, it
+            # would follow its own error, and finger and cap would drag each other away.
+            turned = 2.0 * (CAPS.turn_rad_s * age_s) ** 2
+            grown = hand.tilt_walk_rad2_s2[self._caps.finger] * age_s**2 - turned
+            ours = tilt[:, 0, 0] + tilt[:, 1, 1] + tilt[:, 2, 2] + turned
+            walked = np.maximum(grown, 0.0) / np.maximum(ours, 1e-12)
         points, cov = np.empty((count, 3)), np.empty((count, 3, 3))
         noise, apart = np.empty((count, 3, 3)), np.empty(count, np.bool_)
         left_out = np.empty((cameras, count), np.bool_)
-        variance, common = np.empty((cameras, count)), np.empty(count)
+        seen, variance = np.empty((cameras, count, 2)), np.empty((cameras, count))
+        own = np.empty((count, 3, 3))
         locate(
             self._cameras,
             self._caps,
@@ -314,16 +376,19 @@ class RayTriangulator:
             R,
             tilt,
             (CAPS.turn_rad_s * age_s) ** 2,
+            np.ascontiguousarray(at),
+            np.ascontiguousarray(walked),
             observed,
             points,
             cov,
             noise,
             apart,
             left_out,
+            seen,
             variance,
-            common,
+            own,
         )
-        return RayPositions(points, cov, noise, apart, left_out, variance, common)
+        return RayPositions(points, cov, noise, apart, left_out, seen, variance, own)
 
     def triangulate(self, uv: Float, sigma_px: float | Float = 0.1) -> Triangulation:
         """Triangulate markers as they are seen (`master.fabrik.intersection`)."""

@@ -190,7 +190,7 @@ class FabrikSolver:
         joints, _ = self._palm.pose(T, angles)
         off = joints.position_m - fit.joints.position_m
         joint_cov = fit.cov_m2 + off[:, :, None] * off[:, None, :]
-        hand = SolvedHand(T, angles, joints, joint_cov, fit.tilt_cov_rad2)
+        hand = SolvedHand(T, angles, joints, joint_cov, fit.tilt_cov_rad2, fit.tilt_walk_rad2_s2)
         self._judge(out, fit.surprise, placed)
         self._last, self._last_ns = hand, out.t_ns
         return replace(out, solution=hand)

@@ -21,6 +21,7 @@ from common.arrays import Float
 from common.calibration import ImuCalibration
 from common.geometry import matrix_to_quaternion, quaternion_to_matrix
 from common.wrist_bend import forearm_palm
+from master.estimator.settings import DEFAULT
 from master.fusion.forearm_state import (
     ANYWHERE_RAD,
     HEADING,
@@ -29,10 +30,9 @@ from master.fusion.forearm_state import (
     SeenForearm,
     bend_axes,
 )
+from master.fusion.orientation import Orientation, turn_of
 from master.fusion.orientation_samples import Between
 from master.fusion.told_forearm import ToldForearm
-from master.ik.orientation import TURN_RAD_S, turn_of
-from master.ik.palm import Orientation
 from master.wrist.palm_world import NO_WORLD, PalmWorld
 
 _LOST_RAD = 1.0  # a heading less sure than this may point anywhere
@@ -110,7 +110,7 @@ class Forearm:
         if state.heading_sigma_rad > _LOST_RAD:
             return None
         rotation, slope = state.palm(self._forearm(found))
-        turned = (TURN_RAD_S * found.away_s) ** 2 * np.eye(3)
+        turned = (DEFAULT.palm_walk_rad_s * found.away_s) ** 2 * np.eye(3)
         return Orientation(rotation, slope @ state.cov @ slope.T + turned), slope @ state.with_bend
 
     def bend_at(self, t_ns: int) -> tuple[Float, Float]:

@@ -8,7 +8,7 @@ the believed ones (20) and the bend less the believed one (2):
     fingers: what sights tell of angles and bend       palm: the inverse of its covariance with the bend
 
 and what is left when the bend is integrated out joins markers and habits in the same normal equations
-(`master.ik.hand_problem`): no sensor is switched on or off, and a bend that all fingers suggest is none of theirs.
+(`master.estimator.solve`): no sensor is switched on or off, and a bend that all fingers suggest is none of theirs.
 
 A sensor that errs once in a while (a false fingertip) must not win by being narrow. A finger whose angles by the fit
 are farther from the believed ones than their information allows counts less, by (N + 4) / (N + chi square), the weight
@@ -28,7 +28,7 @@ from common.messages import Level
 from master.estimator.attached import Attached
 from master.estimator.estimator import Sensed
 from master.estimator.parameters import HandParameters
-from master.ik.palm import Orientation, turn_of_vector
+from master.fusion.orientation import Orientation, turn_of_vector
 
 _ANGLES, _TURN, _PIP = 4, 3, 2
 _FREEDOM = 4.0

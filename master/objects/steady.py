@@ -1,6 +1,6 @@
 """Smooths the pose of an object as it arrives, so that one at rest does not tremble.
 
-The 1 € filter of its rig, as of the hand (`master.ik.hand_one_euro`), with position and rotation as its groups and the
+The 1 € filter of its rig, as of the hand (`master.estimator.smooth`), with position and rotation as its groups and the
 noise as it is measured. The position is that of the middle of the features, about which the rotation is unsure; at the
 object's own origin, a lever away, the noise of the rotation would shake the position as well. A rotation counts by how
 far it moves what is a decimetre away.

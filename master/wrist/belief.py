@@ -1,9 +1,9 @@
 """From how far fingers are closed to their angles, and how sure each is.
 
 The laser gives two numbers of a finger and its pose has four. The other two come from habit: joints that bend together
-(`master.wrist.forward`). How far hands stray from that is `master.ik.priors`: a natural MCP by 14 degrees, a DIP by 15,
-each joint of the thumb by 20. What the laser says of a bent finger is the slope of its proximal bone, hence the MCP; a
-PIP is that divided by 0.54 and its doubt is large, which the covariance says:
+(`master.wrist.forward`). How far hands stray from that is in `master.estimator.settings`: a natural MCP by 14 degrees,
+a DIP by 15, each joint of the thumb by 20. What the laser says of a bent finger is the slope of its proximal bone,
+hence the MCP; a PIP is that divided by 0.54 and its doubt is large, which the covariance says:
 
     information = G' R^-1 G + H      G (2, 4): how the point moves with each angle, R: how sure the point is, H: habits
 
@@ -18,7 +18,7 @@ import numpy as np
 from common.arrays import Bool, Code, Float
 from common.hand_limits import ABDUCTION, FLEXION
 from common.messages import Level
-from master.ik.priors import Priors
+from master.estimator.settings import DEFAULT, Settings
 from master.wrist.forward import DIP, PIP, ForwardTable
 from master.wrist.invert import Closed
 from master.wrist.setup import WristSetup
@@ -56,15 +56,14 @@ class FingerAngles:
 class AngleBelief:
     """What laser points say of angles, for one device and hand. What it holds was prepared by the constructor."""
 
-    def __init__(self, setup: WristSetup, table: ForwardTable, priors: Priors | None = None) -> None:
-        priors = priors or Priors()
+    def __init__(self, setup: WristSetup, table: ForwardTable, settings: Settings = DEFAULT) -> None:
         self._model, self._curve = setup.model, table.curve
         self._sight = SightNoise(setup)
         self._most = np.minimum(table.curve.range_rad[:, 1], setup.model.limits_rad[:, PIP, 1])
         self._aside = table.abduction_rad[:, [0, -1]].T
-        self._habits = np.zeros((5, 4, 4))
+        self._habits, s = np.zeros((5, 4, 4)), settings
         for f in range(5):
-            mcp, dip = (priors.thumb, priors.thumb) if f == 0 else (priors.natural_flexion, priors.free_dip)
+            mcp, dip = (s.thumb_rad, s.thumb_rad) if f == 0 else (s.natural_flexion_rad, s.loose_dip_rad)
             rows = np.zeros((3, 4))
             rows[0, [FLEXION, PIP]] = np.array([1.0, -table.curve.slope[f, FLEXION]]) / mcp
             rows[1, [DIP, PIP]] = np.array([1.0, -table.curve.slope[f, DIP]]) / dip

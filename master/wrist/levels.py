@@ -27,7 +27,7 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.messages import Level
-from master.ik.priors import Priors
+from master.estimator.settings import DEFAULT, Settings
 from master.wrist.belief import FingerAngles
 from master.wrist.bent import BentView
 from master.wrist.finger_poses import SEEN, UNKNOWNS, FingerPoses
@@ -79,12 +79,12 @@ class Sighting:
 class Levels:
     """Solves fingers at the level that the rig asks for. What it holds was prepared by the constructor."""
 
-    def __init__(self, setup: WristSetup, model: InverseModel, priors: Priors | None = None) -> None:
-        priors = priors or Priors()
+    def __init__(self, setup: WristSetup, model: InverseModel, settings: Settings = DEFAULT) -> None:
         self._model, self._hand = model, setup.model
-        self._sight, self._valleys = SightNoise(setup), Valleys(model.poses, priors)
+        self._sight, self._valleys = SightNoise(setup), Valleys(model.poses, settings)
         self._alone, self._optics = setup.level == "ik", setup.optics
-        self._share = np.log([priors.natural_share, *2 * [0.5 * (1.0 - priors.natural_share)]])
+        share = settings.natural_share
+        self._share = np.log([share, *2 * [0.5 * (1.0 - share)]])
 
     def __call__(
         self,

@@ -18,8 +18,9 @@ import numpy as np
 from common.arrays import Float
 from common.calibration import ImuCalibration
 from common.geometry import matrix_to_quaternion, quaternion_to_matrix
+from master.estimator.settings import DEFAULT
+from master.fusion.orientation import turn_of
 from master.fusion.orientation_samples import OrientationSamples
-from master.ik.orientation import TURN_RAD_S, turn_of
 
 _ANYWHERE_RAD = pi / sqrt(3.0)  # standard deviation of a uniform circle
 NO_WORLD = np.full(4, np.nan), np.full(2, np.nan)
@@ -59,7 +60,7 @@ class PalmWorld:
             self.counts["orientation.absent"] += 1
             return NO_WORLD
         self.counts["orientation.used"] += 1
-        turned = TURN_RAD_S * found.away_s
+        turned = DEFAULT.palm_walk_rad_s * found.away_s
         tilt = hypot(self._imu.orientation_sigma_rad, turned)
         heading = hypot(self._imu.heading_sigma_rad or 0.0, found.drift_rad, turned)
         palm = matrix_to_quaternion(quaternion_to_matrix(found.q_wxyz) @ self._imu_palm)

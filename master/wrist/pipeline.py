@@ -19,7 +19,7 @@ import numpy as np
 from common.arrays import Bool, Code, Float
 from common.messages import Source, WristDetections
 from master.estimator.pipeline import SolvedPose, Stage
-from master.ik.hidden import strayed_rad2
+from master.estimator.settings import DEFAULT
 from master.wrist.belief import FingerAngles
 from master.wrist.fingers import FORGET_S, NEVER_NS, WristFingers, count
 from master.wrist.inverse import InverseModel
@@ -97,7 +97,7 @@ class WristPipeline:
         source[held] = Source.HELD
         angles, cov = found.angles_rad.copy(), found.cov_rad2.copy()
         angles[held] = self._angles[held]
-        cov[held] = self._cov[held] + strayed_rad2(gone_s[held])[:, None, None] * np.eye(4)
+        cov[held] = self._cov[held] + _strayed_rad2(gone_s[held])[:, None, None] * np.eye(4)
         self._remember(t_ns, found, seen)
         return replace(found, angles_rad=angles, cov_rad2=cov), source
 
@@ -107,3 +107,8 @@ class WristPipeline:
             found.cov_rad2[seen],
             t_ns,
         )
+
+
+def _strayed_rad2(gone_s: Float) -> Float:
+    """Variances [rad^2] of angles a time after the finger was last seen (`master.estimator.state`)."""
+    return DEFAULT.stray_rad**2 * (1.0 - np.exp(-np.square(gone_s / DEFAULT.stray_s)))

@@ -10,7 +10,7 @@ from common.arrays import Code, Float
 from common.geometry import matrix_to_quaternion
 from common.hand_model import CHAINS, METACARPALS, PALM, WRIST
 from common.messages import HandPose, Source
-from master.ik.priors import Priors
+from master.estimator.settings import DEFAULT, Settings
 from master.volume import inside
 from master.wrist.belief import FingerAngles
 from master.wrist.palm_world import NO_WORLD
@@ -23,11 +23,10 @@ _NO_MARKERS[0].flags.writeable = False
 class PoseMaker:
     """Makes poses of one device and hand. What it holds was prepared by the constructor."""
 
-    def __init__(self, setup: WristSetup, priors: Priors | None = None) -> None:
-        priors = priors or Priors()
+    def __init__(self, setup: WristSetup, settings: Settings = DEFAULT) -> None:
         self._setup, self._model = setup, setup.model
         self._palm = np.array([PALM, WRIST, *METACARPALS])
-        self._still_m2 = np.broadcast_to(priors.model_m**2 * np.eye(3), (26, 3, 3))
+        self._still_m2 = np.broadcast_to(settings.bones_m**2 * np.eye(3), (26, 3, 3))
         self._low, self._high = np.moveaxis(setup.model.limits_rad, -1, 0)
 
     def __call__(

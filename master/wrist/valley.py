@@ -11,7 +11,7 @@ interpolated between the nodes, and the density over the PIP is
 with flexion and abduction integrated out (Laplace; MacKay, "Information Theory, Inference, and Learning Algorithms",
 27). p is a mixture of three hands: a *natural* one, whose flexion follows the PIP within 14 degrees, a *straight* one,
 whose fingers are stretched while they bend in their knuckles, as lumbricals and interossei do it (the "intrinsic plus"
-posture of hand surgery), and a *free* one, whose joints know nothing of each other (`master.ik.priors`).
+posture of hand surgery), and a *free* one, whose joints know nothing of each other (`master.estimator.priors`).
 
 **The jump.** Where the last phalanx comes into the light the laser point jumps, and at which PIP is known as badly as
 the DIP is: R of a node holds what a DIP off by its coupling's spread makes of the laser point. Elsewhere that is
@@ -24,7 +24,7 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.hand_limits import ABDUCTION, FLEXION
-from master.ik.priors import FreeHand, Priors
+from master.estimator.settings import Settings
 from master.wrist.finger_poses import SEEN, UNKNOWNS, FingerPoses
 from master.wrist.forward import DIP, PIP
 from master.wrist.pose_table import Forward
@@ -76,17 +76,17 @@ class Valley:
 class Valleys:
     """Finds them for one device and hand. What it holds was prepared by the constructor."""
 
-    def __init__(self, poses: FingerPoses, priors: Priors) -> None:
+    def __init__(self, poses: FingerPoses, settings: Settings) -> None:
         self._low, self._high = poses.low, poses.high
-        free = priors.free or FreeHand()
         self._range = 12.0 / (poses.high - poses.low)[:, None, :2] ** 2
         slope, base = poses.habit
         self._slope, self._base = slope[:, None], base[:, None]
         span = poses.high - poses.low
         self._free_flexion = -np.log(span[:, FLEXION])[:, None]
-        self._pip = (priors.pip_mean, priors.pip), (free.pip_mean, free.pip)
-        self._stray = np.full((5, 1), priors.natural_flexion)
-        self._stray[0] = priors.thumb
+        natural = settings.pip_mean_rad, settings.pip_rad
+        self._pip = natural, (settings.free_pip_mean_rad, settings.free_pip_rad)
+        self._stray = np.full((5, 1), settings.natural_flexion_rad)
+        self._stray[0] = settings.thumb_rad
 
     def __call__(self, poses: FingerPoses, table: Forward, start_rad: Float, seen: Float, R: Float) -> Valley:
         """Valleys.

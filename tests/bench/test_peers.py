@@ -7,17 +7,19 @@ import msgspec
 import numpy as np
 import pytest
 
-from bench import hand, ik, peers_mink, peers_scipy
-from bench.hand_draws import FACING_ROTATION, MARKERS, bench_model, draw
+from bench import hand, hand_poses, ik, peers_mink, peers_scipy
+from bench.hand_draws import FACING_ROTATION, MARKERS, Noise, bench_model, draw, seen
 from bench.hand_score import score
 from bench.peers_paper import Angles, PaperFingers, finger_solvers, tips_in_palm
 from bench.row import Row
+from bench.solved_hand import PointHand
 from common.arrays import Float
 from common.calibration import Couplings
 from common.geometry import quaternion_to_matrix, rotation_vector_to_matrix
 from common.hand_model import FINGERS, HandModel
 from common.hand_presets import preset_limits
 from common.hand_profiles import generated_profile
+from master.estimator.settings import DEFAULT
 from master.fabrik.rotations import Vector
 
 MODEL = bench_model()
@@ -81,7 +83,7 @@ def test_a_moving_hand_is_solved_in_every_way_and_a_fixed_palm_costs() -> None:
 
 
 def test_scipy_finds_the_hand_when_habits_are_the_truth_and_caps_are_exact() -> None:
-    way = peers_scipy.WholeHand.of(MODEL, hand._NOISE)
+    way = peers_scipy.WholeHand.of(MODEL, hand.NOISE)
     angles = MODEL.clamp(way.parameters.angles(way.mean))
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation_vector_to_matrix(np.array([0.2, -0.1, 0.3])) @ FACING_ROTATION, 0.1
@@ -91,6 +93,33 @@ def test_scipy_finds_the_hand_when_habits_are_the_truth_and_caps_are_exact() -> 
     found, bent = way.solve(caps, start, np.zeros((5, 4)))
     np.testing.assert_allclose(found, T, atol=1e-4)
     np.testing.assert_allclose(np.degrees(bent), np.degrees(angles), atol=0.1)
+
+
+@pytest.mark.parametrize("noise", [hand.NOISE, hand_poses.SCENARIOS["depth 4.5 mm"].noise], ids=str)
+def test_the_estimator_ends_where_scipy_ends_on_the_same_residuals(noise: Noise) -> None:
+    count = 20
+    way = peers_scipy.WholeHand.of(MODEL, noise)
+    exact = DEFAULT._replace(tolerance=1e-12, tolerance_share=0.0)  # to the end
+    solver = PointHand(MODEL, MARKERS, continuous=False, natural=True, faces=False, settings=exact)
+    truth = draw(MODEL, 21, count)
+    points, _ = seen(truth, noise, 21)
+
+    def cost(T: Float, angles: Float, k: int) -> float:
+        return 0.5 * float(np.square(way.residuals(T, way.parameters.of_angles(angles), points[k])).sum())
+
+    same = 0
+    for k in range(count):
+        found = solver.push(k, points[k], noise.cov_m2).solution
+        assert found is not None
+        ours = cost(found.T_rig_palm, found.angles_rad, k)
+        theirs, bent = way.solve(points[k], found.T_rig_palm, found.angles_rad)
+        assert ours == pytest.approx(cost(theirs, bent, k), rel=1e-6)
+        off = MODEL.forward(theirs, bent).position_m - found.joints.position_m
+        assert np.linalg.norm(off, axis=1).max() < 1e-5
+        # From the truth there may be another minimum, either way; nearly always it is the same.
+        elsewhere = cost(*way.solve(points[k], truth.T_rig_palm[k], truth.angles_rad[k]), k)
+        same += ours == pytest.approx(elsewhere, rel=1e-6)
+    assert same >= count - 1
 
 
 # -- mink -------------------------------------------------------------------------------------------------------

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from bench.real_motion import Recorded, held_poses, jitter, play, recordings, wide_limits
+from bench.solved_hand import PointHand
 from common.hand_model import HandModel
 from common.hand_profiles import generated_profile
-from master.ik.hand import HandSolver
-from tests.hand_helpers import FACING, MARKERS, palm, small_cov
+from tests.hand_helpers import MARKERS, palm, small_cov
 
 
 def named(folder: Path, name: str) -> Recorded:
@@ -43,10 +43,10 @@ def test_jitter_is_what_differs_over_time() -> None:
     model = HandModel.of(generated_profile("held", "right"))
     angles = held_poses(model)["relaxed"]
     assert model.within_limits(angles).all()
-    solver = HandSolver(model, MARKERS)
+    solver = PointHand(model, MARKERS, continuous=False)
     caps = model.marker_points(model.forward(palm(), angles), MARKERS)
-    near = [solver.solve(caps + np.array([x, 0.0, 0.0]), small_cov(), facing=FACING) for x in (-1e-3, 1e-3)]
-    hands = [hand for hand in near if hand is not None]
+    near = [solver.push(k, caps + np.array([x, 0.0, 0.0]), small_cov()) for k, x in enumerate((-1e-3, 1e-3))]
+    hands = [hand.solution for hand in near if hand.solution is not None]
     place, bent, turned = jitter(hands * 4)
     np.testing.assert_allclose(place, 1.0, atol=0.05)  # 1 mm to either side
     assert bent < 0.2

@@ -13,11 +13,16 @@ from scipy.spatial.transform import Rotation, Slerp
 from common.arrays import Float
 from common.calibration import ImuCalibration
 from common.errors import CalibrationError
-from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
+from common.geometry import (
+    axis_rotation,
+    matrix_to_quaternion,
+    matrix_to_rotation_vector,
+    quaternion_to_matrix,
+    rotation_vector_to_matrix,
+)
+from master.fabrik.estimate import SolvedHand
+from master.fusion.orientation import Orientation, OrientationTrack, turn_of_vector
 from master.fusion.orientation_samples import REACH_NS, slerp
-from master.ik.hand import HandSolution
-from master.ik.orientation import OrientationTrack
-from master.ik.palm import Orientation
 from tests.hand_helpers import any_rotation
 
 MS = 1_000_000
@@ -37,18 +42,18 @@ def said(palm: Float) -> Float:
     return matrix_to_quaternion(world_imu)
 
 
-def solved(palm: Float) -> HandSolution:
+def solved(palm: Float) -> SolvedHand:
     """A hand of which only the palm's orientation (3, 3) is known."""
     T = np.eye(4)
     T[:3, :3] = palm
-    return cast(HandSolution, SimpleNamespace(T_rig_palm=T))
+    return cast(SolvedHand, SimpleNamespace(T_rig_palm=T))
 
 
 def degrees(a: Float, b: Float) -> float:
     return float(np.degrees(Rotation.from_matrix(a @ b.T).magnitude()))
 
 
-def at(track: OrientationTrack, t_ns: int, near: HandSolution | None = None) -> Orientation:
+def at(track: OrientationTrack, t_ns: int, near: SolvedHand | None = None) -> Orientation:
     found = track.at(t_ns, near)
     assert found is not None
     return found
@@ -194,3 +199,16 @@ def test_what_it_holds_is_bounded() -> None:
 def test_one_that_is_not_placed_is_refused_with_the_key(key: str) -> None:
     with pytest.raises(CalibrationError, match=rf"imu\.{key}: missing"):
         OrientationTrack(msgspec.structs.replace(KNOWN, **{key: None}))
+
+
+@given(seeds, st.sampled_from([0.0, 1e-6, 0.1, 1.0, 3.0]))
+def test_a_small_turn_changes_the_rotation_vector_as_its_derivative_says(seed: int, angle_rad: float) -> None:
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=3)
+    vector = angle_rad * axis / np.linalg.norm(axis)
+    by, rotation = turn_of_vector(vector), rotation_vector_to_matrix(vector)
+    for k in range(3):
+        ends = [
+            matrix_to_rotation_vector(axis_rotation(k, way * 1e-5) @ rotation) / 2e-5 for way in (1.0, -1.0)
+        ]
+        np.testing.assert_allclose(ends[0] - ends[1], by[:, k], atol=1e-4)

@@ -5,20 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from common.arrays import Float
+from master.calibrate.mounting.hands import HandProblem, Hands, Linear
 from master.calibrate.mounting.unknown import CAMERA_LATE, UNKNOWN
 from master.estimator.parameters import HandParameters
-from master.ik.hand_problem import HandProblem, Linear
 
 _LITTLE = 1e-5
 _NOTHING = 1e-9  # information of what nothing tells
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Hands:
-    """Hands of all instants: palms (T, 4, 4) and free angles (T, n)."""
-
-    T_rig_palm: Float
-    x: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,9 +37,9 @@ class Normal:
         count, size = linear.gradient.shape
         mixed, shared, pull = np.zeros((count, size, UNKNOWN)), np.zeros((UNKNOWN,) * 2), np.zeros(UNKNOWN)
         later = replace(problem, points_m=problem.points_m + _LITTLE * speed)
-        after = later.linearise(hands.T_rig_palm, hands.x).gradient  # linear in the points
+        after = later.linearise(hands).gradient  # linear in the points
         mixed[..., CAMERA_LATE] = (after - linear.gradient) / _LITTLE
-        off = problem.place(hands.T_rig_palm, hands.x) - problem.points_m
+        off = problem.place(hands) - problem.points_m
         residual, by_late = ((problem.whiten @ v[..., None])[..., 0] for v in (off, -speed))
         shared[CAMERA_LATE, CAMERA_LATE] = (by_late**2).sum()
         pull[CAMERA_LATE] = (by_late * residual).sum()

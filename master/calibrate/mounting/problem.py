@@ -1,7 +1,7 @@
 """The most probable mounting, given what marker rig, wrist camera and IMU saw of one motion: one least-squares problem.
 
-Unknown in each instant is the hand, palm and fingers, as in the line of the markers (`master.ik.hand_problem`, with the
-loosest habits); all instants share the mounting (`unknown.Unknown`). Four kinds of sight pull at them:
+Unknown in each instant is the hand, palm and fingers, as markers and the loosest habits have it (`hands`); all instants
+share the mounting (`unknown.Unknown`). Four kinds of sight pull at them:
 
 - **markers**, where they were at that instant of the rig's clock;
 - **laser points and tips**, of the palm as it lies before the camera. Camera and IMU are one body, so that is
@@ -27,7 +27,8 @@ import numpy as np
 from common.arrays import Float
 from common.geometry import rotation_vector_to_matrix
 from common.hand_model import HandModel
-from master.calibrate.mounting.normal import Hands, Normal
+from master.calibrate.mounting.hands import HandProblem, Hands
+from master.calibrate.mounting.normal import Normal
 from master.calibrate.mounting.seen import STRAYS, Fit, Triples
 from master.calibrate.mounting.sights import FINGERS, SEEN, Sights
 from master.calibrate.mounting.tracks import HandTrack, ImuTrack, Markers, Turns
@@ -49,8 +50,7 @@ from master.calibrate.mounting.unknown import (
 from master.calibrate.mounting.wrists import bends, bends_by_turn
 from master.estimator.attached import Attached
 from master.estimator.parameters import HandParameters
-from master.ik.hand_problem import HandProblem, moved
-from master.ik.priors import AnglePrior, Priors
+from master.estimator.priors import Habits, habits_of
 
 _SKIN_M, _TIP_M = 8e-4, 1e-3  # skin of another shape than the cones; a tip is seen anywhere on its pulp
 _CAP_M = 5e-4  # where caps sit, beyond the noise of the cameras
@@ -90,17 +90,12 @@ class Problem:
         self._sights, self._hand, self._imu, self._triples, self._first = sights, hand, imu, triples, first
         self._model, self._parameters = model, HandParameters.of(model)
         count = len(triples.t_s)
-        # The last hypothesis is the loosest.
-        free = AnglePrior.of(model, self._parameters, Priors()).of_hypothesis(np.full(count, -1))
         self._hands = HandProblem(
             model,
-            self._parameters,
             Attached.markers(model, self._parameters, names),
+            _loosest(habits_of(model, self._parameters)),
             np.zeros((count, len(names), 3)),
             np.zeros((count, len(names), 3, 3)),
-            AnglePrior(_HABITS * free.normal, _HABITS * free.pull, _HABITS * free.constant, free.log_density),
-            None,
-            None,
         )
         tip_px = np.hypot(np.nan_to_num(triples.tip_sigma_px), _TIP_M * px_per_m)
         laser_m = np.hypot(np.nan_to_num(triples.laser_sigma_m), _SKIN_M)
@@ -135,7 +130,7 @@ class Problem:
         seen = markers.seen & self._known[:, None]
         cov = np.where(seen[..., None, None], markers.cov_m2, 0.0) + _CAP_M**2 * _EYE
         whiten = np.linalg.inv(np.linalg.cholesky(cov)) * seen[..., None, None]
-        place = self._hands.place(hands.T_rig_palm, hands.x)
+        place = self._hands.place(hands)
         far = (whiten @ (place - np.nan_to_num(markers.points_m))[..., None])[..., 0]
         whiten = whiten * ((1.0 + np.vecdot(far, far) / STRAYS**2) ** -0.5)[..., None, None]
         told = [np.nan_to_num(part) for part in (markers.points_m, markers.speed_m_s, markers.bent_m_s2)]
@@ -191,15 +186,15 @@ class Problem:
         shown, bend = self._shown(unknown, hands)
         off = (self._data - shown) / self.sigma
         here = self._here(unknown)
-        far = self._hands.place(hands.T_rig_palm, hands.x) - here.points_m
+        far = self._hands.place(hands) - here.points_m
         seen = self._hands.whiten[..., 0, 0] > 0.0
         marker_m = float(np.sqrt((far[seen] ** 2).sum(axis=-1).mean()))
         return Fit(unknown, covariance, bend[:, :2], bend[:, 2], off, self.sigma, shown, marker_m, steps)
 
     def _stepped(self, unknown: Unknown, hands: Hands, step: Float, own: Float) -> tuple[Unknown, Hands]:
-        T, x = moved(hands.T_rig_palm, hands.x, own)
-        x = np.minimum(np.maximum(x, self._parameters.low), self._parameters.high)
-        return unknown.moved(step), Hands(T, x)
+        after = hands.moved(own)
+        x = np.minimum(np.maximum(after.x, self._parameters.low), self._parameters.high)
+        return unknown.moved(step), replace(after, x=x)
 
     def _here(self, unknown: Unknown) -> Markers:
         """The markers when the frames were taken."""
@@ -253,7 +248,7 @@ class Problem:
         bent = ((bend / self._bend_sigma) ** 2).sum(axis=-1) * self._known
         wrist = (STRAYS**2 * np.log1p(bent / STRAYS**2)).sum()
         markers = replace(self._hands, points_m=self._here(unknown).points_m)
-        held = 2.0 * markers.linearise(hands.T_rig_palm, hands.x).cost.sum()
+        held = 2.0 * markers.cost(hands).sum()
         believed_off = unknown.off(self._first) / self._believed
         return float(self._share * (data + wrist + held) + (believed_off**2).sum())
 
@@ -261,7 +256,7 @@ class Problem:
         """Normal equations about a place."""
         turns, here = self._turned(unknown), self._here(unknown)
         problem = replace(self._hands, points_m=here.points_m)
-        linear = problem.linearise(hands.T_rig_palm, hands.x)
+        linear = problem.linearise(hands)
         out = Normal.of_markers(problem, linear, hands, here.speed_m_s)
         rows = self._sight_rows(unknown, hands, turns), self._wrist_rows(unknown, hands, turns)
         for residual, own, shared in rows:
@@ -326,3 +321,9 @@ class Problem:
         rate = (self._rig_imu(unknown, turns) @ turns.rate_rad_s[..., None])[..., 0]
         later = (by_imu @ rate[..., None])[..., 0]
         shared[..., CAMERA_LATE], shared[..., IMU_LATE] = later, -later
+
+
+def _loosest(habits: Habits) -> Habits:
+    """Those of the free hand, the last hypothesis, with a share of their information."""
+    normal, pull, constant = (_HABITS * part[-1:] for part in (habits.normal, habits.pull, habits.constant))
+    return Habits(normal, pull, constant, habits.log_density[-1:])

@@ -13,7 +13,6 @@ from common.hand_model import HandJoints, HandModel
 from master.estimator.estimator import Epoch, Estimator, Fitted, FittedHand, Sensed
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT, Settings
-from master.fabrik.caps import CapTables
 from master.fabrik.estimate import SolvedHand
 from tests.hand_helpers import (
     FACING,
@@ -42,9 +41,8 @@ def estimator(
     settings: Settings = DEFAULT,
 ) -> Estimator:
     """An estimator of a hand of which every marker is on the hand."""
-    caps = CapTables.of(model, markers)
     return Estimator(
-        cameras, model, markers, markers, caps, continuous=continuous, natural=natural, settings=settings
+        cameras, model, markers, markers, continuous=continuous, natural=natural, settings=settings
     )
 
 
@@ -142,7 +140,7 @@ class Seen:
             FACING,
             uv=uv,
             variance_px2=variance,
-            common_m2=np.zeros(uv.shape[1]),
+            own_m2=np.zeros((uv.shape[1], 3, 3)),
             sensed=sensed,
             start=start,
         )

@@ -8,12 +8,11 @@ from master.estimator.cameras import CameraArrays, project
 from master.estimator.certainty import Certainty, add_arcs, linear, surer
 from master.estimator.kinematics import Scratch, angles_of, chains
 from master.estimator.priors import Habits
-from master.estimator.residuals import Observations, cap_shift, marker_rows
+from master.estimator.residuals import Observations, marker_rows
 from master.estimator.solve import Rig, linearise
 from master.estimator.state import grow, hide
 from master.estimator.truncated import mean_within
 from master.estimator.update import Model
-from master.fabrik.caps import CapTables
 
 __all__ = ["Certainty", "Scratch"]
 
@@ -25,23 +24,11 @@ def project_at(cameras: CameraArrays, c: int, point: Float, uv: Float, J: Float)
 
 
 @kernel
-def cap_shift_at(caps: CapTables, row: int, ahead: Float, back: Float, shift: Float, slope: Float) -> None:
-    """`master.estimator.residuals.cap_shift`."""
-    cap_shift(caps, row, ahead, back, shift, slope)
-
-
-@kernel
 def marker_rows_at(
-    cameras: CameraArrays,
-    caps: CapTables,
-    observed: Observations,
-    m: int,
-    point: Float,
-    ahead: Float,
-    boxed_work: Any,
+    cameras: CameraArrays, observed: Observations, m: int, point: Float, boxed_work: Any
 ) -> tuple[float, float]:
     """`master.estimator.residuals.marker_rows`; the record in its array."""
-    return marker_rows(cameras, caps, observed, m, point, ahead, boxed_work[0])
+    return marker_rows(cameras, observed, m, point, boxed_work[0])
 
 
 @kernel
@@ -58,7 +45,7 @@ def linearise_at(
     boxed_search: Any,
 ) -> float:
     """`master.estimator.solve.linearise`; records in their arrays."""
-    rig = Rig(model.hand[0], model.mounts, model.cameras, model.caps)
+    rig = Rig(model.hand[0], model.mounts, model.cameras)
     return linearise(rig, habits, boxed_belief[0], observed, h, T, x, gradient, normal, boxed_search[0])
 
 
@@ -113,7 +100,7 @@ def joint_covariances(
 ) -> None:
     """Write the joints' covariances (26, 3, 3) [m^2] by derivatives alone, and with arcs."""
     hand, settings, work, room = model.hand[0], model.settings[0], boxed_work[0], boxed_room[0]
-    rig = Rig(hand, model.mounts, model.cameras, model.caps)
+    rig = Rig(hand, model.mounts, model.cameras)
     angles_of(hand, x, work.angles, work.by)
     chains(hand, T, work.angles, work.R, work.P)
     linear(hand, T, cov, work, room, straight)

@@ -18,10 +18,9 @@ from common.geometry import rigid
 from common.hand_model import TIPS, HandJoints
 from master.fabrik.caps import CAPS, CapTables
 from master.fabrik.depth import CalibrationResidual
-from master.fabrik.estimate import MarkerPositions
+from master.fabrik.estimate import MarkerPositions, SolvedHand
 from master.fabrik.rays import RayTriangulator
 from master.fabrik.rays import locate as kernel_of_rays
-from master.ik.hand import HandSolution
 from tests.hand_helpers import (
     MARKERS,
     RIGHT,
@@ -41,18 +40,18 @@ UNSTATED = np.full((2, 6), np.nan)  # px^2: without areas nothing is known to be
 SIGMA = np.full((2, 6), 0.1)
 
 
-def hand(tilt_rad: float, joints: HandJoints | None = None) -> HandSolution:
+def hand(tilt_rad: float, joints: HandJoints | None = None) -> SolvedHand:
     """A hand whose finger ends are unsure by `tilt_rad` each way across."""
     joints = RIGHT.forward(palm(), np.radians(np.full((5, 4), 20.0))) if joints is None else joints
     ends = joints.rotation[TIPS]
     tilt = tilt_rad**2 * (np.eye(3) - ends[:, :, 2:] @ ends[:, :, 2:].swapaxes(1, 2))
     nothing = np.zeros((26, 3, 3))
-    fitted = np.zeros(6), 0.0, 1, 1.0, np.eye(22), np.zeros((26, 3, 22))
-    return HandSolution(palm(), np.zeros((5, 4)), joints, nothing, tilt, 100.0 * tilt, *fitted)
+    walk = 100.0 * np.trace(tilt, axis1=1, axis2=2)
+    return SolvedHand(palm(), np.zeros((5, 4)), joints, nothing, tilt, walk)
 
 
 def locate(
-    known: HandSolution | None,
+    known: SolvedHand | None,
     uv: Float,
     age_s: float = 0.0,
     sigma_px: Float = SIGMA,

@@ -22,8 +22,8 @@ from common.geometry import (
 from common.wrist_bend import forearm_palm
 from master.fusion.forearm import Forearm
 from master.fusion.forearm_state import FRESH, STAYING, ForearmState, SeenForearm
+from master.fusion.orientation import Orientation
 from master.fusion.told_forearm import ToldForearm
-from master.ik.palm import Orientation
 from tests.hand_helpers import any_rotation
 
 MS, FRAME_MS = 1_000_000, 16

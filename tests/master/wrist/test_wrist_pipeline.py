@@ -14,7 +14,7 @@ from common.calibration import CameraCalibration, HandProfile, RigCalibration, V
 from common.errors import CalibrationError
 from common.hand_model import CHAINS, FINGERS, METACARPALS, HandModel
 from common.messages import HandPose, Source, WristDetections
-from master.ik.priors import Priors
+from master.estimator.settings import DEFAULT
 from master.rig import RigSetup
 from master.wrist.forward import ForwardTable, LaserCut
 from master.wrist.invert import Inverse
@@ -265,16 +265,16 @@ def test_a_finger_at_rest_trembles_less_where_frames_follow_each_other(
 
 def test_nineteen_of_twenty_joints_lie_in_their_regions(alone: WristPipeline, setup: WristSetup) -> None:
     """Of hands that stray from habits and whose skin differs as much as is believed: between 90 and 99 of 100."""
-    pipeline, priors = WristPipeline(setup, continuous=False, inverse=alone.fingers.inverse), Priors()
+    pipeline = WristPipeline(setup, continuous=False, inverse=alone.fingers.inverse)
     rng = np.random.default_rng(12)
     inside: list[bool] = []
     for _ in range(150):
         angles = natural(setup, 0.0)
         pip = np.radians(rng.uniform(15.0, 70.0, 4))
         angles[1:, 0] = np.radians(rng.uniform(-8.0, 8.0, 4)) * (np.arange(4) != 1)
-        angles[1:, 1] = 0.54 * pip + priors.natural_flexion * rng.normal(size=4)
+        angles[1:, 1] = 0.54 * pip + DEFAULT.natural_flexion_rad * rng.normal(size=4)
         angles[1:, 2] = pip
-        angles[1:, 3] = 0.84 * pip + priors.free_dip * rng.normal(size=4)
+        angles[1:, 3] = 0.84 * pip + DEFAULT.loose_dip_rad * rng.normal(size=4)
         angles = setup.model.clamp(angles)
         uv = shown(setup, angles, 1.0 + SPREAD * rng.normal()) + 0.2 * rng.normal(size=(5, 2))
         pose = solved(pipeline, uv)

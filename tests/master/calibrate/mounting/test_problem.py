@@ -8,14 +8,13 @@ import pytest
 from common.arrays import Float
 from common.geometry import quaternion_to_matrix, rotation_vector_to_matrix
 from common.wrist_bend import forearm_palm
+from master.calibrate.mounting.hands import Hands
 from master.calibrate.mounting.mounting import _triples
-from master.calibrate.mounting.normal import Hands
 from master.calibrate.mounting.problem import Problem
 from master.calibrate.mounting.sights import Sights
 from master.calibrate.mounting.tracks import HandTrack, ImuTrack
 from master.calibrate.mounting.unknown import UNKNOWN, Unknown, believed
 from master.calibrate.mounting.wrists import bends, bends_by_turn
-from master.ik import hand_problem
 from master.wrist.setup import WristSetup
 from tests.master.calibrate.mounting.moved import CAMERA_LATE_NS, IMU_LATE_NS, ZERO_NS, moved
 
@@ -78,10 +77,7 @@ def test_the_pull_of_each_hand_is_the_slope_of_the_cost() -> None:
     for k in range(6):
         step = np.zeros_like(pull)
         step[:, k] = little
-        costs = [
-            at.cost(unknown, Hands(*hand_problem.moved(hands.T_rig_palm, hands.x, way * step)))
-            for way in (1.0, -1.0)
-        ]
+        costs = [at.cost(unknown, hands.moved(way * step)) for way in (1.0, -1.0)]
         assert 0.25 * (costs[0] - costs[1]) / little == pytest.approx(pull[:, k].sum(), rel=0.01)
 
 

@@ -1,4 +1,4 @@
-"""How the palm lies at any instant by an IMU on it: its own orientation, mounted and placed, and how sure that is.
+"""The palm's orientation as an IMU on it measures it: mounted, placed in the rig, and with its covariance.
 
 An IMU tells its axes in a world of its own, whose z axis is vertical:
 
@@ -10,6 +10,7 @@ and wide about it. A heading of which nothing is known is taken from the hand as
 """
 
 from collections import Counter
+from dataclasses import dataclass, field
 from math import atan2, hypot, nan
 
 import numpy as np
@@ -17,14 +18,55 @@ import numpy as np
 from common.arrays import Float
 from common.calibration import ImuCalibration, Quaternion
 from common.errors import CalibrationError
-from common.geometry import matrix_to_quaternion, quaternion_to_matrix, rotation_vector_to_matrix
+from common.geometry import (
+    matrix_to_quaternion,
+    matrix_to_rotation_vector,
+    quaternion_to_matrix,
+    rotation_vector_to_matrix,
+    skew,
+)
+from master.estimator.settings import DEFAULT
 from master.fabrik.estimate import SolvedHand
 from master.fusion.orientation_samples import OrientationSamples
-from master.ik.palm import Orientation
 
-TURN_RAD_S = 3.0  # as fast as a palm turns unseen: `Priors.palm_walk_rad_s`
 _LOST_RAD = 1.0  # a heading less sure than this may point anywhere (a uniform circle has 1.8)
 _FREE_RAD = 10.0  # tells nothing beside any marker
+_SURE_RAD = np.radians(15.0)  # about every axis: better known than this, it says how the palm lies
+_SMALL_RAD = 1e-4  # below it a rotation vector is taken as that long in the derivative
+_EYE = np.eye(3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Orientation:
+    """The palm's orientation as something else measured it, an IMU for instance.
+
+    Attributes:
+        rotation: (3, 3) palm frame -> rig frame.
+        cov_rad2: (3, 3) [rad^2] of the rotation vector, in rig axes, that turns it to the true one; positive
+            definite, and large about an axis about which nothing is known.
+        information: (3, 3) its inverse.
+    """
+
+    rotation: Float
+    cov_rad2: Float
+    information: Float = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "information", np.linalg.inv(self.cov_rad2))
+
+    @property
+    def sure(self) -> bool:
+        """Whether it is known about every axis; an IMU without heading is not."""
+        return float(np.linalg.eigvalsh(self.cov_rad2)[-1]) < _SURE_RAD**2
+
+    def add_to(self, R: Float, gradient: Float, normal: Float) -> Float:
+        """The cost (...) of rotations (..., 3, 3); adds to gradients (..., 6 + n) and normals (..., 6 + n, 6 + n)."""
+        off = matrix_to_rotation_vector(R @ self.rotation.T)
+        J = turn_of_vector(off)
+        weighed = off @ self.information
+        gradient[..., :3] += (weighed[..., None, :] @ J)[..., 0, :]
+        normal[..., :3, :3] += np.swapaxes(J, -1, -2) @ (self.information @ J)
+        return 0.5 * np.vecdot(weighed, off)
 
 
 class OrientationTrack:
@@ -68,9 +110,9 @@ class OrientationTrack:
         rotation = self._rig_world @ quaternion_to_matrix(found.q_wxyz) @ self._palm_imu.T
         if heading_rad is None and near is not None:
             rotation = _turn_about(self._up, near.T_rig_palm[:3, :3] @ rotation.T) @ rotation
-        tilt_2 = self._imu.orientation_sigma_rad**2 + (TURN_RAD_S * found.away_s) ** 2
+        tilt_2 = self._imu.orientation_sigma_rad**2 + (DEFAULT.palm_walk_rad_s * found.away_s) ** 2
         about_2 = max((_FREE_RAD if heading_rad is None else heading_rad) ** 2, tilt_2)
-        return Orientation(rotation, tilt_2 * np.eye(3) + (about_2 - tilt_2) * np.outer(self._up, self._up))
+        return Orientation(rotation, tilt_2 * _EYE + (about_2 - tilt_2) * np.outer(self._up, self._up))
 
     def _heading_rad(self, drift_rad: float) -> float | None:
         """Standard deviation of the heading after such a drift; None: not known."""
@@ -97,3 +139,14 @@ def turn_of(key: str, value: Quaternion | None) -> Float:
             f"imu.{key}: missing; the orientation of the IMU cannot be used without: a quaternion wxyz of length 1"
         )
     return quaternion_to_matrix(np.array(value))
+
+
+def turn_of_vector(vector: Float) -> Float:
+    """Derivatives (..., 3, 3) of rotation vectors (..., 3) by a small turn in front of them.
+
+    The inverse of the left Jacobian of SO(3) (Sola, Deray, Atchuthan 2018, "A micro Lie theory", eq. 146).
+    """
+    angle = np.maximum(np.sqrt(np.vecdot(vector, vector)), _SMALL_RAD)[..., None, None]
+    k = skew(vector)
+    factor = 1.0 / (angle * angle) - 0.5 / (angle * np.tan(0.5 * angle))
+    return _EYE - 0.5 * k + factor * (k @ k)

@@ -1,10 +1,10 @@
-"""A hand of several sensors goes on as it moves; what is no motion is led in, no faster than told."""
+"""A hand of several sensors goes on as it moves; what is no motion is led in, no faster than allowed."""
 
 import numpy as np
 import pytest
-from master.ik.lead import Lead
 
 from common.arrays import Float
+from master.estimator.lead import Lead
 
 STEP_S, SPEED = 1 / 60, 0.12
 ON_PALM = np.array([False, True])

@@ -2,22 +2,29 @@
 
 import numpy as np
 import pytest
-from master.ik.hand_one_euro import LEAD_OVER_S, HandOneEuro
 from scipy.spatial.transform import Rotation
 
 from common.arrays import Float
 from common.calibration import FilterCalibration
 from common.geometry import rigid
 from common.hand_model import CHAINS, TIPS
+from master.estimator.estimator import Epoch, Estimator, Fitted, FittedHand
+from master.estimator.settings import DEFAULT
+from master.estimator.smooth import HandOneEuro
 from master.fabrik.one_euro import OneEuroParameters
-from master.ik.hand import HandSolution
-from master.ik.tracker import HandTracker, TrackedHand
-from tests.hand_helpers import FACING, MARKERS, RIGHT, palm, within
+from tests.hand_helpers import FACING, MARKERS, RIGHT, camera_models, palm, rig_file, within
 
 DT_NS = 16_666_667
 SIGMA_M = 1e-3
 SETTINGS = OneEuroParameters.of(FilterCalibration())
 COV = np.tile(SIGMA_M**2 * np.eye(3), (6, 1, 1))
+CAMERAS = tuple(camera_models(rig_file()).values())
+
+
+def machines() -> tuple[Estimator, HandOneEuro]:
+    """The estimator of a hand, and its filter."""
+    estimator = Estimator(CAMERAS, RIGHT, MARKERS, MARKERS, natural=True)
+    return estimator, HandOneEuro(RIGHT, MARKERS, SETTINGS)
 
 
 def angles_of(
@@ -39,7 +46,7 @@ RELAXED = POSES["relaxed"]
 
 
 class Run:
-    """A motion with 1 mm of noise through tracker and filter, 60 Hz; `hidden[k]`: markers that frame k lacks."""
+    """A motion with 1 mm of noise through estimator and filter, 60 Hz; `hidden[k]`: markers that frame k lacks."""
 
     def __init__(
         self,
@@ -53,24 +60,24 @@ class Run:
         self.true_m = joints.position_m
         noise = np.random.default_rng(seed).normal(0.0, sigma_m, (len(poses), 6, 3))
         points = RIGHT.marker_points(joints, MARKERS) + noise
-        tracker, smooth = HandTracker(RIGHT, MARKERS), HandOneEuro(RIGHT, MARKERS, SETTINGS)
-        self.solved: list[TrackedHand] = []
-        self.shown: list[TrackedHand] = []
+        estimator, smooth = machines()
+        self.solved: list[Fitted] = []
+        self.shown: list[Fitted] = []
         for k, seen in enumerate(points):
             cov = COV.copy()
             for m in (hidden or {}).get(k, ()):
                 seen[m], cov[m] = np.nan, np.nan
-            self.solved.append(tracker.push(k * DT_NS, seen, cov, FACING))
+            self.solved.append(estimator.push(Epoch(k * DT_NS, seen, FACING, cov)))
             self.shown.append(smooth.push(k * DT_NS, self.solved[-1], cov))
 
 
-def of(hands: list[TrackedHand]) -> list[HandSolution]:
+def of(hands: list[Fitted]) -> list[FittedHand]:
     solutions = [hand.solution for hand in hands]
     assert all(solution is not None for solution in solutions)
     return [solution for solution in solutions if solution is not None]
 
 
-def positions(hands: list[TrackedHand]) -> Float:
+def positions(hands: list[Fitted]) -> Float:
     return np.array([solution.joints.position_m for solution in of(hands)])
 
 
@@ -82,7 +89,7 @@ def still(angles: Float, count: int) -> tuple[Float, Float]:
 def test_a_held_hand_keeps_within_half_a_millimetre_and_a_degree(name: str) -> None:
     run = Run(*still(POSES[name], 240), seed=len(name))
 
-    def jitter(hands: list[TrackedHand]) -> tuple[float, float, float]:
+    def jitter(hands: list[Fitted]) -> tuple[float, float, float]:
         """Standard deviations over time, RMS over the joints: mm (all three axes), deg of angles, deg of joints."""
         hands = hands[60:]
         solutions = of(hands)
@@ -159,7 +166,7 @@ def led(way: Float, hidden: tuple[int, ...], poses: Float, angles: Float) -> tup
     run = Run(poses, angles, dict.fromkeys(range(60, 78), hidden))
     own = np.linalg.norm(np.diff(run.true_m, axis=0), axis=2)
 
-    def beyond(hands: list[TrackedHand]) -> float:
+    def beyond(hands: list[Fitted]) -> float:
         steps = np.linalg.norm(np.diff(positions(hands), axis=0), axis=2)
         return 1e3 * float((steps - own)[77:].max())
 
@@ -180,7 +187,7 @@ def test_a_finger_that_moved_unseen_is_led_over() -> None:
     assert leap > 40.0
     assert shown < leap / 3.0
     # Soon after, it is where it is solved to be.
-    back = 78 + round(1.5 * LEAD_OVER_S * 60.0)
+    back = 78 + round(1.5 * DEFAULT.blend_s * 60.0)
     off = np.linalg.norm(positions(run.shown)[back:, TIPS[1]] - run.true_m[back:, TIPS[1]], axis=1)
     assert off.mean() < 4e-3
     # Meanwhile its covariance says how far off it is shown; the solution's own does not.
@@ -206,14 +213,14 @@ def test_a_whole_hand_that_moved_unseen_is_led_over() -> None:
 
 
 def test_frames_that_fail_to_come_are_as_good_as_a_hand_unseen() -> None:
-    tracker, smooth = HandTracker(RIGHT, MARKERS), HandOneEuro(RIGHT, MARKERS, SETTINGS)
+    estimator, smooth = machines()
     at = [(k * DT_NS, 0.0) for k in range(30)] + [
         (29 * DT_NS + 300_000_000 + k * DT_NS, 0.05) for k in range(20)
     ]
     tips: list[float] = []
     for t_ns, x in at:
         points = RIGHT.marker_points(RIGHT.forward(palm(at_m=np.array([x, 0.08, 0.5])), RELAXED), MARKERS)
-        hand = smooth.push(t_ns, tracker.push(t_ns, points, COV, FACING), COV)
+        hand = smooth.push(t_ns, estimator.push(Epoch(t_ns, points, FACING, COV)), COV)
         assert hand.solution is not None
         tips.append(float(hand.solution.joints.position_m[TIPS[2], 0]))
     assert max(abs(step) for step in np.diff(tips)) < 0.05 / 3.0
@@ -230,11 +237,11 @@ def test_a_hand_that_was_forgotten_begins_anew_where_it_is() -> None:
 
 
 def test_no_hand_and_a_time_that_stands_still_are_passed_on() -> None:
-    tracker, smooth = HandTracker(RIGHT, MARKERS), HandOneEuro(RIGHT, MARKERS, SETTINGS)
-    nothing = tracker.push(0, np.full((6, 3), np.nan), np.full((6, 3, 3), np.nan), FACING)
+    estimator, smooth = machines()
+    nothing = estimator.push(Epoch(0, np.full((6, 3), np.nan), FACING, np.full((6, 3, 3), np.nan)))
     assert smooth.push(0, nothing, np.full((6, 3, 3), np.nan)) is nothing
     points = RIGHT.marker_points(RIGHT.forward(palm(), RELAXED), MARKERS)
-    hand = tracker.push(DT_NS, points, COV, FACING)
+    hand = estimator.push(Epoch(DT_NS, points, FACING, COV))
     smooth.push(DT_NS, hand, COV)
     assert smooth.push(DT_NS, hand, COV) is hand
 
@@ -246,4 +253,20 @@ def test_what_is_not_filtered_stays() -> None:
         assert shown.solution is not None
         assert shown.valid is solved.valid
         assert shown.source is solved.source
-        assert shown.solution.residual_m is solved.solution.residual_m
+        assert shown.solution.surprise is solved.solution.surprise
+
+
+def test_a_hand_that_was_shown_stays_as_it_was() -> None:
+    estimator, smooth = machines()
+    hands: list[tuple[Fitted, Float]] = []
+    for k in range(4):
+        points = RIGHT.marker_points(
+            RIGHT.forward(palm(at_m=np.array([0.01 * k, 0.08, 0.5])), RELAXED), MARKERS
+        )
+        hand = smooth.push(k * DT_NS, estimator.push(Epoch(k * DT_NS, points, FACING, COV)), COV)
+        hands.append((hand, positions([hand])))
+    for hand, place in hands:
+        np.testing.assert_array_equal(positions([hand]), place)
+        solution = of([hand])[0]
+        forward = RIGHT.forward(solution.T_rig_palm, solution.angles_rad)
+        np.testing.assert_allclose(positions([hand])[0], forward.position_m, atol=1e-12)

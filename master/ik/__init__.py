@@ -1,1 +1,0 @@
-"""From 3D markers to joint angles: joints, finger, fabrik, hand."""
