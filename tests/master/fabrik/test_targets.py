@@ -9,7 +9,7 @@ from tests.hand_helpers import palm
 def test_targets_lie_between_fit_and_measurement_by_their_variances() -> None:
     T, places = palm(np.array([5.0, 10.0, 15.0])), np.tile([0.01, 0.02, -0.1], (3, 1))
     places = places @ T[:3, :3].T + T[:3, 3]
-    points = places + [0.0, 0.0, 0.01]
+    points = places + np.array([0.0, 0.0, 0.01])
     points[2] = np.nan
     cov, out = np.stack([np.zeros((3, 3)), 1e-6 * np.eye(3), np.full((3, 3), np.nan)]), np.empty((3, 3))
     targets_of(points, cov, T, places, 1e-6, out)

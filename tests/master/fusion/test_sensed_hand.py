@@ -7,8 +7,8 @@ from common.arrays import Float
 from common.hand_model import CHAINS
 from common.messages import Level, Source
 from master.estimator.parameters import HandParameters
+from master.fusion.orientation import Orientation
 from master.fusion.sensed_hand import MarkerCheck, SensedHand
-from master.ik.palm import Orientation
 from tests.hand_helpers import MARKERS, RIGHT, natural_angles, palm, small_cov
 from tests.master.estimator.fitted import estimator, fit, found, push
 

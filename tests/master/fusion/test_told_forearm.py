@@ -11,9 +11,9 @@ from common.arrays import Float
 from common.geometry import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
 from master.estimator.estimator import FittedHand
 from master.estimator.parameters import HandParameters
+from master.fusion.orientation import Orientation
 from master.fusion.sensed_hand import SensedHand
 from master.fusion.told_forearm import ToldForearm, told_forearm
-from master.ik.palm import Orientation
 from tests.hand_helpers import RIGHT, any_rotation, natural_angles
 
 PARAMETERS = HandParameters.of(RIGHT)
