@@ -112,7 +112,7 @@ class Room:
     share: Float  # (2,)
     off: Float  # (2, N)
     step: Float  # (2, N)
-    mean: Float  # (N,)
+    middle: Float  # (N,)
     A: Float  # (N, N)
     L: Float  # (N, N)
     work: Float  # (N, N)
@@ -141,7 +141,7 @@ class Room:
             share=2,
             off=(2, N),
             step=(2, N),
-            mean=N,
+            middle=N,
             A=(N, N),
             L=(N, N),
             work=(N, N),
@@ -202,7 +202,7 @@ def _weigh(habits: Habits, settings: Settings, natural: float, counts: float, ro
 
     `natural` is the probability of a natural hand a moment ago, `counts` what that counts, 0 ... 1.
     """
-    N = room.mean.shape[0]
+    N = room.middle.shape[0]
     room.share[0], room.share[1] = 1.0, 0.0
     if habits.constant.shape[0] < 2:
         return
@@ -238,7 +238,7 @@ def _covariance(
     rig: Rig, settings: Settings, habits: Habits, belief: Belief, h: int, numbers: float, room: Room
 ) -> float:
     """Write the covariance (N, N) of one hypothesis by this instant alone; return its scale."""
-    N, A = room.mean.shape[0], room.A
+    N, A = room.middle.shape[0], room.A
     for i in range(N):
         for j in range(i + 1):
             A[i, j] = room.normal[h, i, j]
@@ -273,13 +273,13 @@ def _mix(
     out: Posterior,
 ) -> int:
     """Write mean step and covariance of the hypotheses together; return the likelier one."""
-    n, N = room.x.shape[1], room.mean.shape[0]
+    n, N = room.x.shape[1], room.middle.shape[0]
     best = 0 if room.share[0] >= room.share[1] else 1
     if room.share[best] > 1.0 - settings.negligible:
         room.share[best], room.share[1 - best] = 1.0, 0.0
     out.scale[0] = 0.0
     for i in range(N):
-        room.mean[i] = 0.0
+        room.middle[i] = 0.0
         for j in range(N):
             out.cov[i, j] = 0.0
     for h in range(habits.constant.shape[0]):
@@ -302,11 +302,11 @@ def _mix(
             mean_within(rig.hand, room.normal[h], room.gradient[h], room.x[h], room.cut, room.step[h])
         for i in range(N):
             room.off[h, i] += room.step[h, i]
-            room.mean[i] += share * room.off[h, i]
+            room.middle[i] += share * room.off[h, i]
     for h in range(habits.constant.shape[0]):
         for i in range(N):
             for j in range(N):
-                between = (room.off[h, i] - room.mean[i]) * (room.off[h, j] - room.mean[j])
+                between = (room.off[h, i] - room.middle[i]) * (room.off[h, j] - room.middle[j])
                 out.cov[i, j] += room.share[h] * between
     return best
 
@@ -316,7 +316,7 @@ def _ends(rig: Rig, h: int, room: Room) -> None:
     """Write where the step of a hypothesis brings the markers, to room.here (M, 3), as if on straight lines."""
     markers_of(rig.hand, rig.mounts, room.palm[h], room.x[h], room.search.rows, room.here)
     moves = False
-    for i in range(room.mean.shape[0]):
+    for i in range(room.middle.shape[0]):
         room.search.step[i] = _LITTLE * room.step[h, i]
         moves = moves or room.step[h, i] != 0.0
     if not moves:
@@ -345,7 +345,7 @@ def _onto(
     What is between two hands that explain the markers does so a little worse, since fingers move on arcs. So it is one
     step, the shortest by the normal matrix, to where the mean of their markers is.
     """
-    n, N, between = room.x.shape[1], room.mean.shape[0], blank.between
+    n, N, between = room.x.shape[1], room.middle.shape[0], blank.between
     for m in range(rig.mounts.finger.shape[0]):
         between.seen[m] = between.placed[m] = observed.seen[m]
         for i in range(3):
@@ -359,9 +359,9 @@ def _onto(
                 for i in range(3):
                     between.point[m, i] += room.share[h] * room.here[m, i]
     search = room.search
-    rotate_by(room.mean, room.palm[best], out.palm)
+    rotate_by(room.middle, room.palm[best], out.palm)
     for i in range(n):
-        out.x[i] = room.x[best, i] + room.mean[6 + i]
+        out.x[i] = room.x[best, i] + room.middle[6 + i]
     linearise(
         rig,
         blank.habits,
@@ -420,8 +420,8 @@ def posterior(
     best = _mix(rig, settings, habits, belief, numbers, room, out)
     out.cost[0] = room.cost[best]
     moves = False
-    for i in range(room.mean.shape[0]):
-        moves = moves or room.mean[i] != 0.0
+    for i in range(room.middle.shape[0]):
+        moves = moves or room.middle[i] != 0.0
     if moves:
         _onto(rig, settings, observed, blank, best, room, out)
     else:

@@ -7,11 +7,10 @@ from common.arrays import Float
 from common.hand_model import CHAINS
 from common.messages import Level, Source
 from master.estimator.parameters import HandParameters
+from master.fusion.orientation import Orientation
 from master.fusion.sensed_hand import MarkerCheck, SensedHand
-from master.ik.hand import HandSolver
-from master.ik.palm import Orientation
-from master.ik.tracker import HandTracker
-from tests.hand_helpers import FACING, MARKERS, RIGHT, natural_angles, palm, small_cov
+from tests.hand_helpers import MARKERS, RIGHT, natural_angles, palm, small_cov
+from tests.master.estimator.fitted import estimator, fit, found, push
 
 PARAMETERS = HandParameters.of(RIGHT)
 SLOPE = np.zeros((5, 4, 2))
@@ -78,13 +77,12 @@ def test_a_bend_that_all_fingers_suggest_is_no_flexion_of_theirs(seed: int) -> N
     truth = natural_angles(np.random.default_rng(seed))
     told = truth + SLOPE[..., 0] * np.radians(6.0)  # twenty degrees of all knuckles
     points = markers(truth)
-    found = HandSolver(RIGHT, MARKERS).solve(points, small_cov(), others=sensed(told), facing=FACING)
-    welded = HandSolver(RIGHT, MARKERS).solve(
-        points, small_cov(), others=sensed(told, bend_deg=0.1), facing=FACING
+    measured = np.arange(5)
+    hand, welded = (
+        found(fit(points, small_cov(), sensed=sensed(told, bend_deg=bend).for_fit(PARAMETERS, measured)))
+        for bend in (8.0, 0.1)
     )
-    assert found is not None
-    assert welded is not None
-    off = np.degrees(np.abs(found.angles_rad - truth)[1:, 1]).mean()
+    off = np.degrees(np.abs(hand.angles_rad - truth)[1:, 1]).mean()
     assert off < 4.0
     assert off < 0.5 * np.degrees(np.abs(welded.angles_rad - truth)[1:, 1]).mean()
 
@@ -95,9 +93,8 @@ def test_hidden_fingers_are_bent_as_the_device_has_them_and_say_so() -> None:
     points = markers(truth)
     points[:5] = np.nan  # the back alone is seen
     turned = Orientation(T[:3, :3], np.radians(2.0) ** 2 * np.eye(3))
-    hand = HandTracker(RIGHT, MARKERS).push(
-        10**9, points, small_cov(), FACING, others=sensed(truth, bend_deg=1.0, turn=turned)
-    )
+    said = sensed(truth, bend_deg=1.0, turn=turned).for_fit(PARAMETERS, np.zeros(0, np.int64))
+    hand = push(estimator(), 10**9, points, sensed=said)
     assert hand.solution is not None
     assert np.degrees(np.abs(hand.solution.angles_rad - truth)[1:, 2]).max() < 6.0
     assert np.linalg.norm(hand.solution.T_rig_palm[:3, 3] - T[:3, 3]) < 5e-3

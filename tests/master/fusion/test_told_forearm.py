@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.geometry import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
+from master.estimator.estimator import FittedHand
 from master.estimator.parameters import HandParameters
+from master.fusion.orientation import Orientation
 from master.fusion.sensed_hand import SensedHand
 from master.fusion.told_forearm import ToldForearm, told_forearm
-from master.ik.hand import HandSolution
-from master.ik.palm import Orientation
 from tests.hand_helpers import RIGHT, any_rotation, natural_angles
 
 PARAMETERS = HandParameters.of(RIGHT)
@@ -50,7 +50,7 @@ class Instant:
             size=SIZE
         )  # where markers alone have turn, shift and angles, from R, 0 and x
 
-    def solved(self, scale: float) -> HandSolution:
+    def solved(self, scale: float) -> FittedHand:
         """The least-squares solution of markers and all that the sensors tell."""
         S = np.zeros((23, SIZE))
         S[:3, :3], S[3:, 6:] = np.eye(3), self.free.by_free
@@ -61,11 +61,10 @@ class Instant:
         T = rigid(rotation_vector_to_matrix(at[:3]) @ self.R, at[3:6])
         x = self.x + at[6:]
         angles = PARAMETERS.angles(x)
-        nothing = np.zeros((26, 3, 3)), np.zeros((5, 3, 3)), np.zeros((5, 3, 3)), np.zeros(6), 0.0, 1, 1.0
+        nothing = np.zeros((26, 3, 3)), np.zeros((5, 3, 3))
         alone: Float = np.asarray(scale * np.linalg.inv(normal), np.float64)
-        moved = np.zeros((26, 3, SIZE))
         joints = RIGHT.forward(T, angles)
-        return HandSolution(T, angles, joints, *nothing, alone, moved, x, scale, self.sensed)
+        return FittedHand(T, angles, joints, *nothing, alone, x, scale, 1.0, np.zeros(6), 1)
 
     def expected(self, scale: float) -> tuple[Float, Float]:
         """Turn from R and bend from the believed one, by markers and fingers alone: mean (5,) and covariance (5, 5)."""
@@ -92,7 +91,7 @@ class Instant:
 def test_it_is_the_marginal_of_the_whole_problem_without_the_palm_by_imu(seed: int, scale: float) -> None:
     instant = Instant(seed)
     hand = instant.solved(scale)
-    told = told_forearm(hand, instant.bend, PARAMETERS)
+    told = told_forearm(hand, instant.sensed, instant.bend, PARAMETERS)
     mean, cov = instant.expected(scale)
     np.testing.assert_allclose(told.information @ cov, np.eye(5), atol=1e-3)
     at = np.linalg.solve(told.information, told.pull)
@@ -104,7 +103,7 @@ def test_it_is_the_marginal_of_the_whole_problem_without_the_palm_by_imu(seed: i
 
 def test_no_finger_tells_no_bend_and_the_palm_is_that_of_the_markers() -> None:
     instant = Instant(3, fingers=0)
-    told = told_forearm(instant.solved(1.0), instant.bend, PARAMETERS)
+    told = told_forearm(instant.solved(1.0), instant.sensed, instant.bend, PARAMETERS)
     np.testing.assert_array_equal(told.information[3:], 0.0)
     np.testing.assert_array_equal(told.pull[3:], 0.0)
     markers = np.linalg.inv(np.linalg.inv(instant.markers)[:3, :3])

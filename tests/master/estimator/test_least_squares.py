@@ -1,0 +1,198 @@
+"""The solution of an epoch against scipy on the same residuals, and against trying everything."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from common.arrays import Float
+from common.geometry import rigid, rotation_vector_to_matrix
+from master.estimator.estimator import Epoch, FittedHand
+from master.estimator.priors import habits_of
+from master.estimator.settings import DEFAULT
+from master.fabrik.cap_views import seen_shift
+from master.fabrik.caps import CapTables
+from tests.hand_helpers import FACING, MARKERS, RIGHT, natural_angles, palm, small_cov
+from tests.master.estimator.fitted import FREE, PAIR, PARAMETERS, fit, forgetful, found, places, seen
+
+SIGMA_PX = 0.5
+FINE = DEFAULT.changed("tolerance", 1e-12).changed("tolerance_share", 0.0)
+MACHINE = forgetful(natural=True, settings=FINE)
+HABITS = habits_of(RIGHT, PARAMETERS, FINE)
+
+
+class Residuals:
+    """Of a natural hand whose back faces the cameras: square roots of what the estimator sums up."""
+
+    def __init__(self, near: Float) -> None:
+        self.near, self.root = near, np.linalg.cholesky(HABITS.normal[0])
+        self.mean = np.linalg.solve(HABITS.normal[0], HABITS.pull[0])
+
+    def hand(self, at: Float) -> tuple[Float, Float]:
+        """Palm (4, 4) and free angles (n,) of a step from the palm where it begins, and angles."""
+        R = rotation_vector_to_matrix(at[:3]) @ self.near[:3, :3]
+        return rigid(R, self.near[:3, 3] + at[3:6]), at[6 : 6 + FREE]
+
+    def believed(self, T: Float, x: Float) -> Float:
+        return np.append(self.root.T @ (x - self.mean), (T[:3, 1] - FACING) / FINE.facing_rad)
+
+    def solve(self, start: Float, spare: int = 0) -> tuple[Float, Float, float]:
+        """Palm, angles and cost of the least squares from free angles (n,); `spare`: unknowns without limits."""
+        wide = np.full(6 + spare, 0.5)
+        low = np.concatenate([-wide[:6], PARAMETERS.low - 1e-7, -wide[6:]])
+        high = np.concatenate([wide[:6], PARAMETERS.high + 1e-7, wide[6:]])
+        at = np.clip(np.concatenate([np.zeros(6), start, np.zeros(spare)]), low + 1e-9, high - 1e-9)
+        scale = np.concatenate([np.full(3, 0.1), np.full(3, 0.01), np.full(FREE, 0.1), np.full(spare, 1e-3)])
+        done = least_squares(
+            self, at, bounds=(low, high), x_scale=scale, xtol=1e-14, ftol=1e-14, gtol=1e-12, max_nfev=400
+        )
+        return *self.hand(done.x), float(done.cost)
+
+    def __call__(self, at: Float) -> Float:
+        raise NotImplementedError
+
+
+class OfPoints(Residuals):
+    """And markers at places."""
+
+    def __init__(self, near: Float, points: Float, cov: Float) -> None:
+        super().__init__(near)
+        self.points = points
+        self.white = np.linalg.cholesky(np.linalg.inv(cov + FINE.bones_m**2 * np.eye(3)))
+
+    def __call__(self, at: Float) -> Float:
+        T, x = self.hand(at)
+        off = places(T, PARAMETERS.angles(x)) - self.points
+        return np.append(np.einsum("mij,mi->mj", self.white, off).ravel(), self.believed(T, x))
+
+
+class OfPixels(Residuals):
+    """And markers in images, each with a shift of its own that is an unknown as well."""
+
+    def __init__(self, near: Float, epoch: Epoch, sigma_px: float) -> None:
+        super().__init__(near)
+        assert epoch.uv is not None
+        self.uv, self.sigma_px, self.caps = epoch.uv, sigma_px, CapTables.of(RIGHT, MARKERS)
+        flat = np.array([RIGHT.mount(name).finger is None for name in MARKERS])
+        self.own_m = np.sqrt(FINE.bones_m**2 + flat * FINE.relief_m**2)
+
+    def __call__(self, at: Float) -> Float:
+        T, x = self.hand(at)
+        joints, moved = RIGHT.forward(T, PARAMETERS.angles(x)), at[6 + FREE :].reshape(6, 3)
+        points = RIGHT.marker_points(joints, MARKERS)
+        off, shift = np.zeros((len(PAIR), 6, 2)), np.zeros(3)
+        for c, camera in enumerate(PAIR):
+            for m, point in enumerate(points):
+                place = point + moved[m]
+                if (row := int(self.caps.row[m])) >= 0:
+                    ahead = -np.ascontiguousarray(joints.rotation[self.caps.joint[row], :, 2])
+                    back = (camera.centre - point) / np.linalg.norm(camera.centre - point)
+                    seen_shift(self.caps, row, ahead, back, shift)
+                    place = place + shift
+                off[c, m] = (camera.project(place) - self.uv[c, m]) / self.sigma_px
+        own = moved / self.own_m[:, None]
+        return np.concatenate([off[np.isfinite(off)], own.ravel(), self.believed(T, x)])
+
+
+def compare(hand: FittedHand, T: Float, x: Float, share: float) -> None:
+    """To a share of what each unknown is sure of."""
+    turn = hand.T_rig_palm[:3, :3] @ T[:3, :3].T
+    off = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2.0
+    step = np.concatenate([off, hand.T_rig_palm[:3, 3] - T[:3, 3], hand.x - x])
+    assert (np.abs(step) / np.sqrt(np.diag(hand.alone))).max() < share
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_points_are_fitted_as_scipy_fits_them(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T, angles = palm(rng.uniform(-25.0, 25.0, 3)), natural_angles(rng)
+    points = places(T, angles) + rng.normal(0.0, 2e-3, (6, 3))
+    hand = found(fit(points, small_cov(), by=MACHINE))
+    near, x, cost = OfPoints(T, points, small_cov()).solve(PARAMETERS.of_angles(angles))
+    compare(hand, near, x, 1e-3)
+    assert 0.5 * hand.surprise.sum() < cost
+
+
+def pixels(seed: int) -> tuple[Float, Float, Epoch, FittedHand]:
+    """Palm and angles of a natural hand, what two cameras see of it with 0.5 px of noise, and its fit."""
+    rng = np.random.default_rng(seed)
+    T, angles = palm(rng.uniform(-15.0, 15.0, 3)), natural_angles(rng)
+    epoch = seen(T, angles).epoch(10**9, sigma_px=SIGMA_PX)
+    assert epoch.uv is not None
+    epoch.uv[:] += rng.normal(0.0, SIGMA_PX, epoch.uv.shape)
+    return T, angles, epoch, found(MACHINE.push(epoch).solution)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 4, 5, 7])
+def test_pixels_are_fitted_as_scipy_fits_them_with_what_is_wrong_with_markers_as_unknowns(seed: int) -> None:
+    """Not to the last digit: how the side of a cap changes as it shifts is left out of the slopes."""
+    _, _, epoch, hand = pixels(seed)
+    near, x, _ = OfPixels(hand.T_rig_palm, epoch, SIGMA_PX).solve(hand.x, spare=18)
+    compare(hand, near, x, 0.05)
+
+
+# SHORTFALL: of seeds 0 to 7 the least of 2, 3 and 6 costs 7.1, 5.6 and 4.2, what is found 7.3, 10.3 and 10.0; of 3 the
+# search is at its last step as well, 0.25 sigma from the bottom of its own valley.
+@pytest.mark.xfail(strict=False, reason="a first frame is begun in a valley that is not the lowest")
+@pytest.mark.parametrize("seed", [2, 3, 6])
+def test_a_first_frame_is_found_where_it_costs_least(seed: int) -> None:
+    T, angles, epoch, hand = pixels(seed)
+    _, _, least = OfPixels(T, epoch, SIGMA_PX).solve(PARAMETERS.of_angles(angles), spare=18)
+    _, _, cost = OfPixels(hand.T_rig_palm, epoch, SIGMA_PX).solve(hand.x, spare=18)
+    assert cost < least + 0.1
+
+
+def test_no_other_bend_of_a_finger_costs_less() -> None:
+    """Flexion and PIP of a finger, all that the limits allow in steps of a degree, the rest as it was found."""
+    rng = np.random.default_rng(7)
+    T, angles = palm(rng.uniform(-15.0, 15.0, 3)), natural_angles(rng)
+    points = places(T, angles) + rng.normal(0.0, 2e-3, (6, 3))
+    hand = found(fit(points, small_cov(), by=MACHINE))
+    rows = OfPoints(hand.T_rig_palm, points, small_cov())
+    columns = np.flatnonzero(np.isin(PARAMETERS.free, [4 * 2 + 1, 4 * 2 + 2]))
+
+    def cost(x: Float) -> float:
+        return 0.5 * float(np.sum(rows(np.concatenate([np.zeros(6), x])) ** 2))
+
+    least, step = cost(hand.x), np.radians(1.0)
+    grids = [np.arange(PARAMETERS.low[c], PARAMETERS.high[c], 3.0 * step) for c in columns]
+    costs = np.empty([len(grid) for grid in grids])
+    for i, flexion in enumerate(grids[0]):
+        for j, pip in enumerate(grids[1]):
+            x = hand.x.copy()
+            x[columns] = flexion, pip
+            costs[i, j] = cost(x)
+    assert costs.min() >= least - 1e-6
+    i, j = np.unravel_index(costs.argmin(), costs.shape)
+    assert abs(grids[0][i] - hand.x[columns[0]]) < 6.0 * step
+    assert abs(grids[1][j] - hand.x[columns[1]]) < 6.0 * step
+
+
+_PLAIN = """
+import sys
+import numpy as np
+from tests.hand_helpers import palm
+from tests.master.estimator.fitted import STEP_NS, bent, estimator, push, places, seen
+
+rays, points, out = estimator(), estimator(natural=True), []
+for k in range(5):
+    T = palm(np.array([3.0 * k, -2.0 * k, k]))
+    epoch = seen(T, bent(k / 60.0)).epoch(k * STEP_NS, gone=(2,) if k == 3 else (), cameras=(0,) if k == 4 else None)
+    for hand in (rays.push(epoch).solution, push(points, k * STEP_NS, places(T, bent(k / 60.0))).solution):
+        out += [hand.T_rig_palm.ravel(), hand.angles_rad.ravel(), hand.cov_m2.ravel() * 1e3, [hand.natural]]
+np.save(sys.argv[1], np.concatenate(out))
+"""
+
+
+def test_plain_python_and_machine_code_give_the_same_hands(tmp_path: Path, root: Path) -> None:
+    results = list[Float]()
+    for plain in ("0", "1"):
+        file = tmp_path / f"{plain}.npy"
+        settings = os.environ | {"NUMBA_DISABLE_JIT": plain, "PYTHONPATH": str(root)}
+        subprocess.run([sys.executable, "-c", _PLAIN, str(file)], check=True, env=settings, cwd=root)
+        results.append(np.load(file))
+    np.testing.assert_allclose(results[1], results[0], atol=1e-9, rtol=1e-9)
