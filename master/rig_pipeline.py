@@ -13,7 +13,7 @@ from common.geometry import cross
 from common.messages import Detections
 from master.estimator.estimator import Estimator
 from master.estimator.pipeline import MarkerPipeline, OtherSensors, SolvedPose, Stage
-from master.estimator.settings import DEFAULT, Settings
+from master.estimator.settings import Settings
 from master.estimator.smooth import HandOneEuro
 from master.fabrik.caps import CapTables
 from master.fabrik.compile import log_if_slow
@@ -29,7 +29,7 @@ from master.hurry import never
 from master.rig_setup import RigSetup
 from master.wrist.pipeline import WristPipeline
 
-_ANY_CURL = DEFAULT._replace(curled_rad=100.0)  # a finger that is not seen may be bent anyhow
+_ANY_CURL_RAD = 100.0  # a finger that is not seen may be bent anyhow
 _MOUNTED_RAD = np.radians(0.5)  # standard deviation of the pitch of cameras mounted by eye
 _LEAD_M_S = 0.12  # of a palm, and of a finger on it, when another sensor takes over: 4 mm a frame at 60 Hz
 
@@ -83,7 +83,7 @@ def _rays(setup: RigSetup) -> RayTriangulator | None:
 
 
 def _estimator(
-    setup: RigSetup, *, continuous: bool, natural: bool = False, settings: Settings = DEFAULT
+    setup: RigSetup, *, continuous: bool, natural: bool = False, settings: Settings | None = None
 ) -> Estimator:
     """The estimator of a rig's hand; arguments as of `Estimator`."""
     markers = setup.hand_markers
@@ -94,7 +94,7 @@ def _estimator(
         markers,
         continuous=continuous,
         natural=natural,
-        settings=settings,
+        settings=settings or setup.settings,
     )
 
 
@@ -136,7 +136,9 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
         triangulate=triangulate,
         one_euro=_point_filter(setup) if continuous else None,
         palm=_estimator(setup, continuous=continuous, natural=True),
-        once=_estimator(setup, continuous=False, natural=True, settings=_ANY_CURL),
+        once=_estimator(
+            setup, continuous=False, natural=True, settings=setup.settings._replace(curled_rad=_ANY_CURL_RAD)
+        ),
         stage=stage,
     )
     line.rehearse()

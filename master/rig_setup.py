@@ -13,6 +13,7 @@ from common.gesture_settings import GestureSettings, default_gestures
 from common.hand_model import HandModel
 from common.messages import Detections, MarkerDetections
 from common.object_profile import ObjectProfile
+from master.estimator.settings import DEFAULT, Settings
 from master.rig_merge import gestures_named, merged_rig, refuse_shared_senders
 from master.rig_objects import objects_of
 from master.wrist.setup import WristSetup
@@ -32,6 +33,7 @@ class RigSetup:
         rows: Camera -> which rows of its messages are `markers`, where it watches another hand as well.
         objects: What else its marker cameras watch, in the order of the rig; of a rig of several hands with the first.
         gestures: What counts as a gesture of this hand.
+        settings: Numbers of the estimator.
     """
 
     rig: RigCalibration
@@ -43,6 +45,7 @@ class RigSetup:
     rows: dict[str, tuple[int, ...]] = field(default_factory=dict[str, tuple[int, ...]])
     objects: tuple[ObjectProfile, ...] = ()
     gestures: GestureSettings = field(default_factory=default_gestures)
+    settings: Settings = DEFAULT
 
     @property
     def has_markers(self) -> bool:

@@ -11,6 +11,7 @@ from common.datagram import Address
 from common.endpoints import check, encrypted, port_of
 from common.errors import BusError
 from common.keys import access_of, link_key
+from master.estimator.settings import Settings
 from master.live import LiveSettings, run_live
 from master.options import (
     CALIB_JSON,
@@ -26,7 +27,6 @@ from master.options import (
     Rigs,
     address,
 )
-from master.rig import load_setups
 from master.said import say
 from master.stopping import stop_on_signals
 from master.tuning import RigFiles
@@ -58,6 +58,14 @@ def run(
             " bit for bit."
         ),
     ] = None,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            help="Try another number of the estimator, estimator.NAME=VALUE, such as estimator.tracked_m=0.015; a wrong"
+            " name lists all.",
+        ),
+    ] = None,
 ) -> None:
     """Track live until Ctrl-C; hands, objects, contact and gestures go to the bus (phalanx/hand/<name>, .../object/...)
     and, if asked, to files.
@@ -80,14 +88,15 @@ def run(
 
       phalanx-master run --rig desk --keys DIR --beacon 192.168.1.255:47800 --bind 0.0.0.0:47801 --bus tls/0.0.0.0:47802
     """
-    setups = load_setups(calibration, rig, hand)
+    files = RigFiles(calibration, tuple(rig), hand, Settings.of(changes or []))
+    setups = files.load()
     settings = LiveSettings(
         *checked_ends(beacon, bind, bus),
         bus,
         start_timeout_s,
         poses,
         summary,
-        RigFiles(calibration, tuple(rig), hand),
+        files,
         record,
     )
     run_live(setups, link_key(os.environ, key_file), settings, stop_on_signals(), say)

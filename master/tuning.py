@@ -24,6 +24,7 @@ from common.errors import CalibrationError, PhalanxError
 from common.messages import Detections, Name
 from common.watching import WatchedFiles
 from master.estimator.pipeline import SolvedPose, Stage
+from master.estimator.settings import DEFAULT, Settings
 from master.hurry import never
 from master.needs_restart import refuse_other_hands, refuse_restart
 from master.rig import Pipeline, RigSetup, load_setups, pipeline_of
@@ -37,11 +38,12 @@ _ROUNDS = 20
 
 @dataclass(frozen=True, slots=True)
 class RigFiles:
-    """Where setups were read: the arguments of `load_setups`."""
+    """Where setups were read: the arguments of `load_setups`, and numbers of the estimator that go with them."""
 
     calibration: Path
     rigs: tuple[str, ...]
     hand: Path | None = None
+    settings: Settings = DEFAULT
 
     def load(self) -> tuple[RigSetup, ...]:
         """Read the files as they are now.
@@ -49,7 +51,8 @@ class RigFiles:
         Raises:
             CalibrationError: As `load_setups`.
         """
-        return load_setups(self.calibration, self.rigs, self.hand)
+        setups = load_setups(self.calibration, self.rigs, self.hand)
+        return tuple(replace(setup, settings=self.settings) for setup in setups)
 
     def paths(self, setups: Sequence[RigSetup]) -> tuple[Path, ...]:
         """All files that `setups` were read from."""
@@ -353,7 +356,7 @@ def _show(pipeline: Pipeline, told: Detections | _Turn) -> list[SolvedPose]:
 
 
 def _content(setup: RigSetup) -> tuple[object, ...]:
-    return setup.rig, setup.wrist_rig, setup.cameras, setup.hand.profile, setup.rows
+    return setup.rig, setup.wrist_rig, setup.cameras, setup.hand.profile, setup.rows, setup.settings
 
 
 def _beside(setup: RigSetup) -> tuple[object, ...]:

@@ -1,5 +1,6 @@
 """Every number that tunes the estimator, each with its unit, its range and where it is from."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite, radians
 from typing import Annotated, NamedTuple, Self, get_type_hints
@@ -171,6 +172,26 @@ class Settings(NamedTuple):
                 f"estimator.{name}: {value} is out of range: {allowed.low} to {allowed.high} {allowed.unit}"
             )
         return self._replace(**{name: value})
+
+    @classmethod
+    def of(cls, changes: Sequence[str]) -> Self:
+        """The defaults with changes such as `estimator.walk_rad_s=6`.
+
+        Raises:
+            CalibrationError: One is malformed, there is no such setting, or the value is out of its range.
+        """
+        settings = cls()
+        for change in changes:
+            name, equals, value = change.partition("=")
+            room, dot, name = name.partition(".")
+            if not (room == "estimator" and dot and equals):
+                raise CalibrationError(f"--set {change!r}: expected estimator.NAME=VALUE")
+            try:
+                number = float(value)
+            except ValueError as error:
+                raise CalibrationError(f"--set {change!r}: {value!r} is no number") from error
+            settings = settings.changed(name, number)
+        return settings
 
     def record(self) -> Self:
         """The same for kernels, which take it as one pointer."""

@@ -1,0 +1,37 @@
+"""Numbers of the estimator from the command line."""
+
+import pytest
+
+from common.errors import CalibrationError
+from master.estimator.settings import DEFAULT, Settings
+
+
+def test_changes_are_taken_in_their_order() -> None:
+    settings = Settings.of(["estimator.tracked_m=0.012", "estimator.walk_rad_s=6", "estimator.walk_rad_s=7"])
+    assert (settings.tracked_m, settings.walk_rad_s) == (0.012, 7.0)
+    assert settings._replace(tracked_m=DEFAULT.tracked_m, walk_rad_s=DEFAULT.walk_rad_s) == DEFAULT
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ("estimator.tracked_m=9", "0.002 to 0.1 m"),
+        ("estimator.tracked_m=nan", "out of range"),
+        ("estimator.track=1", "no such setting"),
+        ("estimator.tracked_m=wide", "no number"),
+        ("tracked_m=0.01", "estimator.NAME=VALUE"),
+        ("estimator.tracked_m", "estimator.NAME=VALUE"),
+    ],
+)
+def test_what_is_wrong_is_refused_with_the_fix(change: str, named: str) -> None:
+    with pytest.raises(CalibrationError, match=named):
+        Settings.of([change])
+
+
+def test_every_default_is_inside_its_range() -> None:
+    ranges = Settings.ranges()
+    assert set(ranges) == set(DEFAULT._fields)
+    for name, value in DEFAULT._asdict().items():
+        assert ranges[name].low <= value <= ranges[name].high, name
+        assert ranges[name].source
+        assert ranges[name].unit
