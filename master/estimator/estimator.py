@@ -480,7 +480,7 @@ class Estimator:
     def _likeliest(self) -> Float:
         """Free angles (n,) of the natural hand."""
         habits = self._habits_of(_NONE)
-        x = np.linalg.solve(habits.normal[0], habits.pull[0])
+        x = np.asarray(np.linalg.solve(habits.normal[0], habits.pull[0]), np.float64)
         return np.minimum(np.maximum(x, self.parameters.low), self.parameters.high)
 
     def _rests(self, at: Epoch, rays: Int, *, palm_shown: bool, by_markers: bool) -> Int:

@@ -268,7 +268,7 @@ class MarkerPipeline:
             (frames.uv, frames.sigma_px, frames.area),
             (frames.rival_uv, frames.rival_sigma_px),
             among(clear, self._on_hand) if others is None else self._expected(others),
-            (self._was_m, (frames.t_ns - self._was_ns) * 1e-9),
+            (self._was_m, np.asarray((frames.t_ns - self._was_ns) * 1e-9, np.float64)),
             self._rays_px,
         )
         self._count("rival", chosen.taken)

@@ -19,7 +19,6 @@ from tests.hand_helpers import (
     MARKERS,
     RIGHT,
     camera_models,
-    cap_views,
     palm,
     rig_file,
     small_cov,
@@ -147,11 +146,10 @@ class Seen:
 
 
 def seen(T: Float, angles: Float, cameras: Sequence[CameraModel] = PAIR, model: HandModel = RIGHT) -> Seen:
-    """What cameras see of a hand, caps from the side that they see."""
+    """What cameras see of a hand, without the bias of the caps."""
     joints = model.forward(T, angles)
     points = model.marker_points(joints, MARKERS)
-    bias, _ = cap_views(model, MARKERS, joints, points, tuple(cameras))
-    return Seen(joints, np.stack([camera.project(points) for camera in cameras]) + bias, points)
+    return Seen(joints, np.stack([camera.project(points) for camera in cameras]), points)
 
 
 def bent(t_s: float, speed_deg_s: float = 120.0) -> Float:

@@ -250,8 +250,6 @@ def points(whole: Whole) -> None:
 def flat_rays(whole: Whole) -> None:
     """Rays of markers without a shape, with nothing wrong with themselves."""
     rays(whole)
-    caps = whole.rig.caps
-    whole.rig = whole.rig._replace(caps=caps._replace(row=np.full_like(caps.row, -1)))
     whole.observed.own[:] = 1e15 * np.eye(3)
 
 

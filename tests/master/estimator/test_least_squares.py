@@ -14,8 +14,6 @@ from common.geometry import rigid, rotation_vector_to_matrix
 from master.estimator.estimator import Epoch, FittedHand
 from master.estimator.priors import habits_of
 from master.estimator.settings import DEFAULT
-from master.fabrik.cap_views import seen_shift
-from master.fabrik.caps import CapTables
 from tests.hand_helpers import FACING, MARKERS, RIGHT, natural_angles, palm, small_cov
 from tests.master.estimator.fitted import FREE, PAIR, PARAMETERS, fit, forgetful, found, places, seen
 
@@ -76,24 +74,16 @@ class OfPixels(Residuals):
     def __init__(self, near: Float, epoch: Epoch, sigma_px: float) -> None:
         super().__init__(near)
         assert epoch.uv is not None
-        self.uv, self.sigma_px, self.caps = epoch.uv, sigma_px, CapTables.of(RIGHT, MARKERS)
-        flat = np.array([RIGHT.mount(name).finger is None for name in MARKERS])
-        self.own_m = np.sqrt(FINE.bones_m**2 + flat * FINE.relief_m**2)
+        self.uv, self.sigma_px, self.own_m = epoch.uv, sigma_px, np.full(6, FINE.bones_m)
 
     def __call__(self, at: Float) -> Float:
         T, x = self.hand(at)
         joints, moved = RIGHT.forward(T, PARAMETERS.angles(x)), at[6 + FREE :].reshape(6, 3)
         points = RIGHT.marker_points(joints, MARKERS)
-        off, shift = np.zeros((len(PAIR), 6, 2)), np.zeros(3)
+        off = np.zeros((len(PAIR), 6, 2))
         for c, camera in enumerate(PAIR):
             for m, point in enumerate(points):
-                place = point + moved[m]
-                if (row := int(self.caps.row[m])) >= 0:
-                    ahead = -np.ascontiguousarray(joints.rotation[self.caps.joint[row], :, 2])
-                    back = (camera.centre - point) / np.linalg.norm(camera.centre - point)
-                    seen_shift(self.caps, row, ahead, back, shift)
-                    place = place + shift
-                off[c, m] = (camera.project(place) - self.uv[c, m]) / self.sigma_px
+                off[c, m] = (camera.project(point + moved[m]) - self.uv[c, m]) / self.sigma_px
         own = moved / self.own_m[:, None]
         return np.concatenate([off[np.isfinite(off)], own.ravel(), self.believed(T, x)])
 
