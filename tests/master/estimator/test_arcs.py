@@ -17,7 +17,6 @@ from master.estimator.kinematics import Scratch
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT
 from master.estimator.update import Model
-from master.fabrik.caps import CapTables
 from tests.hand_helpers import LEFT, MARKERS, RIGHT, natural_angles, palm, small_cov
 from tests.master.estimator.fitted import PAIR, fit, forgetful, found, places
 from tests.master.estimator.kernels import joint_covariances
@@ -37,10 +36,9 @@ def solution(model: HandModel = RIGHT) -> FittedHand:
 def covariances(hand: FittedHand, cov: Float, seen: Bool, model: HandModel = RIGHT) -> tuple[Float, Float]:
     """Of the joints (26, 3, 3): by derivatives alone, and with arcs; markers that are seen hold their places."""
     tables = HandTables.of(model, HandParameters.of(model))
-    caps, mounts = CapTables.of(model, MARKERS), Mounts.of(model, MARKERS)
-    rig = Model(boxed(tables), boxed(DEFAULT.record()), mounts, CameraArrays.of(PAIR), caps)
+    rig = Model(boxed(tables), boxed(DEFAULT.record()), Mounts.of(model, MARKERS), CameraArrays.of(PAIR))
     straight, whole = np.empty((26, 3, 3)), np.empty((26, 3, 3))
-    room, information = Certainty.empty(len(hand.x), 16), np.linalg.inv(small_cov())
+    room, information = Certainty.empty(len(hand.x), 16), np.asarray(np.linalg.inv(small_cov()), np.float64)
     T, scratch = hand.T_rig_palm, boxed(Scratch.empty())
     joint_covariances(rig, T, hand.x, cov, seen, information, scratch, boxed(room), straight, whole)
     return straight, whole

@@ -90,7 +90,7 @@ def errors_after(run: SyntheticRun, T: Callable[[Float], Float], *, start: bool)
     assert machine is not None
     if not start:
         push = machine.push
-        machine.push = lambda at: push(replace(at, start=None))  # type: ignore[method-assign]
+        machine.push = lambda at: push(replace(at, start=None))
     for message in run.messages:
         for solved in pipeline.push(message):
             count += 1

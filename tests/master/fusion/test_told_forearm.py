@@ -61,7 +61,7 @@ class Instant:
         T = rigid(rotation_vector_to_matrix(at[:3]) @ self.R, at[3:6])
         x = self.x + at[6:]
         angles = PARAMETERS.angles(x)
-        nothing = np.zeros((26, 3, 3)), np.zeros((5, 3, 3))
+        nothing = np.zeros((26, 3, 3)), np.zeros((5, 3, 3)), np.zeros(5)
         alone: Float = np.asarray(scale * np.linalg.inv(normal), np.float64)
         joints = RIGHT.forward(T, angles)
         return FittedHand(T, angles, joints, *nothing, alone, x, scale, 1.0, np.zeros(6), 1)
