@@ -22,6 +22,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from common.arrays import Bool, Float, Int
+from common.kernels import constant, kernel
 from master.estimator.cameras import CameraArrays, project
 from master.fabrik.intersection import triangulate
 
@@ -183,10 +184,16 @@ def _best(
     return None if best > 0 and near[overruled > 0].any() else best
 
 
+@kernel
+def _seen_at(cameras: CameraArrays, c: int, point: Float, uv: Float, J: Float) -> None:
+    """Write where camera `c` sees a point, and derivatives: what kernels call has no door from Python."""
+    project(cameras, c, point, uv, J)
+
+
 def _in_image(cameras: CameraArrays, c: int, prior: Prior) -> Prior:
     """A prior of one marker as camera `c` sees it: (2,) [px], (2, 2) [px^2]."""
     uv, J = np.full(2, np.nan), np.zeros((2, 3))
-    project(cameras, c, np.ascontiguousarray(prior.points_m), uv, J)
+    _seen_at(cameras, constant(c), np.ascontiguousarray(prior.points_m), uv, J)
     return Prior(uv, J @ prior.cov_m2 @ J.T)
 
 

@@ -83,7 +83,7 @@ def places(T: Float, angles: Float, model: HandModel = RIGHT, markers: tuple[str
 
 def turned(rotation: Float, cov_rad2: Float, *, sure: bool = True, n: int = FREE) -> Sensed:
     """A palm's rotation (3, 3) by an IMU, with its covariance (3, 3)."""
-    return Sensed.turn(rotation, np.linalg.inv(cov_rad2), n, sure=sure)
+    return Sensed.turn(rotation, np.asarray(np.linalg.inv(cov_rad2), np.float64), n, sure=sure)
 
 
 def residual_m(hand: FittedHand, points: Float, model: HandModel = RIGHT) -> Float:
@@ -146,7 +146,7 @@ class Seen:
 
 
 def seen(T: Float, angles: Float, cameras: Sequence[CameraModel] = PAIR, model: HandModel = RIGHT) -> Seen:
-    """What cameras see of a hand, without the bias of the caps."""
+    """What cameras see of a hand; caps are corrected before the fit."""
     joints = model.forward(T, angles)
     points = model.marker_points(joints, MARKERS)
     return Seen(joints, np.stack([camera.project(points) for camera in cameras]), points)

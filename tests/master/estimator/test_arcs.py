@@ -36,10 +36,9 @@ def solution(model: HandModel = RIGHT) -> FittedHand:
 def covariances(hand: FittedHand, cov: Float, seen: Bool, model: HandModel = RIGHT) -> tuple[Float, Float]:
     """Of the joints (26, 3, 3): by derivatives alone, and with arcs; markers that are seen hold their places."""
     tables = HandTables.of(model, HandParameters.of(model))
-    mounts = Mounts.of(model, MARKERS)
-    rig = Model(boxed(tables), boxed(DEFAULT.record()), mounts, CameraArrays.of(PAIR))
+    rig = Model(boxed(tables), boxed(DEFAULT.record()), Mounts.of(model, MARKERS), CameraArrays.of(PAIR))
     straight, whole = np.empty((26, 3, 3)), np.empty((26, 3, 3))
-    room, information = Certainty.empty(len(hand.x), 16), np.linalg.inv(small_cov())
+    room, information = Certainty.empty(len(hand.x), 16), np.asarray(np.linalg.inv(small_cov()), np.float64)
     T, scratch = hand.T_rig_palm, boxed(Scratch.empty())
     joint_covariances(rig, T, hand.x, cov, seen, information, scratch, boxed(room), straight, whole)
     return straight, whole

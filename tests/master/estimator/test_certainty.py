@@ -37,6 +37,7 @@ def tilt_deg(hand: FittedHand) -> Float:
 @pytest.mark.parametrize("dt_s", [0.002, 0.011, 0.1])
 def test_a_pose_that_is_held_makes_its_directions_no_surer(dt_s: float) -> None:
     machine, first = estimator(), solved(NATURAL)
+    hand = first
     for k in range(21):
         hand = found(push(machine, round(k * dt_s * 1e9), places(palm(), NATURAL)).solution)
     np.testing.assert_allclose(tilt_deg(hand), tilt_deg(first), rtol=0.15)

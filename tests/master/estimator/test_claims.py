@@ -126,9 +126,8 @@ def test_what_moves_on_an_arc_is_as_wide_as_drawn_hands_are() -> None:
     machine, hidden = estimator(), np.zeros((6, 1), bool)
     points = places(palm(), natural_angles(np.random.default_rng(3)))
     hidden[INDEX] = True
-    for k in range(60):
-        hand = push(machine, k * STEP_NS, np.where(hidden & (k >= 10), np.nan, points))
-    last = found(hand.solution)
+    hands = [push(machine, k * STEP_NS, np.where(hidden & (k >= 10), np.nan, points)) for k in range(60)]
+    last = found(hands[-1].solution)
     cov = np.array(machine.state.cov)
     draws = np.random.default_rng(2).multivariate_normal(np.zeros(len(cov)), cov, 4000)
     drawn = PARAMETERS.angles(last.x + draws[:, 6:])

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from common.arrays import Float
 from common.calibration import Couplings
 from common.geometry import rotation_vector_to_matrix
-from common.hand_model import HandModel
+from common.hand_model import PALM, HandModel
 from common.hand_presets import preset_limits
 from common.messages import Source
 from master.estimator.estimator import Estimator, FittedHand, Sensed
@@ -300,12 +300,12 @@ def test_one_marker_is_enough_where_the_orientation_is_known() -> None:
 def test_a_palm_turns_with_the_imu_between_frames() -> None:
     """The last palm is turned by what the IMU says that it has turned since, before it is believed."""
     truth, machine = np.zeros((5, 4)), estimator()
-    wide, one = np.diag(np.radians([8.0, 8.0, 8.0]) ** 2), np.eye(3)
+    wide = np.radians(8.0) ** 2 * np.eye(3)
     for k in range(30):
         T = palm(np.array([0.0, 0.0, 4.0 * k]))  # 240 degrees a second
         points = places(T, truth)
         if k >= 20:
             points[:5] = np.nan
-        hand = push(machine, k * STEP_NS, points, sensed=turned(one @ T[:3, :3], wide, sure=True))
+        hand = push(machine, k * STEP_NS, points, sensed=turned(T[:3, :3], wide, sure=True))
         assert palm_deg(hand.solution, T) < 12.0
-    assert hand.source[1] == Source.SOLVED
+        assert hand.source[PALM] == Source.SOLVED

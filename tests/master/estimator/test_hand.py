@@ -344,6 +344,9 @@ def test_covariances_of_joints_and_directions_are_those_of_numpy() -> None:
     turn = (J[ends] - J[before]) / np.linalg.norm(p[ends] - p[before], axis=1)[:, None, None]
     expected = turn @ hand.alone @ turn.swapaxes(1, 2)
     np.testing.assert_allclose(hand.tilt_cov_rad2, expected, atol=1e-5 * np.abs(expected).max())
+    # A bending joint turns the end of its finger as fast as it bends itself: MCP, PIP and DIP = 2/3 PIP together.
+    rate = np.concatenate([np.full(6, DEFAULT.palm_walk_rad_s), np.full(FREE, DEFAULT.walk_rad_s)])
+    np.testing.assert_allclose(hand.tilt_walk_rad2_s2, ((turn * rate) ** 2).sum(axis=(1, 2)), rtol=1e-4)
 
 
 # -- where the search begins ------------------------------------------------------------------------------------

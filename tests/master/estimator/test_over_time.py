@@ -22,6 +22,7 @@ from tests.master.estimator.fitted import (
     bent,
     bent_points,
     estimator,
+    found,
     places,
     push,
     run,
@@ -317,8 +318,8 @@ def test_an_orientation_without_heading_does_not_tell_the_palm_by_one_finger(
     run(machine, range(5))
     cov = 0.03**2 * np.eye(3) + (heading_rad**2 - 0.03**2) * np.outer(up, up)
     points = bent_points(bent(5 / 60.0), tuple(m for m in range(6) if m != MARKER_INDEX))
-    for k in range(5, 10):
-        hand = push(machine, k * STEP_NS, points, sensed=turned(palm()[:3, :3], cov, sure=told))
+    said = turned(palm()[:3, :3], cov, sure=told)
+    hand = [push(machine, k * STEP_NS, points, sensed=said) for k in range(5, 10)][-1]
     assert hand.tracked[TIPS[INDEX]]
     assert (hand.rests[5] > 0) == told
     assert hand.source[PALM] == (Source.SOLVED if told else Source.HELD)
@@ -383,18 +384,15 @@ def test_one_camera_alone_goes_on_with_the_fingers_and_holds_the_depth() -> None
 
 def test_a_hand_that_one_camera_sees_is_less_sure_along_the_sight_the_longer_it_is_so() -> None:
     machine, truth = estimator(), seen(palm(), bent(0.2))
-    sigma = list[float]()
-    for k in range(70):
-        hand = machine.push(truth.epoch(k * STEP_NS, cameras=None if k < 10 else (0,)))
-        assert hand.solution is not None
-        value, axis = np.linalg.eigh(hand.solution.cov_m2[PALM])
-        sigma.append(float(np.sqrt(value[-1])))
+    hands = [machine.push(truth.epoch(k * STEP_NS, cameras=None if k < 10 else (0,))) for k in range(70)]
+    value, axis = np.linalg.eigh([found(hand.solution).cov_m2[PALM] for hand in hands])
+    sigma = np.sqrt(value[:, -1])
     age_s = (np.arange(70) - 9) * STEP_NS * 1e-9
     late = age_s > 0.5
-    assert (np.array(sigma)[late] >= 0.99 * DEFAULT.drift_m_s * age_s[late]).all()
+    assert (sigma[late] >= 0.99 * DEFAULT.drift_m_s * age_s[late]).all()
     sight = truth.joints.position_m[PALM] - PAIR[0].centre
-    assert abs(axis[:, -1] @ sight) / np.linalg.norm(sight) > 0.99
-    assert not hand.tracked.any()
+    assert abs(axis[-1][:, -1] @ sight) / np.linalg.norm(sight) > 0.99
+    assert not hands[-1].tracked.any()
 
 
 def test_a_marker_that_one_camera_loses_is_kept_on_the_ray_of_the_other() -> None:
