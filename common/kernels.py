@@ -93,7 +93,7 @@ def fields(one: R) -> R:
     return cast(R, found)
 
 
-def boxed(one: R) -> Any:
+def boxed(one: object) -> Any:
     """The array that a record lies in: kernels are handed that in a fraction of the time."""
     return cast(Any, one).base
 
