@@ -392,7 +392,7 @@ class Estimator:
     def _starts(self, epoch: Epoch) -> list[tuple[Float, Float]]:
         """Three hands, open to closed, each laid on the markers as a rigid body."""
         sensed = epoch.sensed
-        placed = np.isfinite(epoch.points_m[self._on_hand, 0])
+        placed = self._placed(epoch)
         weight = np.where(self._finger[placed] >= 0, 1.0, _PALM_WEIGHT)
         observed = epoch.points_m[self._on_hand][placed]
         starts: list[tuple[Float, Float]] = []
@@ -446,8 +446,7 @@ class Estimator:
         What faces the cameras turns the hand about a line of markers, but not about one that points at them. With an
         orientation that is known any one marker is enough.
         """
-        points = epoch.points_m[self._on_hand]
-        points = points[np.isfinite(points[:, 0])]
+        points = epoch.points_m[self._on_hand][self._placed(epoch)]
         if sure:
             return len(points) > 0
         if len(points) < 2:
@@ -459,6 +458,12 @@ class Estimator:
         if len(points) > 2 and extent[1] > _SPREAD_M:
             return True
         return back and bool(extent[0] > _LENGTH_M and abs(axes[0] @ epoch.facing) < _ACROSS)
+
+    def _placed(self, epoch: Epoch) -> Bool:
+        """The hand's markers (M,) whose places are known: of points those that are measured."""
+        if epoch.cov_m2 is not None:
+            return self._observed.placed
+        return np.isfinite(epoch.points_m[self._on_hand].sum(axis=1))
 
     def _knows_place(self) -> bool:
         """Whether it is still known where the hand is, when nothing but its fingers is told."""

@@ -263,6 +263,8 @@ def _take_over(
             state.rates[a] = 0.0
         for f in range(5):
             state.hidden_ns[f] = NEVER_NS
+        for part in range(6):  # what was measured was another hand
+            state.told_ns[part] = NEVER_NS
     if goes_on and lost:
         now = space.room.cov
         copy(found.cov, now)

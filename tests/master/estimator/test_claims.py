@@ -30,7 +30,7 @@ def surer(now: Float, past: Float) -> Float:
 
 
 def spd(rng: np.random.Generator, n: int) -> Float:
-    a = rng.normal(size=(n, n + 9)) * 10.0 ** rng.uniform(-2.0, 1.0, (n, 1))
+    a = rng.normal(size=(n, n + 9)) * 10.0 ** rng.uniform(-1.0, 1.0, (n, 1))
     return a @ a.T
 
 

@@ -116,7 +116,7 @@ def pixels(seed: int) -> tuple[Float, Float, Epoch, FittedHand]:
     return T, angles, epoch, found(MACHINE.push(epoch).solution)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2, 4, 5, 7])
+@pytest.mark.parametrize("seed", range(6))
 def test_pixels_are_fitted_as_scipy_fits_them_with_what_is_wrong_with_markers_as_unknowns(seed: int) -> None:
     """Not to the last digit: the shift of a marker is integrated out along straight lines."""
     _, _, epoch, hand = pixels(seed)
@@ -124,10 +124,7 @@ def test_pixels_are_fitted_as_scipy_fits_them_with_what_is_wrong_with_markers_as
     compare(hand, near, x, 0.05)
 
 
-# SHORTFALL: of seeds 0 to 7 the least of 2, 3 and 6 costs 7.1, 5.6 and 4.2, what is found 7.3, 10.3 and 10.0; of 3 the
-# search is at its last step as well, 0.25 sigma from the bottom of its own valley.
-@pytest.mark.xfail(strict=False, reason="a first frame is begun in a valley that is not the lowest")
-@pytest.mark.parametrize("seed", [2, 3, 6])
+@pytest.mark.parametrize("seed", range(8))
 def test_a_first_frame_is_found_where_it_costs_least(seed: int) -> None:
     T, angles, epoch, hand = pixels(seed)
     _, _, least = OfPixels(T, epoch, SIGMA_PX).solve(PARAMETERS.of_angles(angles), spare=18)
