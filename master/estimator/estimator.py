@@ -536,8 +536,8 @@ def _surely_spread(off: Float) -> bool:
     """Whether points (N, 3) [m] about their mean are plainly not in one line: without what a decomposition takes."""
     length2 = np.vecdot(off, off)
     along = off @ off[length2.argmax()]
-    aside2 = length2 - along * along / length2.max()
-    return float(aside2.max()) > (4.0 * _SPREAD_M) ** 2
+    longest2 = float(length2.max())
+    return longest2 > 0.0 and float((length2 - along * along / longest2).max()) > (4.0 * _SPREAD_M) ** 2
 
 
 def _unknown(rests: Int) -> Fitted:

@@ -91,7 +91,10 @@ def mean_within(hand: HandTables, normal: Float, gradient: Float, x: Float, cut:
                 cut.total[i, j] = normal[i, j]
             if i >= 6:
                 cut.total[i, i] += cut.weight[i - 6]
-        cholesky(cut.total, N, cut.L)
+        if not cholesky(cut.total, N, cut.L):  # by rounding: nothing is known of where the mean is
+            for i in range(N):
+                mean[i] = 0.0
+            return
         inverse(cut.L, N, cut.work, cut.cov)
         for i in range(N):
             mean[i] = 0.0
