@@ -108,6 +108,11 @@ def pip_deg(hand: FittedHand | None, truth: Float) -> float:
     return float(np.degrees(np.abs(found(hand).angles_rad[1:, 2] - truth[1:, 2])).mean())
 
 
+def region_m(hand: Fitted) -> Float:
+    """Half the largest axes of the 95 % regions of the joints (26,)."""
+    return np.sqrt(7.815 * np.linalg.eigvalsh(found(hand.solution).cov_m2)[:, -1])
+
+
 @dataclass(frozen=True)
 class Seen:
     """A hand before cameras: the truth of an epoch in pixels."""

@@ -17,14 +17,13 @@ from master.estimator.settings import DEFAULT
 from master.fabrik.estimate import MarkerPositions
 from tests.hand_helpers import MARKERS, RIGHT, natural_angles, palm, small_cov, within
 from tests.master.estimator.fitted import (
-    PAIR,
     STEP_NS,
     bent,
     bent_points,
     estimator,
-    found,
     places,
     push,
+    region_m,
     run,
     seen,
     turned,
@@ -41,12 +40,6 @@ def pip_deg(hand: Fitted, finger: int = INDEX) -> float:
 def positions(points: Float, cov: Float) -> MarkerPositions:
     none = np.zeros(6, np.bool_)
     return MarkerPositions(points, cov, cov, none, none[None])
-
-
-def region_m(hand: Fitted) -> Float:
-    """Half the largest axes of the 95 % regions of the joints (26,)."""
-    assert hand.solution is not None
-    return np.sqrt(7.815 * np.linalg.eigvalsh(hand.solution.cov_m2)[:, -1])
 
 
 def sigma_m(hand: Fitted, joint: int) -> float:
@@ -361,61 +354,6 @@ def test_a_finger_that_is_lost_is_tracked_no_longer_than_its_measurement_is_fres
         fresh = k * STEP_NS * 1e-9 <= age_s
         sure = region_m(hand)[CHAINS[INDEX]] < 0.1
         np.testing.assert_array_equal(hand.tracked[CHAINS[INDEX]], sure & fresh)
-
-
-# -- one camera alone -------------------------------------------------------------------------------------------
-
-
-def test_one_camera_alone_goes_on_with_the_fingers_and_holds_the_depth() -> None:
-    machine, off, along = estimator(), list[float](), list[float]()
-    for k in range(60):
-        truth = seen(palm(), bent(k / 60.0, 40.0))
-        hand = machine.push(truth.epoch(k * STEP_NS, cameras=None if k < 15 else (0,)))
-        assert hand.solution is not None
-        if k >= 18:
-            error = hand.solution.joints.position_m - truth.joints.position_m
-            off.append(float(np.linalg.norm(error[:, :2], axis=1).mean()))
-            along.append(float(np.abs(error[:, 2]).mean()))
-            assert not (hand.source == Source.MEASURED).any()
-            assert hand.valid.all()
-    assert np.mean(off) < 5e-3
-    assert np.max(along) < 30e-3
-
-
-def test_a_hand_that_one_camera_sees_is_less_sure_along_the_sight_the_longer_it_is_so() -> None:
-    machine, truth = estimator(), seen(palm(), bent(0.2))
-    hands = [machine.push(truth.epoch(k * STEP_NS, cameras=None if k < 10 else (0,))) for k in range(70)]
-    value, axis = np.linalg.eigh([found(hand.solution).cov_m2[PALM] for hand in hands])
-    sigma = np.sqrt(value[:, -1])
-    age_s = (np.arange(70) - 9) * STEP_NS * 1e-9
-    late = age_s > 0.5
-    assert (sigma[late] >= 0.99 * DEFAULT.drift_m_s * age_s[late]).all()
-    sight = truth.joints.position_m[PALM] - PAIR[0].centre
-    assert abs(axis[-1][:, -1] @ sight) / np.linalg.norm(sight) > 0.99
-    assert not hands[-1].tracked.any()
-
-
-def test_a_marker_that_one_camera_loses_is_kept_on_the_ray_of_the_other() -> None:
-    """Sideways, where one camera measures, it is as good as two."""
-    machine, off = estimator(), list[Float]()
-    for k in range(40):
-        truth = seen(palm(), bent(k / 60.0, 40.0))
-        epoch = truth.epoch(k * STEP_NS)
-        assert epoch.uv is not None
-        assert epoch.variance_px2 is not None
-        if k >= 15:
-            epoch.uv[1, MARKER_INDEX] = epoch.variance_px2[1, MARKER_INDEX] = np.nan
-            epoch.points_m[MARKER_INDEX] = np.nan
-        hand = machine.push(epoch)
-        assert hand.solution is not None
-        if k >= 18:
-            error = np.abs(hand.solution.joints.position_m - truth.joints.position_m)[TIPS[INDEX]]
-            off.append(error)
-            sure = region_m(hand)[CHAINS[INDEX]] < DEFAULT.tracked_m
-            np.testing.assert_array_equal(hand.tracked[CHAINS[INDEX]], sure)
-            assert hand.source[TIPS[INDEX]] == Source.SOLVED
-    assert np.mean(off, axis=0)[0] < 4e-3
-    assert np.linalg.norm(off, axis=1).mean() < 15e-3  # its depth is that of habits
 
 
 # -- the hand of a moment ago was wrong -------------------------------------------------------------------------
