@@ -37,8 +37,9 @@ def joint_mm(pose: HandPose) -> Float:
     return 1e3 * np.linalg.norm(pose.position_m - hand_at(pose.t_ns * 1e-9).position_m, axis=1)
 
 
-# SHORTFALL: joints of exact hands whose 95 % regions are larger than the 20 mm of `tracked_m`, though they are 1 to 2 mm
-# off, 4 at most: the thumb's metacarpal (22 mm) and proximal joint (21), the little finger's proximal one (20).
+# SHORTFALL: joints of exact hands whose 95 % regions are larger than the 20 mm of `tracked_m`, though they are
+# 1 to 2 mm off, 4 at most: the thumb's metacarpal (22 mm) and proximal joint (21), the little finger's proximal
+# one (20).
 SURE = np.setdiff1d(np.arange(26), [CHAINS[0, 0], CHAINS[0, 1], CHAINS[4, 0], CHAINS[4, 1]])
 
 
