@@ -60,12 +60,12 @@ def record(kind: type[R], **fields: Shape | tuple[str, Shape] | object) -> R:
     types: list[tuple[str, Any] | tuple[str, Any, Any]] = []
     for name, of in fields.items():
         if isinstance(of, np.void):
-            types.append((name, of.dtype))
+            types.append((name, cast(Any, of.dtype)))
         elif isinstance(of, tuple) and isinstance(cast(Any, of)[0], str):
             kind_of, shape = cast(tuple[str, Shape], of)
             types.append((name, kind_of, shape if isinstance(shape, tuple) else (shape,)))
         else:
-            types.append((name, "f8", of if isinstance(of, tuple) else (of,)))
+            types.append((name, "f8", cast(Any, of if isinstance(of, tuple) else (of,))))
     out = np.zeros(1, np.dtype(types, align=True)).view(np.recarray)[0]
     for name, of in fields.items():
         if isinstance(of, np.void):

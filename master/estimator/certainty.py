@@ -166,7 +166,7 @@ def _slopes(hand: HandTables, joint: int, T: Float, work: Scratch, room: Certain
         room.at[a] = a
     if f < 0:
         return 6
-    count = hand.first[f + 1] - hand.first[f]
+    count = int(hand.first[f + 1] - hand.first[f])
     finger_slopes(hand, work.by, T, work.R, work.P, f, level, work.point, False, room.J)
     for c in range(count):
         room.at[6 + c] = 6 + hand.first[f] + c

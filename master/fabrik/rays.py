@@ -276,7 +276,7 @@ def locate(
             for j in range(3):
                 own[m, i, j] = 0.0
         if meets:
-            much = walked[row] if known and row >= 0 else 0.0
+            much = float(walked[row]) if known and row >= 0 else 0.0
             _covariance(cameras, caps, row, count, shared, rays, views, much, cov[m], own[m])
         elif seen == 1 and known and row >= 0:
             _lone(cameras, caps, hand, rays_px, row, observed[:, m, 3], rays, views)
