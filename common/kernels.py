@@ -50,17 +50,21 @@ def constant(number: int) -> int:
     return cast(int, np.int64(number))
 
 
-def record(kind: type[R], **fields: Shape | tuple[str, Shape] | object) -> R:
+def record(kind: type[R], **fields: Shape | tuple[str, Shape] | tuple[object, int] | object) -> R:
     """Allocate a struct of arrays with fixed shapes, all zero: kernels take it as one pointer.
 
     Args:
         kind: A class that declares the fields; never called.
-        fields: Shape of each, of float64; or data type and shape; or another record, which is copied into it.
+        fields: Shape of each, of float64; or data type and shape; or another record, which is copied into it; or one
+            and how many of its kind there are, all zero.
     """
     types: list[tuple[str, Any] | tuple[str, Any, Any]] = []
     for name, of in fields.items():
         if isinstance(of, np.void):
             types.append((name, cast(Any, of.dtype)))
+        elif isinstance(of, tuple) and isinstance(cast(Any, of)[0], np.void):
+            one, count = cast(tuple[np.void, int], of)
+            types.append((name, cast(Any, one.dtype), (count,)))
         elif isinstance(of, tuple) and isinstance(cast(Any, of)[0], str):
             kind_of, shape = cast(tuple[str, Shape], of)
             types.append((name, kind_of, shape if isinstance(shape, tuple) else (shape,)))

@@ -29,14 +29,16 @@ from math import sqrt
 
 from common.arrays import Bool, Float, Int
 from common.hand_model import CHAINS
-from common.kernels import inlined, inner, record
+from common.kernels import constant, inlined, inner, record
 from master.estimator.hand_tables import HandTables
-from master.estimator.kinematics import Scratch, finger_slopes, marker_point, palm_slopes
+from master.estimator.kinematics import DIRECTION, PLACE, Scratch, finger_slopes, marker_point, palm_slopes
 from master.estimator.matrices import cholesky, eigen
 from master.estimator.settings import Settings
 from master.estimator.solve import Rig
 from master.estimator.state import Hidden
 
+_LAST = constant(3)  # joint of a finger: its tip
+_NONE = constant(0)
 _MOST = 12  # turns that count in arcs: those of the palm, which moves all joints, then the largest
 
 
@@ -167,7 +169,7 @@ def _slopes(hand: HandTables, joint: int, T: Float, work: Scratch, room: Certain
     if f < 0:
         return 6
     count = int(hand.first[f + 1] - hand.first[f])
-    finger_slopes(hand, work.by, T, work.R, work.P, f, level, work.point, False, room.J)
+    finger_slopes(hand, work.by, T, work.R, work.P, f, level, work.point, PLACE, room.J)
     for c in range(count):
         room.at[6 + c] = 6 + hand.first[f] + c
     return 6 + count
@@ -221,7 +223,7 @@ def tilts(
         for i in range(3):
             work.ahead[i] /= sqrt(squared)
         palm_slopes(work.ahead, room.J)
-        finger_slopes(hand, work.by, T, work.R, work.P, f, 3, work.ahead, True, room.J)
+        finger_slopes(hand, work.by, T, work.R, work.P, f, _LAST, work.ahead, DIRECTION, room.J)
         count = hand.first[f + 1] - hand.first[f]
         for a in range(6 + count):
             room.at[a] = a if a < 6 else hand.first[f] + a
@@ -401,7 +403,7 @@ def _gain(
         size, start = 6, 0
         if f >= 0:
             start, size = hand.first[f], 6 + hand.first[f + 1] - hand.first[f]
-            finger_slopes(hand, work.by, T, work.R, work.P, f, mounts.level[m], work.point, False, room.J)
+            finger_slopes(hand, work.by, T, work.R, work.P, f, mounts.level[m], work.point, PLACE, room.J)
         _whiten(information[m], room.white)
         for i in range(3):
             for c in range(N):
@@ -483,7 +485,7 @@ def add_arcs(
     if count == 0:
         return
     _bone_turns(rig.hand, T, count, work, room)
-    pairs = 0
+    pairs = _NONE
     for k in range(count):
         for m in range(k + 1):
             _arcs(rig, T, seen, k, m, pairs, work, room)

@@ -11,7 +11,6 @@ from common.geometry import fit_rigid
 from common.hand_model import CHAINS, HandJoints, HandModel
 from common.kernels import bound, boxed, fields
 from common.messages import Source
-from master.estimator.attached import Attached
 from master.estimator.cameras import CameraArrays
 from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.kinematics import Scratch, pose
@@ -23,16 +22,12 @@ from master.estimator.settings import DEFAULT, Settings
 from master.estimator.solve import MAX_ITERATIONS, Rig
 from master.estimator.state import HandState
 from master.estimator.update import (
-    BEGIN,
-    LOST,
-    ROUGH,
-    TAKE_OVER,
-    TRACK,
-    TRACKED_ON,
     Estimate,
     Model,
     Workspace,
-    epoch,
+    fit_epoch,
+    predict_epoch,
+    take_over_epoch,
 )
 from master.fabrik.estimate import SolvedHand
 
@@ -44,10 +39,11 @@ _STEP = 16
 _SPREAD_M = 5e-3  # markers nearer than this to one line do not turn a hand about it
 _LENGTH_M = 20e-3  # a line shorter than this has no direction
 _ACROSS = 0.9  # cosine to the sight, at most
+_EVEN = 0.5  # probability
 _SOMEWHERE_M = 0.1  # about each axis: a hand that is known no better than this is lost
 ON_MARKERS, ON_OTHERS, BY_MARKERS = 1, 2, 16
 _FIRST_MARKER = 8  # bit
-_EYE = np.eye(3)
+_EYE, _AT_ORIGIN = np.eye(3), np.eye(4)
 _NONE = frozenset[int]()
 
 
@@ -207,7 +203,6 @@ class Estimator:
         bent[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (_MCP_PER_PIP, 1.0))[:, None]
         self._postures = np.array([self.parameters.of_angles(angles) for angles in bent])
         self._natural = self._likeliest()
-        self._attached = Attached.markers(model, self.parameters, hand_markers)
         self._bit = 1 << np.arange(_FIRST_MARKER, _FIRST_MARKER + count)
         self._finger_of_free = self.parameters.free // 4
         self._turn: Float | None = None
@@ -226,15 +221,11 @@ class Estimator:
             nothing, nothing[..., 0].copy(), own, self._on_hand, self._observed
         )  # compiled now, not later
         observe_points(own[self._on_hand, 0], own[self._on_hand], 0.0, self._observed)
-        self._kernel = bound(
-            epoch,
-            self._model,
-            self._habits_of(_NONE),
-            self._boxed_state,
-            self._observed,
-            self._blank,
-            self._boxed_space,
-            boxed(self._out),
+        state, space = self._boxed_state, self._boxed_space
+        self._predict = bound(predict_epoch, self._model, state, self._observed, space)
+        self._fit = bound(fit_epoch, self._model, self._habits_of(_NONE), self._observed, self._blank, space)
+        self._take_over = bound(
+            take_over_epoch, self._model, state, True, self._observed, space, boxed(self._out)
         )
 
     @property
@@ -292,22 +283,56 @@ class Estimator:
 
     def _solve(self, at: Epoch, out: Estimate, *, known: bool, enough: bool) -> tuple[bool, bool]:
         """Fit an epoch and take it over; return whether there is a hand, and whether the one before was wrong."""
-        if known and self._only_natural and enough:
-            before = self._boxed_state.copy()
-            self._track(at, out, may_leave=False)
-            surprise = self._at.found.surprise[: len(self._on_hand)]
-            wrong = float(self._at.found.wrong[0])
-            if not (surprise > self.settings.explained).any():
+        if known:
+            wrong, explained = self._go_on(at, may_leave=enough)
+            # Where nothing is better, what goes on is kept.
+            if explained or wrong <= self.settings.misled + self._begin(at):
+                if not explained:
+                    self._go_on(at, may_leave=False)
+                self._write(out, goes_on=True)
                 return True, False
-            self._boxed_state[:] = before
-            known = wrong <= self.settings.misled + self._begin(at)
-        if known and self._track(at, out, may_leave=enough):
-            return True, False
-        if not enough:
+        elif enough:
+            self._begin(at)
+        else:
             return False, False
-        self._begin(at)
-        self._run(TAKE_OVER, self._habits_of(_NONE), out)
-        return True, known
+        self._write(out, goes_on=False)
+        return True, known and not self._only_natural
+
+    def _go_on(self, at: Epoch, *, may_leave: bool) -> tuple[float, bool]:
+        """Fit from the state; return chi square of the markers, and whether no hand that may take its place is better.
+
+        Chi square is infinite where no motion explains the markers, but another hand does.
+        """
+        start, sensed, task = at.start, at.sensed, self._at.task
+        task.turned[:] = _EYE
+        if sensed is not None and sensed.rotation is not None and self._turn is not None:
+            task.turned[:] = sensed.rotation @ self._turn.T
+        task.may_leave[0] = may_leave and start is not None
+        if start is not None:
+            task.palm[:], task.x[:] = start.T_rig_palm, self.parameters.of_angles(start.angles_rad)
+        limit = self._predict(self._model, self._boxed_state, self._observed, self._boxed_space)
+        if limit < 0.0:
+            return np.inf, False
+        wrong = self._search(self._with_laser(self._habits_of(_NONE), sensed))
+        if self._only_natural and may_leave:
+            return wrong, not self._unexplained()
+        return wrong, wrong <= limit
+
+    def _unexplained(self) -> bool:
+        """Whether a marker is too far from what was found."""
+        surprise = self._at.found.surprise[: len(self._on_hand)]
+        return bool((surprise > self.settings.explained).any())
+
+    def _search(self, habits: Habits, *, rough: bool = False) -> float:
+        """Fit what is measured; return chi square of the markers, or the cost of a rough search."""
+        self._at.task.rough[0] = rough
+        return self._fit(self._model, habits, self._observed, self._blank, self._boxed_space)
+
+    def _write(self, out: Estimate, *, goes_on: bool) -> None:
+        """Take over what was found, into the state and `out`."""
+        self._take_over(
+            self._model, self._boxed_state, goes_on, self._observed, self._boxed_space, boxed(out)
+        )
 
     def _observe(self, at: Epoch) -> int:
         """Write the rows of an epoch; return how many markers have any."""
@@ -320,24 +345,6 @@ class Estimator:
         assert at.own_m2 is not None
         own = at.own_m2 + self.settings.bones_m**2 * _EYE
         return observe_rays(at.uv, at.variance_px2, own, self._on_hand, self._observed)
-
-    def _track(self, at: Epoch, out: Estimate, *, may_leave: bool) -> bool:
-        """Go on from the state; False: another hand of this epoch takes its place, or there is none."""
-        start, sensed, task = at.start, at.sensed, self._at.task
-        task.turned[:] = _EYE
-        if sensed is not None and sensed.rotation is not None and self._turn is not None:
-            task.turned[:] = sensed.rotation @ self._turn.T
-        while True:
-            task.may_leave[0] = may_leave and start is not None
-            if start is not None:
-                task.palm[:], task.x[:] = start.T_rig_palm, self.parameters.of_angles(start.angles_rad)
-            said = self._run(TRACK, self._with_laser(self._habits_of(_NONE), sensed), out)
-            if said == TRACKED_ON:
-                return True
-            wrong = float(self._at.found.wrong[0])
-            if said == LOST or wrong > self.settings.misled + self._begin(at):
-                return False
-            may_leave = False  # nothing is better: keep what was found
 
     def _begin(self, at: Epoch) -> float:
         """Fit without the state, from the other hand or from several starts; return chi square of the markers.
@@ -353,41 +360,29 @@ class Estimator:
 
     def _begin_with(self, at: Epoch, shown: frozenset[int], like: frozenset[int]) -> float:
         """As `_begin`, while the hidden fingers of `like` are bent as their neighbours."""
-        apart, space = frozenset(range(5)) - shown - like, self._at
-        belief, found, task, start = space.belief, space.found, space.task, at.start
+        apart, task, start = frozenset(range(5)) - shown - like, self._at.task, at.start
+        belief, room = self._at.belief, self._at.room
+        belief.past_w2[:], belief.past[:], belief.palm_w2[:], belief.depth_w2[:] = 0.0, 0.0, 0.0, 0.0
         fingers = np.isin(np.arange(5), list(apart))
         belief.own_w2[:], belief.own[:] = curled(self.parameters, self.settings, fingers)
+        task.natural[0], task.counts[0] = _EVEN, 0.0
         habits = self._with_laser(self._habits_of(apart), at.sensed)
         try:
             if start is not None:
                 shows = task.shown[self._finger_of_free] > 0
                 x = np.where(shows, self.parameters.of_angles(start.angles_rad), self._natural)
-                task.palm[:], task.x[:] = start.T_rig_palm, self._as_sensed(x, at.sensed)
-                chi2 = self._run(BEGIN, habits, self._out)
-                surprise = found.surprise[: len(self._on_hand)]
-                if found.steps[0] < MAX_ITERATIONS and not (surprise > self.settings.explained).any():
+                room.start_T[:], room.start_x[:] = start.T_rig_palm, self._as_sensed(x, at.sensed)
+                chi2 = self._search(habits)
+                if self._at.found.steps[0] < MAX_ITERATIONS and not self._unexplained():
                     return chi2
             ends = list[tuple[float, Float, Float]]()
             for T, x in self._starts(at):
                 task.palm[:], task.x[:] = T, x
-                ends.append((self._run(ROUGH, habits, self._out), task.palm.copy(), task.x.copy()))
-            _, task.palm[:], task.x[:] = min(ends, key=lambda end: end[0])
-            return self._run(BEGIN, habits, self._out)
+                ends.append((self._search(habits, rough=True), task.palm.copy(), task.x.copy()))
+            _, room.start_T[:], room.start_x[:] = min(ends, key=lambda end: end[0])
+            return self._search(habits)
         finally:
             belief.own_w2[:] = 0.0
-
-    def _run(self, what: int, habits: Habits, out: Estimate) -> float:
-        """The kernel, for what is in the task."""
-        self._at.task.what[0] = what
-        return self._kernel(
-            self._model,
-            habits,
-            self._boxed_state,
-            self._observed,
-            self._blank,
-            self._boxed_space,
-            boxed(out),
-        )
 
     def _starts(self, epoch: Epoch) -> list[tuple[Float, Float]]:
         """Three hands, open to closed, each laid on the markers as a rigid body."""
@@ -398,7 +393,7 @@ class Estimator:
         starts: list[tuple[Float, Float]] = []
         for posture in self._postures:
             x = self._as_sensed(posture.copy(), sensed)
-            expected = self._attached.place(self.model.chains(self.parameters.angles(x)))[placed]
+            expected = self.pose(_AT_ORIGIN, self.parameters.angles(x))[1][placed]
             if sensed is not None and sensed.sure and sensed.rotation is not None:
                 T = np.eye(4)
                 T[:3, :3] = sensed.rotation

@@ -12,8 +12,11 @@ from typing import Any
 import numpy as np
 
 from common.arrays import Float
-from common.kernels import inlined, inner, kernel, record
+from common.kernels import constant, inlined, inner, kernel, record
 from master.estimator.hand_tables import HandTables, Mounts
+from master.estimator.matrices import copy
+
+PLACE, DIRECTION = constant(0), constant(1)
 
 
 class Scratch:
@@ -36,6 +39,7 @@ class Scratch:
     point: Float  # (3,)
     arm: Float  # (3,)
     ahead: Float  # (3,)
+    palm: Float  # (4, 4)
 
     @classmethod
     def empty(cls) -> "Scratch":
@@ -59,6 +63,7 @@ class Scratch:
             point=3,
             arm=3,
             ahead=3,
+            palm=(4, 4),
         )
 
 
@@ -224,7 +229,7 @@ def finger_slopes(
     f: int,
     level: int,
     point: Float,
-    turned: bool,
+    what: int,
     J: Float,
 ) -> None:
     """Write derivatives by the free angles of finger f.
@@ -233,7 +238,7 @@ def finger_slopes(
         tables, by, T, R, P: The hand (`angles_of`, `chains`).
         f, level: Finger, and joint of its chain that carries what moves.
         point: (3,) [m] of the finger, rig frame; of what is only turned, the direction (3,).
-        turned: Whether it is a direction.
+        what: PLACE or DIRECTION.
         J: (10, 3), written from row 6 on, as many as the finger has free angles.
     """
     count = tables.first[f + 1] - tables.first[f]
@@ -250,7 +255,7 @@ def finger_slopes(
         else:
             ax, ay, az = -R[f, k - 1, 0, 0], -R[f, k - 1, 1, 0], -R[f, k - 1, 2, 0]
         dx, dy, dz = point[0], point[1], point[2]
-        if not turned:
+        if what == PLACE:
             joint = max(k - 1, 0)
             dx, dy, dz = dx - P[f, joint, 0], dy - P[f, joint, 1], dz - P[f, joint, 2]
         tx, ty, tz = ay * dz - az * dy, az * dx - ax * dz, ax * dy - ay * dx
@@ -331,7 +336,10 @@ def pose(
         position, rotation, out: Written: (26, 3) [m], (26, 3, 3), markers (M, 3) [m].
     """
     hand, work = boxed_hand[0], boxed_work[0]
-    chains(hand, T, angles, work.R, work.P)
-    joints(hand, T, work.R, work.P, position, rotation)
+    copy(T, work.palm)
+    for a in range(20):
+        work.angles[a] = angles[a]
+    chains(hand, work.palm, work.angles, work.R, work.P)
+    joints(hand, work.palm, work.R, work.P, position, rotation)
     for m in range(mounts.finger.shape[0]):
-        marker_point(mounts, m, T, work.R, work.P, out[m])
+        marker_point(mounts, m, work.palm, work.R, work.P, out[m])

@@ -22,13 +22,14 @@ A good fit makes nothing surer than it was claimed. Beliefs that contradict each
 nothing of the instant: their least cost is no part of chi^2.
 """
 
+from collections.abc import Sequence
 from math import exp, log
 from typing import NamedTuple
 
 import numpy as np
 
 from common.arrays import Float
-from common.kernels import inlined, inner, record
+from common.kernels import constant, inlined, inner, record
 from master.estimator.kinematics import markers_of, rotate_by, turn_between
 from master.estimator.matrices import cholesky, copy, half_log_determinant, inverse, substitute
 from master.estimator.priors import Habits
@@ -38,6 +39,7 @@ from master.estimator.solve import Belief, Rig, Search, descend, linearise, own_
 from master.estimator.truncated import Cut, mean_within
 
 _LITTLE = 1e-4  # of a step: what a difference is taken over
+_ONLY = constant(0)  # hypothesis of `Blank`
 
 
 class Posterior:
@@ -96,22 +98,56 @@ class Blank(NamedTuple):
         return cls(nothing, Belief.none(n), Observations.empty(cameras, markers))
 
 
-class Room:
-    """Room for two hypotheses of N = 6 + n unknowns and M markers."""
+class Hypothesis:
+    """A hand of N = 6 + n unknowns and M markers under one hypothesis.
 
+    Attributes:
+        palm, x: (4, 4), (n,) where its search ended.
+        gradient, normal: (N,), (N, N) there.
+        surprise, information: (M,) chi square and (M, 3, 3) what is known of the place of each marker.
+        cost, apart: (1,) half the sum of squares, and the half of what rays that do not meet have between them.
+        share: (1,) its probability.
+        step: (N,) from there to the mean within the limits, and `off` (N,) the same from the likelier hand.
+    """
+
+    palm: Float
+    x: Float
+    gradient: Float
+    normal: Float
+    surprise: Float
+    information: Float
+    cost: Float
+    apart: Float
+    share: Float
+    step: Float
+    off: Float
+
+    @classmethod
+    def empty(cls, n: int, markers: int) -> "Hypothesis":
+        """Room for one."""
+        N = 6 + n
+        return record(
+            cls,
+            palm=(4, 4),
+            x=n,
+            gradient=N,
+            normal=(N, N),
+            surprise=markers,
+            information=(markers, 3, 3),
+            cost=1,
+            apart=1,
+            share=1,
+            step=N,
+            off=N,
+        )
+
+
+class Room:
+    """Room for both hypotheses of N = 6 + n unknowns and M markers."""
+
+    each: Sequence[Hypothesis]  # (2,) natural and free
     start_T: Float  # (4, 4)
     start_x: Float  # (n,)
-    palm: Float  # (2, 4, 4)
-    x: Float  # (2, n)
-    gradient: Float  # (2, N)
-    normal: Float  # (2, N, N)
-    surprise: Float  # (2, M)
-    information: Float  # (2, M, 3, 3)
-    cost: Float  # (2,)
-    apart: Float  # (2,)
-    share: Float  # (2,)
-    off: Float  # (2, N)
-    step: Float  # (2, N)
     middle: Float  # (N,)
     A: Float  # (N, N)
     L: Float  # (N, N)
@@ -128,19 +164,9 @@ class Room:
         N, M = 6 + n, markers
         return record(
             cls,
+            each=(Hypothesis.empty(n, markers), 2),
             start_T=(4, 4),
             start_x=n,
-            palm=(2, 4, 4),
-            x=(2, n),
-            gradient=(2, N),
-            normal=(2, N, N),
-            surprise=(2, M),
-            information=(2, M, 3, 3),
-            cost=2,
-            apart=2,
-            share=2,
-            off=(2, N),
-            step=(2, N),
             middle=N,
             A=(N, N),
             L=(N, N),
@@ -167,10 +193,10 @@ def _solve_each(
     """Search under each hypothesis from one start; return the steps of the first."""
     steps = 0
     for h in range(habits.constant.shape[0]):
-        T_h, x_h, gradient, normal = room.palm[h], room.x[h], room.gradient[h], room.normal[h]
-        copy(T, T_h)
+        one = room.each[h]
+        copy(T, one.palm)
         for i in range(x.shape[0]):
-            x_h[i] = x[i]
+            one.x[i] = x[i]
         _, taken = descend(
             rig,
             habits,
@@ -179,19 +205,21 @@ def _solve_each(
             h,
             settings.tolerance,
             settings.tolerance_share,
-            T_h,
-            x_h,
-            gradient,
-            normal,
+            one.palm,
+            one.x,
+            one.gradient,
+            one.normal,
             room.search,
         )
-        room.cost[h] = linearise(rig, habits, belief, observed, h, T_h, x_h, gradient, normal, room.search)
-        room.apart[h] = room.search.apart[0]
+        one.cost[0] = linearise(
+            rig, habits, belief, observed, h, one.palm, one.x, one.gradient, one.normal, room.search
+        )
+        one.apart[0] = room.search.apart[0]
         for m in range(rig.mounts.finger.shape[0]):
-            room.surprise[h, m] = room.search.surprise[m]
+            one.surprise[m] = room.search.surprise[m]
             for i in range(3):
                 for j in range(3):
-                    room.information[h, m, i, j] = room.search.information[m, i, j]
+                    one.information[m, i, j] = room.search.information[m, i, j]
         steps = taken if h == 0 else steps
     return steps
 
@@ -202,19 +230,20 @@ def _weigh(habits: Habits, settings: Settings, natural: float, counts: float, ro
 
     `natural` is the probability of a natural hand a moment ago, `counts` what that counts, 0 ... 1.
     """
-    N = room.middle.shape[0]
-    room.share[0], room.share[1] = 1.0, 0.0
+    N, share, other = room.middle.shape[0], room.each[0].share, room.each[1].share
+    share[0], other[0] = 1.0, 0.0
     if habits.constant.shape[0] < 2:
         return
     odds = 0.0
     for h in range(2):
-        known = half_log_determinant(room.L, N) if cholesky(room.normal[h], N, room.L) else 0.0
-        odds += (1.0 - 2.0 * h) * (habits.log_density[h] - room.cost[h] - known)
+        one = room.each[h]
+        known = half_log_determinant(room.L, N) if cholesky(one.normal, N, room.L) else 0.0
+        odds += (1.0 - 2.0 * h) * (habits.log_density[h] - one.cost[0] - known)
     odds = min(max(odds, -settings.certain), settings.certain)
     then = log(max(natural, 1e-9)) - log(max(1.0 - natural, 1e-9))
     odds += counts * (min(max(then, -settings.certain), settings.certain) - odds)
-    room.share[0] = 1.0 / (1.0 + exp(-odds))
-    room.share[1] = 1.0 - room.share[0]
+    share[0] = 1.0 / (1.0 + exp(-odds))
+    other[0] = 1.0 - share[0]
 
 
 @inner
@@ -238,10 +267,10 @@ def _covariance(
     rig: Rig, settings: Settings, habits: Habits, belief: Belief, h: int, numbers: float, room: Room
 ) -> float:
     """Write the covariance (N, N) of one hypothesis by this instant alone; return its scale."""
-    N, A = room.middle.shape[0], room.A
+    N, A, one = room.middle.shape[0], room.A, room.each[h]
     for i in range(N):
         for j in range(i + 1):
-            A[i, j] = room.normal[h, i, j]
+            A[i, j] = one.normal[i, j]
         A[i, i] += rig.hand.anywhere[i] - (belief.palm_w2[i] if i < 6 else belief.past_w2[i - 6])
     for i in range(3):
         for j in range(i + 1):
@@ -252,14 +281,20 @@ def _covariance(
                 room.cov[i, j] = 1.0 / rig.hand.anywhere[i] if i == j else 0.0
         return 1.0
     inverse(room.L, N, room.work, room.cov)
-    past = past_cost(belief, room.palm[h], room.x[h], room.search.off)
-    chi2 = 2.0 * (room.cost[h] - past - room.apart[h] - _least(habits, belief, h, room))
+    past = past_cost(belief, one.palm, one.x, room.search.off)
+    chi2 = 2.0 * (one.cost[0] - past - one.apart[0] - _least(habits, belief, h, room))
     free = max(numbers - 6.0, 0.0)
     scale = max((settings.claimed + max(chi2, 0.0)) / (settings.claimed + free), 1.0)
     for i in range(N):
         for j in range(N):
             room.cov[i, j] *= scale
     return scale
+
+
+@inlined
+def likelier(room: Room) -> int:
+    """The hypothesis with the larger probability."""
+    return 0 if room.each[0].share[0] >= room.each[1].share[0] else 1
 
 
 @inner
@@ -273,57 +308,59 @@ def _mix(
     out: Posterior,
 ) -> int:
     """Write mean step and covariance of the hypotheses together; return the likelier one."""
-    n, N = room.x.shape[1], room.middle.shape[0]
-    best = 0 if room.share[0] >= room.share[1] else 1
-    if room.share[best] > 1.0 - settings.negligible:
-        room.share[best], room.share[1 - best] = 1.0, 0.0
+    n, N = out.x.shape[0], room.middle.shape[0]
+    best = likelier(room)
+    if room.each[best].share[0] > 1.0 - settings.negligible:
+        room.each[best].share[0], room.each[1 - best].share[0] = 1.0, 0.0
     out.scale[0] = 0.0
     for i in range(N):
         room.middle[i] = 0.0
         for j in range(N):
             out.cov[i, j] = 0.0
     for h in range(habits.constant.shape[0]):
-        share = room.share[h]
+        one, from_here = room.each[h], room.each[best]
+        share = one.share[0]
         for i in range(N):
-            room.off[h, i] = room.step[h, i] = 0.0
+            one.off[i] = one.step[i] = 0.0
         if share == 0.0:
             continue
         if h != best:
-            turn_between(room.palm[h], room.palm[best], room.search.J, room.off[h])
+            turn_between(one.palm, from_here.palm, room.search.J, one.off)
             for i in range(3):
-                room.off[h, 3 + i] = room.palm[h, i, 3] - room.palm[best, i, 3]
+                one.off[3 + i] = one.palm[i, 3] - from_here.palm[i, 3]
             for i in range(n):
-                room.off[h, 6 + i] = room.x[h, i] - room.x[best, i]
+                one.off[6 + i] = one.x[i] - from_here.x[i]
         out.scale[0] += share * _covariance(rig, settings, habits, belief, h, numbers, room)
         for i in range(N):
             for j in range(N):
                 out.cov[i, j] += share * room.cov[i, j]
         if h > 0 and share > settings.noticed:
-            mean_within(rig.hand, room.normal[h], room.gradient[h], room.x[h], room.cut, room.step[h])
+            mean_within(rig.hand, one.normal, one.gradient, one.x, room.cut, one.step)
         for i in range(N):
-            room.off[h, i] += room.step[h, i]
-            room.middle[i] += share * room.off[h, i]
+            one.off[i] += one.step[i]
+            room.middle[i] += share * one.off[i]
     for h in range(habits.constant.shape[0]):
+        one = room.each[h]
         for i in range(N):
             for j in range(N):
-                between = (room.off[h, i] - room.middle[i]) * (room.off[h, j] - room.middle[j])
-                out.cov[i, j] += room.share[h] * between
+                between = (one.off[i] - room.middle[i]) * (one.off[j] - room.middle[j])
+                out.cov[i, j] += one.share[0] * between
     return best
 
 
 @inlined
-def _ends(rig: Rig, h: int, room: Room) -> None:
+def _ends(rig: Rig, one: Hypothesis, room: Room) -> None:
     """Write where the step of a hypothesis brings the markers, to room.here (M, 3), as if on straight lines."""
-    markers_of(rig.hand, rig.mounts, room.palm[h], room.x[h], room.search.rows, room.here)
+    markers_of(rig.hand, rig.mounts, one.palm, one.x, room.search.rows, room.here)
     moves = False
-    for i in range(room.middle.shape[0]):
-        room.search.step[i] = _LITTLE * room.step[h, i]
-        moves = moves or room.step[h, i] != 0.0
+    for i in range(one.step.shape[0]):
+        room.search.step[i] = _LITTLE * one.step[i]
+        moves = moves or one.step[i] != 0.0
     if not moves:
         return
-    rotate_by(room.search.step, room.palm[h], room.search.palm)
-    for i in range(room.x.shape[1]):
-        room.search.x[i] = room.x[h, i] + room.search.step[6 + i]
+    rotate_by(room.search.step, one.palm, room.search.palm)
+    for i in range(one.x.shape[0]):
+        room.search.x[i] = one.x[i] + room.search.step[6 + i]
     markers_of(rig.hand, rig.mounts, room.search.palm, room.search.x, room.search.rows, room.there)
     for m in range(rig.mounts.finger.shape[0]):
         for i in range(3):
@@ -345,29 +382,30 @@ def _onto(
     What is between two hands that explain the markers does so a little worse, since fingers move on arcs. So it is one
     step, the shortest by the normal matrix, to where the mean of their markers is.
     """
-    n, N, between = room.x.shape[1], room.middle.shape[0], blank.between
+    n, N, between, likely = out.x.shape[0], room.middle.shape[0], blank.between, room.each[best]
     for m in range(rig.mounts.finger.shape[0]):
         between.seen[m] = between.placed[m] = observed.seen[m]
         for i in range(3):
             between.point[m, i] = 0.0
             for j in range(3):
-                between.information[m, i, j] = room.information[best, m, i, j]
+                between.information[m, i, j] = likely.information[m, i, j]
     for h in range(2):
-        if room.share[h] > 0.0:
-            _ends(rig, h, room)
+        one = room.each[h]
+        if one.share[0] > 0.0:
+            _ends(rig, one, room)
             for m in range(rig.mounts.finger.shape[0]):
                 for i in range(3):
-                    between.point[m, i] += room.share[h] * room.here[m, i]
+                    between.point[m, i] += one.share[0] * room.here[m, i]
     search = room.search
-    rotate_by(room.middle, room.palm[best], out.palm)
+    rotate_by(room.middle, likely.palm, out.palm)
     for i in range(n):
-        out.x[i] = room.x[best, i] + room.middle[6 + i]
+        out.x[i] = likely.x[i] + room.middle[6 + i]
     linearise(
         rig,
         blank.habits,
         blank.belief,
         between,
-        0,
+        _ONLY,
         out.palm,
         out.x,
         search.gradient,
@@ -377,7 +415,7 @@ def _onto(
     for i in range(N):
         search.step[i] = -search.gradient[i]
         for j in range(i + 1):
-            room.A[i, j] = search.normal[i, j] + settings.stiff * room.normal[best, i, j]
+            room.A[i, j] = search.normal[i, j] + settings.stiff * likely.normal[i, j]
     if cholesky(room.A, N, room.L):
         substitute(room.L, N, search.step)
         copy(out.palm, search.palm)
@@ -416,17 +454,18 @@ def posterior(
     """
     out.steps[0] = _solve_each(rig, settings, habits, belief, observed, T, x, room)
     _weigh(habits, settings, natural, counts, room)
-    out.natural[0] = room.share[0]
+    out.natural[0] = room.each[0].share[0]
     best = _mix(rig, settings, habits, belief, numbers, room, out)
-    out.cost[0] = room.cost[best]
+    likely = room.each[best]
+    out.cost[0] = likely.cost[0]
     moves = False
     for i in range(room.middle.shape[0]):
         moves = moves or room.middle[i] != 0.0
     if moves:
         _onto(rig, settings, observed, blank, best, room, out)
     else:
-        copy(room.palm[best], out.palm)
+        copy(likely.palm, out.palm)
         for i in range(x.shape[0]):
-            out.x[i] = room.x[best, i]
+            out.x[i] = likely.x[i]
     for m in range(rig.mounts.finger.shape[0]):
-        out.surprise[m] = room.surprise[best, m]
+        out.surprise[m] = likely.surprise[m]

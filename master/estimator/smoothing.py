@@ -217,7 +217,7 @@ def _filter(state: Smoothing, t_ns: int, rests: Int, marker_cov: Float) -> None:
 @inner
 def _write_pose(hand: HandTables, state: Smoothing, shown: Pose) -> None:
     """Write palm, angles and joints of the filtered signals."""
-    T, turn, angles, work = shown.palm, state.work.g, state.work.angles, state.work
+    T, turn, angles, work = state.work.palm, state.work.g, state.work.angles, state.work
     for i in range(3):
         turn[i] = (state.filtered[3 + i] - state.values[3 + i]) / state.across[0]
     rotate_by(turn, state.palm, T)
@@ -232,6 +232,7 @@ def _write_pose(hand: HandTables, state: Smoothing, shown: Pose) -> None:
     clamp(hand, angles)
     chains(hand, T, angles, work.R, work.P)
     joints(hand, T, work.R, work.P, shown.position, shown.rotation)
+    copy(T, shown.palm)
     for a in range(20):
         shown.angles[a // 4, a % 4] = angles[a]
 

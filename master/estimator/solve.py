@@ -18,6 +18,7 @@ from common.kernels import inlined, inner, record
 from master.estimator.cameras import CameraArrays
 from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.kinematics import (
+    PLACE,
     Scratch,
     angles_of,
     chains,
@@ -350,7 +351,7 @@ def _marker(
     if f >= 0:
         start = hand.first[f]
         size += hand.first[f + 1] - start
-        finger_slopes(hand, work.by, T, work.R, work.P, f, mounts.level[m], work.point, False, D)
+        finger_slopes(hand, work.by, T, work.R, work.P, f, mounts.level[m], work.point, PLACE, D)
     for a in range(size):
         ia = a if a < 6 else start + a
         gradient[ia] += D[a, 0] * work.g[0] + D[a, 1] * work.g[1] + D[a, 2] * work.g[2]

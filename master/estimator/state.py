@@ -17,7 +17,7 @@ one by one, and so does every hand its thumb.
 from math import exp, sqrt
 
 from common.arrays import Bool, Float, Int
-from common.kernels import inlined, inner, record
+from common.kernels import constant, inlined, inner, record
 from master.estimator.hand_tables import HandTables
 from master.estimator.kinematics import clamp, free_of
 from master.estimator.matrices import cholesky, copy, substitute
@@ -25,6 +25,7 @@ from master.estimator.settings import Settings
 from master.estimator.solve import Belief
 
 NEVER_NS = -(2**61)
+_NONE = constant(0)
 PALM_PART = 5  # behind the five fingers
 
 
@@ -129,7 +130,7 @@ def strayed(settings: Settings, gone_s: float) -> float:
 @inner
 def _neighbours(settings: Settings, state: HandState, f: int, shown: Bool, hidden: Hidden) -> None:
     """Move the hidden finger f as the seen ones moved since it was lost."""
-    count, alike, K, weight = 0, state.then_alike[f], hidden.K, hidden.weight
+    count, alike, K, weight = _NONE, state.then_alike[f], hidden.K, hidden.weight
     for g in range(1, 5):
         if not shown[g]:
             continue
@@ -221,16 +222,6 @@ def predict(
         belief.palm_w2[i] = 1.0 / (settings.palm_walk_rad_s * age_s) ** 2
         belief.palm_w2[3 + i] = 1.0 / (settings.palm_walk_m_s * age_s) ** 2
     copy(state.palm, belief.palm)
-
-
-@inner
-def forget(belief: Belief) -> None:
-    """Let a belief hold nothing of the past."""
-    for i in range(belief.past.shape[0]):
-        belief.past_w2[i] = belief.past[i] = 0.0
-    for i in range(6):
-        belief.palm_w2[i] = 0.0
-    belief.depth_w2[0] = 0.0
 
 
 @inner

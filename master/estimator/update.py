@@ -3,6 +3,8 @@
 from math import acos, cos, exp, sqrt
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from common.arrays import Bool, Code, Float, Int
 from common.kernels import inlined, inner, kernel, record
 from common.messages import Source
@@ -11,16 +13,14 @@ from master.estimator.certainty import Certainty, add_arcs, linear, only_limits,
 from master.estimator.hand_tables import Mounts
 from master.estimator.kinematics import angles_of, chains, clamp, joints, marker_point
 from master.estimator.matrices import copy, inverse_3
-from master.estimator.posterior import Blank, Posterior, Room, posterior
+from master.estimator.posterior import Blank, Posterior, Room, likelier, posterior
 from master.estimator.priors import Habits
 from master.estimator.residuals import Observations, marker_rows
 from master.estimator.settings import Settings
 from master.estimator.solve import Belief, Rig, Search, descend
-from master.estimator.state import NEVER_NS, PALM_PART, HandState, Hidden, forget, grow, predict
+from master.estimator.state import NEVER_NS, PALM_PART, HandState, Hidden, grow, predict
 
 _QUANTILE_95 = 7.815  # chi square of three numbers
-TRACK, BEGIN, ROUGH, TAKE_OVER = 0, 1, 2, 3
-TRACKED_ON, LOST, MISLED = 0.0, 1.0, 2.0
 _SOLVED, _MEASURED, _HELD = int(Source.SOLVED), int(Source.MEASURED), int(Source.HELD)
 
 
@@ -67,17 +67,17 @@ class Task:
     """What is to be done at an epoch.
 
     Attributes:
-        what: (1,) TRACK, BEGIN, ROUGH or TAKE_OVER.
         t_ns: (1,) the epoch.
         shown: (5,) fingers that are measured.
         palm_shown: (1,) whether something tells where the palm is.
         numbers: (1,) how many numbers are measured.
         turned: (3, 3) by how much sensors say that the palm has turned since.
-        palm, x: (4, 4), (n,) another hand of the epoch, inside the limits.
-        may_leave: (1,) whether there is one, and it may take the place of the state.
+        palm, x: (4, 4), (n,) another hand of the epoch, inside the limits; or where a search begins.
+        may_leave: (1,) whether there is another, and it may take the place of the state.
+        rough: (1,) whether a search is to end early, in place, under the widest hypothesis alone.
+        natural: (1,) probability of a natural hand a moment ago, and `counts` (1,) what that counts, 0 ... 1.
     """
 
-    what: Int
     t_ns: Int
     shown: Bool
     palm_shown: Bool
@@ -86,13 +86,15 @@ class Task:
     palm: Float
     x: Float
     may_leave: Bool
+    rough: Bool
+    natural: Float
+    counts: Float
 
     @classmethod
     def empty(cls, n: int) -> "Task":
         """Room for one."""
         return record(
             cls,
-            what=("i8", 1),
             t_ns=("i8", 1),
             shown=("u1", 5),
             palm_shown=("u1", 1),
@@ -101,6 +103,9 @@ class Task:
             palm=(4, 4),
             x=n,
             may_leave=("u1", 1),
+            rough=("u1", 1),
+            natural=1,
+            counts=1,
         )
 
 
@@ -176,7 +181,6 @@ def _judge(
     settings: Settings,
     state: HandState,
     t_ns: int,
-    shown: Bool,
     observed: Observations,
     out: Estimate,
 ) -> None:
@@ -229,20 +233,129 @@ def _drift(
                 out.cov[joint, i, j] += sigma_m * sigma_m * belief.sight[i] * belief.sight[j]
 
 
-@inner
-def _take_over(
-    rig: Rig,
-    settings: Settings,
-    state: HandState,
-    t_ns: int,
-    goes_on: bool,
-    shown: Bool,
-    palm_shown: bool,
-    observed: Observations,
-    space: Workspace,
-    out: Estimate,
+class Model(NamedTuple):
+    """What is the same at every epoch; the hand and the settings in their arrays (`common.kernels.boxed`)."""
+
+    hand: Any
+    settings: Any
+    mounts: Mounts
+    cameras: CameraArrays
+
+
+@kernel
+def predict_epoch(model: Model, boxed_state: Any, observed: Observations, boxed_space: Any) -> float:
+    """Write what the state says of an epoch, and where its search begins.
+
+    Args:
+        model: What is the same at every epoch.
+        boxed_state: (1,) `HandState` of the epoch before.
+        observed: What is measured.
+        boxed_space: (1,) `Workspace`, with the task.
+
+    Returns:
+        Chi square of the markers above which another hand explains them better; infinity: there is none; negative:
+        no motion explains them, but it does.
+    """
+    state, space, settings = boxed_state[0], boxed_space[0], model.settings[0]
+    rig, task, belief, room = (
+        Rig(model.hand[0], model.mounts, model.cameras),
+        space.task,
+        space.belief,
+        space.room,
+    )
+    t_ns, limit = task.t_ns[0], np.inf
+    dt_s = (t_ns - state.t_ns[0]) * 1e-9
+    if task.may_leave[0] > 0:
+        limit = chi_square(rig, observed, task.palm, task.x, 0.0, room.search) + settings.misled
+        walked_m = settings.palm_walk_m_s * dt_s
+        if chi_square(rig, observed, state.palm, state.x, walked_m, room.search) > limit:
+            return -1.0
+    predict(rig.hand, settings, state, t_ns, task.shown, task.palm_shown[0] > 0, space.hidden, belief)
+    for i in range(3):
+        for j in range(3):
+            belief.palm[i, j] = 0.0
+            for k in range(3):
+                belief.palm[i, j] += task.turned[i, k] * state.palm[k, j]
+    task.natural[0], task.counts[0] = state.natural[0], exp(-dt_s / settings.habit_memory_s)
+    copy(belief.palm, room.start_T)
+    for c in range(state.x.shape[0]):
+        room.start_x[c] = state.x[c]
+    return limit
+
+
+@kernel
+def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank, boxed_space: Any) -> float:
+    """Fit an epoch: from where `predict_epoch` says, or roughly from the task's hand, in place.
+
+    Args:
+        model, habits: What is the same at every epoch.
+        observed: What is measured.
+        blank: Room.
+        boxed_space: (1,) `Workspace`, with the task and what is believed; what is found is in its `found`.
+
+    Returns:
+        Chi square of the markers; of a rough search its cost.
+    """
+    space, settings = boxed_space[0], model.settings[0]
+    rig, task, belief, room = (
+        Rig(model.hand[0], model.mounts, model.cameras),
+        space.task,
+        space.belief,
+        space.room,
+    )
+    search, found = room.search, space.found
+    if task.rough[0] > 0:
+        cost, _ = descend(
+            rig,
+            habits,
+            belief,
+            observed,
+            habits.constant.shape[0] - 1,
+            settings.rough,
+            settings.tolerance_share,
+            task.palm,
+            task.x,
+            room.each[0].gradient,
+            room.each[0].normal,
+            search,
+        )
+        return cost
+    posterior(
+        rig,
+        settings,
+        habits,
+        belief,
+        observed,
+        room.start_T,
+        room.start_x,
+        task.natural[0],
+        task.counts[0],
+        task.numbers[0],
+        blank,
+        room,
+        found,
+    )
+    found.wrong[0] = chi_square(rig, observed, found.palm, found.x, 0.0, search)
+    return found.wrong[0]
+
+
+@kernel
+def take_over_epoch(
+    model: Model, boxed_state: Any, goes_on: bool, observed: Observations, boxed_space: Any, boxed_out: Any
 ) -> None:
-    """Write the hand of an epoch, and the state behind it; `goes_on`: from the state before."""
+    """Write the hand that `fit_epoch` found, and the state behind it.
+
+    Args:
+        model: What is the same at every epoch.
+        boxed_state: (1,) `HandState`, changed.
+        goes_on: Whether the hand goes on from it; else nothing of it is kept.
+        observed: What is measured.
+        boxed_space: (1,) `Workspace`.
+        boxed_out: (1,) `Estimate`, written.
+    """
+    state, space, out, settings = boxed_state[0], boxed_space[0], boxed_out[0], model.settings[0]
+    rig, task = Rig(model.hand[0], model.mounts, model.cameras), space.task
+    t_ns, shown, palm_shown = task.t_ns[0], task.shown, task.palm_shown[0] > 0
     found, hidden, room, work = space.found, space.hidden, space.certainty, space.room.search.rows
     hand, n = rig.hand, found.x.shape[0]
     angles_of(hand, found.x, work.angles, work.by)
@@ -277,14 +390,13 @@ def _take_over(
     joints(hand, found.palm, work.R, work.P, out.position, out.rotation)
     linear(hand, found.palm, state.cov, work, room, out.cov)
     tilts(hand, settings, found.palm, found.cov, work, room, out.tilt, out.tilt_walk)
-    best = 0 if space.room.share[0] >= space.room.share[1] else 1
     add_arcs(
         rig,
         settings,
         found.palm,
         state.cov,
         observed.seen,
-        space.room.information[best],
+        space.room.each[likelier(space.room)].information,
         work,
         room,
         out.cov,
@@ -302,119 +414,4 @@ def _take_over(
         out.angles[a] = state.angles[a] = work.angles[a]
     for c in range(n):
         state.x[c] = found.x[c]
-    _judge(rig, settings, state, t_ns, shown, observed, out)
-
-
-class Model(NamedTuple):
-    """What is the same at every epoch; the hand and the settings in their arrays (`common.kernels.boxed`)."""
-
-    hand: Any
-    settings: Any
-    mounts: Mounts
-    cameras: CameraArrays
-
-
-@kernel
-def epoch(
-    model: Model,
-    habits: Habits,
-    boxed_state: Any,
-    observed: Observations,
-    blank: Blank,
-    boxed_space: Any,
-    boxed_out: Any,
-) -> float:
-    """Do one of four things at an epoch, as `space.task` says: one kernel, for each compiles all that it calls.
-
-    TRACK       fit from the state and take it over
-    BEGIN       fit from the start, without the state: what is found is in `space.found`
-    ROUGH       search roughly from the start, in place, under the widest hypothesis
-    TAKE_OVER   take over what BEGIN found
-
-    Args:
-        model, habits: What is the same at every epoch.
-        boxed_state: (1,) `HandState` of the epoch before; of this one, once it is taken over.
-        observed: What is measured.
-        blank: Room.
-        boxed_space: (1,) `Workspace`, with the task; what is believed beside the past is in its `belief`.
-        boxed_out: (1,) `Estimate`, written where the epoch is taken over.
-
-    Returns:
-        Of TRACK: TRACKED_ON; LOST where no motion explains the markers, but the start does; MISLED where it explains
-        them better than what is found. With the latter two the state is as it was. Of BEGIN: chi square of the markers.
-        Of ROUGH: the cost.
-    """
-    state, space, out, settings = boxed_state[0], boxed_space[0], boxed_out[0], model.settings[0]
-    rig = Rig(model.hand[0], model.mounts, model.cameras)
-    task = space.task
-    what, t_ns, palm_shown = task.what[0], task.t_ns[0], task.palm_shown[0] > 0
-    shown, numbers, may_leave = task.shown, task.numbers[0], task.may_leave[0] > 0
-    belief, found, room = space.belief, space.found, space.room
-    search = room.search
-    if what == TAKE_OVER:
-        _take_over(rig, settings, state, t_ns, False, shown, palm_shown, observed, space, out)
-        return TRACKED_ON
-    if what == ROUGH:
-        forget(belief)
-        widest = habits.constant.shape[0] - 1
-        cost, _ = descend(
-            rig,
-            habits,
-            belief,
-            observed,
-            widest,
-            settings.rough,
-            settings.tolerance_share,
-            task.palm,
-            task.x,
-            room.gradient[0],
-            room.normal[0],
-            search,
-        )
-        return cost
-    natural, counts, other = 0.5, 0.0, 0.0
-    if what == BEGIN:
-        forget(belief)
-        copy(task.palm, room.start_T)
-        for c in range(task.x.shape[0]):
-            room.start_x[c] = task.x[c]
-    else:
-        dt_s = (t_ns - state.t_ns[0]) * 1e-9
-        if may_leave:
-            other = chi_square(rig, observed, task.palm, task.x, 0.0, search) + settings.misled
-            walked_m = settings.palm_walk_m_s * dt_s
-            if chi_square(rig, observed, state.palm, state.x, walked_m, search) > other:
-                return LOST
-        predict(rig.hand, settings, state, t_ns, shown, palm_shown, space.hidden, belief)
-        for i in range(3):
-            for j in range(3):
-                belief.palm[i, j] = 0.0
-                for k in range(3):
-                    belief.palm[i, j] += task.turned[i, k] * state.palm[k, j]
-        natural, counts = state.natural[0], exp(-dt_s / settings.habit_memory_s)
-        copy(belief.palm, room.start_T)
-        for c in range(task.x.shape[0]):
-            room.start_x[c] = state.x[c]
-    posterior(
-        rig,
-        settings,
-        habits,
-        belief,
-        observed,
-        room.start_T,
-        room.start_x,
-        natural,
-        counts,
-        numbers,
-        blank,
-        room,
-        found,
-    )
-    explained = chi_square(rig, observed, found.palm, found.x, 0.0, search)
-    if what == BEGIN:
-        return explained
-    found.wrong[0] = explained
-    if may_leave and explained > other:
-        return MISLED
-    _take_over(rig, settings, state, t_ns, True, shown, palm_shown, observed, space, out)
-    return TRACKED_ON
+    _judge(rig, settings, state, t_ns, observed, out)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from common.arrays import Float
-from common.kernels import kernel
+from common.kernels import inner, kernel
 from master.estimator.cameras import CameraArrays, project
 from master.fabrik.caps import CAPS, CapTables
 from master.fabrik.intersection import Rays
@@ -28,6 +28,8 @@ class Views(NamedTuple):
         bias: (T, C, 2) [px] seen centroid less the cap's own.
         whole: (T, C) [m^2] area that the whole cap shows.
         moved: (T, 3) [m] by how much the correction moves the point.
+        back, shift: (3,) room.
+        gain, step, both: (3, 2), (3, 3), (3, 3) room.
     """
 
     area: Float
@@ -37,6 +39,29 @@ class Views(NamedTuple):
     bias: Float
     whole: Float
     moved: Float
+    back: Float
+    shift: Float
+    gain: Float
+    step: Float
+    both: Float
+
+    @classmethod
+    def empty(cls, cameras: int) -> "Views":
+        """Room for a number of cameras."""
+        return cls(
+            np.empty(cameras),
+            np.empty(cameras),
+            np.empty(cameras),
+            np.empty((TILTED, 3)),
+            np.empty((TILTED, cameras, 2)),
+            np.empty((TILTED, cameras)),
+            np.empty((TILTED, 3)),
+            np.empty(3),
+            np.empty(3),
+            np.empty((3, 2)),
+            np.empty((3, 3)),
+            np.empty((3, 3)),
+        )
 
 
 @kernel
@@ -50,7 +75,7 @@ def seen_shift(caps: CapTables, row: int, ahead: Float, back: Float, out: Float)
     """
     cosine = ahead[0] * back[0] + ahead[1] * back[1] + ahead[2] * back[2]
     if not np.isfinite(cosine):  # no row of the table
-        out[:] = np.nan
+        out[0] = out[1] = out[2] = np.nan
         return np.nan
     cosine = min(max(cosine, -1.0), 1.0)
     last = caps.looks.shape[1] - 1
@@ -103,7 +128,7 @@ def tilted(row: int, R: Float, tilt_rad2: Float, turned_rad2: float, out: Float)
             out[t, i] = (x * R[row, i, 0] + y * R[row, i, 1] - R[row, i, 2]) / length
 
 
-@kernel
+@inner
 def any_direction(cameras: CameraArrays, point: Float, out: Float) -> None:
     """Write directions in which a cap may point while no hand is known.
 
@@ -198,21 +223,7 @@ def hidden_part(
             out[c] = (max(out[c], CAPS.reach * most) * caps.radius_m[row] / scale_m[c]) ** 2
 
 
-@kernel
-def views_of(count: int) -> Views:
-    """Return room for a number of cameras."""
-    return Views(
-        np.empty(count),
-        np.empty(count),
-        np.empty(count),
-        np.empty((TILTED, 3)),
-        np.empty((TILTED, count, 2)),
-        np.empty((TILTED, count)),
-        np.empty((TILTED, 3)),
-    )
-
-
-@kernel
+@inner
 def appearance(
     cameras: CameraArrays, caps: CapTables, row: int, count: int, rays: Rays, views: Views
 ) -> None:
@@ -220,7 +231,7 @@ def appearance(
 
     A flat marker has neither.
     """
-    back, shift = np.empty(3), np.empty(3)
+    back, shift = views.back, views.shift
     for c in range(rays.weight.shape[0]):
         distance = 0.0
         for i in range(3):

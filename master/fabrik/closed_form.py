@@ -42,6 +42,7 @@ REACHED_M = 1e-6
 _ENOUGH_M = 0.05 * REACHED_M
 _SLACK_RAD = 1e-6
 """A limit passed by less is rounding: the angle is clamped, which moves the point < 0.2 um."""
+_FIRST = constant(0)
 PIP, DIP = constant(1), constant(2)  # links
 _EDGE_M2 = 1e-14
 """Rounding of a squared distance at the end of a branch."""
@@ -270,7 +271,7 @@ def _start(chain: ChainArrays, local: Vector, near: Float, seeds: Float, start: 
     if start < len(seeds):
         _copy_row(seeds, start, angles)
     elif pair < 0:
-        _copy_row(seeds, 0, angles)
+        _copy_row(seeds, _FIRST, angles)
         if _known(near):
             _copy(near, angles)
     else:

@@ -21,7 +21,7 @@ from scipy.special import chdtri
 from common.arrays import Bool, Float
 from common.kernels import inner, kernel
 from master.estimator.cameras import CameraArrays, project, undistort
-from master.estimator.small_matrices import inverse_3
+from master.estimator.matrices import inverse_3_plus
 
 _STEPS = 8  # of Gauss-Newton; from the linear solution three are the rule
 _SETTLED_M = 1e-7  # then the error is its square, about
@@ -97,23 +97,22 @@ class Rays(NamedTuple):
     seen: Float
     J: Float
 
-
-@kernel
-def rays_of(count: int) -> Rays:
-    """Return room for a number of cameras."""
-    return Rays(
-        np.empty((count, 2)),
-        np.empty((count, 2)),
-        np.empty(count),
-        np.empty(count),
-        np.empty(count),
-        np.empty(3),
-        np.empty((3, 3)),
-        np.empty((3, 3)),
-        np.empty(3),
-        np.empty(2),
-        np.empty((2, 3)),
-    )
+    @classmethod
+    def empty(cls, cameras: int) -> "Rays":
+        """Room for a number of cameras."""
+        return cls(
+            np.empty((cameras, 2)),
+            np.empty((cameras, 2)),
+            np.empty(cameras),
+            np.empty(cameras),
+            np.empty(cameras),
+            np.empty(3),
+            np.empty((3, 3)),
+            np.empty((3, 3)),
+            np.empty(3),
+            np.empty(2),
+            np.empty((2, 3)),
+        )
 
 
 @inner
@@ -147,7 +146,7 @@ def observe(
 @inner
 def _solve(rays: Rays) -> bool:
     """Write the inverse of the normal matrix into `cov`; False: singular."""
-    inverse_3(rays.normal, 0.0, rays.cov)
+    inverse_3_plus(rays.normal, 0.0, rays.cov)
     trace = rays.normal[0, 0] + rays.normal[1, 1] + rays.normal[2, 2]
     spread = rays.cov[0, 0] + rays.cov[1, 1] + rays.cov[2, 2]
     return spread > 0.0 and trace * spread < _SINGULAR
@@ -279,6 +278,8 @@ def intersect(
     rays_px: float,
     limits: Float,
     observed: Float,
+    left_out: Bool,
+    rays: Rays,
     points: Float,
     cov: Float,
     errors: Float,
@@ -291,14 +292,14 @@ def intersect(
         rays_px: Standard deviation that the calibration leaves.
         limits: (C + 1,) most chi-square by the number of cameras.
         observed: (C, M, 3) u, v, sigma [px].
+        left_out: (C, M) what does not count.
+        rays: Room.
         points, cov: (M, 3) [m], (M, 3, 3) [m^2] written; NaN: not determined.
         errors: (2, M) written: residual [px], chi-square.
         apart: (M,) written.
     """
-    rays = rays_of(observed.shape[0])
-    nothing = np.zeros(observed.shape[:2], np.bool_)
     for m in range(observed.shape[1]):
-        count = observe(cameras, observed, nothing, rays_px, m, rays)
+        count = observe(cameras, observed, left_out, rays_px, m, rays)
         found = count >= 2 and linear(cameras, rays) and refine(cameras, rays)
         total = 0.0
         for c in range(observed.shape[0]):
@@ -343,5 +344,6 @@ def triangulate(
     observed[..., :2], observed[..., 2] = uv, sigma_px
     points, cov, errors = np.empty((markers, 3)), np.empty((markers, 3, 3)), np.empty((2, markers))
     apart = np.empty(markers, np.bool_)
-    intersect(cameras, rays_px, limits_of(count), observed, points, cov, errors, apart)
+    none, room = np.zeros((count, markers), np.bool_), Rays.empty(count)
+    intersect(cameras, rays_px, limits_of(count), observed, none, room, points, cov, errors, apart)
     return Triangulation(points, cov, errors[0], errors[1], apart)

@@ -24,7 +24,7 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.camera_model import CameraModel
-from common.kernels import kernel
+from common.kernels import inner, kernel
 from master.estimator.cameras import CameraArrays, project
 from master.fabrik.cap_views import (
     ANY,
@@ -34,7 +34,6 @@ from master.fabrik.cap_views import (
     appearance,
     hidden_part,
     tilted,
-    views_of,
 )
 from master.fabrik.caps import CAPS, CapTables
 from master.fabrik.estimate import MarkerPositions, SolvedHand
@@ -47,7 +46,6 @@ from master.fabrik.intersection import (
     linear,
     observe,
     outlier,
-    rays_of,
     refine,
     triangulate,
 )
@@ -77,7 +75,7 @@ class _Hand(NamedTuple):
     walked: Float
 
 
-@kernel
+@inner
 def _covariance(
     cameras: CameraArrays,
     caps: CapTables,
@@ -94,8 +92,11 @@ def _covariance(
 
     `walked`: as of `_Hand`.
     """
-    moved, gain = views.moved, np.empty((3, 2))
-    step, both = np.zeros((3, 3)), np.zeros((3, 3))  # of the point by a common step; gain gain'
+    moved, gain = views.moved, views.gain
+    step, both = views.step, views.both  # of the point by a common step; gain gain'
+    for i in range(3):
+        for j in range(3):
+            step[i, j] = both[i, j] = 0.0
     for t in range(count):
         for i in range(3):
             moved[t, i] = 0.0
@@ -125,7 +126,7 @@ def _covariance(
             own[i, j] = shape + (1.0 + walked) * tilt
 
 
-@kernel
+@inner
 def _correct(
     cameras: CameraArrays,
     caps: CapTables,
@@ -165,7 +166,7 @@ def _correct(
     return count, 0.0 if occluded else RAYS.common * shared
 
 
-@kernel
+@inner
 def _place(
     cameras: CameraArrays,
     caps: CapTables,
@@ -191,14 +192,14 @@ def _place(
     return seen, refine(cameras, rays), count, shared
 
 
-@kernel
+@inner
 def _lone(
     cameras: CameraArrays,
     caps: CapTables,
     hand: _Hand,
     rays_px: float,
-    row: int,
-    area: Float,
+    observed: Float,
+    m: int,
     rays: Rays,
     views: Views,
 ) -> None:
@@ -206,10 +207,11 @@ def _lone(
 
     Its uncertain tilt is that camera's own error.
     """
+    row = caps.row[m]
     for i in range(3):
         rays.point[i] = hand.at[row, i]
     for c in range(rays.weight.shape[0]):
-        views.area[c] = area[c] if rays.weight[c] > 0.0 else np.nan
+        views.area[c] = observed[c, m, 3] if rays.weight[c] > 0.0 else np.nan
     count, _ = _correct(cameras, caps, hand, rays_px, row, rays, views)
     for c in range(rays.weight.shape[0]):
         for t in range(1, count):
@@ -232,6 +234,8 @@ def locate(
     at: Float,
     walked: Float,
     observed: Float,
+    rays: Rays,
+    views: Views,
     points: Float,
     cov: Float,
     noise: Float,
@@ -249,13 +253,13 @@ def locate(
         limits: (C + 1,) most chi-square by the number of cameras.
         known, as_seen, R, tilt_rad2, turned_rad2, at, walked: Directions of the caps, as of `_Hand`.
         observed: (C, M, 4) u, v, sigma [px], area [px^2]; NaN: not seen.
+        rays, views: Room.
         points, cov, noise: (M, 3), (M, 3, 3), (M, 3, 3) written as of `MarkerPositions`.
         apart: (M,) written: two cameras or more see it, but their rays do not meet.
         left_out: (C, M) written: outliers, without which they do.
         uv, variance, own: Written, as of `RayPositions`.
     """
     hand = _Hand(known, as_seen, R, tilt_rad2, turned_rad2, at, walked)
-    rays, views = rays_of(observed.shape[0]), views_of(observed.shape[0])
     for m in range(observed.shape[1]):
         for c in range(observed.shape[0]):
             left_out[c, m] = False
@@ -279,7 +283,7 @@ def locate(
             much = float(walked[row]) if known and row >= 0 else 0.0
             _covariance(cameras, caps, row, count, shared, rays, views, much, cov[m], own[m])
         elif seen == 1 and known and row >= 0:
-            _lone(cameras, caps, hand, rays_px, row, observed[:, m, 3], rays, views)
+            _lone(cameras, caps, hand, rays_px, observed, m, rays, views)
         common = 0.0
         for c in range(observed.shape[0]):
             used = rays.weight[c] > 0.0 and not apart[m]
@@ -317,7 +321,7 @@ class RayPositions(MarkerPositions):
 
 
 class RayTriangulator:
-    """Triangulates the markers of a rig by rays. Holds no state."""
+    """Triangulates the markers of a rig by rays. Holds room for its kernels, no state."""
 
     def __init__(self, cameras: Sequence[CameraModel], caps: CapTables, rays_px: float = 0.0) -> None:
         """Triangulate these markers with these cameras.
@@ -334,6 +338,7 @@ class RayTriangulator:
             raise ValueError(f"triangulation needs two cameras or more, not {len(cameras)}")
         self._cameras, self._caps, self._rays_px = CameraArrays.of(cameras), caps, rays_px
         self._limits = limits_of(len(cameras))
+        self._rays, self._views = Rays.empty(len(cameras)), Views.empty(len(cameras))
         self._unknown = np.zeros((len(caps.radius_m), 3, 3))
 
     def __call__(
@@ -379,6 +384,8 @@ class RayTriangulator:
             np.ascontiguousarray(at),
             np.ascontiguousarray(walked),
             observed,
+            self._rays,
+            self._views,
             points,
             cov,
             noise,

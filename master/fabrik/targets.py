@@ -6,7 +6,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.kernels import kernel
-from master.estimator.small_matrices import inverse_3
+from master.estimator.matrices import inverse_3_plus
 
 
 @kernel
@@ -75,7 +75,7 @@ def targets_of(points: Float, cov: Float, T: Float, fitted: Float, fit_m2: float
     """
     gain, off, target = np.empty((3, 3)), np.empty(3), np.empty(3)
     for m in range(points.shape[0]):
-        inverse_3(cov[m], fit_m2, gain)
+        inverse_3_plus(cov[m], fit_m2, gain)
         for i in range(3):
             off[i] = points[m, i] - fitted[m, i]
         for i in range(3):

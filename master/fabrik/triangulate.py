@@ -25,7 +25,7 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.camera_model import CameraModel
-from common.kernels import kernel
+from common.kernels import constant, inner, kernel
 from master.fabrik.cap_views import hidden_part, seen_shift
 from master.fabrik.caps import CAPS, CapTables
 from master.fabrik.depth import AffineDisparity, PowerLaw, disparity_on_axis
@@ -37,6 +37,7 @@ _LAW_TURNS = 3  # each leaves a thousandth of the correction off the axis
 _ANYHOW_RAD = (
     1.0  # standard deviation of the direction of a finger that shows its end, from that to the cameras
 )
+_ONE = constant(1)  # direction
 _ANYHOW_M2 = (4e-3) ** 2  # of a cap's seen centroid while nothing tells where the finger points
 
 
@@ -130,7 +131,7 @@ def depth(tables: DisparityTables, disparity: float) -> float:
     return tables.k / off if off > 0.0 else np.nan
 
 
-@kernel
+@inner
 def metres_per_pixel(tables: DisparityTables, depth_m: float) -> float:
     """|dD/dx| [m/px] at a depth [m]."""
     if tables.power:
@@ -207,7 +208,7 @@ def cap_bias(
         bias[c, 1] = tables.focal_px[c] * (there[1] / there[2] - here[1] / here[2])
 
 
-@kernel
+@inner
 def _across(ahead: Float, tilt: Float, out: Float) -> None:
     """Write two directions (2, 3) across `ahead`, as long as it is unsure [rad].
 
@@ -329,7 +330,7 @@ def triangulate(
                     cov[m, a, b] = spread2 if a == b else 0.0
         for c in range(2):
             seen_px2[c], scale_m[c] = area_px2[c, m], z / tables.focal_px[c]
-        hidden_part(caps, row, seen_px2, scale_m, whole, 1, variance)
+        hidden_part(caps, row, seen_px2, scale_m, whole, _ONE, variance)
         rows2 = tables.row_sigma_px * tables.row_sigma_px + sigma_px[0, m] ** 2 + sigma_px[1, m] ** 2
         if rows * rows > tables.row_limit * (rows2 + variance[0] + variance[1]):
             points[m, :] = np.nan

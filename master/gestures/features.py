@@ -20,7 +20,7 @@ from common.arrays import Bool, Float, Int
 from common.hand_model import CHAINS, FINGERS, TIPS, WRIST, HandModel
 from common.kernels import inner, kernel
 from common.messages import HandPose
-from master.estimator.small_matrices import spread
+from master.estimator.matrices import spread
 from master.fabrik.rotations import cross, dot
 
 KNOWN_SIGMA_M = 0.015  # a tip that may be farther off is anywhere between straight and half bent

@@ -13,7 +13,7 @@ from common.arrays import Bool, Float
 from common.geometry import quaternion_to_matrix
 from common.gesture_actions import DialSettings
 from common.kernels import inner, kernel
-from master.estimator.small_matrices import diagonalise
+from master.estimator.matrices import diagonalise
 from master.fabrik.rotations import dot
 from master.gestures.features import HandFeatures
 

@@ -23,7 +23,7 @@ from common.gesture_actions import PointSettings
 from common.hand_model import CHAINS
 from common.kernels import kernel
 from common.messages import Gesture, Phase
-from master.estimator.small_matrices import spread
+from master.estimator.matrices import spread
 from master.gestures.features import HandFeatures
 from master.gestures.lasting import Lasting
 

@@ -15,13 +15,14 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.gesture_settings import Quantity
 from common.hand_model import CHAINS, MIDDLE_PROXIMAL, WRIST
-from common.kernels import inner, kernel
+from common.kernels import constant, inner, kernel
 from master.gestures.features import HandFeatures
 
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 # MCP and PIP of a finger that hides, and of their sum the standard deviation.
 _HIDDEN_DEG, _HIDDEN_SIGMA_DEG = (55.0, 75.0), 45.0
 _COUNT = len(QUANTITIES)
+_FROM, _TO = constant(WRIST), constant(MIDDLE_PROXIMAL)  # the length of the hand
 # Where they begin: index ... little, each MCP, PIP, both; and so on.
 _THUMB_BEND, _THUMB_PLACE, _GAPS, _AHEAD, _ALL, _SPREADS = 12, 13, 16, 20, 21, 22
 
@@ -75,7 +76,7 @@ def _write(
     for f in range(5):
         lever = _length(joints, CHAINS[f, 1], CHAINS[f, 2]) + _length(joints, CHAINS[f, 2], CHAINS[f, 3])
         turned[f] = degrees(doubt[f] / lever)
-    size = _length(joints, WRIST, MIDDLE_PROXIMAL)
+    size = _length(joints, _FROM, _TO)
     value[_THUMB_BEND], sigma[_THUMB_BEND] = degrees(bend[0, 1] + bend[0, 2]), turned[0]
     for i in range(3):
         place = 0.0

@@ -21,7 +21,7 @@ from common.arrays import Float
 from common.gesture_actions import TapSettings
 from common.hand_model import CHAINS, TIPS
 from common.messages import Gesture
-from master.estimator.small_matrices import spread
+from master.estimator.matrices import spread
 from master.gestures.features import HandFeatures
 from master.gestures.lasting import Lasting, below
 from master.gestures.touch import ThumbTouch

@@ -8,12 +8,13 @@ import numpy as np
 
 from common.arrays import Float
 from common.hand_model import CHAINS
-from common.kernels import inner, kernel
+from common.kernels import constant, inner, kernel
 from common.skin_gaps import ROUNDS, foot_of, nearest
-from master.estimator.small_matrices import spread
+from master.estimator.matrices import spread
 from master.fabrik.rotations import Vector, cross, dot, length, minus
 from master.gestures.features import PAD_SHARE, HandFeatures
 
+_THUMB, _SIDE = constant(0), constant(2)
 _Foot = tuple[float, float, float, float, float, float]
 _foot_of = cast(Callable[[float, float, float, float, float, float, float], _Foot], inner(foot_of))
 _nearest = cast(Callable[[_Foot, float], float], inner(nearest))
@@ -65,8 +66,8 @@ def thumb_touch(features: HandFeatures, radius_m: Float) -> ThumbTouch:
 def _write(joints: Float, cov: Float, pads: Float, radius: Float, out: ThumbTouch) -> None:
     """Write a touch; arguments as of `HandFeatures`."""
     thumb, tip = CHAINS[0, 2], CHAINS[0, 3]
-    thumb_side = _palmar(0, 2, joints, pads)
-    thumb_turned = _turned_rad(0, joints, cov)
+    thumb_side = _palmar(_THUMB, _SIDE, joints, pads)
+    thumb_turned = _turned_rad(_THUMB, joints, cov)
     for k in range(4):
         for s in range(3):
             a, b = CHAINS[k + 1, s], CHAINS[k + 1, s + 1]

@@ -16,7 +16,7 @@ from common.messages import HandPose
 from common.sim.gesture_postures import knob_grip, pinch_posture
 from common.sim.motion import POSES, angles_of
 from common.skin_gaps import RoundCones, gaps_between
-from master.estimator.small_matrices import diagonalise, spread
+from master.estimator.matrices import diagonalise, spread
 from master.gestures.features import FeatureExtractor
 from master.gestures.grip import Tips, turned_by
 from master.gestures.recogniser import GestureRecogniser
