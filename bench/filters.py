@@ -23,7 +23,7 @@ from common.calibration import FilterCalibration
 from common.geometry import rigid
 from common.hand_model import HandModel
 from common.hand_profiles import generated_profile
-from master.estimator.estimator import Fitted, FittedHand
+from master.estimator.epoch import Fitted, FittedHand
 from master.estimator.smooth import HandOneEuro
 from master.fabrik.one_euro import OneEuro, OneEuroParameters, PointFilter
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from common.messages import MarkerDetections
 from master.__main__ import main
-from master.estimator.estimator import Fitted
+from master.estimator.epoch import Fitted
 from master.estimator.pipeline import MarkerPipeline, SolvedPose
 from master.estimator.pose import pose_of
 from master.fabrik.estimate import MarkerPositions

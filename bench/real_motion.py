@@ -33,7 +33,7 @@ from common.hand_model import CHAINS, FINGERS, HandModel
 from common.hand_profiles import generated_profile
 from common.npz import read_npz
 from common.sim.leap import KEYS, RIG_FROM_LEAP, palm_rotation
-from master.estimator.estimator import FittedHand
+from master.estimator.epoch import FittedHand
 from master.estimator.smooth import HandOneEuro
 from master.fabrik.one_euro import OneEuroParameters
 

@@ -7,7 +7,8 @@ import numpy as np
 from common.arrays import Float
 from common.camera_model import CameraModel
 from common.hand_model import HandModel
-from master.estimator.estimator import Epoch, Estimator, Fitted, Sensed
+from master.estimator.epoch import Epoch, Fitted, Sensed
+from master.estimator.estimator import Estimator
 from master.estimator.settings import DEFAULT, Settings
 
 TOWARDS = np.array([0.0, 0.0, -1.0])  # from hands to cameras that look along the rig's +z

@@ -1,45 +1,25 @@
-"""Kernels of how sure each joint is: this epoch and the state before, and joints that move on arcs.
+"""Kernels of how sure each joint is: this epoch and the state before.
 
 What this epoch says and what the state before says are no independent witnesses: the same habits, and errors of markers
 that repeat, are in both. So they are never added up as the Kalman filter does (Julier, Uhlmann 1997, "A non-divergent
 estimation algorithm in the presence of unknown correlations", show what that leads to). In each direction the surer of
 the two is taken, and no more: in the coordinates in which the covariance of this instant is the unit matrix and that of
 the past diagonal, the smaller of each pair. Where every finger is seen this instant says more, and counts alone.
-
-Joints move on arcs, which linear covariances leave out: a palm that is turned by 30 degrees about the one marker on its
-back has its wrist 8 mm off the tangent. A bone b that is turned by w moves by w x b + w x (w x b) / 2 to second order.
-With w = sum_k c_k w_k, c_k independent of variance one,
-
-    h_kl = (w_k x (w_l x b) + w_l x (w_k x b)) / 2
-    E[(sum_kl c_k c_l h_kl / 2)(sum_kl c_k c_l h_kl / 2)'] = (sum_k h_kk)(sum_k h_kk)' / 4 + sum_kl h_kl h_kl' / 2
-
-(Isserlis 1918), h summed over the bones from the palm's origin to the joint; w_k are columns of a pivoted Cholesky
-factor of the turns' covariance, as many as are not straight.
-
-A marker that is seen does not leave its place by any turn: its arc h^m is taken back by the answer of the fit to a
-marker that moved so far,
-
-    h - J K h^m,   K = cov Jm' (Jm cov Jm' v R)^-1
-
-R is the covariance of the markers, and v takes the larger in each direction. So tips that are seen stay where they are,
-and the palm turns about the marker on its back.
 """
 
 from math import sqrt
 
-from common.arrays import Bool, Float, Int
+from common.arrays import Float, Int
 from common.hand_model import CHAINS
 from common.kernels import constant, inlined, inner, record
 from master.estimator.hand_tables import HandTables
-from master.estimator.kinematics import DIRECTION, PLACE, Scratch, finger_slopes, marker_point, palm_slopes
+from master.estimator.kinematics import DIRECTION, PLACE, Scratch, finger_slopes, palm_slopes
 from master.estimator.matrices import cholesky, eigen
 from master.estimator.settings import Settings
-from master.estimator.solve import Rig
 from master.estimator.state import Hidden
 
 _LAST = constant(3)  # joint of a finger: its tip
-_NONE = constant(0)
-_MOST = 12  # turns that count in arcs: those of the palm, which moves all joints, then the largest
+MOST_TURNS = 12  # turns that count in arcs: those of the palm, which moves all joints, then the largest
 
 
 class Certainty:
@@ -71,7 +51,7 @@ class Certainty:
     @classmethod
     def empty(cls, n: int, markers: int) -> "Certainty":
         """Allocate it."""
-        N, K, pairs = 6 + n, 3 * markers, _MOST * (_MOST + 1) // 2
+        N, K, pairs = 6 + n, 3 * markers, MOST_TURNS * (MOST_TURNS + 1) // 2
         room = record(
             cls,
             A=(N, N),
@@ -79,9 +59,9 @@ class Certainty:
             V=(N, N),
             work=(N, N),
             values=N,
-            turns=(_MOST, N),
+            turns=(MOST_TURNS, N),
             left=N,
-            w=(5, 4, _MOST, 3),
+            w=(5, 4, MOST_TURNS, 3),
             joint=(pairs, 26, 3),
             marker=(pairs, K),
             Jm=(K, N),
@@ -155,7 +135,7 @@ def only_limits(hand: HandTables, x: Float, hidden: Hidden, cov: Float) -> None:
 
 
 @inner
-def _slopes(hand: HandTables, joint: int, T: Float, work: Scratch, room: Certainty) -> int:
+def joint_slopes(hand: HandTables, joint: int, T: Float, work: Scratch, room: Certainty) -> int:
     """Write derivatives of a joint (10, 3) and which unknowns they belong to; return how many."""
     f, level = hand.finger[joint], hand.level[joint]
     for i in range(3):
@@ -196,7 +176,7 @@ def _project(cov: Float, count: int, room: Certainty, out: Float) -> None:
 def linear(hand: HandTables, T: Float, cov: Float, work: Scratch, room: Certainty, joint_cov: Float) -> None:
     """Write the covariances of the joints (26, 3, 3) [m^2], by their derivatives; `work` as `chains` left it."""
     for joint in range(26):
-        count = _slopes(hand, joint, T, work, room)
+        count = joint_slopes(hand, joint, T, work, room)
         _project(cov, count, room, joint_cov[joint])
 
 
@@ -235,299 +215,3 @@ def tilts(
             for i in range(3):
                 walk[f] += (rate * room.J[a, i]) ** 2
         _project(cov, 6 + count, room, tilt[f])
-
-
-@inner
-def _turns(settings: Settings, cov: Float, room: Certainty) -> int:
-    """Write the turns that are not straight, as columns of a pivoted Cholesky factor; return how many.
-
-    One that is less sure than `turns_most_rad` leads nowhere farther.
-    """
-    N, left = cov.shape[0], room.left
-    for i in range(N):
-        left[i] = 0.0 if 3 <= i < 6 else cov[i, i]
-    count = 0
-    while count < _MOST:
-        pivot = 0
-        for i in range(3):
-            if left[i] > left[pivot]:
-                pivot = i
-        if not left[pivot] > settings.straight_rad**2:
-            for i in range(6, N):
-                if left[i] > left[pivot]:
-                    pivot = i
-        if not left[pivot] > settings.straight_rad**2:
-            break
-        root, squared = sqrt(left[pivot]), 0.0
-        for i in range(N):
-            value = 0.0 if 3 <= i < 6 else cov[i, pivot]
-            for k in range(count):
-                value -= room.turns[k, i] * room.turns[k, pivot]
-            value = 0.0 if 3 <= i < 6 else value / root
-            room.turns[count, i] = value
-            squared += value * value
-            left[i] = max(left[i] - value * value, 0.0)
-        left[pivot] = 0.0
-        most = settings.turns_most_rad
-        room.values[count] = min(most / sqrt(squared), 1.0)
-        count += 1
-    return count
-
-
-@inner
-def _bone_turns(hand: HandTables, T: Float, count: int, work: Scratch, room: Certainty) -> None:
-    """Write how each turn turns each bone (5, 4, K, 3): the palm, and the axes of the joints before it."""
-    for f in range(5):
-        columns = hand.first[f + 1] - hand.first[f]
-        for k in range(count):
-            scale = room.values[k]
-            for i in range(3):
-                room.w[f, 0, k, i] = scale * room.turns[k, i]
-        for axis in range(4):
-            ax, ay, az = -work.R[f, max(axis - 1, 0), 0, 0], -work.R[f, max(axis - 1, 0), 1, 0], 0.0
-            az = -work.R[f, max(axis - 1, 0), 2, 0]
-            if axis == 0:
-                ax = ay = az = 0.0
-                for j in range(3):
-                    ax += T[0, j] * hand.abduction_axis[f, j]
-                    ay += T[1, j] * hand.abduction_axis[f, j]
-                    az += T[2, j] * hand.abduction_axis[f, j]
-            # Abduction and flexion turn the first bone behind the root, PIP the next, DIP the last.
-            bone, before = max(axis, 1), max(axis - 1, 0)
-            for k in range(count):
-                rate = 0.0
-                for c in range(columns):
-                    rate += work.by[4 * f + axis, c] * room.turns[k, 6 + hand.first[f] + c]
-                rate *= room.values[k]
-                for i in range(3):
-                    if axis != 1:
-                        room.w[f, bone, k, i] = room.w[f, before, k, i]
-                room.w[f, bone, k, 0] += rate * ax
-                room.w[f, bone, k, 1] += rate * ay
-                room.w[f, bone, k, 2] += rate * az
-
-
-@inlined
-def _arc(one: Float, other: Float, bx: float, by: float, bz: float, i: int) -> float:
-    """Component i of h of a bone that is turned by two turns (3,)."""
-    b = bx if i == 0 else (by if i == 1 else bz)
-    one_b = one[0] * bx + one[1] * by + one[2] * bz
-    other_b = other[0] * bx + other[1] * by + other[2] * bz
-    both = one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
-    return 0.5 * (one[i] * other_b + other[i] * one_b) - both * b
-
-
-@inner
-def _arcs(rig: Rig, T: Float, seen: Bool, k: int, m: int, pair: int, work: Scratch, room: Certainty) -> None:
-    """Write the arcs of joints and markers by turns k and m: room.joint, room.marker (not yet whitened)."""
-    hand, mounts, w = rig.hand, rig.mounts, room.w
-    for joint in range(26):
-        if hand.finger[joint] >= 0:
-            continue
-        bx = by = bz = 0.0
-        for j in range(3):
-            bx += T[0, j] * hand.rest_m[joint, j]
-            by += T[1, j] * hand.rest_m[joint, j]
-            bz += T[2, j] * hand.rest_m[joint, j]
-        for i in range(3):
-            room.joint[pair, joint, i] = _arc(w[0, 0, k], w[0, 0, m], bx, by, bz, i)
-    for joint in range(26):
-        f, level = hand.finger[joint], hand.level[joint]
-        if f < 0:
-            continue
-        bx, by, bz = work.P[f, level, 0], work.P[f, level, 1], work.P[f, level, 2]
-        if level > 0:  # joints of a finger follow each other
-            bx, by, bz = (
-                bx - work.P[f, level - 1, 0],
-                by - work.P[f, level - 1, 1],
-                bz - work.P[f, level - 1, 2],
-            )
-        else:
-            bx, by, bz = bx - T[0, 3], by - T[1, 3], bz - T[2, 3]
-        for i in range(3):
-            bent = _arc(w[f, level, k], w[f, level, m], bx, by, bz, i)
-            room.joint[pair, joint, i] = bent + (room.joint[pair, joint - 1, i] if level > 0 else 0.0)
-    for marker in range(mounts.finger.shape[0]):
-        if not seen[marker]:
-            continue
-        f, level = mounts.finger[marker], mounts.level[marker]
-        marker_point(mounts, marker, T, work.R, work.P, work.point)
-        bone = min(level, 2) + 1
-        bx, by, bz = work.point[0] - T[0, 3], work.point[1] - T[1, 3], work.point[2] - T[2, 3]
-        if f >= 0:
-            bx, by, bz = (
-                work.point[0] - work.P[f, level, 0],
-                work.point[1] - work.P[f, level, 1],
-                work.point[2] - work.P[f, level, 2],
-            )
-        for i in range(3):
-            if f < 0:
-                room.marker[pair, 3 * marker + i] = _arc(w[0, 0, k], w[0, 0, m], bx, by, bz, i)
-            else:
-                carried = room.joint[pair, room.joint_of[f, level], i]
-                bent = _arc(w[f, bone, k], w[f, bone, m], bx, by, bz, i)
-                room.marker[pair, 3 * marker + i] = carried + bent
-
-
-@inner
-def _whiten(information: Float, white: Float) -> None:
-    """Write W (3, 3) with W' W = information, which may be singular: the transposed factor of Cholesky."""
-    for j in range(3):
-        total = information[j, j]
-        for k in range(j):
-            total -= white[k, j] ** 2
-        root = sqrt(max(total, 0.0))
-        white[j, j] = root
-        for i in range(j + 1, 3):
-            total = information[i, j]
-            for k in range(j):
-                total -= white[k, i] * white[k, j]
-            white[j, i] = total / root if root > 1e-6 else 0.0
-            white[i, j] = 0.0
-
-
-@inner
-def _gain(
-    rig: Rig, T: Float, cov: Float, seen: Bool, information: Float, pairs: int, work: Scratch, room: Certainty
-) -> int:
-    """Write the answer of the fit to moved markers (N, K), and whiten the markers' arcs; return K."""
-    hand, mounts, N, K = rig.hand, rig.mounts, cov.shape[0], 0
-    for m in range(mounts.finger.shape[0]):
-        if not seen[m]:
-            continue
-        f = mounts.finger[m]
-        marker_point(mounts, m, T, work.R, work.P, work.point)
-        for i in range(3):
-            work.arm[i] = work.point[i] - T[i, 3]
-        palm_slopes(work.arm, room.J)
-        size, start = 6, 0
-        if f >= 0:
-            start, size = hand.first[f], 6 + hand.first[f + 1] - hand.first[f]
-            finger_slopes(hand, work.by, T, work.R, work.P, f, mounts.level[m], work.point, PLACE, room.J)
-        _whiten(information[m], room.white)
-        for i in range(3):
-            for c in range(N):
-                room.Jm[K + i, c] = 0.0
-            for a in range(size):
-                total = 0.0
-                for j in range(3):
-                    total += room.white[i, j] * room.J[a, j]
-                room.Jm[K + i, a if a < 6 else start + a] = total
-        for p in range(pairs):
-            hx, hy, hz = room.marker[p, 3 * m], room.marker[p, 3 * m + 1], room.marker[p, 3 * m + 2]
-            for i in range(3):
-                whitened = room.white[i, 0] * hx + room.white[i, 1] * hy + room.white[i, 2] * hz
-                room.marker[p, K + i] = whitened  # K <= 3 m: nothing that is still needed
-        K += 3
-    for c in range(N):
-        for r in range(K):
-            total = 0.0
-            for d in range(N):
-                total += cov[c, d] * room.Jm[r, d]
-            room.gain[c, r] = total
-    for r in range(K):
-        for q in range(r + 1):
-            total = 0.0
-            for d in range(N):
-                total += room.Jm[r, d] * room.gain[d, q]
-            room.B[r, q] = room.B[q, r] = total
-    return K
-
-
-@inner
-def _at_most_one(N: int, K: int, room: Certainty) -> None:
-    """Divide the gain by what is wider than its markers, because misfit or two hypotheses made it so."""
-    for r in range(K):
-        for q in range(K):
-            room.BL[r, q] = (1.0 if r == q else 0.0) - room.B[r, q]
-    if cholesky(room.BL, K, room.BV):
-        return
-    eigen(room.B, K, room.B_values, room.BV)
-    for r in range(K):
-        for q in range(K):
-            total = 0.0
-            for d in range(K):
-                total += room.BV[r, d] * room.BV[q, d] / max(room.B_values[d], 1.0)
-            room.BL[r, q] = total
-    for c in range(N):
-        for r in range(K):
-            total = 0.0
-            for q in range(K):
-                total += room.gain[c, q] * room.BL[q, r]
-            room.row[r] = total
-        for r in range(K):
-            room.gain[c, r] = room.row[r]
-
-
-@inner
-def add_arcs(
-    rig: Rig,
-    settings: Settings,
-    T: Float,
-    cov: Float,
-    seen: Bool,
-    information: Float,
-    work: Scratch,
-    room: Certainty,
-    joint_cov: Float,
-) -> None:
-    """Add to covariances of the joints what the linear ones leave out.
-
-    Args:
-        rig, settings: The hand and its markers.
-        T: (4, 4) palm; chains and derivatives of its angles are in `work`.
-        cov: (N, N) of the unknowns.
-        seen: (M,) markers that are measured, and `information` (M, 3, 3) [1/m^2] of their places.
-        work, room: Room.
-        joint_cov: (26, 3, 3) [m^2], changed.
-    """
-    count, N = _turns(settings, cov, room), cov.shape[0]
-    if count == 0:
-        return
-    _bone_turns(rig.hand, T, count, work, room)
-    pairs = _NONE
-    for k in range(count):
-        for m in range(k + 1):
-            _arcs(rig, T, seen, k, m, pairs, work, room)
-            pairs += 1
-    K = _gain(rig, T, cov, seen, information, pairs, work, room)
-    _at_most_one(N, K, room)
-    for joint in range(26):
-        size = _slopes(rig.hand, joint, T, work, room)
-        mx = my = mz = 0.0
-        out = joint_cov[joint]
-        for i in range(3):
-            for r in range(K):  # how the joint answers to the markers
-                total = 0.0
-                for a in range(size):
-                    total += room.J[a, i] * room.gain[room.at[a], r]
-                room.BL[i, r] = total
-        pair = 0
-        for k in range(count):
-            for m in range(k + 1):
-                hx, hy, hz = (
-                    room.joint[pair, joint, 0],
-                    room.joint[pair, joint, 1],
-                    room.joint[pair, joint, 2],
-                )
-                for r in range(K):
-                    hx -= room.BL[0, r] * room.marker[pair, r]
-                    hy -= room.BL[1, r] * room.marker[pair, r]
-                    hz -= room.BL[2, r] * room.marker[pair, r]
-                share = 0.5 if k == m else 1.0  # those of two turns count twice
-                if k == m:
-                    mx, my, mz = mx + hx, my + hy, mz + hz
-                out[0, 0] += share * hx * hx
-                out[0, 1] += share * hx * hy
-                out[0, 2] += share * hx * hz
-                out[1, 1] += share * hy * hy
-                out[1, 2] += share * hy * hz
-                out[2, 2] += share * hz * hz
-                pair += 1
-        out[0, 0] += 0.25 * mx * mx
-        out[0, 1] += 0.25 * mx * my
-        out[0, 2] += 0.25 * mx * mz
-        out[1, 1] += 0.25 * my * my
-        out[1, 2] += 0.25 * my * mz
-        out[2, 2] += 0.25 * mz * mz
-        out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]

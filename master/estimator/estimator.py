@@ -1,25 +1,27 @@
 """The estimator: a hand at each epoch, predicted from the one before and fitted to what is measured."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from common.arrays import Bool, Code, Float, Int
+from common.arrays import Bool, Float, Int
 from common.camera_model import CameraModel
 from common.geometry import fit_rigid
 from common.hand_model import CHAINS, HandJoints, HandModel
 from common.kernels import bound, boxed, fields
 from common.messages import Source
 from master.estimator.cameras import CameraArrays
+from master.estimator.epoch import BY_MARKERS, ON_MARKERS, ON_OTHERS, Epoch, Fitted, FittedHand, Sensed
 from master.estimator.hand_tables import HandTables, Mounts
+from master.estimator.hypotheses import Blank
 from master.estimator.kinematics import Scratch, pose
 from master.estimator.parameters import HandParameters
-from master.estimator.posterior import Blank
 from master.estimator.priors import Habits, curled, habits_of
+from master.estimator.problem import Rig
 from master.estimator.residuals import Observations, observe_points, observe_rays
 from master.estimator.settings import DEFAULT, Settings
-from master.estimator.solve import MAX_ITERATIONS, Rig
+from master.estimator.solve import MAX_ITERATIONS
 from master.estimator.state import HandState
 from master.estimator.update import (
     Estimate,
@@ -29,7 +31,6 @@ from master.estimator.update import (
     predict_epoch,
     take_over_epoch,
 )
-from master.fabrik.estimate import SolvedHand
 
 _BENDS_RAD = (0.1, 0.7, 1.3)  # of the PIP, from which a search afresh begins: open to closed
 _MCP_PER_PIP = 0.6
@@ -41,118 +42,9 @@ _LENGTH_M = 20e-3  # a line shorter than this has no direction
 _ACROSS = 0.9  # cosine to the sight, at most
 _EVEN = 0.5  # probability
 _SOMEWHERE_M = 0.1  # about each axis: a hand that is known no better than this is lost
-ON_MARKERS, ON_OTHERS, BY_MARKERS = 1, 2, 16
 _FIRST_MARKER = 8  # bit
 _EYE, _AT_ORIGIN = np.eye(3), np.eye(4)
 _NONE = frozenset[int]()
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Epoch:
-    """What is measured at one time.
-
-    Attributes:
-        t_ns: When.
-        points_m: (A, 3) where rays place the markers; NaN: they do not.
-        cov_m2: (A, 3, 3) covariances of these, where they are what is measured; None: the centroids are.
-        uv: (C, A, 2) [px] centroids of all markers of the rig; NaN: not seen, or gated out.
-        variance_px2: (C, A) of each camera's own errors; NaN: not to be used.
-        own_m2: (A, 3, 3) covariance of what is wrong with each marker itself, beside bones.
-        facing: (3,) unit vector from the hand to the cameras that see its back.
-        sensed: What other sensors say of the palm's turn and of angles; None: nothing.
-        start: Another hand of this epoch; None: there is none.
-    """
-
-    t_ns: int
-    points_m: Float
-    facing: Float
-    cov_m2: Float | None = None
-    uv: Float | None = None
-    variance_px2: Float | None = None
-    own_m2: Float | None = None
-    sensed: "Sensed | None" = None
-    start: SolvedHand | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sensed:
-    """What other sensors say of the palm's turn and the free angles, as normal equations.
-
-    Attributes:
-        rotation: (3, 3) palm -> rig about which turns count; None: only angles are known.
-        sure: Whether it is known about every axis how the palm lies.
-        information, pull, constant: (3 + n, 3 + n), (3 + n,) and a number, of turn and free angles.
-        told: (5,) fingers that are told, and `level` (5,) from what (`Level`).
-        angles: (n,) the angles of those, where a search may begin.
-        lit: Columns of the PIPs of fingers that a laser point alone tells: they bend as their knuckles do.
-        weighed: The same with fingers counting less that a hand of angles (5, 4) contradicts; None: there are none.
-        belief: Where it is from.
-    """
-
-    rotation: Float | None
-    sure: bool
-    information: Float
-    pull: Float
-    constant: float
-    told: Bool
-    level: Code
-    angles: Float
-    lit: Int = field(default_factory=lambda: np.zeros(0, np.int64))
-    weighed: "Callable[[Float], Sensed | None]" = lambda _: None
-    belief: object = None
-
-    @classmethod
-    def turn(cls, rotation: Float, information: Float, n: int, *, sure: bool) -> "Sensed":
-        """Of the palm's rotation (3, 3) alone, with information (3, 3) [1/rad^2] about it."""
-        both = np.zeros((3 + n, 3 + n))
-        both[:3, :3] = information
-        none, level = np.zeros(5, np.bool_), np.zeros(5, np.uint8)
-        return cls(rotation, sure, both, np.zeros(3 + n), 0.0, none, level, np.zeros(n))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FittedHand(SolvedHand):
-    """A hand fitted by the estimator.
-
-    Attributes:
-        alone: (6 + n, 6 + n) covariance of the palm's turn [rad] and shift [m] and of the free angles [rad], by this
-            instant alone.
-        x: (n,) free angles.
-        scale: By how much the misfit of the instant has scaled `alone`.
-        natural: Probability that the hand obeys habits.
-        surprise: (M,) chi square of each marker.
-        steps: Of the search.
-    """
-
-    alone: Float
-    x: Float
-    scale: float
-    natural: float
-    surprise: Float
-    steps: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Fitted:
-    """What the estimator says at an epoch.
-
-    Attributes:
-        solution: The hand; None: nothing is known of it.
-        valid, tracked, source: (26,) as of `HandPose`.
-        rests: (6,) what thumb ... little and the palm rest on now; 0: on nothing. Equal numbers are equal grounds: for
-            a finger the sum of `ON_MARKERS`, `BY_MARKERS` where its own is placed, and `ON_OTHERS` by its level; for
-            the palm one of the former and which markers are seen.
-        anew: The hand of a moment ago was wrong: nothing of it is in this one.
-        sensed: What other sensors said, as the fit took it; None: nothing.
-    """
-
-    solution: FittedHand | None
-    valid: Bool
-    tracked: Bool
-    source: Code
-    rests: Int
-    anew: bool = False
-    sensed: "Sensed | None" = None
 
 
 class Estimator:
@@ -412,7 +304,7 @@ class Estimator:
             starts.append((np.ascontiguousarray(T), x))
         return starts
 
-    def _as_sensed(self, x: Float, sensed: "Sensed | None") -> Float:
+    def _as_sensed(self, x: Float, sensed: Sensed | None) -> Float:
         """Free angles (n,) with those of fingers that another sensor tells."""
         if sensed is None or not sensed.told.any():
             return x
@@ -471,7 +363,7 @@ class Estimator:
             self._habits[unlike] = habits.natural() if self._only_natural else habits
         return self._habits[unlike]
 
-    def _with_laser(self, habits: Habits, sensed: "Sensed | None") -> Habits:
+    def _with_laser(self, habits: Habits, sensed: Sensed | None) -> Habits:
         """Habits where a laser point alone tells some PIPs: a natural hand has no belief about these by themselves."""
         if sensed is None or not len(sensed.lit) or self.model.mcp_per_pip is None:
             return habits

@@ -19,7 +19,8 @@ from common.camera_model import CameraModel
 from common.hand_model import HandModel
 from common.messages import HandPose, MarkerDetections, restamped
 from master.estimator.cameras import CameraArrays
-from master.estimator.estimator import Epoch, Estimator, Fitted, Sensed
+from master.estimator.epoch import Epoch, Fitted, Sensed
+from master.estimator.estimator import Estimator
 from master.estimator.gate import Prior, among, associate
 from master.estimator.pose import pose_of
 from master.estimator.smooth import HandOneEuro

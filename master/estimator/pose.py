@@ -7,7 +7,7 @@ from common.calibration import Volume
 from common.geometry import matrix_to_quaternion
 from common.hand_model import HandModel
 from common.messages import HandPose
-from master.estimator.estimator import Fitted
+from master.estimator.epoch import Fitted
 from master.fabrik.estimate import HandEstimate, MarkerPositions
 from master.volume import inside
 

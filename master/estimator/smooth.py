@@ -34,7 +34,7 @@ import numpy as np
 from common.arrays import Float
 from common.hand_model import HandJoints, HandModel
 from common.kernels import bound, boxed
-from master.estimator.estimator import Fitted, FittedHand
+from master.estimator.epoch import Fitted, FittedHand
 from master.estimator.hand_tables import HandTables
 from master.estimator.lead import Lead
 from master.estimator.parameters import HandParameters

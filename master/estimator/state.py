@@ -21,8 +21,8 @@ from common.kernels import constant, inlined, inner, record
 from master.estimator.hand_tables import HandTables
 from master.estimator.kinematics import clamp, free_of
 from master.estimator.matrices import cholesky, copy, substitute
+from master.estimator.problem import Belief
 from master.estimator.settings import Settings
-from master.estimator.solve import Belief
 
 NEVER_NS = -(2**61)
 _NONE = constant(0)

@@ -8,16 +8,19 @@ import numpy as np
 from common.arrays import Bool, Code, Float, Int
 from common.kernels import inlined, inner, kernel, record
 from common.messages import Source
+from master.estimator.arcs import add_arcs
 from master.estimator.cameras import CameraArrays
-from master.estimator.certainty import Certainty, add_arcs, linear, only_limits, surer, tilts
+from master.estimator.certainty import Certainty, linear, only_limits, surer, tilts
 from master.estimator.hand_tables import Mounts
+from master.estimator.hypotheses import Blank, Posterior, Room, likelier
 from master.estimator.kinematics import angles_of, chains, clamp, joints, marker_point
 from master.estimator.matrices import copy, inverse_3
-from master.estimator.posterior import Blank, Posterior, Room, likelier, posterior
+from master.estimator.posterior import posterior
 from master.estimator.priors import Habits
+from master.estimator.problem import Belief, Rig, Search
 from master.estimator.residuals import Observations, marker_rows
 from master.estimator.settings import Settings
-from master.estimator.solve import Belief, Rig, Search, descend
+from master.estimator.solve import descend
 from master.estimator.state import NEVER_NS, PALM_PART, HandState, Hidden, grow, predict
 
 _QUANTILE_95 = 7.815  # chi square of three numbers

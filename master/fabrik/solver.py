@@ -15,7 +15,8 @@ from common.camera_model import CameraModel
 from common.geometry import rigid
 from common.hand_model import CHAINS, METACARPALS, PALM, TIPS, WRIST, HandModel
 from common.messages import MarkerDetections, Source
-from master.estimator.estimator import Epoch, Estimator, Fitted
+from master.estimator.epoch import Epoch, Fitted
+from master.estimator.estimator import Estimator
 from master.fabrik.estimate import HandEstimate, SolvedHand
 from master.fabrik.finger import Finger
 from master.fabrik.one_euro import PointFilter

@@ -26,7 +26,7 @@ from common.geometry import matrix_to_rotation_vector
 from common.hand_model import HandModel
 from common.messages import Level
 from master.estimator.attached import Attached
-from master.estimator.estimator import Sensed
+from master.estimator.epoch import Sensed
 from master.estimator.parameters import HandParameters
 from master.fusion.orientation import Orientation, turn_of_vector
 

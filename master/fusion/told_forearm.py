@@ -20,7 +20,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.geometry import rotation_vector_to_matrix
-from master.estimator.estimator import FittedHand
+from master.estimator.epoch import FittedHand
 from master.estimator.parameters import HandParameters
 from master.fusion.sensed_hand import SensedHand
 

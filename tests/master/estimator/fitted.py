@@ -10,7 +10,8 @@ from common.arrays import Float
 from common.camera_model import CameraModel
 from common.geometry import matrix_to_rotation_vector
 from common.hand_model import HandJoints, HandModel
-from master.estimator.estimator import Epoch, Estimator, Fitted, FittedHand, Sensed
+from master.estimator.epoch import Epoch, Fitted, FittedHand, Sensed
+from master.estimator.estimator import Estimator
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT, Settings
 from master.fabrik.estimate import SolvedHand

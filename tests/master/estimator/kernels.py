@@ -4,12 +4,14 @@ from typing import Any
 
 from common.arrays import Bool, Float
 from common.kernels import kernel
+from master.estimator.arcs import add_arcs
 from master.estimator.cameras import CameraArrays, project
-from master.estimator.certainty import Certainty, add_arcs, linear, surer
+from master.estimator.certainty import Certainty, linear, surer
 from master.estimator.kinematics import Scratch, angles_of, chains
 from master.estimator.priors import Habits
+from master.estimator.problem import Rig
 from master.estimator.residuals import Observations, marker_rows
-from master.estimator.solve import Rig, linearise
+from master.estimator.solve import linearise
 from master.estimator.state import grow, hide
 from master.estimator.truncated import mean_within
 from master.estimator.update import Model

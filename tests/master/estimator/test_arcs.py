@@ -11,7 +11,7 @@ from common.kernels import boxed
 from master.estimator.attached import Attached
 from master.estimator.cameras import CameraArrays
 from master.estimator.certainty import Certainty
-from master.estimator.estimator import FittedHand
+from master.estimator.epoch import FittedHand
 from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.kinematics import Scratch
 from master.estimator.parameters import HandParameters

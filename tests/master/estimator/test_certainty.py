@@ -5,7 +5,7 @@ import pytest
 
 from common.arrays import Float
 from common.hand_model import TIPS
-from master.estimator.estimator import FittedHand
+from master.estimator.epoch import FittedHand
 from master.estimator.settings import DEFAULT
 from tests.hand_helpers import RIGHT, palm, small_cov
 from tests.master.estimator.fitted import estimator, fit, found, places, push

@@ -14,7 +14,8 @@ from common.geometry import rotation_vector_to_matrix
 from common.hand_model import PALM, HandModel
 from common.hand_presets import preset_limits
 from common.messages import Source
-from master.estimator.estimator import Estimator, FittedHand, Sensed
+from master.estimator.epoch import FittedHand, Sensed
+from master.estimator.estimator import Estimator
 from master.estimator.settings import DEFAULT
 from tests.hand_helpers import RIGHT, natural_angles, palm, small_cov
 from tests.master.estimator.fitted import (

@@ -15,7 +15,8 @@ from common.geometry import rigid, rotation_vector_to_matrix
 from common.hand_model import CHAINS, TIPS, HandModel
 from common.hand_presets import preset_couplings, preset_limits
 from common.hand_profiles import generated_profile
-from master.estimator.estimator import Estimator, Sensed
+from master.estimator.epoch import Sensed
+from master.estimator.estimator import Estimator
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT, Settings
 from tests.hand_helpers import (

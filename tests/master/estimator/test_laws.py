@@ -23,9 +23,9 @@ from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.kinematics import Scratch
 from master.estimator.parameters import HandParameters
 from master.estimator.priors import habits_of
+from master.estimator.problem import Belief, Search
 from master.estimator.residuals import Observations
 from master.estimator.settings import DEFAULT
-from master.estimator.solve import Belief, Search
 from master.estimator.update import Model
 from tests.hand_helpers import FACING, MARKERS, any_rotation, natural_angles, palm
 from tests.master.estimator.fitted import PAIR

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from common.arrays import Float
 from common.geometry import rigid, rotation_vector_to_matrix
-from master.estimator.estimator import Epoch, FittedHand
+from master.estimator.epoch import Epoch, FittedHand
 from master.estimator.priors import habits_of
 from master.estimator.settings import DEFAULT
 from tests.hand_helpers import FACING, MARKERS, RIGHT, natural_angles, palm, small_cov

@@ -11,7 +11,7 @@ from common.arrays import Float
 from common.hand_model import CHAINS, METACARPALS, PALM, TIPS
 from common.kernels import boxed
 from common.messages import Source
-from master.estimator.estimator import Fitted
+from master.estimator.epoch import Fitted
 from master.estimator.pose import pose_of
 from master.estimator.settings import DEFAULT
 from master.fabrik.estimate import MarkerPositions

@@ -8,7 +8,8 @@ from common.arrays import Float
 from common.calibration import FilterCalibration
 from common.geometry import rigid
 from common.hand_model import CHAINS, TIPS
-from master.estimator.estimator import Epoch, Estimator, Fitted, FittedHand
+from master.estimator.epoch import Epoch, Fitted, FittedHand
+from master.estimator.estimator import Estimator
 from master.estimator.settings import DEFAULT
 from master.estimator.smooth import HandOneEuro
 from master.fabrik.one_euro import OneEuroParameters

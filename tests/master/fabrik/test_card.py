@@ -12,7 +12,8 @@ import pytest
 from common.arrays import Float
 from common.geometry import axis_rotation
 from common.messages import HandPose, MarkerDetections
-from master.estimator.estimator import Epoch, Estimator, Fitted
+from master.estimator.epoch import Epoch, Fitted
+from master.estimator.estimator import Estimator
 from master.fabrik.finger import Finger
 from master.fabrik.one_euro import OneEuro
 from master.fabrik.triangulate import DepthTriangulator

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.geometry import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
-from master.estimator.estimator import FittedHand
+from master.estimator.epoch import FittedHand
 from master.estimator.parameters import HandParameters
 from master.fusion.orientation import Orientation
 from master.fusion.sensed_hand import SensedHand

@@ -1,0 +1,156 @@
+"""Records of a fit: a hand under each hypothesis, and both together."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from common.arrays import Float
+from common.kernels import inlined, record
+from master.estimator.priors import Habits
+from master.estimator.problem import Belief, Search
+from master.estimator.residuals import Observations
+from master.estimator.truncated import Cut
+
+
+class Posterior:
+    """A hand by one epoch.
+
+    Attributes:
+        palm, x: (4, 4) palm, (n,) free angles.
+        cov: (N, N) of turn [rad], shift [m], rig axes, and free angles [rad], by this instant alone.
+        surprise: (M,) chi square of each marker.
+        cost: (1,) half the sum of squares, of the likelier hypothesis.
+        steps: (1,) of the search.
+        natural: (1,) probability that the hand obeys habits.
+        scale: (1,) by how much the misfit has scaled the covariance.
+        wrong: (1,) chi square of the markers, where another hand explains them better.
+    """
+
+    palm: Float
+    x: Float
+    cov: Float
+    surprise: Float
+    cost: Float
+    steps: Float
+    natural: Float
+    scale: Float
+    wrong: Float
+
+    @classmethod
+    def empty(cls, n: int, markers: int) -> "Posterior":
+        """Room for one."""
+        N = 6 + n
+        return record(
+            cls,
+            palm=(4, 4),
+            x=n,
+            cov=(N, N),
+            surprise=markers,
+            cost=1,
+            steps=1,
+            natural=1,
+            scale=1,
+            wrong=1,
+        )
+
+
+class Blank(NamedTuple):
+    """Of which nothing is believed: what `_onto` needs for a fit to points alone."""
+
+    habits: Habits
+    belief: Belief
+    between: Observations
+
+    @classmethod
+    def of(cls, n: int, cameras: int, markers: int) -> "Blank":
+        """For a hand with n free angles."""
+        nothing = Habits(np.zeros((1, n, n)), np.zeros((1, n)), np.zeros(1), np.zeros(1))
+        return cls(nothing, Belief.none(n), Observations.empty(cameras, markers))
+
+
+class Hypothesis:
+    """A hand of N = 6 + n unknowns and M markers under one hypothesis.
+
+    Attributes:
+        palm, x: (4, 4), (n,) where its search ended.
+        gradient, normal: (N,), (N, N) there.
+        surprise, information: (M,) chi square and (M, 3, 3) what is known of the place of each marker.
+        cost, apart: (1,) half the sum of squares, and the half of what rays that do not meet have between them.
+        share: (1,) its probability.
+        step: (N,) from there to the mean within the limits, and `off` (N,) the same from the likelier hand.
+    """
+
+    palm: Float
+    x: Float
+    gradient: Float
+    normal: Float
+    surprise: Float
+    information: Float
+    cost: Float
+    apart: Float
+    share: Float
+    step: Float
+    off: Float
+
+    @classmethod
+    def empty(cls, n: int, markers: int) -> "Hypothesis":
+        """Room for one."""
+        N = 6 + n
+        return record(
+            cls,
+            palm=(4, 4),
+            x=n,
+            gradient=N,
+            normal=(N, N),
+            surprise=markers,
+            information=(markers, 3, 3),
+            cost=1,
+            apart=1,
+            share=1,
+            step=N,
+            off=N,
+        )
+
+
+class Room:
+    """Room for both hypotheses of N = 6 + n unknowns and M markers."""
+
+    each: Sequence[Hypothesis]  # (2,) natural and free
+    start_T: Float  # (4, 4)
+    start_x: Float  # (n,)
+    middle: Float  # (N,)
+    A: Float  # (N, N)
+    L: Float  # (N, N)
+    work: Float  # (N, N)
+    cov: Float  # (N, N)
+    here: Float  # (M, 3)
+    there: Float  # (M, 3)
+    cut: Cut
+    search: Search
+
+    @classmethod
+    def empty(cls, n: int, markers: int) -> "Room":
+        """Allocate it."""
+        N, M = 6 + n, markers
+        return record(
+            cls,
+            each=(Hypothesis.empty(n, markers), 2),
+            start_T=(4, 4),
+            start_x=n,
+            middle=N,
+            A=(N, N),
+            L=(N, N),
+            work=(N, N),
+            cov=(N, N),
+            here=(M, 3),
+            there=(M, 3),
+            cut=Cut.empty(n),
+            search=Search.empty(n, markers),
+        )
+
+
+@inlined
+def likelier(room: Room) -> int:
+    """The hypothesis with the larger probability."""
+    return 0 if room.each[0].share[0] >= room.each[1].share[0] else 1
