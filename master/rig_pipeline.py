@@ -11,7 +11,9 @@ from common.arrays import Float
 from common.errors import CalibrationError
 from common.geometry import cross
 from common.messages import Detections
+from master.estimator.cameras import CameraArrays
 from master.estimator.estimator import Estimator
+from master.estimator.gate import rehearse
 from master.estimator.pipeline import MarkerPipeline, OtherSensors, SolvedPose, Stage
 from master.estimator.settings import Settings
 from master.estimator.smooth import HandOneEuro
@@ -142,6 +144,7 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
         stage=stage,
     )
     line.rehearse()
+    rehearse(CameraArrays.of(tuple(setup.models.values())))
     return line
 
 

@@ -98,7 +98,7 @@ class Estimator:
         self._bit = 1 << np.arange(_FIRST_MARKER, _FIRST_MARKER + count)
         self._finger_of_free = self.parameters.free // 4
         self._turn: Float | None = None
-        self._out, self._scratch = Estimate.empty(), Scratch.empty()
+        self._scratch = Scratch.empty()
         self._model = Model(
             boxed(self._rig.hand),
             boxed(settings.record()),
@@ -117,7 +117,7 @@ class Estimator:
         self._predict = bound(predict_epoch, self._model, state, self._observed, space)
         self._fit = bound(fit_epoch, self._model, self._habits_of(_NONE), self._observed, self._blank, space)
         self._take_over = bound(
-            take_over_epoch, self._model, state, True, self._observed, space, boxed(self._out)
+            take_over_epoch, self._model, state, True, self._observed, space, Estimate.empty()
         )
 
     @property
@@ -161,7 +161,7 @@ class Estimator:
         if (
             solved
             and sensed is not None
-            and (weighed := sensed.weighed(fields(out).angles.reshape(5, 4))) is not None
+            and (weighed := sensed.weighed(out.angles.reshape(5, 4))) is not None
         ):
             self._boxed_state[:], sensed = before, weighed
             at = replace(at, sensed=sensed)
@@ -222,9 +222,7 @@ class Estimator:
 
     def _write(self, out: Estimate, *, goes_on: bool) -> None:
         """Take over what was found, into the state and `out`."""
-        self._take_over(
-            self._model, self._boxed_state, goes_on, self._observed, self._boxed_space, boxed(out)
-        )
+        self._take_over(self._model, self._boxed_state, goes_on, self._observed, self._boxed_space, out)
 
     def _observe(self, at: Epoch) -> int:
         """Write the rows of an epoch; return how many markers have any."""
@@ -389,7 +387,7 @@ class Estimator:
         return rests
 
     def _fitted(self, at: Epoch, out: Estimate, rests: Int, *, anew: bool) -> Fitted:
-        found, sensed, out = self._at.found, at.sensed, fields(out)
+        found, sensed = self._at.found, at.sensed
         recent = (at.t_ns - int(self._now.seen_ns[0])) * 1e-9 <= self.settings.forget_s
         if sensed is not None:  # a tip that is measured stays so
             by_others = CHAINS[sensed.told & (rests[:5] & ON_MARKERS == 0)]
@@ -411,7 +409,7 @@ class Estimator:
         return Fitted(
             hand,
             np.full(26, recent),
-            out.tracked.astype(np.bool_) & recent,
+            out.tracked & recent,
             out.source,
             rests,
             anew,

@@ -27,7 +27,7 @@ _QUANTILE_95 = 7.815  # chi square of three numbers
 _SOLVED, _MEASURED, _HELD = int(Source.SOLVED), int(Source.MEASURED), int(Source.HELD)
 
 
-class Estimate:
+class Estimate(NamedTuple):
     """A hand at one epoch, as kernels write it.
 
     Attributes:
@@ -52,17 +52,16 @@ class Estimate:
     @classmethod
     def empty(cls) -> "Estimate":
         """Room for one."""
-        return record(
-            cls,
-            palm=(4, 4),
-            angles=20,
-            position=(26, 3),
-            rotation=(26, 3, 3),
-            cov=(26, 3, 3),
-            tilt=(5, 3, 3),
-            tilt_walk=5,
-            tracked=("u1", 26),
-            source=("u1", 26),
+        return cls(
+            palm=np.empty((4, 4)),
+            angles=np.empty(20),
+            position=np.empty((26, 3)),
+            rotation=np.empty((26, 3, 3)),
+            cov=np.empty((26, 3, 3)),
+            tilt=np.empty((5, 3, 3)),
+            tilt_walk=np.empty(5),
+            tracked=np.empty(26, np.bool_),
+            source=np.empty(26, np.uint8),
         )
 
 
@@ -344,7 +343,7 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
 
 @kernel
 def take_over_epoch(
-    model: Model, boxed_state: Any, goes_on: bool, observed: Observations, boxed_space: Any, boxed_out: Any
+    model: Model, boxed_state: Any, goes_on: bool, observed: Observations, boxed_space: Any, out: Estimate
 ) -> None:
     """Write the hand that `fit_epoch` found, and the state behind it.
 
@@ -354,9 +353,9 @@ def take_over_epoch(
         goes_on: Whether the hand goes on from it; else nothing of it is kept.
         observed: What is measured.
         boxed_space: (1,) `Workspace`.
-        boxed_out: (1,) `Estimate`, written.
+        out: Written.
     """
-    state, space, out, settings = boxed_state[0], boxed_space[0], boxed_out[0], model.settings[0]
+    state, space, settings = boxed_state[0], boxed_space[0], model.settings[0]
     rig, task = Rig(model.hand[0], model.mounts, model.cameras), space.task
     t_ns, shown, palm_shown = task.t_ns[0], task.shown, task.palm_shown[0] > 0
     found, hidden, room, work = space.found, space.hidden, space.certainty, space.room.search.rows

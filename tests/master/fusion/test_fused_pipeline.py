@@ -10,6 +10,7 @@ from bench.played import START_NS
 from common.arrays import Bool
 from common.hand_model import CHAINS
 from common.messages import ImuSample, MarkerDetections, Source
+from master.estimator.settings import DEFAULT
 
 SECONDS, GONE_S, BACK_S = 3.2, 1.8, 2.5
 
@@ -46,7 +47,11 @@ def test_fingers_are_seen_and_the_palm_is_held_meanwhile(watched: tuple[Both, So
     _, _, cut = watched
     at = away(cut)
     assert (cut.poses.source[at][:, CHAINS[1:].ravel()] == Source.WRIST).mean() > 0.7
-    assert not cut.poses.tracked[at].any()  # nobody sees where the hand is
+    tracked = cut.poses.tracked[at]
+    assert not tracked[
+        cut.t_s[at] > GONE_S + 0.25
+    ].any()  # nobody sees where the hand is, and it may have gone
+    assert cut.off_mm[at][tracked[:, 1:]].max() < 1e3 * DEFAULT.tracked_m
     assert cut.poses.valid[at].all()
     assert np.nanmean(cut.pip_deg[at][:, 1:]) < 12.0
 
