@@ -8,8 +8,6 @@ import numpy as np
 from common.arrays import Bool, Code, Float, Int
 from master.fabrik.estimate import SolvedHand
 
-ON_MARKERS, ON_OTHERS, BY_MARKERS = 1, 2, 16
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Epoch:

@@ -12,7 +12,8 @@ from common.hand_model import CHAINS, HandJoints, HandModel
 from common.kernels import bound, boxed, fields
 from common.messages import Source
 from master.estimator.cameras import CameraArrays
-from master.estimator.epoch import BY_MARKERS, ON_MARKERS, ON_OTHERS, Epoch, Fitted, FittedHand, Sensed
+from master.estimator.epoch import Epoch, Fitted, FittedHand, Sensed
+from master.estimator.ground import ON_MARKERS, ON_OTHERS, count_rows
 from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.hypotheses import Blank
 from master.estimator.kinematics import Scratch, pose
@@ -35,14 +36,12 @@ from master.estimator.update import (
 _BENDS_RAD = (0.1, 0.7, 1.3)  # of the PIP, from which a search afresh begins: open to closed
 _MCP_PER_PIP = 0.6
 _ABOVE_M, _ABOVE_WEIGHT, _PALM_WEIGHT = 0.05, 0.3, 3.0
-_PALM_BY = 3
 _STEP = 16
 _SPREAD_M = 5e-3  # markers nearer than this to one line do not turn a hand about it
 _LENGTH_M = 20e-3  # a line shorter than this has no direction
 _ACROSS = 0.9  # cosine to the sight, at most
 _EVEN = 0.5  # probability
 _SOMEWHERE_M = 0.1  # about each axis: a hand that is known no better than this is lost
-_FIRST_MARKER = 8  # bit
 _EYE, _AT_ORIGIN = np.eye(3), np.eye(4)
 _NONE = frozenset[int]()
 
@@ -89,13 +88,10 @@ class Estimator:
         self._only_natural = natural
         self._habits: dict[frozenset[int], Habits] = {}
         self._finger = mounts.finger
-        self._on_palm = np.array([model.mount(name).joint is None for name in hand_markers])
-        self._carries = self._finger == np.arange(5)[:, None]  # (5, M)
         bent = np.zeros((len(_BENDS_RAD), 5, 4))
         bent[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (_MCP_PER_PIP, 1.0))[:, None]
         self._postures = np.array([self.parameters.of_angles(angles) for angles in bent])
         self._natural = self._likeliest()
-        self._bit = 1 << np.arange(_FIRST_MARKER, _FIRST_MARKER + count)
         self._finger_of_free = self.parameters.free // 4
         self._turn: Float | None = None
         self._scratch = Scratch.empty()
@@ -107,12 +103,14 @@ class Estimator:
         )
         self._boxed_state, self._boxed_space = boxed(self.state), boxed(self._space)
         self._now, self._at = fields(self.state), fields(self._space)
+        self._boxed_ground = self._boxed_space["ground"]
         nothing = np.full((len(cameras), len(markers), 2), np.nan)
         own = np.zeros((len(markers), 3, 3))
         observe_rays(
             nothing, nothing[..., 0].copy(), own, self._on_hand, self._observed
         )  # compiled now, not later
         observe_points(own[self._on_hand, 0], own[self._on_hand], 0.0, self._observed)
+        count_rows(mounts, self._observed, self._boxed_ground)
         state, space = self._boxed_state, self._boxed_space
         self._predict = bound(predict_epoch, self._model, state, self._observed, space)
         self._fit = bound(fit_epoch, self._model, self._habits_of(_NONE), self._observed, self._blank, space)
@@ -140,21 +138,16 @@ class Estimator:
 
     def push(self, at: Epoch) -> Fitted:
         """Fit one epoch."""
-        observed, sensed, task = self._observed, at.sensed, self._at.task
-        count = self._observe(at)
-        seen, rays = observed.seen, (observed.weight > 0.0).sum(axis=0) + 2 * observed.placed
-        back = bool((seen & self._on_palm).any())
-        sure = sensed is not None and sensed.sure
-        shown = (self._carries & seen).any(axis=1)
-        numbers = 3.0 * int((rays > 1).sum()) + 2.0 * int((rays == 1).sum()) + (2.0 if back else 0.0)
+        sensed, task, ground = at.sensed, self._at.task, self._at.ground
+        self._observe(at)
         if sensed is not None:
-            shown |= sensed.told
-            numbers += 3.0 * int(sensed.told.sum())
-        by_markers = count >= _PALM_BY or (count == _PALM_BY - 1 and back)
-        palm_shown = by_markers or (sure and count > 0)
-        task.t_ns[0], task.shown[:], task.palm_shown[0], task.numbers[0] = at.t_ns, shown, palm_shown, numbers
-        known, enough = self.recent(at.t_ns), self._enough(at, back, sure)
-        self._believe(at, back, rays, known=known)
+            ground.shown[:] |= sensed.told
+            ground.numbers[0] += 3.0 * int(sensed.told.sum())
+        sure = sensed is not None and sensed.sure
+        palm_shown = bool(ground.by_markers[0]) or (sure and ground.seen[0] > 0)
+        task.t_ns[0], task.palm_shown[0] = at.t_ns, palm_shown
+        known, enough = self.recent(at.t_ns), self._enough(at, sure)
+        self._believe(at, known=known)
         out = Estimate.empty()
         before = None if sensed is None else self._boxed_state.copy()
         solved, anew = self._solve(at, out, known=known, enough=enough)
@@ -165,12 +158,12 @@ class Estimator:
         ):
             self._boxed_state[:], sensed = before, weighed
             at = replace(at, sensed=sensed)
-            self._believe(at, back, rays, known=known)
+            self._believe(at, known=known)
             solved, anew = self._solve(at, out, known=known, enough=enough)
         self._turn = None if sensed is None else sensed.rotation
-        if count > 0 or (sensed is not None and bool(sensed.told.any()) and self._knows_place()):
+        if ground.seen[0] > 0 or (sensed is not None and bool(sensed.told.any()) and self._knows_place()):
             self._now.seen_ns[0] = at.t_ns
-        rests = self._rests(at, rays, palm_shown=palm_shown, by_markers=by_markers)
+        rests = self._rests(at, palm_shown=palm_shown)
         return self._fitted(at, out, rests, anew=anew) if solved else _unknown(rests)
 
     def _solve(self, at: Epoch, out: Estimate, *, known: bool, enough: bool) -> tuple[bool, bool]:
@@ -224,24 +217,26 @@ class Estimator:
         """Take over what was found, into the state and `out`."""
         self._take_over(self._model, self._boxed_state, goes_on, self._observed, self._boxed_space, out)
 
-    def _observe(self, at: Epoch) -> int:
-        """Write the rows of an epoch; return how many markers have any."""
+    def _observe(self, at: Epoch) -> None:
+        """Write the rows of an epoch, and count them."""
         if at.cov_m2 is not None:
             bones_m2 = self.settings.bones_m**2
             points, cov = at.points_m[self._on_hand], at.cov_m2[self._on_hand]
-            return observe_points(points, cov, bones_m2, self._observed)
-        assert at.uv is not None
-        assert at.variance_px2 is not None
-        assert at.own_m2 is not None
-        own = at.own_m2 + self.settings.bones_m**2 * _EYE
-        return observe_rays(at.uv, at.variance_px2, own, self._on_hand, self._observed)
+            observe_points(points, cov, bones_m2, self._observed)
+        else:
+            assert at.uv is not None
+            assert at.variance_px2 is not None
+            assert at.own_m2 is not None
+            own = at.own_m2 + self.settings.bones_m**2 * _EYE
+            observe_rays(at.uv, at.variance_px2, own, self._on_hand, self._observed)
+        count_rows(self._rig.mounts, self._observed, self._boxed_ground)
 
     def _begin(self, at: Epoch) -> float:
         """Fit without the state, from the other hand or from several starts; return chi square of the markers.
 
         A finger between two that show is rather bent as they are: no hand curls it alone. But straight it would show.
         """
-        shown = frozenset(np.flatnonzero(self._at.task.shown).tolist())
+        shown = frozenset(np.flatnonzero(self._at.ground.shown).tolist())
         like = frozenset(f for f in (2, 3) if f not in shown and {f - 1, f + 1} <= shown)
         chi2 = self._begin_with(at, shown, like)
         angles = self.parameters.angles(self._at.found.x)
@@ -259,7 +254,7 @@ class Estimator:
         habits = self._with_laser(self._habits_of(apart), at.sensed)
         try:
             if start is not None:
-                shows = task.shown[self._finger_of_free] > 0
+                shows = self._at.ground.shown[self._finger_of_free] > 0
                 x = np.where(shows, self.parameters.of_angles(start.angles_rad), self._natural)
                 room.start_T[:], room.start_x[:] = start.T_rig_palm, self._as_sensed(x, at.sensed)
                 chi2 = self._search(habits)
@@ -308,13 +303,13 @@ class Estimator:
             return x
         return np.where(sensed.told[self._finger_of_free], sensed.angles, x)
 
-    def _believe(self, epoch: Epoch, back: bool, rays: Int, *, known: bool) -> None:
+    def _believe(self, epoch: Epoch, *, known: bool) -> None:
         """Write what is believed beside the past and habits."""
-        belief, sensed = self._at.belief, epoch.sensed
+        belief, ground, sensed = self._at.belief, self._at.ground, epoch.sensed
         belief.facing[:] = epoch.facing
-        belief.facing_w2[0] = self.settings.facing_rad**-2.0 if back else 0.0
+        belief.facing_w2[0] = self.settings.facing_rad**-2.0 if ground.back[0] else 0.0
         belief.depth_w2[0] = 0.0
-        if known and rays.max() == 1:
+        if known and ground.most[0] == 1:
             alone = self._rig.cameras.centre[(self._observed.weight > 0.0).sum(axis=1).argmax()]
             sight = self._now.palm[:3, 3] - alone
             belief.sight[:] = sight / np.sqrt(sight @ sight)
@@ -325,7 +320,7 @@ class Estimator:
             belief.sensed[:], belief.sensed_pull[:] = sensed.information, sensed.pull
             belief.sensed_constant[0] = sensed.constant
 
-    def _enough(self, epoch: Epoch, back: bool, sure: bool) -> bool:
+    def _enough(self, epoch: Epoch, sure: bool) -> bool:
         """Whether the markers fix a hand: not all in one line, or in a line across `facing`.
 
         What faces the cameras turns the hand about a line of markers, but not about one that points at them. With an
@@ -342,7 +337,9 @@ class Estimator:
         _, extent, axes = np.linalg.svd(off)
         if len(points) > 2 and extent[1] > _SPREAD_M:
             return True
-        return back and bool(extent[0] > _LENGTH_M and abs(axes[0] @ epoch.facing) < _ACROSS)
+        return bool(
+            self._at.ground.back[0] and extent[0] > _LENGTH_M and abs(axes[0] @ epoch.facing) < _ACROSS
+        )
 
     def _placed(self, epoch: Epoch) -> Bool:
         """The hand's markers (M,) whose places are known: of points those that are measured."""
@@ -373,17 +370,16 @@ class Estimator:
         x = np.asarray(np.linalg.solve(habits.normal[0], habits.pull[0]), np.float64)
         return np.minimum(np.maximum(x, self.parameters.low), self.parameters.high)
 
-    def _rests(self, at: Epoch, rays: Int, *, palm_shown: bool, by_markers: bool) -> Int:
+    def _rests(self, at: Epoch, *, palm_shown: bool) -> Int:
         """What thumb ... little and the palm rest on now (6,), as of `Fitted`."""
-        seen, sensed = self._observed.seen, at.sensed
-        rests = np.zeros(6, np.int64)
-        rests[:5] = ON_MARKERS * (self._carries & seen).any(axis=1)
-        rests[:5] += BY_MARKERS * (self._carries & (rays > 1)).any(axis=1)
+        ground, sensed = self._at.ground, at.sensed
+        rests = ground.rests.copy()
         if sensed is not None:
             rests[:5] += ON_OTHERS * np.where(sensed.told, sensed.level, 0)
-        if palm_shown:
-            rests[5] = (ON_MARKERS | BY_MARKERS) if by_markers else ON_OTHERS
-            rests[5] += int(seen @ self._bit)
+        if not palm_shown:
+            rests[5] = 0
+        elif not ground.by_markers[0]:
+            rests[5] += ON_OTHERS
         return rests
 
     def _fitted(self, at: Epoch, out: Estimate, rests: Int, *, anew: bool) -> Fitted:

@@ -102,11 +102,13 @@ class Mounts(NamedTuple):
         finger: (M,) chain; -1: the palm.
         level: (M,) joint of the chain.
         offset_m: (M, 3) [m] place in that joint's frame.
+        on_back: (M,) whether it is on the palm itself.
     """
 
     finger: Int
     level: Int
     offset_m: Float
+    on_back: Bool
 
     @classmethod
     def of(cls, model: HandModel, names: Sequence[str]) -> "Mounts":
@@ -125,4 +127,5 @@ class Mounts(NamedTuple):
             elif mount.joint is not None:  # wrist and metacarpals do not move against the palm
                 R, p = model.rest_rotation[mount.joint], model.rest_position_m[mount.joint]
                 offset[m] = p + R @ mount.offset_m
-        return cls(finger, level, offset)
+        on_back = np.array([model.mount(name).joint is None for name in names], np.bool_)
+        return cls(finger, level, offset, on_back)

@@ -13,7 +13,7 @@ from math import exp
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from master.estimator.epoch import BY_MARKERS
+from master.estimator.ground import BY_MARKERS
 
 PLACE, TURN, ANGLES = slice(0, 3), slice(3, 6), slice(6, 26)
 PARTS: Int = np.repeat([5, 0, 1, 2, 3, 4], [6, 4, 4, 4, 4, 4])  # signal -> finger, or 5: the palm

@@ -37,6 +37,7 @@ class Observations(NamedTuple):
         information: (M, 3, 3) [1/m^2] their inverse covariances.
         placed: (M,) whether there is a POINT row.
         seen: (M,) whether there is any row.
+        rays: (M,) how many rays; of a POINT row two.
     """
 
     uv: Float
@@ -46,6 +47,7 @@ class Observations(NamedTuple):
     information: Float
     placed: Bool
     seen: Bool
+    rays: Int
 
     @classmethod
     def empty(cls, cameras: int, markers: int) -> "Observations":
@@ -58,6 +60,7 @@ class Observations(NamedTuple):
             np.zeros((markers, 3, 3)),
             np.zeros(markers, np.bool_),
             np.zeros(markers, np.bool_),
+            np.zeros(markers, np.int64),
         )
 
 
@@ -131,8 +134,8 @@ def marker_rows(
 
 
 @kernel
-def observe_rays(uv: Float, variance: Float, own: Float, markers: Int, observed: Observations) -> int:
-    """Write the RAY rows of a hand's markers; return how many markers have any.
+def observe_rays(uv: Float, variance: Float, own: Float, markers: Int, observed: Observations) -> None:
+    """Write the RAY rows of a hand's markers.
 
     Args:
         uv: (C, A, 2) [px] of all markers of the rig; NaN: not seen.
@@ -141,33 +144,28 @@ def observe_rays(uv: Float, variance: Float, own: Float, markers: Int, observed:
         markers: (M,) which of them are the hand's.
         observed: Written.
     """
-    count = 0
     zero = np.zeros((3, 3))
     for k in range(markers.shape[0]):
-        m = markers[k]
-        seen = False
+        m, rays = markers[k], 0
         for c in range(uv.shape[0]):
             row = np.isfinite(uv[c, m, 0] + uv[c, m, 1] + variance[c, m])
             observed.weight[c, k] = 1.0 / variance[c, m] if row else 0.0
             observed.uv[c, k, 0], observed.uv[c, k, 1] = uv[c, m, 0], uv[c, m, 1]
-            seen = seen or row
-        observed.seen[k], observed.placed[k] = seen, False
-        if seen:
+            rays += 1 if row else 0
+        observed.seen[k], observed.placed[k], observed.rays[k] = rays > 0, False, rays
+        if rays > 0:
             inverse_3(own[m], zero, observed.own[k])
-            count += 1
-    return count
 
 
 @kernel
-def observe_points(point: Float, cov: Float, own_m2: float, observed: Observations) -> int:
-    """Write POINT rows; return how many markers have one.
+def observe_points(point: Float, cov: Float, own_m2: float, observed: Observations) -> None:
+    """Write POINT rows.
 
     Args:
         point, cov: (M, 3) [m], (M, 3, 3) [m^2]; NaN: not seen.
         own_m2: Variance of what is wrong with the markers themselves.
         observed: Written.
     """
-    count = 0
     own = np.zeros((3, 3))
     for i in range(3):
         own[i, i] = own_m2
@@ -179,10 +177,8 @@ def observe_points(point: Float, cov: Float, own_m2: float, observed: Observatio
             for j in range(3):
                 total += cov[m, i, j]
         seen = np.isfinite(total)
-        observed.seen[m], observed.placed[m] = seen, seen
+        observed.seen[m], observed.placed[m], observed.rays[m] = seen, seen, 2 if seen else 0
         for c in range(observed.weight.shape[0]):
             observed.weight[c, m] = 0.0
         if seen:
             inverse_3(cov[m], own, observed.information[m])
-            count += 1
-    return count

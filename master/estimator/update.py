@@ -11,6 +11,7 @@ from common.messages import Source
 from master.estimator.arcs import add_arcs
 from master.estimator.cameras import CameraArrays
 from master.estimator.certainty import Certainty, linear, only_limits, surer, tilts
+from master.estimator.ground import Ground
 from master.estimator.hand_tables import Mounts
 from master.estimator.hypotheses import Blank, Posterior, Room, likelier
 from master.estimator.kinematics import angles_of, chains, clamp, joints, marker_point
@@ -70,9 +71,7 @@ class Task:
 
     Attributes:
         t_ns: (1,) the epoch.
-        shown: (5,) fingers that are measured.
         palm_shown: (1,) whether something tells where the palm is.
-        numbers: (1,) how many numbers are measured.
         turned: (3, 3) by how much sensors say that the palm has turned since.
         palm, x: (4, 4), (n,) another hand of the epoch, inside the limits; or where a search begins.
         may_leave: (1,) whether there is another, and it may take the place of the state.
@@ -81,9 +80,7 @@ class Task:
     """
 
     t_ns: Int
-    shown: Bool
     palm_shown: Bool
-    numbers: Float
     turned: Float
     palm: Float
     x: Float
@@ -98,9 +95,7 @@ class Task:
         return record(
             cls,
             t_ns=("i8", 1),
-            shown=("u1", 5),
             palm_shown=("u1", 1),
-            numbers=1,
             turned=(3, 3),
             palm=(4, 4),
             x=n,
@@ -115,6 +110,7 @@ class Workspace:
     """Room for all kernels of one hand, what is to be done, and what is believed at the epoch."""
 
     task: Task
+    ground: Ground
     belief: Belief
     hidden: Hidden
     found: Posterior
@@ -127,6 +123,7 @@ class Workspace:
         return record(
             cls,
             task=Task.empty(n),
+            ground=Ground.empty(),
             belief=Belief.none(n),
             hidden=Hidden.none(n),
             found=Posterior.empty(n, markers),
@@ -201,10 +198,8 @@ def _judge(
         now = state.told_ns[part] == t_ns
         out.source[joint] = _SOLVED if now else _HELD
     for m in range(rig.mounts.finger.shape[0]):
-        f, rays = rig.mounts.finger[m], 0
-        for c in range(observed.uv.shape[0]):
-            rays += 1 if observed.weight[c, m] > 0.0 else 0
-        if f >= 0 and (rays > 1 or observed.placed[m]) and rig.mounts.level[m] == 3:
+        f = rig.mounts.finger[m]
+        if f >= 0 and observed.rays[m] > 1 and rig.mounts.level[m] == 3:
             for joint in range(26):
                 if hand.finger[joint] == f and hand.level[joint] == 3:
                     out.source[joint] = _MEASURED
@@ -212,18 +207,13 @@ def _judge(
 
 @inner
 def _drift(
-    settings: Settings, state: HandState, t_ns: int, observed: Observations, belief: Belief, out: Estimate
+    settings: Settings, state: HandState, t_ns: int, ground: Ground, belief: Belief, out: Estimate
 ) -> None:
     """Add how far a hand may have drifted along the sight while one camera alone saw it.
 
     Perspective tells the depth of a hand to centimetres only, and the fit is as sure of it as of the last epoch's.
     """
-    placed, seen = False, False
-    for m in range(observed.seen.shape[0]):
-        rays = 0
-        for c in range(observed.uv.shape[0]):
-            rays += 1 if observed.weight[c, m] > 0.0 else 0
-        placed, seen = placed or observed.placed[m] or rays > 1, seen or observed.seen[m]
+    placed, seen = ground.most[0] > 1, ground.seen[0] > 0
     if placed or state.placed_ns[0] == NEVER_NS:
         state.placed_ns[0] = t_ns
     if placed or not seen:
@@ -272,7 +262,7 @@ def predict_epoch(model: Model, boxed_state: Any, observed: Observations, boxed_
         walked_m = settings.palm_walk_m_s * dt_s
         if chi_square(rig, observed, state.palm, state.x, walked_m, room.search) > limit:
             return -1.0
-    predict(rig.hand, settings, state, t_ns, task.shown, task.palm_shown[0] > 0, space.hidden, belief)
+    predict(rig.hand, settings, state, t_ns, space.ground.shown, task.palm_shown[0] > 0, space.hidden, belief)
     for i in range(3):
         for j in range(3):
             belief.palm[i, j] = 0.0
@@ -332,7 +322,7 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
         room.start_x,
         task.natural[0],
         task.counts[0],
-        task.numbers[0],
+        space.ground.numbers[0],
         blank,
         room,
         found,
@@ -357,7 +347,7 @@ def take_over_epoch(
     """
     state, space, settings = boxed_state[0], boxed_space[0], model.settings[0]
     rig, task = Rig(model.hand[0], model.mounts, model.cameras), space.task
-    t_ns, shown, palm_shown = task.t_ns[0], task.shown, task.palm_shown[0] > 0
+    t_ns, shown, palm_shown = task.t_ns[0], space.ground.shown, task.palm_shown[0] > 0
     found, hidden, room, work = space.found, space.hidden, space.certainty, space.room.search.rows
     hand, n = rig.hand, found.x.shape[0]
     angles_of(hand, found.x, work.angles, work.by)
@@ -403,7 +393,7 @@ def take_over_epoch(
         room,
         out.cov,
     )
-    _drift(settings, state, t_ns, observed, space.belief, out)
+    _drift(settings, state, t_ns, space.ground, space.belief, out)
     state.t_ns[0], state.known[0], state.natural[0] = t_ns, True, found.natural[0]
     for f in range(5):
         if shown[f]:

@@ -22,7 +22,8 @@ import numpy as np
 from common.arrays import Bool, Code, Float
 from common.messages import Detections, HandPose, WristDetections
 from common.wrist_bend import STRAIGHT
-from master.estimator.epoch import ON_MARKERS, Fitted
+from master.estimator.epoch import Fitted
+from master.estimator.ground import ON_MARKERS
 from master.estimator.parameters import HandParameters
 from master.estimator.pipeline import MarkerPipeline, SolvedPose, Stage
 from master.fusion.finger_track import REACH_NS, FingerTrack
