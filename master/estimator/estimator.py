@@ -106,11 +106,14 @@ class Estimator:
         self._boxed_ground = self._boxed_space["ground"]
         nothing = np.full((len(cameras), len(markers), 2), np.nan)
         own = np.zeros((len(markers), 3, 3))
-        observe_rays(
-            nothing, nothing[..., 0].copy(), own, self._on_hand, self._observed
-        )  # compiled now, not later
-        observe_points(own[self._on_hand, 0], own[self._on_hand], 0.0, self._observed)
-        count_rows(mounts, self._observed, self._boxed_ground)
+        observed, room = self._observed, (np.empty((26, 3)), np.empty((26, 3, 3)), np.empty((count, 3)))
+        self._observe_rays = bound(
+            observe_rays, nothing, nothing[..., 0].copy(), own, self._on_hand, observed
+        )
+        self._observe_points = bound(observe_points, room[2], own[self._on_hand], 0.0, observed)
+        self._count_rows = bound(count_rows, mounts, observed, self._boxed_ground)
+        work = boxed(self._scratch)
+        self._pose = bound(pose, self._model.hand, mounts, _AT_ORIGIN, np.zeros(20), work, *room)
         state, space = self._boxed_state, self._boxed_space
         self._predict = bound(predict_epoch, self._model, state, self._observed, space)
         self._fit = bound(fit_epoch, self._model, self._habits_of(_NONE), self._observed, self._blank, space)
@@ -133,7 +136,8 @@ class Estimator:
         position, rotation = np.empty((26, 3)), np.empty((26, 3, 3))
         places = np.empty((len(self._on_hand), 3))
         hand, mounts, work = self._model.hand, self._model.mounts, boxed(self._scratch)
-        pose(hand, mounts, np.ascontiguousarray(T), angles_rad.reshape(20), work, position, rotation, places)
+        angles = np.ascontiguousarray(angles_rad).reshape(20)
+        self._pose(hand, mounts, np.ascontiguousarray(T), angles, work, position, rotation, places)
         return HandJoints(position, rotation, T), places
 
     def push(self, at: Epoch) -> Fitted:
@@ -222,14 +226,15 @@ class Estimator:
         if at.cov_m2 is not None:
             bones_m2 = self.settings.bones_m**2
             points, cov = at.points_m[self._on_hand], at.cov_m2[self._on_hand]
-            observe_points(points, cov, bones_m2, self._observed)
+            self._observe_points(points, cov, bones_m2, self._observed)
         else:
             assert at.uv is not None
             assert at.variance_px2 is not None
             assert at.own_m2 is not None
             own = at.own_m2 + self.settings.bones_m**2 * _EYE
-            observe_rays(at.uv, at.variance_px2, own, self._on_hand, self._observed)
-        count_rows(self._rig.mounts, self._observed, self._boxed_ground)
+            uv, variance = np.ascontiguousarray(at.uv), np.ascontiguousarray(at.variance_px2)
+            self._observe_rays(uv, variance, own, self._on_hand, self._observed)
+        self._count_rows(self._rig.mounts, self._observed, self._boxed_ground)
 
     def _begin(self, at: Epoch) -> float:
         """Fit without the state, from the other hand or from several starts; return chi square of the markers.

@@ -10,6 +10,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.hand_model import CHAINS, HandModel
+from common.kernels import bound
 from master.fabrik.chain import Chain, Coupling, Link
 from master.fabrik.chain_arrays import end_of
 from master.fabrik.closed_form import REACHED_M, closed_form, distance2_of, nearest_pose
@@ -72,12 +73,15 @@ class FingerSolver:
         root: MCP (thumb: CMC) in the palm frame [m].
         ratio: DIP per PIP that makes the closed form exact.
         edges: (B + 1,) ends of the branches of the PIP, rising [rad].
+        closed, nearest: `closed_form` and `nearest_pose`, bound to the types of this finger.
     """
 
     chain: Chain
     root: Vector
     ratio: float
     edges: Float
+    closed: Callable[..., float]
+    nearest: Callable[..., float]
 
     @classmethod
     def of(
@@ -102,7 +106,16 @@ class FingerSolver:
             ratio = model.dip_per_pip
         else:
             ratio = dip_high / pip_high if pip_high > 0.0 else 1.0
-        return cls(chain, finger_root(model, finger), float(ratio), _branches(chain, float(ratio)))
+        edges, four, goal = _branches(chain, float(ratio)), np.zeros(4), (0.0, 0.0, 0.0)
+        seeds = np.zeros((3, 4))
+        return cls(
+            chain,
+            finger_root(model, finger),
+            float(ratio),
+            edges,
+            bound(closed_form, chain.arrays, edges, float(ratio), goal, four, four, seeds),
+            bound(nearest_pose, chain.arrays, goal, four, seeds, four),
+        )
 
     @property
     def limits(self) -> tuple[Pair, ...]:
@@ -140,8 +153,8 @@ class FingerSolver:
             Distance of the point to the target [m].
         """
         arrays, seeds = self.chain.arrays, np.empty((3, 4))
-        left = closed_form(arrays, self.edges, self.ratio, goal, near, angles, seeds)
-        return left if left < inf else nearest_pose(arrays, goal, near, seeds, angles)
+        left = self.closed(arrays, self.edges, self.ratio, goal, near, angles, seeds)
+        return left if left < inf else self.nearest(arrays, goal, near, seeds, angles)
 
     def forward(self, angles: Four) -> Vector:
         """The point [m] in the palm frame at given angles [rad]."""
@@ -157,11 +170,13 @@ class Finger:
         closed_form: The same finger.
         tolerance_m: Residual that counts as reached.
         max_iterations: Of FABRIK; the seed is the answer, and what it cannot reach iterations improve little.
+        iterate: `solve_chain`, bound to the types of this finger.
     """
 
     closed_form: FingerSolver
     tolerance_m: float
     max_iterations: int
+    iterate: Callable[..., tuple[float, int]]
 
     @classmethod
     def of(
@@ -181,7 +196,10 @@ class Finger:
             raise ValueError(
                 f"tolerance {tolerance_m} m and {max_iterations} iterations: both must be positive"
             )
-        return cls(FingerSolver.of(model, finger, offset_m), tolerance_m, max_iterations)
+        solver = FingerSolver.of(model, finger, offset_m)
+        arrays, goal = solver.chain.arrays, (0.0, 0.0, 0.0)
+        iterate = bound(solve_chain, arrays, goal, float(tolerance_m), max_iterations, 0, np.zeros(4))
+        return cls(solver, float(tolerance_m), max_iterations, iterate)
 
     def solve(self, target_m: Float, angles_rad: Float) -> FingerResult:
         """Bring the finger's point to a target: FABRIK from the closed form.
@@ -202,11 +220,11 @@ class Finger:
         arrays, tolerance_m, most = solver.chain.arrays, self.tolerance_m, self.max_iterations
         near, before = angles_rad.copy(), 0
         if solver.chain.coupling is None and isfinite(near.sum()):
-            residual, before = solve_chain(arrays, goal, tolerance_m, most, 0, angles_rad)
+            residual, before = self.iterate(arrays, goal, tolerance_m, most, 0, angles_rad)
             if residual <= tolerance_m:
                 return FingerResult(residual, before, True)
         solver.seed(goal, near, angles_rad)
-        residual, iterations = solve_chain(arrays, goal, tolerance_m, most, 0, angles_rad)
+        residual, iterations = self.iterate(arrays, goal, tolerance_m, most, 0, angles_rad)
         return FingerResult(residual, before + iterations, residual <= tolerance_m)
 
 

@@ -16,7 +16,7 @@ same light, so that its rim and its shading mislead them alike: most of a whole 
 occludes a part of a cap, or comes of time, is each camera's own.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.camera_model import CameraModel
-from common.kernels import inner, kernel
+from common.kernels import bound, inner, kernel
 from master.estimator.cameras import CameraArrays, project
 from master.fabrik.cap_views import (
     ANY,
@@ -340,6 +340,7 @@ class RayTriangulator:
         self._limits = limits_of(len(cameras))
         self._rays, self._views = Rays.empty(len(cameras)), Views.empty(len(cameras))
         self._unknown = np.zeros((len(caps.radius_m), 3, 3))
+        self._locate: Callable[..., None] | None = None
 
     def __call__(
         self,
@@ -371,7 +372,7 @@ class RayTriangulator:
         left_out = np.empty((cameras, count), np.bool_)
         seen, variance = np.empty((cameras, count, 2)), np.empty((cameras, count))
         own = np.empty((count, 3, 3))
-        locate(
+        arguments = (
             self._cameras,
             self._caps,
             self._rays_px,
@@ -395,6 +396,9 @@ class RayTriangulator:
             variance,
             own,
         )
+        if self._locate is None:
+            self._locate = bound(locate, *arguments)
+        self._locate(*arguments)
         return RayPositions(points, cov, noise, apart, left_out, seen, variance, own)
 
     def triangulate(self, uv: Float, sigma_px: float | Float = 0.1) -> Triangulation:
