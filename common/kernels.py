@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Mapping
+from functools import cache
 from types import SimpleNamespace
 from typing import Any, TypeVar, cast
 
@@ -70,11 +71,17 @@ def record(kind: type[R], **fields: Shape | tuple[str, Shape] | tuple[object, in
             types.append((name, kind_of, shape if isinstance(shape, tuple) else (shape,)))
         else:
             types.append((name, "f8", cast(Any, of if isinstance(of, tuple) else (of,))))
-    out = np.zeros(1, np.dtype(types, align=True)).view(np.recarray)[0]
+    out = np.zeros(1, _layout(tuple(types))).view(np.recarray)[0]
     for name, of in fields.items():
         if isinstance(of, np.void):
             out[name] = of
     return cast(R, out)
+
+
+@cache
+def _layout(types: tuple[Any, ...]) -> np.dtype[Any]:
+    """The layout of records with these fields: one object for all alike, which makes them quick to compare."""
+    return np.dtype(list(types), align=True)
 
 
 def filled(kind: type[R], values: Mapping[str, Any]) -> R:
@@ -106,7 +113,23 @@ def bound(function: F, *arguments: Any) -> F:
     """A kernel for arguments of these very types alone: it looks at no type again, which takes longer than the call."""
     if not hasattr(function, "compile"):  # NUMBA_DISABLE_JIT
         return function
-    compiled = cast(Any, function)
-    types = tuple(cast(Any, numba).typeof(one) for one in arguments)
-    compiled.compile(types)
-    return cast(F, compiled.overloads[types].entry_point)
+    alike = function, tuple(_alike(one) for one in arguments)
+    if alike not in _BOUND:
+        compiled = cast(Any, function)
+        types = tuple(cast(Any, numba).typeof(one) for one in arguments)
+        compiled.compile(types)
+        _BOUND[alike] = compiled.overloads[types].entry_point
+    return cast(F, _BOUND[alike])
+
+
+_BOUND: dict[tuple[object, ...], Any] = {}
+
+
+def _alike(one: Any) -> object:
+    """What two arguments have in common that are of one type to a kernel: numba takes milliseconds to say so."""
+    if isinstance(one, np.ndarray):
+        flags = one.flags
+        return one.dtype, one.ndim, flags.c_contiguous, flags.f_contiguous, flags.writeable, flags.aligned
+    if isinstance(one, tuple):
+        return type(one), tuple(_alike(each) for each in cast(tuple[Any, ...], one))
+    return type(one)

@@ -34,6 +34,9 @@ LIVE = (
     "tests/master/export/test_export_gltf.py",
 )
 
+# These solve hands of more free angles, whose kernels no other test needs: two workers would compile them twice.
+OTHER_HANDS = ("tests/master/estimator/", "tests/master/fabrik/test_any_input.py")
+
 _KERNELS = (
     "common/kernels.py",
     "common/skin_gaps.py",
@@ -65,10 +68,13 @@ BEHIND = 10  # niceness of the workers whose tests are not live
 
 
 class LiveScheduling(LoadFileScheduling):
-    """Each file goes to one worker whole, and all that is live goes to the same one."""
+    """Each file goes to one worker whole, all that is live to the same one, and what compiles for other hands, too."""
 
     def _split_scope(self, nodeid: str) -> str:
-        return "live" if nodeid.startswith(LIVE) else super()._split_scope(nodeid)
+        for name, begins in (("live", LIVE), ("hands", OTHER_HANDS)):
+            if nodeid.startswith(begins):
+                return name
+        return super()._split_scope(nodeid)
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LiveScheduling:

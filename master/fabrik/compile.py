@@ -1,4 +1,4 @@
-"""Say that kernels are compiled, about 30 s on a version's first start."""
+"""Say that kernels are compiled, two minutes on a version's first start."""
 
 import logging
 import threading
@@ -13,7 +13,7 @@ _LOG = logging.getLogger(__name__)
 def log_if_slow() -> Generator[None]:
     """Log that kernels are compiled, where that takes longer than loading them does."""
     timer = threading.Timer(
-        _SLOW_S, _LOG.warning, ("compiling kernels, once for each version: about 30 s in all ...",)
+        _SLOW_S, _LOG.warning, ("compiling kernels, once for each version: about two minutes in all ...",)
     )
     timer.daemon = True
     timer.start()
