@@ -205,7 +205,7 @@ class Estimator:
         wrong = self._search(self._with_laser(self._habits_of(_NONE), sensed))
         if self._only_natural and may_leave:
             return wrong, not self._unexplained()
-        return wrong, wrong <= limit
+        return wrong, not wrong > limit  # NaN: there is nothing to compare
 
     def _unexplained(self) -> bool:
         """Whether a marker is too far from what was found."""
