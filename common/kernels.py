@@ -128,8 +128,11 @@ _BOUND: dict[tuple[object, ...], Any] = {}
 def _alike(one: Any) -> object:
     """What two arguments have in common that are of one type to a kernel: numba takes milliseconds to say so."""
     if isinstance(one, np.ndarray):
-        flags = one.flags
-        return one.dtype, one.ndim, flags.c_contiguous, flags.f_contiguous, flags.writeable, flags.aligned
+        array = cast(Any, one)
+        flags = array.flags
+        layout = flags.c_contiguous, flags.f_contiguous, flags.writeable, flags.aligned
+        return cast(object, (array.dtype, array.ndim, *layout))
     if isinstance(one, tuple):
-        return type(one), tuple(_alike(each) for each in cast(tuple[Any, ...], one))
-    return type(one)
+        each = cast(tuple[Any, ...], one)
+        return cast(Any, type(each)), tuple(_alike(part) for part in each)
+    return cast(object, type(one))
