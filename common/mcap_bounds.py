@@ -77,5 +77,7 @@ class Losses:
         """Count one."""
         self.count += 1
         if len(self.named) < _NAMED:
-            text = "".join(one if one.isprintable() else f"\\x{ord(one):02x}" for one in what[:200])
+            text = what[:200]
+            if not text.isprintable():
+                text = "".join(one if one.isprintable() else f"\\x{ord(one):02x}" for one in text)
             self.named += [text] if text not in self.named else []
