@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _FORKED = multiprocessing.get_context("forkserver")
-_FORKED.set_forkserver_preload(["master.__main__", "slave.__main__", "master.export.run"])
+_FORKED.set_forkserver_preload(["master.__main__", "master.commands", "slave.__main__", "master.export.run"])
 _WAIT_S = 120.0
 
 
