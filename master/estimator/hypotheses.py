@@ -20,22 +20,18 @@ class Posterior:
         palm, x: (4, 4) palm, (n,) free angles.
         cov: (N, N) of turn [rad], shift [m], rig axes, and free angles [rad], by this instant alone.
         surprise: (M,) chi square of each marker.
-        cost: (1,) half the sum of squares, of the likelier hypothesis.
         steps: (1,) of the search.
         natural: (1,) probability that the hand obeys habits.
         scale: (1,) by how much the misfit has scaled the covariance.
-        wrong: (1,) chi square of the markers, where another hand explains them better.
     """
 
     palm: Float
     x: Float
     cov: Float
     surprise: Float
-    cost: Float
     steps: Float
     natural: Float
     scale: Float
-    wrong: Float
 
     @classmethod
     def empty(cls, n: int, markers: int) -> "Posterior":
@@ -47,11 +43,9 @@ class Posterior:
             x=n,
             cov=(N, N),
             surprise=markers,
-            cost=1,
             steps=1,
             natural=1,
             scale=1,
-            wrong=1,
         )
 
 

@@ -22,6 +22,7 @@ from master.estimator.cameras import CameraArrays
 from master.estimator.epoch import Epoch, Fitted, Sensed
 from master.estimator.estimator import Estimator
 from master.estimator.gate import Prior, among, associate
+from master.estimator.hand_tables import Mounts
 from master.estimator.pose import pose_of
 from master.estimator.smooth import HandOneEuro
 from master.fabrik.blob_bias import LensShift
@@ -108,9 +109,7 @@ class MarkerPipeline:
         self._on_hand, self._hand_markers = line.on_hand, tuple(markers[int(m)] for m in line.on_hand)
         joints = [model.mount(name).joint for name in self._hand_markers]
         self._joint = np.array([0 if joint is None else joint for joint in joints])  # 0: the palm
-        self._finger_of = np.array(
-            [-1 if one is None else one for one in (model.mount(name).finger for name in self._hand_markers)]
-        )
+        self._finger_of = Mounts.of(model, self._hand_markers).finger
         self._elsewhere = MarkerCheck(model, self._hand_markers)
         self._stage, self._volume, self._shed = stage, volume, shed
         self._orientation = None if imu is None or not imu.placed else OrientationTrack(imu, self.counts)

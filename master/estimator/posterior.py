@@ -312,7 +312,6 @@ def posterior(
     out.natural[0] = room.each[0].share[0]
     best = _mix(rig, settings, habits, belief, numbers, room, out)
     likely = room.each[best]
-    out.cost[0] = likely.cost[0]
     moves = False
     for i in range(room.middle.shape[0]):
         moves = moves or room.middle[i] != 0.0

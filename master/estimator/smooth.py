@@ -35,7 +35,7 @@ from common.arrays import Float
 from common.hand_model import HandJoints, HandModel
 from common.kernels import bound, boxed
 from master.estimator.epoch import Fitted, FittedHand
-from master.estimator.hand_tables import HandTables
+from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.lead import Lead
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT, Settings
@@ -68,7 +68,7 @@ class HandOneEuro:
             CalibrationError: The profile mounts no marker of one of the names.
         """
         self._settings = settings
-        self._on_palm = np.array([model.mount(name).joint is None for name in markers], np.bool_)
+        self._on_palm = Mounts.of(model, markers).on_back
         self._lead_m_s = lead_m_s
         self._lead: Lead | None = None
         state = Smoothing.of(model, markers, parameters, settings)

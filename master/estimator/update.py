@@ -327,8 +327,7 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
         room,
         found,
     )
-    found.wrong[0] = chi_square(rig, observed, found.palm, found.x, 0.0, search)
-    return found.wrong[0]
+    return chi_square(rig, observed, found.palm, found.x, 0.0, search)
 
 
 @kernel

@@ -17,6 +17,9 @@ from common.hand_model import CHAINS, METACARPALS, PALM, TIPS, WRIST, HandModel
 from common.messages import MarkerDetections, Source
 from master.estimator.epoch import Epoch, Fitted
 from master.estimator.estimator import Estimator
+from master.estimator.ground import ON_MARKERS
+from master.estimator.hand_tables import Mounts
+from master.estimator.state import PALM_PART
 from master.fabrik.estimate import HandEstimate, SolvedHand
 from master.fabrik.finger import Finger
 from master.fabrik.one_euro import PointFilter
@@ -30,7 +33,6 @@ _ON_TARGET_M = 1e-4
 _FIT_M2 = (3e-3) ** 2  # of a finger's marker as the palm's fit has it
 _DRIFT_M_S = 0.3  # of a hand that is held
 _PALM_JOINTS = np.array([PALM, WRIST, *METACARPALS])
-_PALM_MARKERS = 3
 _AWAY = rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))  # a hand before a camera at the origin
 
 
@@ -71,11 +73,10 @@ class FabrikSolver:
         self._centres = np.array([camera.centre for camera in cameras.values()])
         self._focal_px = np.array([camera.matrix[0, 0] for camera in cameras.values()])
         self._ahead = -next(iter(cameras.values())).T_rig_camera[:3, 2]
-        mounts = [model.mount(name) for name in hand_markers]
-        self._on_palm = np.array([mount.joint is None for mount in mounts], np.bool_)
+        mounts, places = [model.mount(name) for name in hand_markers], Mounts.of(model, hand_markers)
         self._count = len(markers)
-        self._back = self.on_hand[self._on_palm]
-        self._finger_of = np.array([-1 if mount.finger is None else mount.finger for mount in mounts])
+        self._back = self.on_hand[places.on_back]
+        self._finger_of = places.finger
         self._on_finger = self._finger_of >= 0
         at_tips = {int(self._finger_of[m]): m for m, mount in enumerate(mounts) if mount.joint in TIPS}
         self._fingers = {
@@ -192,11 +193,11 @@ class FabrikSolver:
         off = joints.position_m - fit.joints.position_m
         joint_cov = fit.cov_m2 + off[:, :, None] * off[:, None, :]
         hand = SolvedHand(T, angles, joints, joint_cov, fit.tilt_cov_rad2, fit.tilt_walk_rad2_s2)
-        self._judge(out, fit.surprise, placed)
+        self._judge(out, palm, fit.surprise, placed)
         self._last, self._last_ns = hand, out.t_ns
         return replace(out, solution=hand)
 
-    def _judge(self, out: HandEstimate, surprise: Float, placed: Bool) -> None:
+    def _judge(self, out: HandEstimate, palm: Fitted, surprise: Float, placed: Bool) -> None:
         """Write the bits of a solved hand; `placed`: (H,) which markers are.
 
         What they explain is tracked.
@@ -208,8 +209,7 @@ class FabrikSolver:
         out.valid[:] = True
         out.source[CHAINS[out.seen]] = Source.SOLVED
         out.source[TIPS[out.seen]] = Source.MEASURED
-        count, back = int(placed.sum()), bool(placed[self._on_palm].any())
-        if count >= _PALM_MARKERS or (count == _PALM_MARKERS - 1 and back):
+        if palm.rests[PALM_PART] & ON_MARKERS:
             out.tracked[_PALM_JOINTS], out.source[_PALM_JOINTS] = True, Source.SOLVED
             out.tracked[CHAINS[explained]] = True
         else:
