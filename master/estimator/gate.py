@@ -188,10 +188,9 @@ def rehearse(cameras: CameraArrays) -> None:
     """Call every kernel once, so that none is compiled while a hand is tracked."""
     nothing = Prior(np.full((1, 3), np.nan), np.full((1, 3, 3), np.nan))
     _in_image(cameras, 0, Prior(nothing.points_m[0], nothing.cov_m2[0]))
-    if (count := len(cameras.scale)) > 1:
-        one = np.ones((count, 1))
-        pixels, rivals = np.full((count, 1, 2), 100.0), np.full((count, 1, 2), 101.0)
-        associate(cameras, (pixels, one, one), (rivals, one), nothing, (nothing.points_m, one[0]))
+    one = np.ones((len(cameras.scale), 1))
+    pixels, rivals = np.full((*one.shape, 2), 100.0), np.full((*one.shape, 2), 101.0)
+    associate(cameras, (pixels, one, one), (rivals, one), nothing, (nothing.points_m, one[0]))
 
 
 @kernel

@@ -260,11 +260,9 @@ class MarkerPipeline:
         in_doubt = np.isfinite(frames.rival_uv[..., 0]).any(axis=0)
         if not in_doubt.any():  # an alternative was named in a frame nearby, and is not carried to this epoch
             return replace(frames, rival_uv=None)
-        clear, others = np.full((len(self.markers), 3), np.nan), None
-        if len(self._names) > 1:
-            first = triangulate(self._cameras, frames.uv, frames.sigma_px, self._rays_px)
-            clear = np.where((in_doubt | first.apart)[:, None], np.nan, first.points_m)
-            others = self._line.solve_once(clear, first.cov_m2, frames.area)
+        first = triangulate(self._cameras, frames.uv, frames.sigma_px, self._rays_px)
+        clear = np.where((in_doubt | first.apart)[:, None], np.nan, first.points_m)
+        others = self._line.solve_once(clear, first.cov_m2, frames.area)
         chosen = associate(
             self._cameras,
             (frames.uv, frames.sigma_px, frames.area),
