@@ -11,7 +11,8 @@ from math import sqrt
 
 from common.arrays import Float, Int
 from common.hand_model import CHAINS
-from common.kernels import constant, inlined, inner, record
+from common.kernels import constant, inlined, inner
+from common.records import record
 from master.estimator.hand_tables import HandTables
 from master.estimator.kinematics import DIRECTION, PLACE, Scratch, finger_slopes, palm_slopes
 from master.estimator.matrices import cholesky, eigen

@@ -9,8 +9,9 @@ from common.arrays import Bool, Float, Int
 from common.camera_model import CameraModel
 from common.geometry import fit_rigid
 from common.hand_model import CHAINS, HandJoints, HandModel
-from common.kernels import bound, boxed, fields
+from common.kernels import bound
 from common.messages import Source
+from common.records import boxed, fields
 from master.estimator.cameras import CameraArrays
 from master.estimator.epoch import Epoch, Fitted, FittedHand, Sensed
 from master.estimator.ground import ON_MARKERS, ON_OTHERS, count_rows

@@ -3,7 +3,8 @@
 from typing import Any
 
 from common.arrays import Bool, Float, Int
-from common.kernels import kernel, record
+from common.kernels import kernel
+from common.records import record
 from master.estimator.hand_tables import Mounts
 from master.estimator.residuals import Observations
 

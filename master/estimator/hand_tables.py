@@ -7,7 +7,7 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.hand_model import CHAINS, HandModel
-from common.kernels import filled
+from common.records import filled
 from master.estimator.parameters import HandParameters
 
 _STIFF_RAD = 1e-9  # an angle whose highest flexion is 0 narrows nothing

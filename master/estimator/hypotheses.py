@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from common.arrays import Float
-from common.kernels import inlined, record
+from common.kernels import inlined
+from common.records import record
 from master.estimator.priors import Habits
 from master.estimator.problem import Belief, Search
 from master.estimator.residuals import Observations

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from common.arrays import Float
-from common.kernels import constant, inlined, inner, kernel, record
+from common.kernels import constant, inlined, inner, kernel
+from common.records import record
 from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.matrices import copy
 

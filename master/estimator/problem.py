@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from common.arrays import Bool, Float
-from common.kernels import record
+from common.records import record
 from master.estimator.cameras import CameraArrays
 from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.kinematics import Scratch

@@ -33,7 +33,8 @@ import numpy as np
 
 from common.arrays import Float
 from common.hand_model import HandJoints, HandModel
-from common.kernels import bound, boxed
+from common.kernels import bound
+from common.records import boxed
 from master.estimator.epoch import Fitted, FittedHand
 from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.lead import Lead

@@ -7,7 +7,8 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.hand_model import CHAINS, MIDDLE_PROXIMAL, TIPS, HandModel
-from common.kernels import constant, inner, kernel, record
+from common.kernels import constant, inner, kernel
+from common.records import record
 from master.estimator.hand_tables import HandTables
 from master.estimator.kinematics import Scratch, chains, clamp, joints, rotate_by, turn_between
 from master.estimator.lead import PARTS

@@ -17,7 +17,8 @@ one by one, and so does every hand its thumb.
 from math import exp, sqrt
 
 from common.arrays import Bool, Float, Int
-from common.kernels import constant, inlined, inner, record
+from common.kernels import constant, inlined, inner
+from common.records import record
 from master.estimator.hand_tables import HandTables
 from master.estimator.kinematics import clamp, free_of
 from master.estimator.matrices import cholesky, copy, substitute

@@ -12,7 +12,8 @@ For hands that are free of habits only: natural ones rest at their limits, as fl
 from math import erfc, exp, inf, pi, sqrt
 
 from common.arrays import Float
-from common.kernels import inlined, inner, record
+from common.kernels import inlined, inner
+from common.records import record
 from master.estimator.hand_tables import HandTables
 from master.estimator.matrices import cholesky, inverse
 

@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from common.arrays import Bool, Code, Float, Int
-from common.kernels import inlined, inner, kernel, record
+from common.kernels import inlined, inner, kernel
 from common.messages import Source
+from common.records import record
 from master.estimator.arcs import add_arcs
 from master.estimator.cameras import CameraArrays
 from master.estimator.certainty import Certainty, linear, only_limits, surer, tilts

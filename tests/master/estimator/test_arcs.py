@@ -7,7 +7,7 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.geometry import rotation_vector_to_matrix
 from common.hand_model import CHAINS, TIPS, WRIST, HandModel
-from common.kernels import boxed
+from common.records import boxed
 from master.estimator.attached import Attached
 from master.estimator.cameras import CameraArrays
 from master.estimator.certainty import Certainty

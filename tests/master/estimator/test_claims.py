@@ -9,7 +9,7 @@ from bench.joint_certainty import NOISE_M, Coverage, compared, joined, kinds
 from common.arrays import Float
 from common.geometry import rigid
 from common.hand_model import CHAINS, PALM, TIPS, HandModel
-from common.kernels import boxed
+from common.records import boxed
 from common.sim.motion import HandMotion, ScriptedMotion
 from common.sim.poses import StudyPoses
 from master.estimator.certainty import Certainty

@@ -16,7 +16,8 @@ from common.geometry import rigid, rotation_vector_to_matrix
 from common.hand_model import HandModel
 from common.hand_presets import preset_couplings, preset_limits
 from common.hand_profiles import generated_profile
-from common.kernels import boxed, constant
+from common.kernels import constant
+from common.records import boxed
 from master.estimator.attached import Attached
 from master.estimator.cameras import CameraArrays
 from master.estimator.hand_tables import HandTables, Mounts
