@@ -23,7 +23,9 @@ from common.sim.scenes import scene_by_name
 from master.gestures.recogniser import GestureRecogniser
 from master.objects.contact import ContactWatch
 from master.objects.line import ObjectLine
-from master.rig import RigSetup, build_pipeline, load_setup
+from master.rig import load_setup
+from master.rig_pipeline import build_pipeline
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 
 CALIBRATION = Path(__file__).resolve().parents[1] / "calib_json"

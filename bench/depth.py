@@ -27,7 +27,9 @@ from common.sim.render import Renderer
 from common.sim.scene import Scene, view_centre
 from master.calibrate.depth.fit import fit_affine_disparity, fit_power_law, ideal_of, relative_error
 from master.fabrik.depth import AffineDisparity
-from master.rig import RigSetup, build_pipeline, load_setup
+from master.rig import load_setup
+from master.rig_pipeline import build_pipeline
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from slave.markers.detector import MarkerDetector
 

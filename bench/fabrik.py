@@ -22,8 +22,9 @@ from common.hand_model import FINGER_JOINTS
 from common.messages import HandPose, MarkerDetections
 from master.estimator.cameras import CameraArrays
 from master.fabrik.intersection import triangulate
-from master.rig import RigSetup, build_pipeline, load_setup
-from master.rig_pipeline import line_of
+from master.rig import load_setup
+from master.rig_pipeline import build_pipeline, line_of
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -23,7 +23,8 @@ from common.clock import SkewedClock, SystemClock
 from common.keys import rig_key
 from common.messages import WIRE_VERSION, MarkerDetections
 from common.sim.scene import Scene
-from master.rig import RigSetup, load_setup
+from master.rig import load_setup
+from master.rig_setup import RigSetup
 from slave.uplink import Uplink
 
 WAY_S = 10.0  # of the scene, forth and back: nothing ever leaps

@@ -14,7 +14,8 @@ from common.sim.imu import SimulatedImu
 from common.sim.scene import Scene, SceneTruth
 from common.sim.scenes import scene_by_name
 from common.sim.wrist.scene import WristScene
-from master.rig import RigSetup, load_setup
+from master.rig import load_setup
+from master.rig_setup import RigSetup
 
 CALIBRATION = Path(__file__).parent.parent / "calib_json"
 SCENES = ("both-poses", "both-curl", "both-travel", "grasp")

@@ -17,7 +17,8 @@ from common.geometry import quaternion_to_matrix
 from common.hand_model import CHAINS, WRIST
 from common.messages import HandPose, ImuSample, MarkerDetections
 from master.outputs.poses import Poses
-from master.rig import RigSetup, pipeline_of
+from master.rig_pipeline import pipeline_of
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 
 _FOLLOWS_S = 0.1  # poses farther apart are a new beginning, not a step

@@ -30,7 +30,9 @@ from common.sim.render import Renderer
 from common.sim.scene import Scene, view_centre
 from common.sim.together import Bent
 from common.sim.wrist.scene import WristScene
-from master.rig import RigSetup, load_setup, pipeline_of
+from master.rig import load_setup
+from master.rig_pipeline import pipeline_of
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from master.study.participant import Participant, participant, turned
 from slave.markers.following import detector_for

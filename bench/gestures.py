@@ -37,7 +37,8 @@ from common.sim.gestures import Gestures
 from common.sim.motion import HandMotion
 from common.sim.scenes import scene_by_name
 from master.gestures.recogniser import GestureRecogniser
-from master.rig import RigSetup, load_setup
+from master.rig import load_setup
+from master.rig_setup import RigSetup
 
 RATE_HZ = 60.0
 FUSED = "desk-back3+wrist-back3"

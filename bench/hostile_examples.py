@@ -31,7 +31,7 @@ from common.messages import (
 )
 from common.session import EchoAnswer, Hello, Started
 from common.sim.wrist.scene import WristScene
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 
 _JPEG = cv2.imencode(".jpg", np.full((16, 16, 3), 90, np.uint8))[1].tobytes()
 _LOOP, _RATE_HZ = 300, 30.0  # frames, then the same again

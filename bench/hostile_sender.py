@@ -29,7 +29,8 @@ from common.keys import rig_key
 from common.messages import Health, Preview, Still
 from common.session import EchoAnswer, Hello, RigKeys, Started
 from common.streams import key_of
-from master.rig import RigSetup, load_setup
+from master.rig import load_setup
+from master.rig_setup import RigSetup
 from slave.uplink import Uplink
 
 _START_S = 60.0

@@ -24,7 +24,8 @@ from common.sim.leap import load_leap
 from common.sim.motion import HandMotion, HandState, ScriptedMotion, base_pose, smooth_step
 from common.sim.poses import StudyPoses
 from common.sim.scenes import scene_by_name
-from master.rig import RigSetup, load_setup
+from master.rig import load_setup
+from master.rig_setup import RigSetup
 
 _CALIBRATION = Path(__file__).parent.parent / "calib_json"
 _HAND = _CALIBRATION / "hands/default-right.json"

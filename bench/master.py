@@ -15,7 +15,9 @@ from common.keys import new_key
 from common.messages import MarkerDetections, decode, encode
 from common.sim.scene import Scene
 from master.ingest import Ingest
-from master.rig import RigSetup, build_pipeline, load_setup
+from master.rig import load_setup
+from master.rig_pipeline import build_pipeline
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 
 _CALIBRATION = Path(__file__).parent.parent / "calib_json"

@@ -19,7 +19,8 @@ from common.calibration import HandProfile, load
 from common.hand_model import HandModel
 from common.sim.scene import Scene
 from common.sim.scenes import scene_by_name
-from master.rig import RigSetup, load_setup
+from master.rig import load_setup
+from master.rig_setup import RigSetup
 
 CALIBRATION = Path(__file__).parent.parent / "calib_json"
 PAIR, FOUR = ("left", "right"), ("left", "right", "left2", "right2")

@@ -19,7 +19,8 @@ import numpy as np
 
 from common.messages import HandPose, ImuSample
 from common.recording import open_messages
-from master.rig import load_setup, pipeline_of
+from master.rig import load_setup
+from master.rig_pipeline import pipeline_of
 from master.stages import StageTimes
 
 FROZEN = "frozen"

@@ -24,7 +24,9 @@ from common.messages import ImuSample, MarkerDetections
 from common.sim.imu import SimulatedImu
 from common.sim.render import Renderer
 from common.sim.scene import Scene
-from master.rig import RigSetup, build_pipeline, load_setup
+from master.rig import load_setup
+from master.rig_pipeline import build_pipeline
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from slave.markers.detector import MarkerDetector
 

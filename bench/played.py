@@ -12,7 +12,8 @@ from common.arrays import Float, Int
 from common.messages import HandPose, MarkerDetections
 from common.sim.render import Renderer
 from common.sim.scene import Scene
-from master.rig import RigSetup, build_pipeline
+from master.rig_pipeline import build_pipeline
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from slave.markers.detector import Detections
 from slave.markers.following import detector_for

@@ -26,7 +26,8 @@ from bench.fusion_shown import shown
 from bench.row import Row
 from bench.scale_rig import ROOM, in_order, room, told
 from common.messages import ImuSample
-from master.rig import load_setups, pipeline_of
+from master.rig import load_setups
+from master.rig_pipeline import pipeline_of
 from master.stages import StageTimes
 from master.tuning import LivePipeline
 from master.world import World

@@ -14,7 +14,8 @@ from common.calibration import HandProfile, load
 from common.camera_model import CameraModel
 from common.sim.motion import REST, HandState, angles_of, base_pose
 from common.sim.scene import Scene, view_centre
-from master.rig import RigSetup, load_setup
+from master.rig import load_setup
+from master.rig_setup import RigSetup
 
 CALIBRATION = Path(__file__).resolve().parents[1] / "calib_json"
 AMPLITUDE_M = 0.15

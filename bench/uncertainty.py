@@ -19,7 +19,9 @@ from common.messages import HandPose, MarkerDetections
 from common.sim.motion import POSES, REST, HandMotion, HandState, angles_of, base_pose, smooth_step
 from common.sim.render import Renderer
 from common.sim.scene import Scene, view_centre
-from master.rig import RigSetup, build_pipeline, load_setup
+from master.rig import load_setup
+from master.rig_pipeline import build_pipeline
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from slave.markers.detector import MarkerDetector
 

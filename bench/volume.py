@@ -16,7 +16,8 @@ from common.geometry import rigid
 from common.hand_model import HandModel
 from common.sim.motion import POSES, HandState, angles_of, base_pose, smooth_step
 from common.sim.scene import Scene
-from master.rig import RigSetup, load_setup
+from master.rig import load_setup
+from master.rig_setup import RigSetup
 
 CALIBRATION = Path(__file__).parent.parent / "calib_json"
 TIP = 1  # the marker that is taken about: the index finger's

@@ -36,7 +36,9 @@ from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.mounting.command import imu_samples, marker_poses
 from master.calibrate.mounting.mounting import Mounting, calibrate_mounting
 from master.recorded import recorded_triples
-from master.rig import RigSetup, build_pipeline, load_setup
+from master.rig import load_setup
+from master.rig_pipeline import build_pipeline
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 
 M = TypeVar("M", WristDetections, ImuSample)

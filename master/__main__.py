@@ -5,7 +5,8 @@ import os
 import sys
 
 try:
-    from master.key_options import command_of, program
+    from master.commands import command_line
+    from master.key_options import program
 except ModuleNotFoundError as error:  # a slave's machine has the scripts of both, and the packages of one
     raise SystemExit(
         f"phalanx-master: {error.name} is missing: install the master's packages, pip install '.[master]'"
@@ -25,15 +26,7 @@ def main() -> None:
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it tells of its font cache on the first run
     with supervised_threads():
         try:
-            # A master that starts again after a fault is back a third sooner without the other commands.
-            if sys.argv[1:2] == ["run"]:
-                from master.run_command import run
-
-                command_of(run)(sys.argv[2:], "phalanx-master run")
-            else:
-                from master.commands import command_line
-
-                program(command_line())()
+            program(command_line(next(iter(sys.argv[1:]), None)))()
         except PhalanxError as error:
             ServiceManager(os.environ).send(f"STATUS=failed: {one_line(str(error))}")
             print(f"phalanx-master: {error}", file=sys.stderr)

@@ -1,44 +1,57 @@
-"""All commands of `phalanx-master`."""
+"""All commands of `phalanx-master`, imported when they are asked for: all of them take two seconds to import."""
+
+from collections.abc import Callable, Mapping
+from importlib import import_module
 
 import typer
 
-from master.calibrate.cli import calibrate_app
-from master.camera_command import camera
-from master.checklist.command import check
-from master.console_command import console
-from master.export.command import export
-from master.fleet import fleet
-from master.gestures.command import gestures_app
-from master.hear import hear
-from master.install_command import OPTIONS_OF_RUN, install
-from master.keys_command import keys_app
-from master.recording.command import info, play, record
-from master.report_command import report
-from master.router_command import relay, router
-from master.run_command import run
-from master.send.command import send
-from master.solve_command import solve
-from master.study.command import evaluate_app
-from master.view_command import view
+COMMANDS = {
+    "run": "master.run_command:run",
+    "solve": "master.solve_command:solve",
+    "view": "master.view_command:view",
+    "console": "master.console_command:console",
+    "report": "master.report_command:report",
+    "camera": "master.camera_command:camera",
+    "check": "master.checklist.command:check",
+    "export": "master.export.command:export",
+    "fleet": "master.fleet:fleet",
+    "hear": "master.hear:hear",
+    "record": "master.recording.record_command:record",
+    "play": "master.recording.play_command:play",
+    "info": "master.recording.info_command:info",
+    "router": "master.router_command:router",
+    "relay": "master.router_command:relay",
+    "send": "master.send.command:send",
+    "install": "master.install_command:install",
+}
+GROUPS = {
+    "calibrate": "master.calibrate.cli:calibrate_app",
+    "evaluate": "master.study.command:evaluate_app",
+    "gestures": "master.gestures.command:gestures_app",
+    "keys": "master.keys_command:keys_app",
+}
+# Takes the options of `run`, which it passes on.
+_CONTEXT = {"install": {"allow_extra_args": True, "ignore_unknown_options": True}}
 
 
-def command_line() -> typer.Typer:
-    """All commands of `phalanx-master`."""
+def command_line(wanted: str | None = None) -> typer.Typer:
+    """The commands as one program: the one that is wanted alone, all where there is none of that name."""
     app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
     app.callback()(phalanx_master)
-    first = (run, solve, view, console, report)
-    for command in (*first, camera, check, export, fleet, hear, record, play, info, router, relay, send):
-        app.command()(command)
-    app.command(context_settings=OPTIONS_OF_RUN)(install)
-    groups = {
-        "calibrate": calibrate_app,
-        "evaluate": evaluate_app,
-        "gestures": gestures_app,
-        "keys": keys_app,
-    }
-    for name, group in groups.items():
-        app.add_typer(group(), name=name)
+    if wanted not in GROUPS:
+        for name, command in imported(COMMANDS, wanted).items():
+            app.command(name, context_settings=_CONTEXT.get(name))(command)
+    if wanted not in COMMANDS:
+        for name, group in imported(GROUPS, wanted).items():
+            app.add_typer(group(), name=name)
     return app
+
+
+def imported(table: Mapping[str, str], wanted: str | None) -> dict[str, Callable[..., typer.Typer]]:
+    """The functions of a table of `module:name`: the wanted one alone, all where it has none of that name."""
+    names = [wanted] if wanted in table else list(table)
+    found = {name: table[name].split(":") for name in names if name is not None}
+    return {name: getattr(import_module(module), attribute) for name, (module, attribute) in found.items()}
 
 
 def phalanx_master() -> None:

@@ -20,10 +20,6 @@ from master.run_command import checked_ends, run
 from master.service_unit import unit_text
 from master.user_services import UserServices
 
-OPTIONS_OF_RUN = {
-    "allow_extra_args": True,
-    "ignore_unknown_options": True,
-}  # how the command line is to be read
 _ONE_RUN = ("poses", "summary", "record")  # files of one run: the next start would write over them
 
 

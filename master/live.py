@@ -30,11 +30,12 @@ from master.outputs.files import RunFiles
 from master.outputs.sink import Sink
 from master.recording.child import RecorderProcess
 from master.recording.tap import Tap, Tapped
-from master.rig import RigSetup
+from master.rig import RigFiles
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from master.summary import write_summary
 from master.time_watch import TimeWatch
-from master.tuning import LivePipeline, RigFiles, RigTuning, renew
+from master.tuning import LivePipeline, RigTuning, renew
 from master.world import World, fresh_world
 
 __all__ = ["LiveSettings", "cameras_line", "cameras_of", "devices_of", "ingest_of", "run_live", "trackers_of"]

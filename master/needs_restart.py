@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from common.errors import CalibrationError
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 
 _OF_CAMERA = ("width_px", "height_px")
 _ALL = "give all processes of the rig the same files, then restart them"

@@ -27,6 +27,7 @@ KeyFile = Annotated[
     Path | None,
     typer.Option(help="File of the rig key alone; default: PHALANX_RIG_KEY, then --keys."),
 ]
+MessageFile = Annotated[Path, typer.Argument(metavar="FILE.mcap", help="The recording.")]
 
 
 def _bus(text: str) -> str:

@@ -12,7 +12,7 @@ from common.frame_recording import FrameRecording
 from common.imu_fusion import OrientationFilter
 from common.imu_recording import IMU, read_imu
 from common.messages import ImuSample
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 
 _UNPLACED = (
     "imu.q_palm_imu and imu.q_rig_world do not both say how the IMU is mounted and how its world lies to the rig; a "

@@ -22,7 +22,7 @@ from master.outputs.picture_wrist import WristPicture
 from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
 from master.outputs.truth import PosesTruth
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 from master.score import Truth, score, score_hidden
 from master.solve import fingers_of
 from master.told_report import ToldRun

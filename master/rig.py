@@ -1,6 +1,7 @@
 """From JSON to rigs: reads them and what they name of a calibration folder; pipelines are made of what it returns."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from dataclasses import replace as with_fields
 from pathlib import Path
 
@@ -9,22 +10,10 @@ from common.errors import CalibrationError
 from common.gesture_settings import GestureSettings, default_gestures
 from common.hand_model import HandModel
 from common.object_profile import ObjectProfile
+from master.estimator.settings import DEFAULT, Settings
 from master.rig_merge import refuse_shared_senders, rigs_by_hand
-from master.rig_objects import load_gestures, load_objects, refuse_shared_objects
-from master.rig_pipeline import Pipeline, build_pipeline, pipeline_of
+from master.rig_objects import gestures_file, load_gestures, load_objects, refuse_shared_objects
 from master.rig_setup import RigSetup
-
-__all__ = [
-    "Pipeline",
-    "RigSetup",
-    "build_pipeline",
-    "load_hand",
-    "load_setup",
-    "load_setups",
-    "pipeline_of",
-    "setups_of",
-    "setups_with_hands",
-]
 
 
 def setups_of(
@@ -147,3 +136,40 @@ def load_hand(calibration: Path | None, name: str, hand_file: Path | None) -> Ha
         return HandModel.of(profile)
     except CalibrationError as error:
         raise CalibrationError(f"{hand_file}: {error}") from error
+
+
+@dataclass(frozen=True, slots=True)
+class RigFiles:
+    """Where setups were read: the arguments of `load_setups`, and numbers of the estimator that go with them."""
+
+    calibration: Path
+    rigs: tuple[str, ...]
+    hand: Path | None = None
+    settings: Settings = DEFAULT
+
+    def load(self) -> tuple[RigSetup, ...]:
+        """Read the files as they are now.
+
+        Raises:
+            CalibrationError: As `load_setups`.
+        """
+        setups = load_setups(self.calibration, self.rigs, self.hand)
+        return tuple(with_fields(setup, settings=self.settings) for setup in setups)
+
+    def paths(self, setups: Sequence[RigSetup]) -> tuple[Path, ...]:
+        """All files that `setups` were read from."""
+        rigs = [self.calibration / "rigs" / f"{name}.json" for name in self.rigs]
+        cameras = [
+            self.calibration / "cameras" / f"{name}.json" for setup in setups for name in setup.camera_names
+        ]
+        hands = [self.hand or self.calibration / "hands" / f"{setup.rig.hand}.json" for setup in setups]
+        objects = [
+            self.calibration / "objects" / f"{one.name}.json" for setup in setups for one in setup.objects
+        ]
+        gestures = [
+            gestures_file(self.calibration, rig.gestures)
+            for setup in setups
+            for rig in (setup.rig, setup.wrist_rig)
+            if rig is not None
+        ]
+        return tuple(dict.fromkeys([*rigs, *cameras, *hands, *objects, *gestures]))

@@ -27,9 +27,9 @@ from master.options import (
     Rigs,
     address,
 )
+from master.rig import RigFiles
 from master.said import say
 from master.stopping import stop_on_signals
-from master.tuning import RigFiles
 
 
 def run(

@@ -36,7 +36,8 @@ from master.rates import CameraRates
 from master.recorded import recorded_detections, recorded_triples
 from master.recorded_imu import recorded_samples
 from master.recorded_tags import recorded_tags
-from master.rig import RigSetup, pipeline_of
+from master.rig_pipeline import pipeline_of
+from master.rig_setup import RigSetup
 from master.score import load_truth, score, score_hidden
 from master.sequence import TRIPLE
 from master.sequence import Sequence as FrameSequence

@@ -10,7 +10,7 @@ from common.messages import Detections, MarkerDetections, restamped
 from master.monitor.timing import ResidualTiming
 from master.monitor.timing_fit import TimeOffset
 from master.phases import CameraPhases
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 
 WARN_NS = 1e6
 WARN_SIGMAS = 3.0

@@ -22,7 +22,7 @@ from master.outputs.told_files import (
     load_object,
     object_path,
 )
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 
 _LATE_S = 0.4  # a gesture that is told so long after it was made is not that one
 _GAP_NS = 200_000_000  # between two rows of one contact

@@ -11,7 +11,7 @@ from math import inf
 from common.messages import MarkerDetections, TagDetections, TrackerPose
 from master.objects.line import ObjectLine, SolvedObject
 from master.objects.tracker import TrackerLine, registered
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 
 _PREFERRED_NS = 100_000_000  # so long after a pose of one the other waits
 _NAME = 64  # characters of a name in `Health`

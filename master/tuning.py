@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from math import ceil, nan
-from pathlib import Path
 
 import msgspec
 
@@ -24,53 +23,16 @@ from common.errors import CalibrationError, PhalanxError
 from common.messages import Detections, Name
 from common.watching import WatchedFiles
 from master.estimator.pipeline import SolvedPose, Stage
-from master.estimator.settings import DEFAULT, Settings
 from master.hurry import never
 from master.needs_restart import refuse_other_hands, refuse_restart
-from master.rig import Pipeline, RigSetup, load_setups, pipeline_of
-from master.rig_objects import gestures_file
+from master.rig import RigFiles
+from master.rig_pipeline import Pipeline, pipeline_of
+from master.rig_setup import RigSetup
 from master.world import World
 
 _WARM_FRAMES = 6  # of each camera: tracks need two, and the shipped 1 € filter has settled after 0.1 s
 _CLOSE_FRAMES = 2  # of each camera: what may be left for the loop to catch up with
 _ROUNDS = 20
-
-
-@dataclass(frozen=True, slots=True)
-class RigFiles:
-    """Where setups were read: the arguments of `load_setups`, and numbers of the estimator that go with them."""
-
-    calibration: Path
-    rigs: tuple[str, ...]
-    hand: Path | None = None
-    settings: Settings = DEFAULT
-
-    def load(self) -> tuple[RigSetup, ...]:
-        """Read the files as they are now.
-
-        Raises:
-            CalibrationError: As `load_setups`.
-        """
-        setups = load_setups(self.calibration, self.rigs, self.hand)
-        return tuple(replace(setup, settings=self.settings) for setup in setups)
-
-    def paths(self, setups: Sequence[RigSetup]) -> tuple[Path, ...]:
-        """All files that `setups` were read from."""
-        rigs = [self.calibration / "rigs" / f"{name}.json" for name in self.rigs]
-        cameras = [
-            self.calibration / "cameras" / f"{name}.json" for setup in setups for name in setup.camera_names
-        ]
-        hands = [self.hand or self.calibration / "hands" / f"{setup.rig.hand}.json" for setup in setups]
-        objects = [
-            self.calibration / "objects" / f"{one.name}.json" for setup in setups for one in setup.objects
-        ]
-        gestures = [
-            gestures_file(self.calibration, rig.gestures)
-            for setup in setups
-            for rig in (setup.rig, setup.wrist_rig)
-            if rig is not None
-        ]
-        return tuple(dict.fromkeys([*rigs, *cameras, *hands, *objects, *gestures]))
 
 
 class FilterTrial(Part, frozen=True):

@@ -33,7 +33,8 @@ from master.gestures.recogniser import GestureRecogniser
 from master.link_senders import Taken
 from master.objects.contact import ContactWatch
 from master.objects.line import SolvedObject
-from master.rig import RigSetup, pipeline_of
+from master.rig_pipeline import pipeline_of
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from master.tracked_object import TrackedObject
 

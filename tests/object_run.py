@@ -15,7 +15,8 @@ from common.messages import MarkerDetections, TagDetections, TrackerPose
 from common.object_profile import ObjectProfile, tag_corners
 from common.sim.scene import Scene
 from master.report import Played
-from master.rig import RigSetup, load_setups
+from master.rig import load_setups
+from master.rig_setup import RigSetup
 
 PERIOD_NS = 16_666_667
 START_NS = 1_000_000_000

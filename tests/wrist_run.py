@@ -9,7 +9,8 @@ from common.geometry import matrix_to_quaternion
 from common.messages import HandPose, Source, WristDetections
 from common.sim.wrist.scene import WristScene, WristTruth
 from master.outputs.poses import Poses
-from master.rig import RigSetup, load_setup
+from master.rig import load_setup
+from master.rig_setup import RigSetup
 
 TRIPLE_NS = 33_333_333
 START_NS = 1_000_000_000

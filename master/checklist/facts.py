@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from common.messages import CheckCode, CheckItem
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 from master.turned_away import Away, MarkerCounts
 
 

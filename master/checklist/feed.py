@@ -17,7 +17,7 @@ from master.checklist.facts import MasterNow, SenderNow, plan_of
 from master.checklist.files import FileWatch
 from master.checklist.watch import ChecklistWatch
 from master.quarantine import Quarantine
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 from master.sequence import CameraCounts
 from master.turned_away import Away, MarkerCounts
 

@@ -12,7 +12,8 @@ from common.messages import Detections, Told
 from master.export.take import Take
 from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
-from master.rig import RigSetup, load_setups
+from master.rig import load_setups
+from master.rig_setup import RigSetup
 from master.told_report import contact_row, object_row
 
 

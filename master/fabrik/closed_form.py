@@ -112,6 +112,13 @@ def distance2_of(chain: ChainArrays, ratio: float, pip: float) -> tuple[float, f
     return dot(w, w), 2.0 * dot(w, rotate(turn, plus(turning, (0.0, end[2], -end[1]))))
 
 
+@kernel
+def distances2(chain: ChainArrays, ratio: float, pips: Float, squares: Float) -> None:
+    """Squared distances |w|^2 [m^2] at many PIPs [rad], into `squares`."""
+    for i in range(len(pips)):
+        squares[i] = distance2_of(chain, ratio, pips[i])[0]
+
+
 @inner
 def _point(chain: ChainArrays, pip: float, dip: float) -> Vector:
     """The point w [m] in the root joint's frame at PIP and DIP [rad]."""

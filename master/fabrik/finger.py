@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 from math import inf, isfinite
 from typing import NamedTuple
 
@@ -13,7 +12,7 @@ from common.hand_model import CHAINS, HandModel
 from common.kernels import bound
 from master.fabrik.chain import Chain, Coupling, Link
 from master.fabrik.chain_arrays import end_of
-from master.fabrik.closed_form import REACHED_M, closed_form, distance2_of, nearest_pose
+from master.fabrik.closed_form import REACHED_M, closed_form, distance2_of, distances2, nearest_pose
 from master.fabrik.fabrik import solve_chain
 from master.fabrik.joints import Hinge, Rotor
 from master.fabrik.limits import Pair
@@ -272,12 +271,12 @@ def _branches(chain: Chain, ratio: float) -> Float:
         return distance2_of(chain.arrays, ratio, pip)[0]
 
     (low, high), dip_span = chain.spans[2:]
-    grid = np.linspace(low, high, _GRID).tolist()
-    rising = [b > a for a, b in pairwise([distance2(pip) for pip in grid])]
+    grid, squares = np.linspace(low, high, _GRID), np.empty(_GRID)
+    distances2(chain.arrays, ratio, grid, squares)
+    rising = np.diff(squares) > 0.0
     cuts = {low, high}
-    for i, (before, after) in enumerate(pairwise(rising)):
-        if before != after:
-            cuts.add(_extremum(distance2, grid[i], grid[i + 2], maximum=before))
+    for i in np.flatnonzero(rising[1:] != rising[:-1]).tolist():
+        cuts.add(_extremum(distance2, float(grid[i]), float(grid[i + 2]), maximum=bool(rising[i])))
     if ratio > 0.0:
         cuts |= {bound / ratio for bound in dip_span if low < bound / ratio < high}
     edges = sorted(cuts)

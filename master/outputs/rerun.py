@@ -31,7 +31,7 @@ from master.outputs.rerun_blueprint import blueprint
 from master.outputs.rerun_process import ViewerProcess
 from master.outputs.rerun_scene import RerunScene
 from master.outputs.truth import PosesTruth
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 
 Mode = Literal["spawn", "web", "save"]
 

@@ -9,7 +9,7 @@ import rerun.blueprint as rrb
 from common.messages import Source
 from master.outputs.object_look import OBJECT_RGB, ObjectLook
 from master.outputs.palette import SOURCE_MEANING, SOURCE_RGB
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 
 TIMELINE = "capture"
 WORLD = "world"

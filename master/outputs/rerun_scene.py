@@ -45,7 +45,7 @@ from master.outputs.rerun_images import CameraImages
 from master.outputs.rerun_told import ToldLayer
 from master.outputs.rerun_wrist import WristLayer
 from master.outputs.truth import PosesTruth, distance_m, mean_known
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 
 _STRIPS = (*((WRIST, *joints) for joints in FINGER_JOINTS), (WRIST, 7, 12, 17, 22, WRIST))
 _STRIP_SOURCE = (*TIPS.tolist(), WRIST)

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from common.bus import Bus
 from common.errors import RecordingError
-from master.tuning import RigFiles
+from master.rig import RigFiles
 
 READY_S = 60.0  # Python, numpy and the bus on a busy machine
 _END_S = 20.0

@@ -8,8 +8,8 @@ from pathlib import Path
 from common.errors import RecordingError
 from common.recording import MessageRecording
 from common.recording_parts import plain_names
-from master.rig import RigSetup, load_setups
-from master.tuning import RigFiles
+from master.rig import RigFiles, load_setups
+from master.rig_setup import RigSetup
 
 
 def carried_files(files: RigFiles, setups: Sequence[RigSetup]) -> dict[str, bytes]:

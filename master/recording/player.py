@@ -22,7 +22,7 @@ from master.outputs.sink import Sink
 from master.recording.clock import ReplayClock
 from master.recording.digest import ToldDigest
 from master.recording.lines import EventWatch
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from master.tuning import LivePipeline
 from master.world import World

@@ -22,7 +22,7 @@ from master.recording.feed import Feed, MasterClock, TapLease
 from master.recording.files import carried_files, rigs_text
 from master.recording.raw import RawAsker, raw_text
 from master.recording.recorder import MessageRecorder, Progress
-from master.tuning import RigFiles
+from master.rig import RigFiles
 
 NAME = "recorder"
 KEPT = ("taken", "hand", "object", "contact", "gesture", "health", "checklist")

@@ -22,7 +22,7 @@ from common.npz import write_npz
 from common.recorded_files import TRUTH, read_truth
 from master.outputs.files import load_poses
 from master.outputs.poses import Poses
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 from master.solve import solve
 
 Level = Literal["fk", "ik", "auto"]

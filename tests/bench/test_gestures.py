@@ -13,7 +13,8 @@ from common.gesture_settings import default_gestures
 from common.messages import Gesture
 from common.sim.gestures import Gestures
 from common.sim.scenes import scene_by_name
-from master.rig import RigSetup, load_setup
+from master.rig import load_setup
+from master.rig_setup import RigSetup
 
 CALIBRATION = Path(__file__).parents[2] / "calib_json"
 SETTINGS = default_gestures()

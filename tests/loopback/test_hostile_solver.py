@@ -23,7 +23,8 @@ from master.admission import limits_of
 from master.app import told_at
 from master.link import MasterLink
 from master.link_senders import Taken
-from master.rig import RigSetup, load_setup, load_setups
+from master.rig import load_setup, load_setups
+from master.rig_setup import RigSetup
 from master.world import fresh_world
 from slave.link import SlaveLink
 from tests.loopback.test_handshake import BROADCAST, KEY, MASTER, S, Wires

@@ -14,7 +14,8 @@ from common.hand_model import WRIST
 from common.messages import HandPose, ImuSample, MarkerDetections, Told
 from master.app import Beside, Observed, RunFigures, health, run
 from master.live import cameras_line
-from master.rig import RigSetup, pipeline_of
+from master.rig_pipeline import pipeline_of
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from master.world import World
 from tests.hand_helpers import detections

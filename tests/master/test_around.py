@@ -9,7 +9,8 @@ from common.calibration import Matrix4, RigCalibration
 from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix, rigid
 from common.hand_model import WRIST
 from common.messages import HandPose, MarkerDetections
-from master.rig import RigSetup, build_pipeline
+from master.rig_pipeline import build_pipeline
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from tests.hand_helpers import (
     MARKERS,

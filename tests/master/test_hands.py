@@ -16,10 +16,11 @@ from common.messages import Detections, ImuSample, MarkerDetections
 from master.estimator.pipeline import SolvedPose
 from master.needs_restart import refuse_restart
 from master.outputs.files import RunFiles, load_poses
-from master.rig import load_setup, pipeline_of
+from master.rig import RigFiles, load_setup
+from master.rig_pipeline import pipeline_of
 from master.stages import StageTimes
 from master.time_watch import TimeWatch
-from master.tuning import LivePipeline, RigFiles, RigTuning
+from master.tuning import LivePipeline, RigTuning
 from master.world import World
 from tests.hand_helpers import MARKERS
 from tests.master.test_outputs_files import random_pose

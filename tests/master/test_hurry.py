@@ -12,7 +12,8 @@ import pytest
 from common.messages import HandPose, MarkerDetections
 from master.hurry import MOST, Hurry, Shedding
 from master.message_queue import QUEUE, QUEUE_PER_CAMERA, ROOM, MessageQueue, Span, room
-from master.rig import RigSetup, build_pipeline
+from master.rig_pipeline import build_pipeline
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from tests.hand_helpers import MARKERS, RIGHT, camera_file, rig_file
 from tests.network_helpers import detections, triple

@@ -13,7 +13,8 @@ from common.messages import Command, Detections, WristDetections
 from common.zenoh_bus import ZenohBus
 from master.estimator.pipeline import SolvedPose
 from master.live import LiveSettings, run_live
-from master.tuning import LivePipeline, RigFiles
+from master.rig import RigFiles
+from master.tuning import LivePipeline
 from slave.uplink import Uplink
 from tests.master.test_live import free_tcp_port
 from tests.network_helpers import detections, free_udp_port, until

@@ -12,7 +12,8 @@ from common.errors import CalibrationError
 from common.hand_calibration import MarkerMount
 from common.hand_model import TIPS, HandModel
 from common.messages import HandPose, MarkerDetections, decode, encode
-from master.rig import RigSetup, build_pipeline
+from master.rig_pipeline import build_pipeline
+from master.rig_setup import RigSetup
 from master.solve import fingers_of
 from master.stages import StageTimes
 from tests.hand_helpers import (

@@ -13,7 +13,7 @@ from common.messages import HandPose, MarkerDetections, Source
 from master.fabrik.caps import CapTables
 from master.fabrik.estimate import MarkerPositions
 from master.fabrik.rays import RayTriangulator
-from master.rig import build_pipeline
+from master.rig_pipeline import build_pipeline
 from master.stages import StageTimes
 from tests.hand_helpers import (
     MARKERS,

@@ -20,7 +20,8 @@ from master.outputs.picture_wrist import WristPicture
 from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
 from master.outputs.rerun_scene import RerunScene
-from master.rig import RigSetup, load_setups
+from master.rig import load_setups
+from master.rig_setup import RigSetup
 from tests.master.test_outputs_rerun import column, rows_of
 
 TIMES_S = np.linspace(0.5, 9.0, 5)

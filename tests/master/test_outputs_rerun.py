@@ -23,7 +23,7 @@ from master.outputs.rerun import run_viewer, write_rrd
 from master.outputs.rerun_process import ViewerProcess, viewer_arguments
 from master.outputs.rerun_scene import RerunScene
 from master.outputs.truth import PosesTruth
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 from tests.hand_helpers import detections
 
 MODEL = HandModel.of(generated_profile("test-hand", "right"))

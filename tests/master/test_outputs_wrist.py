@@ -19,7 +19,7 @@ from master.outputs.picture_wrist import WristPicture
 from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
 from master.outputs.truth import PosesTruth
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 from master.wrist_report import lit_view
 from tests.master.test_outputs_rerun import column, rows_of
 from tests.wrist_run import exact_triple, true_poses, wrist_scene, wrist_setup

@@ -23,7 +23,9 @@ from common.geometry import axis_rotation, matrix_to_quaternion, rigid
 from common.hand_model import HandModel
 from common.hand_profiles import generated_profile
 from common.messages import MarkerDetections
-from master.rig import RigSetup, build_pipeline, load_setup, load_setups, setups_of
+from master.rig import load_setup, load_setups, setups_of
+from master.rig_pipeline import build_pipeline
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from tests.hand_helpers import RIGHT, camera_file, detections, rig_file
 

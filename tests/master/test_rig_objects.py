@@ -13,11 +13,11 @@ from common.errors import CalibrationError
 from common.gesture_settings import default_gestures
 from common.object_profile import Bead, ObjectProfile
 from master.needs_restart import refuse_restart
-from master.rig import load_setup, load_setups, setups_with_hands
+from master.rig import RigFiles, load_setup, load_setups, setups_with_hands
 from master.rig_merge import in_world, merged_rig
 from master.rig_objects import load_gestures, objects_of, refuse_shared_objects
 from master.stages import StageTimes
-from master.tuning import LivePipeline, RigFiles, RigTuning
+from master.tuning import LivePipeline, RigTuning
 from master.world import World
 from tests.loopback.test_imu_link import sample
 from tests.master.test_rig_merge import ASIDE, rows

@@ -11,7 +11,8 @@ import pytest
 
 from common.geometry import axis_rotation
 from common.keys import new_key
-from master.rig import build_pipeline, load_setup
+from master.rig import load_setup
+from master.rig_pipeline import build_pipeline
 from master.stages import StageTimes
 from tests.commands import Ended, command
 from tests.network_helpers import free_endpoint

@@ -21,7 +21,8 @@ from common.sim.render import Renderer
 from common.sim.wrist.record import WristTake
 from master.outputs.files import load_poses
 from master.recorded_imu import recorded_samples
-from master.rig import RigSetup, setups_of
+from master.rig import setups_of
+from master.rig_setup import RigSetup
 from master.solve import rigs_to_solve, solve_hands
 from tests.hand_helpers import LEFT
 

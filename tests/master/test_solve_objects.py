@@ -11,7 +11,8 @@ from common.errors import RecordingError
 from common.frame_recording import FrameRecording, Manifest
 from common.messages import ObjectSource, TagDetections
 from master.outputs.told_files import contact_path, load_contact, load_object, object_path
-from master.rig import RigSetup, load_setups, setups_with_hands
+from master.rig import load_setups, setups_with_hands
+from master.rig_setup import RigSetup
 from master.solve import rigs_to_solve, solve_hands
 from tests.object_run import PERIOD_NS, START_NS, ObjectRun, Sent, object_run
 

@@ -7,7 +7,7 @@ import pytest
 from common.clock_offset import ClockEstimate
 from common.messages import Health, MarkerDetections, decode, encode
 from master.phases import CameraPhases
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 from master.time_watch import TimeWatch
 from tests import timing_scenes as scenes
 from tests.hand_helpers import RIGHT, camera_file, detections, rig_file

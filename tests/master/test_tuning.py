@@ -20,9 +20,10 @@ from common.keys import new_key
 from common.messages import Command, HandPose, MarkerDetections
 from common.zenoh_bus import ZenohBus
 from master.live import LiveSettings, run_live
-from master.rig import RigSetup, load_setup
+from master.rig import RigFiles, load_setup
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
-from master.tuning import LivePipeline, RigFiles, RigTuning
+from master.tuning import LivePipeline, RigTuning
 from slave.uplink import Uplink
 from tests.hand_helpers import MARKERS, RIGHT, camera_file, cap_bias_px, rig_file
 from tests.hand_helpers import detections as seen

@@ -6,7 +6,7 @@ import pytest
 from common.calibration import Volume
 from common.hand_model import TIPS
 from common.messages import HandPose
-from master.rig import build_pipeline
+from master.rig_pipeline import build_pipeline
 from master.stages import StageTimes
 from master.volume import corners, edges, inside
 from tests.synthetic_run import synthetic_run

@@ -29,7 +29,9 @@ from master.app import Observed, RunFigures, health, run
 from master.estimator.pipeline import SolvedPose
 from master.object_score import ObjectTruth, errors
 from master.outputs.told_files import ObjectPoses
-from master.rig import RigSetup, load_setups, pipeline_of, setups_of
+from master.rig import load_setups, setups_of
+from master.rig_pipeline import pipeline_of
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from master.tracked_object import TrackedObject
 from master.world import World

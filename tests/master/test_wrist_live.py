@@ -19,9 +19,10 @@ from common.messages import Command, Health
 from common.zenoh_bus import ZenohBus
 from master.live import LiveSettings, run_live
 from master.outputs.files import load_poses
-from master.rig import RigSetup, load_setup
+from master.rig import RigFiles, load_setup
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
-from master.tuning import LivePipeline, RigFiles, RigTuning
+from master.tuning import LivePipeline, RigTuning
 from slave.uplink import Uplink
 from tests.network_helpers import detections, free_endpoint, free_udp_port, until
 from tests.wrist_run import exact_triple, wrist_scene, wrist_setup

@@ -13,7 +13,8 @@ from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from master.outputs.files import save_poses
 from master.report import Played, report_scene
-from master.rig import RigSetup, load_setups
+from master.rig import load_setups
+from master.rig_setup import RigSetup
 from master.wrist_report import forearm_tilt, laser_scores, lit_view
 from tests.master.test_outputs_rerun import rows_of
 from tests.wrist_run import START_NS, TRIPLE_NS, true_poses, wrist_scene, wrist_setup

@@ -14,7 +14,7 @@ from common.messages import WristDetections
 from common.sim.wrist.scene import WristTruth
 from master.outputs.files import load_poses
 from master.recorded import recorded_triples
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 from master.solve import solve
 from tests.hand_helpers import camera_file, rig_file
 from tests.wrist_run import START_NS, TRIPLE_NS, exact_triple, wrist_scene, wrist_setup

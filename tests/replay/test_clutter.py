@@ -18,7 +18,8 @@ from common.frame_recording import open_recording
 from common.sim.record import record_scene
 from common.sim.scene import Scene
 from master.outputs.files import load_poses
-from master.rig import RigSetup, load_hand, load_setup
+from master.rig import load_hand, load_setup
+from master.rig_setup import RigSetup
 from master.solve import solve
 from slave.offline import detect_recording, save_detections
 

@@ -19,7 +19,8 @@ import pytest
 from common.calibration import RigCalibration, load
 from common.frame_recording import open_recording
 from master.outputs.files import load_poses
-from master.rig import RigSetup, load_hand
+from master.rig import load_hand
+from master.rig_setup import RigSetup
 from master.solve import solve
 
 CAMERAS = ("left", "right")

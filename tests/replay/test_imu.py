@@ -24,7 +24,8 @@ from common.imu_recording import read_imu, write_imu
 from common.sim.record import record_scene
 from common.sim.scene import Scene
 from master.outputs.files import load_poses
-from master.rig import RigSetup, load_setup
+from master.rig import load_setup
+from master.rig_setup import RigSetup
 from master.solve import solve
 from master.summary import read_summary
 from slave.offline import detect_recording, save_detections

@@ -15,7 +15,8 @@ from common.sim.record import record_scene
 from common.sim.scene import view_centre
 from common.sim.scenes import scene_by_name
 from master.outputs.files import load_poses
-from master.rig import RigSetup, load_setup
+from master.rig import load_setup
+from master.rig_setup import RigSetup
 from master.solve import solve
 from master.summary import read_summary
 from tests.replay.test_datasets import command

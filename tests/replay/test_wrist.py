@@ -17,7 +17,8 @@ from common.arrays import Float
 from common.frame_recording import FrameRecording, Illumination, open_recording
 from common.hand_model import FINGERS
 from master.outputs.files import load_poses
-from master.rig import RigSetup, load_hand
+from master.rig import load_hand
+from master.rig_setup import RigSetup
 from master.solve import solve
 from tests.replay.test_datasets import command
 

@@ -16,7 +16,9 @@ from common.messages import HandPose, ImuSample
 from master.calibrate.wrist.device import device_of, say, write_device
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.recorded import recorded_detections, recorded_triples
-from master.rig import RigSetup, build_pipeline, load_hand
+from master.rig import load_hand
+from master.rig_pipeline import build_pipeline
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from master.summary import write_summary
 

@@ -18,7 +18,8 @@ from common.sim.motion import REST, HandState, angles_of, smooth_step
 from common.sim.scene import view_centre
 from master.gestures.recogniser import GestureRecogniser
 from master.outputs.bus import BusSink
-from master.rig import RigSetup, load_setup
+from master.rig import load_setup
+from master.rig_setup import RigSetup
 from tests.docs.examples.loading import example
 
 HZ = 60.0

@@ -19,8 +19,7 @@ from common.messages import HandPose, MarkerDetections, Source, decode, encode
 from master.fabrik.caps import CapTables
 from master.fabrik.depth import PowerLaw
 from master.fabrik.triangulate import DepthTriangulator, disparity_tables
-from master.rig import build_pipeline
-from master.rig_pipeline import line_of
+from master.rig_pipeline import build_pipeline, line_of
 from master.stages import StageTimes
 from tests.hand_helpers import LEFT, MARKERS, RIGHT
 from tests.synthetic_run import SyntheticRun, synthetic_run

@@ -17,7 +17,9 @@ from master.estimator.estimator import Estimator
 from master.fabrik.finger import Finger
 from master.fabrik.one_euro import OneEuro
 from master.fabrik.triangulate import DepthTriangulator
-from master.rig import RigSetup, build_pipeline, load_setup
+from master.rig import load_setup
+from master.rig_pipeline import build_pipeline
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from tests.hand_helpers import cap_views, detections, natural_angles, palm
 from tests.synthetic_run import SyntheticRun, synthetic_run

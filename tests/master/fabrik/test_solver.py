@@ -9,8 +9,7 @@ from common.hand_model import CHAINS, TIPS
 from common.messages import MarkerDetections, Source
 from master.fabrik.estimate import HandEstimate
 from master.fabrik.solver import FORGET_S, FabrikSolver
-from master.rig import build_pipeline
-from master.rig_pipeline import line_of
+from master.rig_pipeline import build_pipeline, line_of
 from master.stages import StageTimes
 from tests.hand_helpers import RIGHT, detections
 from tests.synthetic_run import PERIOD_NS, SyntheticRun, synthetic_run

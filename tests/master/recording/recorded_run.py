@@ -16,7 +16,7 @@ from master.recording.digest import ToldDigest
 from master.recording.files import carried_files, rigs_text
 from master.recording.player import world_of
 from master.recording.tap import Tap, Tapped, came_ns
-from master.tuning import RigFiles
+from master.rig import RigFiles
 from tests.network_helpers import ManualClock
 from tests.synthetic_run import synthetic_run
 

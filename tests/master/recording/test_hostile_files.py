@@ -15,7 +15,7 @@ from common.message_parts import MAX_TIME_NS
 from common.messages import Health, MarkerDetections, Message, encode
 from common.streams import sender_of
 from master.recording.files import carried_files
-from master.tuning import RigFiles
+from master.rig import RigFiles
 from tests.commands import command
 from tests.common.hostile_mcap import (
     HostileMcap,

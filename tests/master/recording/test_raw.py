@@ -16,7 +16,7 @@ from master.recording.lines import raw_lines
 from master.recording.process import RecordSettings, run_recorder
 from master.recording.raw import RawAsker
 from master.recording.recorder import Progress
-from master.tuning import RigFiles
+from master.rig import RigFiles
 from tests.master.recording.test_recorder import FakeMaster, recording
 from tests.network_helpers import until
 

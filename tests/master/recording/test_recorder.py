@@ -24,7 +24,7 @@ from master.recording.lines import ProgressLine, events_of, progress_text
 from master.recording.process import NAME, RecordSettings, run_recorder
 from master.recording.recorder import MessageRecorder, Progress
 from master.recording.tap import LEASE_NS, Tap, Tapped, came_ns
-from master.tuning import RigFiles
+from master.rig import RigFiles
 from tests.network_helpers import ManualClock, detections, free_endpoint, until
 from tests.picture_helpers import TINY
 

@@ -11,7 +11,7 @@ from common.frame_recording import FrameRecording, FrameRow, Illumination, Manif
 from common.hand_model import FINGER_JOINTS
 from common.sim.wrist.scene import WristTruth
 from master.outputs.poses import Poses
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 from master.study.session import COLUMNS, Held, write_trials
 from master.study.trials import read_trials, trials_of
 from tests.wrist_run import START_NS, TRIPLE_NS, true_poses, wrist_scene, wrist_setup

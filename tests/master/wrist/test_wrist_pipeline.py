@@ -15,7 +15,7 @@ from common.errors import CalibrationError
 from common.hand_model import CHAINS, FINGERS, METACARPALS, HandModel
 from common.messages import HandPose, Source, WristDetections
 from master.estimator.settings import DEFAULT
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 from master.wrist.forward import ForwardTable, LaserCut
 from master.wrist.invert import Inverse
 from master.wrist.laser_plane import PlaneAxes

@@ -18,7 +18,7 @@ from master.calibrate.mounting.mounting import calibrate_mounting
 from master.calibrate.mounting.report import refuse
 from master.calibrate.mounting.seen import Fit
 from master.calibrate.mounting.unknown import UNKNOWN
-from master.rig import RigSetup
+from master.rig_setup import RigSetup
 from tests.master.calibrate.mounting.moved import CAMERA_LATE_NS, IMU_LATE_NS, Moved, moved
 from tests.master.test_solve_both import write_detections
 
