@@ -1,7 +1,6 @@
 """Where the time goes: mean duration of each named stage, measured from outside the pure code."""
 
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 from common.clock import now_ns
 
@@ -12,23 +11,40 @@ class StageTimes:
     def __init__(self, now_ns: Callable[[], int] = now_ns) -> None:
         """Measure with `now_ns`: time that passes, or `time.thread_time_ns`, what the processor spends."""
         self._now_ns = now_ns
-        self._total_ns: dict[str, int] = {}
-        self._count: dict[str, int] = {}
+        self._stages: dict[str, Stage] = {}
 
-    @contextmanager
-    def __call__(self, name: str) -> Generator[None]:
+    def __call__(self, name: str) -> "Stage":
         """Measure one passage through stage `name`."""
-        start = self._now_ns()
-        try:
-            yield
-        finally:
-            self._total_ns[name] = self._total_ns.get(name, 0) + self._now_ns() - start
-            self._count[name] = self._count.get(name, 0) + 1
+        stage = self._stages.get(name)
+        if stage is None:
+            stage = self._stages[name] = Stage(self._now_ns)
+        return stage
 
     def mean_us(self) -> dict[str, float]:
         """Mean duration by stage [us], in the order of first use."""
-        return {name: round(total / self._count[name] / 1e3, 1) for name, total in self._total_ns.items()}
+        return {
+            name: round(one.total_ns / one.count / 1e3, 1) for name, one in self._stages.items() if one.count
+        }
 
     def total_us(self) -> dict[str, float]:
         """All durations of each stage together [us], in the order of first use."""
-        return {name: total / 1e3 for name, total in self._total_ns.items()}
+        return {name: one.total_ns / 1e3 for name, one in self._stages.items() if one.count}
+
+
+class Stage:
+    """Sums the durations of one stage, which is never entered twice at once."""
+
+    __slots__ = ("_began_ns", "_now_ns", "count", "total_ns")
+
+    def __init__(self, now_ns: Callable[[], int]) -> None:
+        """Begin with none."""
+        self._now_ns, self._began_ns, self.count, self.total_ns = now_ns, 0, 0, 0
+
+    def __enter__(self) -> None:
+        """Begin to measure."""
+        self._began_ns = self._now_ns()
+
+    def __exit__(self, *_: object) -> None:
+        """Add the time since."""
+        self.total_ns += self._now_ns() - self._began_ns
+        self.count += 1

@@ -23,6 +23,7 @@ class Epoch:
         facing: (3,) unit vector from the hand to the cameras that see its back.
         sensed: What other sensors say of the palm's turn and of angles; None: nothing.
         start: Another hand of this epoch; None: there is none.
+        second_order: Whether the joints' covariance is wanted to second order, as a hand that is published has it.
     """
 
     t_ns: int
@@ -34,6 +35,7 @@ class Epoch:
     own_m2: Float | None = None
     sensed: "Sensed | None" = None
     start: SolvedHand | None = None
+    second_order: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -150,12 +150,12 @@ class Estimator:
             ground.numbers[0] += 3.0 * int(sensed.told.sum())
         sure = sensed is not None and sensed.sure
         palm_shown = bool(ground.by_markers[0]) or (sure and ground.seen[0] > 0)
-        task.t_ns[0], task.palm_shown[0] = at.t_ns, palm_shown
-        known, enough = self.recent(at.t_ns), self._enough(at, sure)
+        task.t_ns[0], task.palm_shown[0], task.second_order[0] = at.t_ns, palm_shown, at.second_order
+        known = self.recent(at.t_ns)
         self._believe(at, known=known)
         out = Estimate.empty()
         before = None if sensed is None else self._boxed_state.copy()
-        solved, anew = self._solve(at, out, known=known, enough=enough)
+        solved, anew = self._solve(at, out, known=known)
         if (
             solved
             and sensed is not None
@@ -164,24 +164,24 @@ class Estimator:
             self._boxed_state[:], sensed = before, weighed
             at = replace(at, sensed=sensed)
             self._believe(at, known=known)
-            solved, anew = self._solve(at, out, known=known, enough=enough)
+            solved, anew = self._solve(at, out, known=known)
         self._turn = None if sensed is None else sensed.rotation
         if ground.seen[0] > 0 or (sensed is not None and bool(sensed.told.any()) and self._knows_place()):
             self._now.seen_ns[0] = at.t_ns
         rests = self._rests(at, palm_shown=palm_shown)
         return self._fitted(at, out, rests, anew=anew) if solved else _unknown(rests)
 
-    def _solve(self, at: Epoch, out: Estimate, *, known: bool, enough: bool) -> tuple[bool, bool]:
+    def _solve(self, at: Epoch, out: Estimate, *, known: bool) -> tuple[bool, bool]:
         """Fit an epoch and take it over; return whether there is a hand, and whether the one before was wrong."""
         if known:
-            wrong, explained = self._go_on(at, may_leave=enough)
+            wrong, explained = self._go_on(at, may_leave=True)
             # Where nothing is better, what goes on is kept.
             if explained or wrong <= self.settings.misled + self._begin(at):
                 if not explained:
                     self._go_on(at, may_leave=False)
                 self._write(out, goes_on=True)
                 return True, False
-        elif enough:
+        elif self._enough(at):
             self._begin(at)
         else:
             return False, False
@@ -197,7 +197,7 @@ class Estimator:
         task.turned[:] = _EYE
         if sensed is not None and sensed.rotation is not None and self._turn is not None:
             task.turned[:] = sensed.rotation @ self._turn.T
-        task.may_leave[0] = may_leave and start is not None
+        task.may_leave[0] = may_leave and start is not None and self._enough(at)
         if start is not None:
             task.palm[:], task.x[:] = start.T_rig_palm, self.parameters.of_angles(start.angles_rad)
         limit = self._predict(self._model, self._boxed_state, self._observed, self._boxed_space)
@@ -205,7 +205,7 @@ class Estimator:
             return np.inf, False
         wrong = self._search(self._with_laser(self._habits_of(_NONE), sensed))
         if self._only_natural and may_leave:
-            return wrong, not self._unexplained()
+            return wrong, not (self._unexplained() and self._enough(at))
         return wrong, not wrong > limit  # NaN: there is nothing to compare
 
     def _unexplained(self) -> bool:
@@ -326,14 +326,14 @@ class Estimator:
             belief.sensed[:], belief.sensed_pull[:] = sensed.information, sensed.pull
             belief.sensed_constant[0] = sensed.constant
 
-    def _enough(self, epoch: Epoch, sure: bool) -> bool:
+    def _enough(self, epoch: Epoch) -> bool:
         """Whether the markers fix a hand: not all in one line, or in a line across `facing`.
 
         What faces the cameras turns the hand about a line of markers, but not about one that points at them. With an
         orientation that is known any one marker is enough.
         """
         points = epoch.points_m[self._on_hand][self._placed(epoch)]
-        if sure:
+        if epoch.sensed is not None and epoch.sensed.sure:
             return len(points) > 0
         if len(points) < 2:
             return False

@@ -78,6 +78,7 @@ class Task:
         may_leave: (1,) whether there is another, and it may take the place of the state.
         rough: (1,) whether a search is to end early, in place, under the widest hypothesis alone.
         natural: (1,) probability of a natural hand a moment ago, and `counts` (1,) what that counts, 0 ... 1.
+        second_order: (1,) whether covariance is wanted to second order.
     """
 
     t_ns: Int
@@ -89,6 +90,7 @@ class Task:
     rough: Bool
     natural: Float
     counts: Float
+    second_order: Bool
 
     @classmethod
     def empty(cls, n: int) -> "Task":
@@ -104,6 +106,7 @@ class Task:
             rough=("u1", 1),
             natural=1,
             counts=1,
+            second_order=("u1", 1),
         )
 
 
@@ -382,17 +385,18 @@ def take_over_epoch(
     joints(hand, found.palm, work.R, work.P, out.position, out.rotation)
     linear(hand, found.palm, state.cov, work, room, out.cov)
     tilts(hand, settings, found.palm, found.cov, work, room, out.tilt, out.tilt_walk)
-    add_arcs(
-        rig,
-        settings,
-        found.palm,
-        state.cov,
-        observed.seen,
-        space.room.each[likelier(space.room)].information,
-        work,
-        room,
-        out.cov,
-    )
+    if task.second_order[0] > 0:
+        add_arcs(
+            rig,
+            settings,
+            found.palm,
+            state.cov,
+            observed.seen,
+            space.room.each[likelier(space.room)].information,
+            work,
+            room,
+            out.cov,
+        )
     _drift(settings, state, t_ns, space.ground, space.belief, out)
     state.t_ns[0], state.known[0], state.natural[0] = t_ns, True, found.natural[0]
     for f in range(5):

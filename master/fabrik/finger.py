@@ -9,9 +9,9 @@ import numpy as np
 
 from common.arrays import Float
 from common.hand_model import CHAINS, HandModel
-from common.kernels import bound
+from common.kernels import bound, constant, kernel
 from master.fabrik.chain import Chain, Coupling, Link
-from master.fabrik.chain_arrays import end_of
+from master.fabrik.chain_arrays import ChainArrays, end_of
 from master.fabrik.closed_form import REACHED_M, closed_form, distance2_of, distances2, nearest_pose
 from master.fabrik.fabrik import solve_chain
 from master.fabrik.joints import Hinge, Rotor
@@ -23,6 +23,7 @@ Four = tuple[float, float, float, float]
 
 _GRID = 2001
 _THIRDS = 52
+_NO_RESTARTS = constant(0)
 _NAN = float("nan")
 _UNKNOWN = (_NAN,) * 4
 
@@ -72,15 +73,14 @@ class FingerSolver:
         root: MCP (thumb: CMC) in the palm frame [m].
         ratio: DIP per PIP that makes the closed form exact.
         edges: (B + 1,) ends of the branches of the PIP, rising [rad].
-        closed, nearest: `closed_form` and `nearest_pose`, bound to the types of this finger.
+        start: `start_of`, bound to the types of this finger.
     """
 
     chain: Chain
     root: Vector
     ratio: float
     edges: Float
-    closed: Callable[..., float]
-    nearest: Callable[..., float]
+    start: Callable[..., float]
 
     @classmethod
     def of(
@@ -106,15 +106,8 @@ class FingerSolver:
         else:
             ratio = dip_high / pip_high if pip_high > 0.0 else 1.0
         edges, four, goal = _branches(chain, float(ratio)), np.zeros(4), (0.0, 0.0, 0.0)
-        seeds = np.zeros((3, 4))
-        return cls(
-            chain,
-            finger_root(model, finger),
-            float(ratio),
-            edges,
-            bound(closed_form, chain.arrays, edges, float(ratio), goal, four, four, seeds),
-            bound(nearest_pose, chain.arrays, goal, four, seeds, four),
-        )
+        start = bound(start_of, chain.arrays, edges, float(ratio), goal, four, four)
+        return cls(chain, finger_root(model, finger), float(ratio), edges, start)
 
     @property
     def limits(self) -> tuple[Pair, ...]:
@@ -136,24 +129,9 @@ class FingerSolver:
         if not isfinite(length(goal)):
             return NOT_SEEN
         before, angles = np.array(_UNKNOWN if near is None else near), np.empty(4)
-        left = self.seed(goal, before, angles)
+        left = self.start(self.chain.arrays, self.edges, self.ratio, goal, before, angles)
         a, f, pip, dip = angles.tolist()
         return FingerSolution(a, f, pip, dip, left, left < REACHED_M)
-
-    def seed(self, goal: Vector, near: Float, angles: Float) -> float:
-        """As `solve`, on arrays.
-
-        Args:
-            goal: Target from the root [m], finite.
-            near: (4,) [rad]; NaN: not known.
-            angles: (4,) [rad], out.
-
-        Returns:
-            Distance of the point to the target [m].
-        """
-        arrays, seeds = self.chain.arrays, np.empty((3, 4))
-        left = self.closed(arrays, self.edges, self.ratio, goal, near, angles, seeds)
-        return left if left < inf else self.nearest(arrays, goal, near, seeds, angles)
 
     def forward(self, angles: Four) -> Vector:
         """The point [m] in the palm frame at given angles [rad]."""
@@ -169,13 +147,13 @@ class Finger:
         closed_form: The same finger.
         tolerance_m: Residual that counts as reached.
         max_iterations: Of FABRIK; the seed is the answer, and what it cannot reach iterations improve little.
-        iterate: `solve_chain`, bound to the types of this finger.
+        bring: `bring_onto`, bound to the types of this finger.
     """
 
     closed_form: FingerSolver
     tolerance_m: float
     max_iterations: int
-    iterate: Callable[..., tuple[float, int]]
+    bring: Callable[..., tuple[float, int]]
 
     @classmethod
     def of(
@@ -196,9 +174,11 @@ class Finger:
                 f"tolerance {tolerance_m} m and {max_iterations} iterations: both must be positive"
             )
         solver = FingerSolver.of(model, finger, offset_m)
-        arrays, goal = solver.chain.arrays, (0.0, 0.0, 0.0)
-        iterate = bound(solve_chain, arrays, goal, float(tolerance_m), max_iterations, 0, np.zeros(4))
-        return cls(solver, float(tolerance_m), max_iterations, iterate)
+        chain, goal, tolerance_m = solver.chain.arrays, (0.0, 0.0, 0.0), float(tolerance_m)
+        bring = bound(
+            bring_onto, chain, solver.edges, solver.ratio, goal, tolerance_m, max_iterations, np.zeros(4)
+        )
+        return cls(solver, tolerance_m, max_iterations, bring)
 
     def solve(self, target_m: Float, angles_rad: Float) -> FingerResult:
         """Bring the finger's point to a target: FABRIK from the closed form.
@@ -216,15 +196,50 @@ class Finger:
         goal = minus((x, y, z), solver.root)
         if not isfinite(length(goal)):
             return _NOT_SEEN
-        arrays, tolerance_m, most = solver.chain.arrays, self.tolerance_m, self.max_iterations
-        near, before = angles_rad.copy(), 0
-        if solver.chain.coupling is None and isfinite(near.sum()):
-            residual, before = self.iterate(arrays, goal, tolerance_m, most, 0, angles_rad)
-            if residual <= tolerance_m:
-                return FingerResult(residual, before, True)
-        solver.seed(goal, near, angles_rad)
-        residual, iterations = self.iterate(arrays, goal, tolerance_m, most, 0, angles_rad)
-        return FingerResult(residual, before + iterations, residual <= tolerance_m)
+        arrays, tolerance_m = solver.chain.arrays, self.tolerance_m
+        residual, iterations = self.bring(
+            arrays, solver.edges, solver.ratio, goal, tolerance_m, self.max_iterations, angles_rad
+        )
+        return FingerResult(residual, iterations, residual <= tolerance_m)
+
+
+@kernel
+def start_of(
+    chain: ChainArrays, edges: Float, ratio: float, goal: Vector, near: Float, angles: Float
+) -> float:
+    """The pose from which FABRIK begins: the closed form, or the legal pose nearest to the target.
+
+    Args:
+        chain, edges, ratio, goal, near: As of `closed_form`.
+        angles: (4,) [rad], out.
+
+    Returns:
+        Distance of the point to the target [m].
+    """
+    seeds = np.empty((3, 4))
+    left = closed_form(chain, edges, ratio, goal, near, angles, seeds)
+    return left if left < inf else nearest_pose(chain, goal, near, seeds, angles)
+
+
+@kernel
+def bring_onto(
+    chain: ChainArrays,
+    edges: Float,
+    ratio: float,
+    goal: Vector,
+    tolerance_m: float,
+    max_iterations: int,
+    angles: Float,
+) -> tuple[float, int]:
+    """As `Finger.solve`: return the distance that is left [m], and the iterations."""
+    near, before = angles.copy(), 0
+    if chain.follower < 0 and isfinite(near.sum()):
+        residual, before = solve_chain(chain, goal, tolerance_m, max_iterations, _NO_RESTARTS, angles)
+        if residual <= tolerance_m:
+            return residual, before
+    start_of(chain, edges, ratio, goal, near, angles)
+    residual, iterations = solve_chain(chain, goal, tolerance_m, max_iterations, _NO_RESTARTS, angles)
+    return residual, before + iterations
 
 
 def finger_chain(model: HandModel, finger: int, offset_m: Float, *, coupled: bool = True) -> Chain:

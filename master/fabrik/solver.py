@@ -105,7 +105,8 @@ class FabrikSolver:
 
         Args:
             frames: What the cameras see of it.
-            near: A hand that is surer than this line's last one, for the side of the caps that the cameras see.
+            near: A hand that is surer than this line's last one, for the side of the caps that the cameras see; this
+                line's then has its covariance to first order.
             near_age_s: How long ago that held [s].
         """
         last, age_s = self._recent(frames.t_ns)
@@ -123,7 +124,9 @@ class FabrikSolver:
         with self._stage("fabrik"):
             facing = self.towards(smooth[self.on_hand], frames.area)
             out = HandEstimate.unseen(frames.t_ns, markers, smooth, facing)
-            palm = self._palm.push(Epoch(frames.t_ns, smooth, facing, cov_m2=markers.cov_m2))
+            palm = self._palm.push(
+                Epoch(frames.t_ns, smooth, facing, cov_m2=markers.cov_m2, second_order=near is None)
+            )
             return self._estimate(out, smooth[self.on_hand], markers.cov_m2[self.on_hand], palm)
 
     def solve_once(self, points: Float, cov: Float, area_px2: Float) -> SolvedHand | None:

@@ -109,9 +109,9 @@ def test_stages_are_measured_once(exact_run: SyntheticRun) -> None:
     pipeline = LivePipeline(exact_run.setup, stages)
     for message in exact_run.messages[:40]:
         count += len(pipeline.push(message))
-    before = stages._count["filter"]
+    before = stages("filter").count
     pipeline.change(exact_run.setup)
-    assert stages._count["filter"] == before == count
+    assert stages("filter").count == before == count
 
 
 def tree(folder: Path, rig: RigCalibration | None = None) -> RigFiles:

@@ -2,6 +2,7 @@
 
 import importlib
 import pkgutil
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -88,6 +89,16 @@ def test_no_kernel_is_compiled_while_a_hand_is_tracked() -> None:
     fortran.flags.writeable = False
     recogniser.push(msgspec.structs.replace(poses[-1], t_ns=60 * FRAME_NS, position_m=fortran))
     assert compiled() == before
+
+
+def test_kernels_are_compiled_once_whether_or_not_a_hand_may_be_written() -> None:
+    counts = list[dict[str, int]]()
+    for writeable in (False, True):
+        radius = RIGHT.radius_m.copy()
+        radius.flags.writeable = writeable
+        GestureRecogniser(default_gestures(), replace(RIGHT, radius_m=radius))
+        counts.append(compiled())
+    assert counts[0] == counts[1]
 
 
 def test_a_finger_that_is_lost_while_a_dial_turns_leaves_the_dial() -> None:
