@@ -139,6 +139,10 @@ class HandModel:
     turn: Float
     swing: Float
 
+    def __post_init__(self) -> None:
+        """Make the radii read-only: poses adopt them, and kernels take what is read-only for another type."""
+        self.radius_m.setflags(write=False)
+
     @classmethod
     def of(cls, profile: HandProfile) -> "HandModel":
         """Build and check.

@@ -25,8 +25,7 @@ class ActionWatch:
 
     def __init__(self, settings: GestureSettings, radius_m: Float) -> None:
         """Of a hand whose joints have the radii (26,) [m]."""
-        self._radius_m, self._taps = radius_m.view(), settings.tap
-        self._radius_m.flags.writeable = False  # of one type to kernels, whoever made it
+        self._radius_m, self._taps = radius_m, settings.tap
         self.pinch, self.dial = PinchWatch(settings.pinch), DialWatch(settings.dial)
         self.tap, self.point = TapWatch(settings.tap), PointWatch(settings.point)
 

@@ -96,7 +96,9 @@ def test_kernels_are_compiled_once_whether_or_not_a_hand_may_be_written() -> Non
     for writeable in (False, True):
         radius = RIGHT.radius_m.copy()
         radius.flags.writeable = writeable
-        GestureRecogniser(default_gestures(), replace(RIGHT, radius_m=radius))
+        hand = replace(RIGHT, radius_m=radius)
+        assert not hand.radius_m.flags.writeable
+        GestureRecogniser(default_gestures(), hand)
         counts.append(compiled())
     assert counts[0] == counts[1]
 
