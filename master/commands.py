@@ -1,6 +1,9 @@
-"""All commands of `phalanx-master`, imported when they are asked for: all of them take two seconds to import."""
+"""All commands of `phalanx-master`, each imported when it is asked for.
 
-from collections.abc import Callable, Mapping
+To import all of them takes two seconds.
+"""
+
+from collections.abc import Callable
 from importlib import import_module
 
 import typer
@@ -35,7 +38,10 @@ _CONTEXT = {"install": {"allow_extra_args": True, "ignore_unknown_options": True
 
 
 def command_line(wanted: str | None = None) -> typer.Typer:
-    """The commands as one program: the one that is wanted alone, all where there is none of that name."""
+    """The commands as one program.
+
+    The wanted one alone, all where there is none of that name.
+    """
     app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
     app.callback()(phalanx_master)
     if wanted not in GROUPS:
@@ -47,11 +53,16 @@ def command_line(wanted: str | None = None) -> typer.Typer:
     return app
 
 
-def imported(table: Mapping[str, str], wanted: str | None) -> dict[str, Callable[..., typer.Typer]]:
-    """The functions of a table of `module:name`: the wanted one alone, all where it has none of that name."""
-    names = [wanted] if wanted in table else list(table)
-    found = {name: table[name].split(":") for name in names if name is not None}
-    return {name: getattr(import_module(module), attribute) for name, (module, attribute) in found.items()}
+def imported(table: dict[str, str], wanted: str | None) -> dict[str, Callable[..., typer.Typer]]:
+    """Import the functions of a table of `module:name`.
+
+    The wanted one alone, all where the table has none of that name.
+    """
+    found: dict[str, Callable[..., typer.Typer]] = {}
+    for name in [wanted] if wanted in table else table:
+        module, attribute = table[name].split(":")
+        found[name] = getattr(import_module(module), attribute)
+    return found
 
 
 def phalanx_master() -> None:

@@ -11,13 +11,13 @@ class StageTimes:
     def __init__(self, now_ns: Callable[[], int] = now_ns) -> None:
         """Measure with `now_ns`: time that passes, or `time.thread_time_ns`, what the processor spends."""
         self._now_ns = now_ns
-        self._stages: dict[str, Stage] = {}
+        self._stages: dict[str, StageTime] = {}
 
-    def __call__(self, name: str) -> "Stage":
-        """Measure one passage through stage `name`."""
+    def __call__(self, name: str) -> "StageTime":
+        """Return what measures passages through stage `name`."""
         stage = self._stages.get(name)
         if stage is None:
-            stage = self._stages[name] = Stage(self._now_ns)
+            stage = self._stages[name] = StageTime(self._now_ns)
         return stage
 
     def mean_us(self) -> dict[str, float]:
@@ -31,7 +31,7 @@ class StageTimes:
         return {name: one.total_ns / 1e3 for name, one in self._stages.items() if one.count}
 
 
-class Stage:
+class StageTime:
     """Sums the durations of one stage, which is never entered twice at once."""
 
     __slots__ = ("_began_ns", "_now_ns", "count", "total_ns")

@@ -148,8 +148,7 @@ class Estimator:
         if sensed is not None:
             ground.shown[:] |= sensed.told
             ground.numbers[0] += 3.0 * int(sensed.told.sum())
-        sure = sensed is not None and sensed.sure
-        palm_shown = bool(ground.by_markers[0]) or (sure and ground.seen[0] > 0)
+        palm_shown = bool(ground.by_markers[0]) or (at.sure and ground.seen[0] > 0)
         task.t_ns[0], task.palm_shown[0], task.second_order[0] = at.t_ns, palm_shown, at.second_order
         known = self.recent(at.t_ns)
         self._believe(at, known=known)
@@ -333,7 +332,7 @@ class Estimator:
         orientation that is known any one marker is enough.
         """
         points = epoch.points_m[self._on_hand][self._placed(epoch)]
-        if epoch.sensed is not None and epoch.sensed.sure:
+        if epoch.sure:
             return len(points) > 0
         if len(points) < 2:
             return False

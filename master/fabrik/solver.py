@@ -156,9 +156,6 @@ class FabrikSolver:
         self.triangulate(100.0 * np.stack([seen, seen], axis=-1), seen, seen, first, 0.0)
         targets = np.empty_like(places)
         targets_of(places, cov[self.on_hand], _AWAY, places, _FIT_M2, targets)
-        for m, (f, finger) in self._fingers.items():
-            for aside_m in (0.0, 0.1):  # with and without a search
-                finger.solve(targets[m] + aside_m, angles[f])
         self.sync.at(0)
 
     def _recent(self, t_ns: int) -> tuple[SolvedHand | None, float]:
