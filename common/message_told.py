@@ -75,8 +75,9 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
             OpenXR axes (-z along the bone to the tip, +y dorsal).
         radius_m: Joint radii (26,) [m].
         valid: (26,) the pose of the joint may be used.
-        tracked: (26,) the 95 % region of the joint is smaller than a stated size, and it rests on measurements of its
-            finger that are not older than a stated age (`estimator.tracked_m`, `tracked_age_s`). Implies valid.
+        tracked: (26,) the 95 % regions of the joint and of its finger's PIP are smaller than a stated size, and it
+            rests on measurements of its finger that are not older than a stated age (`estimator.tracked_m`,
+            `tracked_age_s`). Implies valid.
         cov_m2: Position covariance (26, 3, 3) [m^2], rig frame. NaN: unknown.
         source: (26,) `Source` codes.
         angles_rad: (5, 4) [rad]: abduction, flexion (MCP; thumb CMC), PIP (thumb MCP),

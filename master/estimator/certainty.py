@@ -7,7 +7,7 @@ the two is taken, and no more: in the coordinates in which the covariance of thi
 the past diagonal, the smaller of each pair. Where every finger is seen this instant says more, and counts alone.
 """
 
-from math import sqrt
+from math import acos, cos, sqrt
 
 from common.arrays import Float, Int
 from common.hand_model import CHAINS
@@ -19,6 +19,7 @@ from master.estimator.matrices import cholesky, eigen
 from master.estimator.settings import Settings
 from master.estimator.state import Hidden
 
+_QUANTILE_95 = 7.815  # chi square of three numbers
 _LAST = constant(3)  # joint of a finger: its tip
 MOST_TURNS = 12  # turns that count in arcs: those of the palm, which moves all joints, then the largest
 
@@ -216,3 +217,26 @@ def tilts(
             for i in range(3):
                 walk[f] += (rate * room.J[a, i]) ** 2
         _project(cov, 6 + count, room, tilt[f])
+
+
+@inlined
+def _widest(C: Float) -> float:
+    """The largest eigenvalue of a symmetric matrix (3, 3), by its characteristic polynomial."""
+    mean = (C[0, 0] + C[1, 1] + C[2, 2]) / 3.0
+    a, b, c = C[0, 0] - mean, C[1, 1] - mean, C[2, 2] - mean
+    d, e, f = C[0, 1], C[0, 2], C[1, 2]
+    p = sqrt((a * a + b * b + c * c + 2.0 * (d * d + e * e + f * f)) / 6.0)
+    if not p > 0.0:
+        return mean
+    determinant = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
+    return mean + 2.0 * p * cos(acos(min(max(0.5 * determinant / p**3, -1.0), 1.0)) / 3.0)
+
+
+@inner
+def is_small(hand: HandTables, cov: Float, joint: int, most_m: float) -> bool:
+    """Whether the 95 % region of a joint, of covariances (26, 3, 3), reaches no farther than so far.
+
+    And that of its finger's PIP: a tip may be known to millimetres, and not how the finger is bent.
+    """
+    most_m2 = most_m * most_m / _QUANTILE_95
+    return _widest(cov[joint]) < most_m2 and _widest(cov[hand.middle[joint]]) < most_m2

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.hand_model import CHAINS, HandModel
+from common.hand_model import CHAINS, FINGER_JOINTS, HandModel
 from common.records import filled
 from master.estimator.parameters import HandParameters
 
@@ -33,6 +33,7 @@ class HandTables:
         limits: (5, 4, 2) [rad] low and high of all angles, abductions before they narrow.
         finger: (26,) chain of each joint, -1: fixed to the palm.
         level: (26,) its place in the chain.
+        middle: (26,) the PIP of its finger, a metacarpal's too; those of thumb, palm and wrist: themselves.
         rest_m, rest_R: (26, 3) [m], (26, 3, 3) place and rotation of those fixed to the palm, palm frame.
     """
 
@@ -53,6 +54,7 @@ class HandTables:
     limits: Float
     finger: Int
     level: Int
+    middle: Int
     rest_m: Float
     rest_R: Float
 
@@ -65,6 +67,9 @@ class HandTables:
         finger, level = np.full(26, -1, np.int64), np.zeros(26, np.int64)
         for f, chain in enumerate(CHAINS):
             finger[chain], level[chain] = f, np.arange(4)
+        middle: Int = np.arange(26)
+        for chain, joints in zip(CHAINS[1:], FINGER_JOINTS[1:], strict=True):
+            middle[list(joints)] = chain[1]
         first = np.searchsorted(parameters.free, 4 * np.arange(6)).astype(np.int64)
         complete = np.zeros((20, 4))
         for f in range(5):
@@ -89,6 +94,7 @@ class HandTables:
             "limits": model.limits_rad,
             "finger": finger,
             "level": level,
+            "middle": middle,
             "rest_m": model.rest_position_m,
             "rest_R": model.rest_rotation,
         }

@@ -39,7 +39,7 @@ class Settings(NamedTuple):
     natural_flexion_rad: Annotated[float, Range("rad", 0.01, 2.0, _HANDS)] = radians(14.0)
     neighbour_flexion_rad: Annotated[float, Range("rad", 0.01, 3.0, _HANDS)] = radians(30.0)
     neighbour_pip_rad: Annotated[float, Range("rad", 0.01, 3.0, _HANDS)] = radians(35.0)
-    pip_rad: Annotated[float, Range("rad", 0.01, 3.0, _HANDS)] = radians(45.0)
+    pip_rad: Annotated[float, Range("rad", 0.01, 3.0, _HANDS)] = radians(50.0)
     pip_mean_rad: Annotated[float, Range("rad", 0.0, 1.5, _HANDS)] = radians(12.0)
     loose_dip_rad: Annotated[float, Range("rad", 0.01, 1.0, _HANDS)] = radians(15.0)
     loose_dip_per_pip: Annotated[float, Range("1", 0.0, 1.5, "Kalbfleisch: DIP = 2/3 PIP")] = 2.0 / 3.0
@@ -72,7 +72,7 @@ class Settings(NamedTuple):
     bones_m: Annotated[float, Range("m", 1e-4, 1e-2, "bones and caps are known to about 1 mm")] = 1.0e-3
     # How far a hand that is seen moves in a time, as a random walk: wide, so that what is seen decides.
     walk_rad_s: Annotated[float, Range("rad/s", 0.5, 50.0, _HANDS)] = 8.0
-    palm_walk_rad_s: Annotated[float, Range("rad/s", 0.1, 50.0, _HANDS)] = 3.0
+    palm_walk_rad_s: Annotated[float, Range("rad/s", 0.1, 50.0, _HANDS)] = 2.5
     palm_walk_m_s: Annotated[float, Range("m/s", 0.05, 20.0, _HANDS)] = 2.0
     shortest_s: Annotated[
         float, Range("s", 1e-5, 1e-2, "a shorter step would weld the hand to its last pose")
@@ -135,15 +135,12 @@ class Settings(NamedTuple):
     ] = 0.5
     tracked_m: Annotated[
         float, Range("m", 0.002, 0.1, "half the largest axis of the 95 % region of a joint that is TRACKED")
-    ] = 0.020
+    ] = 0.022
     tracked_age_s: Annotated[
         float, Range("s", 0.0, 1.0, "how old the newest measurement of a TRACKED finger may be")
-    ] = 0.05
+    ] = 0.03
     # What is shown.
     blend_s: Annotated[float, Range("s", 0.01, 1.0, "as long as a leap is seen as a motion")] = 0.1
-    elsewhere_m: Annotated[
-        float, Range("m", 1e-3, 0.1, "a joint shown farther from where it is solved to be is not TRACKED")
-    ] = 5e-3
     # The search.
     tolerance: Annotated[float, Range("half chi square", 1e-12, 1.0, "what a step may leave")] = 1e-7
     tolerance_share: Annotated[float, Range("1", 0.0, 0.1, "of the cost, likewise")] = 1e-4

@@ -19,12 +19,11 @@ limits; what has to be cut is an abduction that the filtered flexion does not al
 from markers, or these from it, it is elsewhere by their errors. The difference between what was shown last and what is
 solved now is added to the solution and fades within a tenth of a second, as networked games lead a player over to where
 the server says it is: the motion goes on, the error goes. While it fades, the covariance of a joint contains the square
-of how far it is shown from where it is solved to be.
+of how far it is shown from where it is solved to be; one whose region is too large now is not tracked.
 
 A hand that was wrong a moment ago, as its tracker says, is shown at once where it is, and the filter begins anew.
 
-A hand that several kinds of sensors watch leaps more often, and is led in as `master.estimator.lead` has it. A joint of
-it is not called tracked while it is shown more than 5 mm from where it is solved to be.
+A hand that several kinds of sensors watch leaps more often, and is led in as `master.estimator.lead` has it.
 
 Beside that the covariance is the solution's. Filtering takes noise away and adds lag; neither is in it.
 """
@@ -78,7 +77,8 @@ class HandOneEuro:
         self._fresh = self._state.copy()
         self._hand = boxed(HandTables.of(model, HandParameters.of(model)))
         rests, cov, room = np.zeros(6, np.int64), np.zeros((len(markers), 3, 3)), Pose.empty()
-        self._kernel = bound(smooth, self._hand, self._state, WHOLE, 0, rests, cov, room, room)
+        none = np.zeros(26, np.bool_)
+        self._kernel = bound(smooth, self._hand, self._state, WHOLE, 0, rests, cov, room, room, none)
 
     def push(self, t_ns: int, hand: Fitted, cov_m2: Float, points_m: Float | None = None) -> Fitted:
         """Filter palm, angles and joints of a hand; the rest of it stays.
@@ -103,17 +103,14 @@ class HandOneEuro:
         at = solution.joints
         solved = Pose(solution.T_rig_palm, solution.angles_rad, at.position_m, at.rotation, solution.cov_m2)
         shown, cov_m2 = Pose.empty(), np.ascontiguousarray(cov_m2)
-        lead, tracked, before, what = self._lead, hand.tracked, self._values.copy(), WHOLE
+        lead, tracked, before, what = self._lead, hand.tracked.copy(), self._values.copy(), WHOLE
         if lead is not None and points_m is not None:
-            self._kernel(self._hand, self._state, SIGNALS, t_ns, rests, cov_m2, solved, shown)
+            self._kernel(self._hand, self._state, SIGNALS, t_ns, rests, cov_m2, solved, shown, tracked)
             self._signals += lead.push(gap_s, rests, before, self._signals, points_m)
             what = REST
-        off = self._kernel(self._hand, self._state, what, t_ns, rests, cov_m2, solved, shown)
+        off = self._kernel(self._hand, self._state, what, t_ns, rests, cov_m2, solved, shown, tracked)
         if lead is not None:
             lead.moved(gap_s, self._values - before)
-            if off:
-                off_m = shown.position - at.position_m
-                tracked = tracked & (np.vecdot(off_m, off_m) < self._settings.elsewhere_m**2)
         smooth_hand = FittedHand(
             T_rig_palm=shown.palm,
             angles_rad=shown.angles,

@@ -5,10 +5,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from common.arrays import Float, Int
+from common.arrays import Bool, Float, Int
 from common.hand_model import CHAINS, MIDDLE_PROXIMAL, TIPS, HandModel
 from common.kernels import constant, inner, kernel
 from common.records import record
+from master.estimator.certainty import is_small
 from master.estimator.hand_tables import HandTables
 from master.estimator.kinematics import Scratch, chains, clamp, joints, rotate_by, turn_between
 from master.estimator.lead import PARTS
@@ -56,7 +57,7 @@ class Smoothing:
         knuckle: (3,) [m] the place in the palm frame.
         across: (1,) [m/rad] by how much a turn counts, and `reach` (20,) the angles.
         dip_per_pip: (1,) how the DIP follows the PIP.
-        blend_s: (1,) in which leaps fade.
+        blend_s: (1,) in which leaps fade, and `tracked_m` (1,) how large the region of a tracked joint may be.
     """
 
     t_ns: Int
@@ -80,6 +81,7 @@ class Smoothing:
     reach: Float
     dip_per_pip: Float
     blend_s: Float
+    tracked_m: Float
     signals: Float  # (26,) [m] as solved, and what is left of leaps
     largest: Float  # (26,) room
     noise: Float  # (26,) room
@@ -97,7 +99,7 @@ class Smoothing:
             **dict.fromkeys(
                 ("values", "offset", "x", "speed", "signals", "largest", "noise", "filtered"), 26
             ),
-            **dict.fromkeys(("dt_s", "across", "dip_per_pip", "blend_s"), 1),
+            **dict.fromkeys(("dt_s", "across", "dip_per_pip", "blend_s", "tracked_m"), 1),
             **dict.fromkeys(("t_ns", "until_ns"), ("i8", 1)),
             **dict.fromkeys(("rests", "since_ns"), ("i8", 6)),
             **dict.fromkeys(("part", "seen_ns"), ("i8", 26)),
@@ -123,7 +125,7 @@ class Smoothing:
         # The DIP bends with the PIP, so it counts as far.
         out.reach[:] = np.linalg.norm(rest[TIPS][:, None] - rest[CHAINS[:, [0, 0, 1, 1]]], axis=2).ravel()
         out.dip_per_pip[:] = model.dip_per_pip or 0.0
-        out.blend_s[:] = settings.blend_s
+        out.blend_s[:], out.tracked_m[:] = settings.blend_s, settings.tracked_m
         return out
 
 
@@ -239,14 +241,19 @@ def _write_pose(hand: HandTables, state: Smoothing, shown: Pose) -> None:
 
 
 @inner
-def _add_offset(solved: Pose, shown: Pose) -> None:
-    """Write the covariance of the joints with how far each is shown from where it is solved to be."""
+def _add_offset(hand: HandTables, state: Smoothing, solved: Pose, shown: Pose, tracked: Bool) -> None:
+    """Write the covariance of the joints with how far each is shown from where it is solved to be.
+
+    A region that is too large now is that of a joint that is not tracked.
+    """
     for joint in range(26):
         for i in range(3):
             for j in range(3):
                 off2 = shown.position[joint, i] - solved.position[joint, i]
                 off2 *= shown.position[joint, j] - solved.position[joint, j]
                 shown.cov[joint, i, j] = solved.cov[joint, i, j] + off2
+    for joint in range(26):
+        tracked[joint] = tracked[joint] and is_small(hand, shown.cov, joint, state.tracked_m[0])
 
 
 @kernel
@@ -259,6 +266,7 @@ def smooth(
     marker_cov: Float,
     solved: Pose,
     shown: Pose,
+    tracked: Bool,
 ) -> bool:
     """Filter one hand.
 
@@ -268,6 +276,7 @@ def smooth(
         t_ns, rests: Of the hand.
         marker_cov: (M, 3, 3) [m^2].
         solved, shown: The hand; `shown` is written, its covariance where anything was added.
+        tracked: (26,) as solved, changed to as shown.
 
     Returns:
         Whether anything was added to the solved signals.
@@ -284,7 +293,7 @@ def smooth(
     _filter(state, t_ns, rests, marker_cov)
     _write_pose(hand, state, shown)
     if added:
-        _add_offset(solved, shown)
+        _add_offset(hand, state, solved, shown, tracked)
     state.t_ns[0] = t_ns
     for p in range(6):
         state.rests[p] = rests[p]

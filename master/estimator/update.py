@@ -1,17 +1,17 @@
 """Kernels of one epoch: predict, fit, and take over what it says into the state."""
 
-from math import acos, cos, exp, sqrt
+from math import exp
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from common.arrays import Bool, Code, Float, Int
-from common.kernels import inlined, inner, kernel
+from common.kernels import inner, kernel
 from common.messages import Source
 from common.records import record
 from master.estimator.arcs import add_arcs
 from master.estimator.cameras import CameraArrays
-from master.estimator.certainty import Certainty, linear, only_limits, surer, tilts
+from master.estimator.certainty import Certainty, is_small, linear, only_limits, surer, tilts
 from master.estimator.ground import Ground
 from master.estimator.hand_tables import Mounts
 from master.estimator.hypotheses import Blank, Posterior, Room, likelier
@@ -25,7 +25,6 @@ from master.estimator.settings import Settings
 from master.estimator.solve import descend
 from master.estimator.state import NEVER_NS, PALM_PART, HandState, Hidden, grow, predict
 
-_QUANTILE_95 = 7.815  # chi square of three numbers
 _SOLVED, _MEASURED, _HELD = int(Source.SOLVED), int(Source.MEASURED), int(Source.HELD)
 
 
@@ -165,19 +164,6 @@ def chi_square(
     return total
 
 
-@inlined
-def _widest(C: Float) -> float:
-    """The largest eigenvalue of a symmetric matrix (3, 3), by its characteristic polynomial."""
-    mean = (C[0, 0] + C[1, 1] + C[2, 2]) / 3.0
-    a, b, c = C[0, 0] - mean, C[1, 1] - mean, C[2, 2] - mean
-    d, e, f = C[0, 1], C[0, 2], C[1, 2]
-    p = sqrt((a * a + b * b + c * c + 2.0 * (d * d + e * e + f * f)) / 6.0)
-    if not p > 0.0:
-        return mean
-    determinant = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
-    return mean + 2.0 * p * cos(acos(min(max(0.5 * determinant / p**3, -1.0), 1.0)) / 3.0)
-
-
 @inner
 def _judge(
     rig: Rig,
@@ -189,16 +175,15 @@ def _judge(
 ) -> None:
     """Write which joints are tracked, and what each rests on.
 
-    Tracked is a joint whose 95 % region is smaller than `tracked_m`, and that rests on measurements of its finger that
-    are no older than `tracked_age_s`.
+    Tracked is a joint whose 95 % region is small (`master.estimator.certainty.is_small`), and that rests on
+    measurements of its finger that are no older than `tracked_age_s`.
     """
     hand = rig.hand
     for joint in range(26):
         f = hand.finger[joint]
         part = f if f >= 0 else PALM_PART
         fresh = (t_ns - state.told_ns[part]) * 1e-9 <= settings.tracked_age_s
-        size_m = sqrt(_QUANTILE_95 * max(_widest(out.cov[joint]), 0.0))
-        out.tracked[joint] = fresh and size_m < settings.tracked_m
+        out.tracked[joint] = fresh and is_small(hand, out.cov, joint, settings.tracked_m)
         now = state.told_ns[part] == t_ns
         out.source[joint] = _SOLVED if now else _HELD
     for m in range(rig.mounts.finger.shape[0]):

@@ -6,10 +6,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from common.arrays import Float
+from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 from common.geometry import matrix_to_rotation_vector
-from common.hand_model import HandJoints, HandModel
+from common.hand_model import CHAINS, FINGER_JOINTS, HandJoints, HandModel
 from master.estimator.epoch import Epoch, Fitted, FittedHand, Sensed
 from master.estimator.estimator import Estimator
 from master.estimator.parameters import HandParameters
@@ -112,6 +112,14 @@ def pip_deg(hand: FittedHand | None, truth: Float) -> float:
 def region_m(hand: Fitted) -> Float:
     """Half the largest axes of the 95 % regions of the joints (26,)."""
     return np.sqrt(7.815 * np.linalg.eigvalsh(found(hand.solution).cov_m2)[:, -1])
+
+
+def sure(hand: Fitted, most_m: float = DEFAULT.tracked_m) -> Bool:
+    """Whether the regions of the joints (26,) and of their fingers' PIPs are that small."""
+    small, of_pip = region_m(hand) < most_m, np.ones(26, np.bool_)
+    for finger in range(1, 5):
+        of_pip[list(FINGER_JOINTS[finger])] = small[CHAINS[finger, 1]]
+    return small & of_pip
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from common.hand_model import CHAINS, PALM, TIPS
 from common.messages import Source
 from master.estimator.settings import DEFAULT
 from tests.hand_helpers import palm
-from tests.master.estimator.fitted import PAIR, STEP_NS, bent, estimator, found, region_m, seen
+from tests.master.estimator.fitted import PAIR, STEP_NS, bent, estimator, found, seen, sure
 
 INDEX, MARKER_INDEX = 1, 1
 
@@ -57,8 +57,7 @@ def test_a_marker_that_one_camera_loses_is_kept_on_the_ray_of_the_other() -> Non
         if k >= 18:
             error = np.abs(hand.solution.joints.position_m - truth.joints.position_m)[TIPS[INDEX]]
             off.append(error)
-            sure = region_m(hand)[CHAINS[INDEX]] < DEFAULT.tracked_m
-            np.testing.assert_array_equal(hand.tracked[CHAINS[INDEX]], sure)
+            np.testing.assert_array_equal(hand.tracked[CHAINS[INDEX]], sure(hand)[CHAINS[INDEX]])
             assert hand.source[TIPS[INDEX]] == Source.SOLVED
     assert np.mean(off, axis=0)[0] < 4e-3
     assert np.linalg.norm(off, axis=1).mean() < 15e-3  # its depth is that of habits

@@ -38,25 +38,8 @@ def joint_mm(pose: HandPose) -> Float:
     return 1e3 * np.linalg.norm(pose.position_m - hand_at(pose.t_ns * 1e-9).position_m, axis=1)
 
 
-# SHORTFALL: joints of exact hands whose 95 % regions are larger than the 20 mm of `tracked_m`, though they are
-# 1 to 2 mm off, 4 at most: the thumb's metacarpal (22 mm) and proximal joint (21), the little finger's proximal
-# one (20).
-SURE = np.setdiff1d(np.arange(26), [CHAINS[0, 0], CHAINS[0, 1], CHAINS[4, 0], CHAINS[4, 1]])
-
-
-@pytest.mark.xfail(strict=False, reason="claims are wider than the errors: 22, 21 and 20 mm of 4 at most")
-def test_every_joint_of_a_hand_that_is_seen_exactly_is_tracked(exact_run: SyntheticRun) -> None:
-    poses = solve_all(build_pipeline(exact_run.setup, StageTimes()), exact_run.messages)
-    assert all(pose.tracked.all() for pose in poses[3:])
-
-
-# SHORTFALL: the region of the proximal joint is 22 mm, its error 1.4 mm.
-@pytest.mark.xfail(strict=False, reason="the proximal joint of a finger on one ray is not tracked")
-def test_every_joint_of_a_finger_on_the_ray_of_one_camera_is_tracked(exact_run: SyntheticRun) -> None:
-    nowhere = np.array([np.nan, np.nan])
-    half = [changed(m, 1, nowhere) if m.camera == "right" and m.seq >= 15 else m for m in exact_run.messages]
-    poses = solve_all(build_pipeline(exact_run.setup, StageTimes()), half)
-    assert all(pose.tracked[CHAINS[1]].all() for pose in poses[18:])
+# All but the thumb's metacarpal: where it is turned habits alone tell, to 23 mm.
+SURE = np.delete(np.arange(26), CHAINS[0, 0])
 
 
 def changed(message: MarkerDetections, marker: int, uv: Float) -> MarkerDetections:
@@ -145,7 +128,7 @@ def test_a_thing_that_one_slave_takes_for_a_marker_is_told_by_the_other_camera(
     poses = solve_all(pipeline, mistaken(exact_run, THING, ("right",), doubt=True))
     for pose, true in zip(poses, clear, strict=True):
         np.testing.assert_allclose(pose.markers_raw_m, true.markers_raw_m, atol=2e-3)
-        assert pose.tracked[SURE].all() or pose is poses[0]
+    assert all(pose.tracked[SURE].all() for pose in poses[3:])
     assert pipeline.counts["rival.index"] >= 18
     assert pipeline.counts["epipolar_misfits"] == pipeline.counts["unclear.index"] == 0
     sure = build_pipeline(exact_run.setup, StageTimes())  # without the slave's doubt nothing can be chosen
@@ -225,7 +208,8 @@ def test_a_marker_one_camera_loses_is_kept_on_the_ray_of_the_other(exact_run: Sy
     seen, unseen = (solve_all(build_pipeline(exact_run.setup, StageTimes()), m) for m in (half, none))
     assert np.isnan(seen[30].markers_raw_m[1]).all()
     index = CHAINS[1]
-    assert all(p.tracked[np.delete(index, 1)].all() for p in seen[18:])
+    region_m = np.sqrt([7.815 * np.linalg.eigvalsh(p.cov_m2[index])[:, -1] for p in seen[18:]])
+    assert (np.delete(region_m, 1, axis=1) < DEFAULT.tracked_m).all()
     assert not any(p.tracked[index].any() for p in unseen[18:])
     assert np.mean([joint_mm(p)[index[3]] for p in seen[18:]]) < 8.0
     # Sideways, where one camera measures, it is as good as two.
