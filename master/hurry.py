@@ -112,8 +112,3 @@ class Shedding:
         """Whether the next instant is left out."""
         self._in_a_row = self._in_a_row + 1 if self._in_a_row < self._hurry.leave_out else 0
         return self._in_a_row > 0
-
-
-def never() -> bool:
-    """Nothing is left out: what is solved offline has time."""
-    return False

@@ -27,7 +27,6 @@ from master.fabrik.solver import FabrikSolver
 from master.fabrik.sync import FrameSync
 from master.fabrik.triangulate import DepthTriangulator, Triangulate, disparity_tables
 from master.fusion.pipeline import FusedPipeline, WristSide
-from master.hurry import never
 from master.rig_setup import RigSetup
 from master.wrist.pipeline import WristPipeline
 
@@ -155,7 +154,7 @@ def build_pipeline(
     continuous: bool = True,
     others: OtherSensors | None = None,
     counts: Counter[str] | None = None,
-    shed: Callable[[], bool] = never,
+    shed: Callable[[], bool] | None = None,
 ) -> MarkerPipeline:
     """The pipeline this marker rig's file describes; of a wrist device beside it nothing is used but through `others`.
 
@@ -165,7 +164,7 @@ def build_pipeline(
         continuous: False: every frame is an unrelated pose; no filter, no memory.
         others: What else watches the hand; None: nothing does.
         counts: Counted into; None: counts of its own.
-        shed: Asked for each instant whether it is left out.
+        shed: Asked for each instant whether it is left out; None: none is.
 
     Raises:
         CalibrationError: The depth model or the solver does not fit the rig, or it is no marker rig.
@@ -205,7 +204,7 @@ def pipeline_of(
     stage: Stage,
     *,
     continuous: bool = True,
-    shed: Callable[[], bool] = never,
+    shed: Callable[[], bool] | None = None,
 ) -> Pipeline:
     """The pipeline of a rig of either kind, or of both; arguments and errors as of `build_pipeline`.
 

@@ -1,14 +1,13 @@
 """Where the time goes: mean duration of each named stage, measured from outside the pure code."""
 
+import time
 from collections.abc import Callable
-
-from common.clock import now_ns
 
 
 class StageTimes:
     """Sums durations by stage name."""
 
-    def __init__(self, now_ns: Callable[[], int] = now_ns) -> None:
+    def __init__(self, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
         """Measure with `now_ns`: time that passes, or `time.thread_time_ns`, what the processor spends."""
         self._now_ns = now_ns
         self._stages: dict[str, StageTime] = {}

@@ -23,7 +23,6 @@ from common.errors import CalibrationError, PhalanxError
 from common.messages import Detections, Name
 from common.watching import WatchedFiles
 from master.estimator.pipeline import SolvedPose, Stage
-from master.hurry import never
 from master.needs_restart import refuse_other_hands, refuse_restart
 from master.rig import RigFiles
 from master.rig_pipeline import Pipeline, pipeline_of
@@ -68,7 +67,7 @@ class LivePipeline:
     Holds it, its setup, what it was told last, and the one that is to take over with the next message.
     """
 
-    def __init__(self, setup: RigSetup, stage: Stage, shed: Callable[[], bool] = never) -> None:
+    def __init__(self, setup: RigSetup, stage: Stage, shed: Callable[[], bool] | None = None) -> None:
         """Begin with the pipeline of `setup`; `stage` measures the stages of whichever is in use, `shed` is asked for
         each of its instants whether it is left out.
 
@@ -135,7 +134,8 @@ class LivePipeline:
         """
         stage = _WhenOpen(self._stage)
         # What it is shown to warm up has been solved by the other already: nothing of it is left out.
-        new = pipeline_of(setup, stage, shed=lambda: stage.open and self._shed())
+        shed = self._shed
+        new = pipeline_of(setup, stage, shed=None if shed is None else lambda: stage.open and shed())
 
         def take() -> None:
             shown = self._warm(new)

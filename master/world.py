@@ -133,7 +133,11 @@ class World:
         self._stage, self._say_gestures = stage, gestures
         self._hands = tuple(zip(setups, lines, strict=True))
         self._watching = {
-            name: [hand for hand in self._hands if name in hand[0].cameras]
+            name: [
+                (setup.own if name in setup.rows else None, line)
+                for setup, line in self._hands
+                if name in setup.cameras
+            ]
             for setup in setups
             for name in setup.camera_names
         }
@@ -177,12 +181,14 @@ class World:
             return
         poses: list[SolvedPose] = []
         if isinstance(message, _FRAMES):
-            for setup, line in self._watching.get(message.camera, ()):
-                poses += line.push(setup.own(message))
+            for own, line in self._watching.get(message.camera, ()):
+                poses += line.push(message if own is None else own(message))
             yield from poses
-        yield from self._seen(message)
-        for one in poses:
-            yield from self._done(one.pose)
+        if self._now.objects:
+            yield from self._seen(message)
+        if self._now.contacts or self._now.gestures:
+            for one in poses:
+                yield from self._done(one.pose)
 
     def flush(self) -> Iterator[Solved]:
         """At the end of a recording: what still waits for something."""

@@ -37,11 +37,6 @@ class Epoch:
     start: SolvedHand | None = None
     second_order: bool = True
 
-    @property
-    def sure(self) -> bool:
-        """Whether other sensors say about every axis how the palm lies."""
-        return self.sensed is not None and self.sensed.sure
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sensed:

@@ -113,7 +113,7 @@ class Estimator:
         )
         self._observe_points = bound(observe_points, room[2], own[self._on_hand], 0.0, observed)
         self._count_rows = bound(count_rows, mounts, observed, self._boxed_ground)
-        work = boxed(self._scratch)
+        self._work = work = boxed(self._scratch)
         self._pose = bound(pose, self._model.hand, mounts, _AT_ORIGIN, np.zeros(20), work, *room)
         state, space = self._boxed_state, self._boxed_space
         self._predict = bound(predict_epoch, self._model, state, self._observed, space)
@@ -130,15 +130,17 @@ class Estimator:
     def recent(self, t_ns: int) -> bool:
         """Whether the state still says anything at `t_ns`."""
         age_s = (t_ns - int(self._now.t_ns[0])) * 1e-9
-        return self._continuous and self.known and 0.0 < age_s <= self.settings.forget_s
+        return self._continuous and bool(self._now.known[0]) and 0.0 < age_s <= self.settings.forget_s
 
     def pose(self, T: Float, angles_rad: Float) -> tuple[HandJoints, Float]:
-        """Joints and markers (M, 3) [m], rig frame, of a palm (4, 4) and angles (5, 4) [rad]."""
+        """Joints and markers (M, 3) [m], rig frame, of a palm (4, 4) and angles (5, 4) [rad].
+
+        The angles are cut at their limits, in place.
+        """
         position, rotation = np.empty((26, 3)), np.empty((26, 3, 3))
         places = np.empty((len(self._on_hand), 3))
-        hand, mounts, work = self._model.hand, self._model.mounts, boxed(self._scratch)
-        angles = np.ascontiguousarray(angles_rad).reshape(20)
-        self._pose(hand, mounts, np.ascontiguousarray(T), angles, work, position, rotation, places)
+        hand, mounts, angles = self._model.hand, self._model.mounts, angles_rad.reshape(20)
+        self._pose(hand, mounts, np.ascontiguousarray(T), angles, self._work, position, rotation, places)
         return HandJoints(position, rotation, T), places
 
     def push(self, at: Epoch) -> Fitted:
@@ -148,7 +150,8 @@ class Estimator:
         if sensed is not None:
             ground.shown[:] |= sensed.told
             ground.numbers[0] += 3.0 * int(sensed.told.sum())
-        palm_shown = bool(ground.by_markers[0]) or (at.sure and ground.seen[0] > 0)
+        sure = sensed is not None and sensed.sure
+        palm_shown = bool(ground.by_markers[0]) or (sure and ground.seen[0] > 0)
         task.t_ns[0], task.palm_shown[0], task.second_order[0] = at.t_ns, palm_shown, at.second_order
         known = self.recent(at.t_ns)
         self._believe(at, known=known)
@@ -175,17 +178,16 @@ class Estimator:
         if known:
             wrong, explained = self._go_on(at, may_leave=True)
             # Where nothing is better, what goes on is kept.
-            if explained or wrong <= self.settings.misled + self._begin(at):
-                if not explained:
-                    self._go_on(at, may_leave=False)
-                self._write(out, goes_on=True)
-                return True, False
+            goes_on = explained or wrong <= self.settings.misled + self._begin(at)
+            if goes_on and not explained:
+                self._go_on(at, may_leave=False)
         elif self._enough(at):
+            goes_on = False
             self._begin(at)
         else:
             return False, False
-        self._write(out, goes_on=False)
-        return True, known and not self._only_natural
+        self._take_over(self._model, self._boxed_state, goes_on, self._observed, self._boxed_space, out)
+        return True, known and not goes_on and not self._only_natural
 
     def _go_on(self, at: Epoch, *, may_leave: bool) -> tuple[float, bool]:
         """Fit from the state; return chi square of the markers, and whether no hand that may take its place is better.
@@ -198,11 +200,12 @@ class Estimator:
             task.turned[:] = sensed.rotation @ self._turn.T
         task.may_leave[0] = may_leave and start is not None and self._enough(at)
         if start is not None:
-            task.palm[:], task.x[:] = start.T_rig_palm, self.parameters.of_angles(start.angles_rad)
+            task.palm[:], task.angles[:] = start.T_rig_palm, start.angles_rad.reshape(20)
         limit = self._predict(self._model, self._boxed_state, self._observed, self._boxed_space)
         if limit < 0.0:
             return np.inf, False
-        wrong = self._search(self._with_laser(self._habits_of(_NONE), sensed))
+        habits = self._habits[_NONE]
+        wrong = self._search(habits if sensed is None else self._with_laser(habits, sensed))
         if self._only_natural and may_leave:
             return wrong, not (self._unexplained() and self._enough(at))
         return wrong, not wrong > limit  # NaN: there is nothing to compare
@@ -216,10 +219,6 @@ class Estimator:
         """Fit what is measured; return chi square of the markers, or the cost of a rough search."""
         self._at.task.rough[0] = rough
         return self._fit(self._model, habits, self._observed, self._blank, self._boxed_space)
-
-    def _write(self, out: Estimate, *, goes_on: bool) -> None:
-        """Take over what was found, into the state and `out`."""
-        self._take_over(self._model, self._boxed_state, goes_on, self._observed, self._boxed_space, out)
 
     def _observe(self, at: Epoch) -> None:
         """Write the rows of an epoch, and count them."""
@@ -256,7 +255,8 @@ class Estimator:
         fingers = np.isin(np.arange(5), list(apart))
         belief.own_w2[:], belief.own[:] = curled(self.parameters, self.settings, fingers)
         task.natural[0], task.counts[0] = _EVEN, 0.0
-        habits = self._with_laser(self._habits_of(apart), at.sensed)
+        habits = self._habits_of(apart)
+        habits = habits if at.sensed is None else self._with_laser(habits, at.sensed)
         try:
             if start is not None:
                 shows = self._at.ground.shown[self._finger_of_free] > 0
@@ -332,13 +332,16 @@ class Estimator:
         orientation that is known any one marker is enough.
         """
         points = epoch.points_m[self._on_hand][self._placed(epoch)]
-        if epoch.sure:
+        if epoch.sensed is not None and epoch.sensed.sure:
             return len(points) > 0
         if len(points) < 2:
             return False
         off = points - points.mean(axis=0)
-        if len(points) > 2 and _surely_spread(off):
-            return True
+        if len(points) > 2:  # plainly not in one line, without what a decomposition takes
+            length2 = np.vecdot(off, off)
+            along, longest2 = off @ off[length2.argmax()], float(length2.max())
+            if longest2 > 0.0 and float((length2 - along * along / longest2).max()) > (4.0 * _SPREAD_M) ** 2:
+                return True
         _, extent, axes = np.linalg.svd(off)
         if len(points) > 2 and extent[1] > _SPREAD_M:
             return True
@@ -363,9 +366,9 @@ class Estimator:
             self._habits[unlike] = habits.natural() if self._only_natural else habits
         return self._habits[unlike]
 
-    def _with_laser(self, habits: Habits, sensed: Sensed | None) -> Habits:
+    def _with_laser(self, habits: Habits, sensed: Sensed) -> Habits:
         """Habits where a laser point alone tells some PIPs: a natural hand has no belief about these by themselves."""
-        if sensed is None or not len(sensed.lit) or self.model.mcp_per_pip is None:
+        if not len(sensed.lit) or self.model.mcp_per_pip is None:
             return habits
         return habits.without(sensed.lit, self.settings.pip_mean_rad, self.settings.pip_rad)
 
@@ -416,14 +419,6 @@ class Estimator:
             anew,
             sensed,
         )
-
-
-def _surely_spread(off: Float) -> bool:
-    """Whether points (N, 3) [m] about their mean are plainly not in one line: without what a decomposition takes."""
-    length2 = np.vecdot(off, off)
-    along = off @ off[length2.argmax()]
-    longest2 = float(length2.max())
-    return longest2 > 0.0 and float((length2 - along * along / longest2).max()) > (4.0 * _SPREAD_M) ** 2
 
 
 def _unknown(rests: Int) -> Fitted:

@@ -318,6 +318,31 @@ def turn_between(A: Float, B: Float, c: Float, out: Float) -> None:
 
 
 @kernel
+def quaternions(rotation: Float, out: Float) -> None:
+    """Write unit quaternions (N, 4) wxyz with w >= 0 of rotation matrices (N, 3, 3).
+
+    By the largest of the four classic forms (Shepperd, 1978), as `common.geometry.matrix_to_quaternion`.
+    """
+    for n in range(rotation.shape[0]):
+        R, q = rotation[n], out[n]
+        trace = R[0, 0] + R[1, 1] + R[2, 2]
+        i = 0
+        for k in range(1, 3):
+            if R[k, k] > R[i, i]:
+                i = k
+        j, k = (i + 1) % 3, (i + 2) % 3
+        if trace >= R[i, i]:
+            q[0], q[1], q[2], q[3] = 1.0 + trace, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+        else:
+            q[0], q[1 + i] = R[k, j] - R[j, k], 1.0 + R[i, i] - R[j, j] - R[k, k]
+            q[1 + j], q[1 + k] = R[i, j] + R[j, i], R[i, k] + R[k, i]
+        length = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+        length = -length if q[0] < 0.0 else length
+        for c in range(4):
+            q[c] /= length
+
+
+@kernel
 def pose(
     boxed_hand: Any,
     mounts: Mounts,
@@ -332,12 +357,14 @@ def pose(
 
     Args:
         boxed_hand, mounts: The hand (`common.kernels.boxed`) and its markers.
-        T, angles: Its pose.
+        T: Its palm.
+        angles: Cut at their limits, in place.
         boxed_work: Scratch.
         position, rotation, out: Written: (26, 3) [m], (26, 3, 3), markers (M, 3) [m].
     """
     hand, work = boxed_hand[0], boxed_work[0]
     copy(T, work.palm)
+    clamp(hand, angles)
     for a in range(20):
         work.angles[a] = angles[a]
     chains(hand, work.palm, work.angles, work.R, work.P)

@@ -17,12 +17,14 @@ from common.arrays import Bool, Float, Int
 from common.calibration import ImuCalibration, Volume
 from common.camera_model import CameraModel
 from common.hand_model import HandModel
+from common.kernels import bound
 from common.messages import HandPose, MarkerDetections, restamped
 from master.estimator.cameras import CameraArrays
 from master.estimator.epoch import Epoch, Fitted, Sensed
 from master.estimator.estimator import Estimator
 from master.estimator.gate import Prior, among, associate
 from master.estimator.hand_tables import Mounts
+from master.estimator.kinematics import quaternions
 from master.estimator.pose import pose_of
 from master.estimator.smooth import HandOneEuro
 from master.fabrik.blob_bias import LensShift
@@ -79,7 +81,7 @@ class MarkerPipeline:
         others: OtherSensors | None = None,
         counts: Counter[str] | None = None,
         stage: Stage = lambda name: nullcontext(),
-        shed: Callable[[], bool] = lambda: False,
+        shed: Callable[[], bool] | None = None,
     ) -> None:
         """Join the parts.
 
@@ -98,13 +100,14 @@ class MarkerPipeline:
             others: What else watches the hand; None: nothing does.
             counts: Counted into; None: counts of its own.
             stage: Opens a timer by stage name.
-            shed: Asked for each epoch whether it is left out, for newer ones wait (`master.hurry`).
+            shed: Asked for each epoch whether it is left out, for newer ones wait (`master.hurry`); None: none is.
         """
         self.model, self.markers = model, markers
         self.counts: Counter[str] = Counter() if counts is None else counts
         self._names, self._cameras = tuple(cameras), CameraArrays.of(tuple(cameras.values()))
         self._line, self._rays, self._rays_px = line, rays, rays_px
         self._estimator, self._smooth = estimator, smooth
+        bound(quaternions, np.empty((26, 3, 3)), np.empty((26, 4)))  # compiles it here, so that no pose waits
         self._lens_shift = LensShift(tuple(cameras.values()))
         self._on_hand, self._hand_markers = line.on_hand, tuple(markers[int(m)] for m in line.on_hand)
         joints = [model.mount(name).joint for name in self._hand_markers]
@@ -157,7 +160,7 @@ class MarkerPipeline:
                 self.counts["instants_late"] += 1
                 continue
             self._last_ns = frames.t_ns
-            if self._shed():
+            if self._shed is not None and self._shed():
                 self.counts["instants_shed"] += 1
                 continue
             poses.append(self._solve(frames))
@@ -178,7 +181,8 @@ class MarkerPipeline:
         if self._estimator is not None:
             found = self._placed(frames, line, last, age_s)
             hand = self._fitted(self._estimator, frames, line, found)
-        self._count_outliers(found, frames)
+        if found.apart.any() or found.left_out.any():
+            self._count_outliers(found, frames)
         pose = pose_of(hand, self.model, t_ns, line.smooth_m, line.markers, self._volume)
         if self._line.continuous:
             placed = np.isfinite(line.markers.points_m[:, 0])
@@ -209,6 +213,7 @@ class MarkerPipeline:
     ) -> Fitted:
         """The hand that explains the pixels of one epoch best."""
         with self._stage("hand"):
+            alone = self._orientation is None and self._others is None
             uv, variance = frames.uv, frames.sigma_px**2 + self._rays_px**2
             own = np.zeros((len(self.markers), 3, 3))
             if isinstance(found, RayPositions):
@@ -221,7 +226,7 @@ class MarkerPipeline:
                     uv=uv,
                     variance_px2=variance,
                     own_m2=own,
-                    sensed=self._sensed(estimator, frames.t_ns, line, found),
+                    sensed=None if alone else self._sensed(estimator, frames.t_ns, line, found),
                     start=line.solution if line.solved else None,
                 )
             )
@@ -293,8 +298,6 @@ class MarkerPipeline:
         if found.apart.any():
             self._count("apart", found.apart)
             self.counts["epipolar_misfits"] += int(found.apart.sum())
-        if not found.left_out.any():
-            return
         sees = np.isfinite(frames.uv[..., 0]) & np.isfinite(found.points_m[:, 0])
         mostly = found.left_out.sum(axis=1) > 0.5 * sees.sum(axis=1)
         for c in np.flatnonzero(found.left_out.any(axis=1)):

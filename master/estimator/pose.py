@@ -4,10 +4,10 @@ import numpy as np
 
 from common.arrays import Float
 from common.calibration import Volume
-from common.geometry import matrix_to_quaternion
 from common.hand_model import HandModel
 from common.messages import HandPose
 from master.estimator.epoch import Fitted
+from master.estimator.kinematics import quaternions
 from master.fabrik.estimate import HandEstimate, MarkerPositions
 from master.volume import inside
 
@@ -37,7 +37,8 @@ def pose_of(
         angles = np.full((5, 4), np.nan)
     else:
         position, cov, angles = solution.joints.position_m, solution.cov_m2, solution.angles_rad
-        orientation = matrix_to_quaternion(solution.joints.rotation)
+        orientation = np.empty((26, 4))
+        quaternions(solution.joints.rotation, orientation)
     return HandPose.known_good(
         model.profile.name,
         t_ns,

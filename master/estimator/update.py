@@ -15,7 +15,7 @@ from master.estimator.certainty import Certainty, is_small, linear, only_limits,
 from master.estimator.ground import Ground
 from master.estimator.hand_tables import Mounts
 from master.estimator.hypotheses import Blank, Posterior, Room, likelier
-from master.estimator.kinematics import angles_of, chains, clamp, joints, marker_point
+from master.estimator.kinematics import angles_of, chains, clamp, free_of, joints, marker_point
 from master.estimator.matrices import copy, inverse_3
 from master.estimator.posterior import posterior
 from master.estimator.priors import Habits
@@ -73,7 +73,8 @@ class Task:
         t_ns: (1,) the epoch.
         palm_shown: (1,) whether something tells where the palm is.
         turned: (3, 3) by how much sensors say that the palm has turned since.
-        palm, x: (4, 4), (n,) another hand of the epoch, inside the limits; or where a search begins.
+        palm, angles: (4, 4), (20,) another hand of the epoch [rad].
+        x: (n,) its free angles, inside the limits; or, with the palm, where a search begins.
         may_leave: (1,) whether there is another, and it may take the place of the state.
         rough: (1,) whether a search is to end early, in place, under the widest hypothesis alone.
         natural: (1,) probability of a natural hand a moment ago, and `counts` (1,) what that counts, 0 ... 1.
@@ -84,6 +85,7 @@ class Task:
     palm_shown: Bool
     turned: Float
     palm: Float
+    angles: Float
     x: Float
     may_leave: Bool
     rough: Bool
@@ -100,6 +102,7 @@ class Task:
             palm_shown=("u1", 1),
             turned=(3, 3),
             palm=(4, 4),
+            angles=20,
             x=n,
             may_leave=("u1", 1),
             rough=("u1", 1),
@@ -247,6 +250,7 @@ def predict_epoch(model: Model, boxed_state: Any, observed: Observations, boxed_
     t_ns, limit = task.t_ns[0], np.inf
     dt_s = (t_ns - state.t_ns[0]) * 1e-9
     if task.may_leave[0] > 0:
+        free_of(rig.hand, task.angles, task.x)
         limit = chi_square(rig, observed, task.palm, task.x, 0.0, room.search) + settings.misled
         walked_m = settings.palm_walk_m_s * dt_s
         if chi_square(rig, observed, state.palm, state.x, walked_m, room.search) > limit:

@@ -65,6 +65,7 @@ class HandEstimate:
         residual_m: (5,) distance at which FABRIK left the marker on a finger's end from its target; NaN: not seen.
         iterations: (5,) of FABRIK.
         reached: (5,) FABRIK brought the marker onto its target.
+        solved: Whether the hand is solved from this instant, not held from an earlier one.
     """
 
     t_ns: int
@@ -79,6 +80,7 @@ class HandEstimate:
     residual_m: Float
     iterations: Int
     reached: Bool
+    solved: bool = False
 
     @classmethod
     def unseen(cls, t_ns: int, markers: MarkerPositions, smooth_m: Float, facing: Float) -> "HandEstimate":
@@ -97,8 +99,3 @@ class HandEstimate:
             iterations=np.zeros(5, np.int64),
             reached=np.zeros(5, np.bool_),
         )
-
-    @property
-    def solved(self) -> bool:
-        """Whether the hand is solved from this instant, not held from an earlier one."""
-        return self.solution is not None and bool(np.isfinite(self.residual_m).any() or self.tracked.any())

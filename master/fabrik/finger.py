@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import inf, isfinite
+from math import inf, isfinite, nan
 from typing import NamedTuple
 
 import numpy as np
@@ -61,7 +61,6 @@ class FingerResult(NamedTuple):
 
 
 NOT_SEEN = FingerSolution(_NAN, _NAN, _NAN, _NAN, _NAN, False)
-_NOT_SEEN = FingerResult(_NAN, 0, False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,9 +173,10 @@ class Finger:
                 f"tolerance {tolerance_m} m and {max_iterations} iterations: both must be positive"
             )
         solver = FingerSolver.of(model, finger, offset_m)
-        chain, goal, tolerance_m = solver.chain.arrays, (0.0, 0.0, 0.0), float(tolerance_m)
+        chain, root, tolerance_m = solver.chain.arrays, solver.root, float(tolerance_m)
+        target, angles = np.zeros(3), np.zeros(4)
         bring = bound(
-            bring_onto, chain, solver.edges, solver.ratio, goal, tolerance_m, max_iterations, np.zeros(4)
+            bring_onto, chain, solver.edges, solver.ratio, root, target, tolerance_m, max_iterations, angles
         )
         return cls(solver, tolerance_m, max_iterations, bring)
 
@@ -191,14 +191,16 @@ class Finger:
             angles_rad: (4,) in place, contiguous; in: the angles of a moment ago, NaN: not known; out: the best legal
                 angles found, or as given where the target is not finite.
         """
-        solver = self.closed_form
-        x, y, z = target_m.tolist()
-        goal = minus((x, y, z), solver.root)
-        if not isfinite(length(goal)):
-            return _NOT_SEEN
-        arrays, tolerance_m = solver.chain.arrays, self.tolerance_m
+        solver, tolerance_m, most = self.closed_form, self.tolerance_m, self.max_iterations
         residual, iterations = self.bring(
-            arrays, solver.edges, solver.ratio, goal, tolerance_m, self.max_iterations, angles_rad
+            solver.chain.arrays,
+            solver.edges,
+            solver.ratio,
+            solver.root,
+            target_m,
+            tolerance_m,
+            most,
+            angles_rad,
         )
         return FingerResult(residual, iterations, residual <= tolerance_m)
 
@@ -226,12 +228,16 @@ def bring_onto(
     chain: ChainArrays,
     edges: Float,
     ratio: float,
-    goal: Vector,
+    root: Vector,
+    target: Float,
     tolerance_m: float,
     max_iterations: int,
     angles: Float,
 ) -> tuple[float, int]:
-    """As `Finger.solve`: return the distance that is left [m], and the iterations."""
+    """As `Finger.solve`: return the distance that is left [m], NaN where nothing is seen, and the iterations."""
+    goal = minus((target[0], target[1], target[2]), root)
+    if not isfinite(length(goal)):
+        return nan, 0
     near, before = angles.copy(), 0
     if chain.follower < 0 and isfinite(near.sum()):
         residual, before = solve_chain(chain, goal, tolerance_m, max_iterations, _NO_RESTARTS, angles)

@@ -44,7 +44,7 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.calibration import FilterCalibration
-from common.kernels import kernel
+from common.kernels import bound, kernel
 
 # Part of the variance of a marker's noise that is new in each frame: about 0.1 on rendered hands, here with room. The
 # rest is light and shape, which stay.
@@ -113,7 +113,20 @@ class OneEuro:
         self._seen_ns: Int = np.empty(0, np.int64)
         self._group: Int = np.empty(0, np.int64)
         self._fastest = np.empty((0, 2))
-        self._step(0, self._x, self._x)  # compiles it here, so that no sample waits for that
+        none = self._x
+        self._step = bound(  # compiles it here, so that no sample waits for that
+            filter_step,
+            0,
+            none,
+            none,
+            self._settings,
+            self._group,
+            self._fastest,
+            none,
+            none,
+            self._seen_ns,
+            none,
+        )
 
     def push(self, t_ns: int, values: Float, variance: Float | None = None) -> Float:
         """Filter one sample of every signal.
@@ -134,27 +147,25 @@ class OneEuro:
         elif t_ns <= self._t_ns:
             self.late += 1
             return self._last.reshape(self._shape).copy()
-        noise = self._unknown if variance is None else _flat(variance)
+        # Writable copies (n,) are the one type that the kernel is bound to.
+        signals = np.array(values, np.float64, order="C").reshape(-1)
+        noise = self._unknown if variance is None else np.array(variance, np.float64, order="C").reshape(-1)
         if len(noise) != len(self._x):
             raise ValueError(f"1 € filter: {len(noise)} variances for {len(self._x)} signals")
-        self._t_ns, self._last = t_ns, self._step(t_ns, _flat(values), noise)
-        return self._last.reshape(self._shape).copy()
-
-    def _step(self, t_ns: int, values: Float, variance: Float) -> Float:
-        out = np.empty(len(values))
-        filter_step(
+        self._t_ns, self._last = t_ns, np.empty(len(signals))
+        self._step(
             t_ns,
-            values,
-            variance,
+            signals,
+            noise,
             self._settings,
             self._group,
             self._fastest,
             self._x,
             self._speed,
             self._seen_ns,
-            out,
+            self._last,
         )
-        return out
+        return self._last.reshape(self._shape).copy()
 
     def _first(self, values: Float) -> None:
         if self._t_ns is not None:
@@ -195,11 +206,6 @@ class PointFilter:
         """
         variance = np.vecdot(self._R @ cov, self._R)  # of each coordinate: the diagonal of R cov R'
         return self._filter.push(t_ns, points @ self._R.T, FRESH * variance) @ self._R
-
-
-def _flat(values: Float) -> Float:
-    """A writable copy (n,), the one type that the kernel is compiled for."""
-    return np.array(values, np.float64, order="C").reshape(-1)
 
 
 @kernel

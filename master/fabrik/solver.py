@@ -69,6 +69,7 @@ class FabrikSolver:
         """
         self._model, self.sync, self.triangulate = model, sync, triangulate
         self._one_euro, self._palm, self._once, self._stage = one_euro, palm, once, stage
+        self.continuous = one_euro is not None  # instants follow each other; else nothing is remembered
         self.on_hand = np.array([markers.index(name) for name in hand_markers], np.int64)
         self._centres = np.array([camera.centre for camera in cameras.values()])
         self._focal_px = np.array([camera.matrix[0, 0] for camera in cameras.values()])
@@ -84,11 +85,6 @@ class FabrikSolver:
         }
         self._last: SolvedHand | None = None
         self._last_ns = -(2**62)
-
-    @property
-    def continuous(self) -> bool:
-        """Whether instants follow each other; else nothing is remembered."""
-        return self._one_euro is not None
 
     def push(self, message: MarkerDetections) -> list[HandEstimate]:
         """Take one camera's centroids; return the hands they complete, oldest first."""
@@ -147,8 +143,7 @@ class FabrikSolver:
     def rehearse(self) -> None:
         """Call every kernel once, so that none is compiled while a hand is tracked."""
         self.sync.at(0)
-        angles = self._model.clamp(np.full((5, 4), 0.2))
-        _, places = self._palm.pose(_AWAY, angles)
+        _, places = self._palm.pose(_AWAY, np.full((5, 4), 0.2))
         points, cov = np.full((self._count, 3), np.nan), np.full((self._count, 3, 3), np.nan)
         points[self.on_hand], cov[self.on_hand] = places, 1e-6 * np.eye(3)
         seen = np.ones((len(self._centres), self._count))
@@ -188,14 +183,14 @@ class FabrikSolver:
         for m, (f, finger) in self._fingers.items():
             if isfinite(targets[m, 0]):
                 out.residual_m[f], out.iterations[f], out.reached[f] = finger.solve(targets[m], angles[f])
-        angles = self._model.clamp(angles)
         joints, _ = self._palm.pose(T, angles)
         off = joints.position_m - fit.joints.position_m
         joint_cov = fit.cov_m2 + off[:, :, None] * off[:, None, :]
         hand = SolvedHand(T, angles, joints, joint_cov, fit.tilt_cov_rad2, fit.tilt_walk_rad2_s2)
         self._judge(out, palm, fit.surprise, placed)
         self._last, self._last_ns = hand, out.t_ns
-        return replace(out, solution=hand)
+        solved = bool(np.isfinite(out.residual_m).any() or out.tracked.any())
+        return replace(out, solution=hand, solved=solved)
 
     def _judge(self, out: HandEstimate, palm: Fitted, surprise: Float, placed: Bool) -> None:
         """Write the bits of a solved hand; `placed`: (H,) which markers are.
