@@ -11,8 +11,7 @@ have the variance (the structure function of a Gaussian correlation)
 
 and the steps of two of the four fingers that are k apart correlate by ALIKE^k. So what the seen ones did since gives
 the conditional mean and variance of the hidden ones. A hand that defied habits when the marker went moves its fingers
-one by one, and so does every hand its thumb. How sure that is depends on how the finger moved as well: the one that was
-on the move may have stopped at once, which adds the square of how far it would go on.
+one by one, and so does every hand its thumb.
 """
 
 from math import exp, sqrt
@@ -104,14 +103,12 @@ class Hidden:
         angles: (20,) [rad]; those of fingers that are seen mean nothing.
         sigma: (5,) [rad] standard deviation of that.
         gone_s: (5,) time since they were seen last; 0: seen now.
-        rate: (5,) [rad/s] of the fastest angle then.
         own: (5,) share of the variance of a step that the fingers that are seen do not tell.
     """
 
     angles: Float
     sigma: Float
     gone_s: Float
-    rate: Float
     own: Float
     x: Float  # (n,) room
     K: Float  # (4, 4) room
@@ -122,28 +119,13 @@ class Hidden:
     @classmethod
     def none(cls, n: int) -> "Hidden":
         """Room for one hand."""
-        return record(
-            cls, angles=20, sigma=5, gone_s=5, rate=5, own=5, x=n, K=(4, 4), L=(4, 4), weight=4, ahead=20
-        )
-
-
-@inlined
-def coasted(settings: Settings, gone_s: float) -> float:
-    """For how long [s] a finger goes on at its last rate within a time after it was last seen."""
-    return settings.coast_s * (1.0 - exp(-gone_s / settings.coast_s))
+        return record(cls, angles=20, sigma=5, gone_s=5, own=5, x=n, K=(4, 4), L=(4, 4), weight=4, ahead=20)
 
 
 @inlined
 def strayed(settings: Settings, gone_s: float) -> float:
     """Variance [rad^2] of a finger's angle about where it was heading, a time after it was last seen."""
     return settings.stray_rad**2 * (1.0 - exp(-((gone_s / settings.stray_s) ** 2)))
-
-
-@inlined
-def doubted(settings: Settings, gone_s: float, rate: float) -> float:
-    """The same where it was on the move at that rate: it may as well have stopped at once."""
-    ahead = rate * coasted(settings, gone_s)
-    return strayed(settings, gone_s) + ahead * ahead
 
 
 @inner
@@ -191,13 +173,11 @@ def hide(
             for a in range(20):
                 state.then[f, a], state.then_rates[f, a] = state.angles[a], state.rates[a]
         gone_s = (t_ns - state.hidden_ns[f]) * 1e-9
-        coasted_s = coasted(settings, gone_s)
+        coasted_s = settings.coast_s * (1.0 - exp(-gone_s / settings.coast_s))
         for a in range(20):
             hidden.ahead[a] = state.then[f, a] + state.then_rates[f, a] * coasted_s
-        hidden.rate[f] = 0.0
         for a in range(4 * f, 4 * f + 4):
             hidden.angles[a] = hidden.ahead[a]
-            hidden.rate[f] = max(hidden.rate[f], abs(state.then_rates[f, a]))
         hidden.gone_s[f] = gone_s
         if f > 0:
             _neighbours(settings, state, f, shown, hidden)
@@ -212,19 +192,18 @@ def predict(
     state: HandState,
     t_ns: int,
     shown: Bool,
-    palm_shown: bool,
     hidden: Hidden,
     belief: Belief,
 ) -> None:
     """Write what the state says of an epoch: `Belief.past`, `palm` and their weights.
 
-    What was hidden moved on for as long as nobody saw it, not since the last epoch.
+    A hidden finger moved on for as long as nobody saw it, not since the last epoch, and so did a hand of which nothing
+    was seen. But the palm of one that showed a single marker is held: it was there.
 
     Args:
         hand, settings, state: The hand; `state.hidden_ns` and what goes with it are kept up.
         t_ns: The epoch.
         shown: (5,) fingers that are measured now.
-        palm_shown: Whether markers or sensors tell where the palm is.
         hidden, belief: Written.
     """
     hide(hand, settings, state, t_ns, shown, hidden)
@@ -237,11 +216,10 @@ def predict(
         for c in range(hand.first[f], hand.first[f + 1]):
             belief.past_w2[c] = walked + held
             belief.past[c] = (walked * state.x[c] + held * hidden.x[c]) / (walked + held)
-    age_s = (t_ns - state.told_ns[PALM_PART]) * 1e-9 if palm_shown else dt_s
-    age_s = max(age_s, settings.shortest_s)
+    walked_s = max((t_ns - state.seen_ns[0]) * 1e-9, settings.shortest_s)
     for i in range(3):
-        belief.palm_w2[i] = 1.0 / (settings.palm_walk_rad_s * age_s) ** 2
-        belief.palm_w2[3 + i] = 1.0 / (settings.palm_walk_m_s * age_s) ** 2
+        belief.palm_w2[i] = 1.0 / (settings.palm_walk_rad_s * walked_s) ** 2
+        belief.palm_w2[3 + i] = 1.0 / (settings.palm_walk_m_s * walked_s) ** 2
     copy(state.palm, belief.palm)
 
 
@@ -286,8 +264,7 @@ def grow(
         gone_s = hidden.gone_s[f]
         added = (settings.walk_rad_s * dt_s) ** 2
         if gone_s > 0.0:
-            rate = hidden.rate[f]
-            added = doubted(settings, gone_s, rate) - doubted(settings, max(gone_s - dt_s, 0.0), rate)
+            added = strayed(settings, gone_s) - strayed(settings, max(gone_s - dt_s, 0.0))
             added *= hidden.own[f]
         for c in range(hand.first[f], hand.first[f + 1]):
             state.cov[6 + c, 6 + c] += added

@@ -255,7 +255,7 @@ def predict_epoch(model: Model, boxed_state: Any, observed: Observations, boxed_
         walked_m = settings.palm_walk_m_s * dt_s
         if chi_square(rig, observed, state.palm, state.x, walked_m, room.search) > limit:
             return -1.0
-    predict(rig.hand, settings, state, t_ns, space.ground.shown, task.palm_shown[0] > 0, space.hidden, belief)
+    predict(rig.hand, settings, state, t_ns, space.ground.shown, space.hidden, belief)
     for i in range(3):
         for j in range(3):
             belief.palm[i, j] = 0.0
