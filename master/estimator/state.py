@@ -197,8 +197,8 @@ def predict(
 ) -> None:
     """Write what the state says of an epoch: `Belief.past`, `palm` and their weights.
 
-    A hidden finger moved on for as long as nobody saw it, not since the last epoch, and so did a hand of which nothing
-    was seen. But the palm of one that showed a single marker is held: it was there.
+    A hand moved on since anything of it was seen, a hidden finger since that was. What comes back to a hand that was
+    seen meanwhile is told by its marker, not by a hand that is let go for it.
 
     Args:
         hand, settings, state: The hand; `state.hidden_ns` and what goes with it are kept up.
@@ -207,19 +207,17 @@ def predict(
         hidden, belief: Written.
     """
     hide(hand, settings, state, t_ns, shown, hidden)
-    dt_s = (t_ns - state.t_ns[0]) * 1e-9
     free_of(hand, hidden.angles, hidden.x)
+    age_s = max((t_ns - state.seen_ns[0]) * 1e-9, settings.shortest_s)
+    walked = 1.0 / (settings.walk_rad_s * age_s) ** 2
     for f in range(5):
-        age_s = (t_ns - state.told_ns[f]) * 1e-9 if shown[f] else dt_s
-        walked = 1.0 / (settings.walk_rad_s * max(age_s, settings.shortest_s)) ** 2
         held = 0.0 if shown[f] else 1.0 / hidden.sigma[f] ** 2
         for c in range(hand.first[f], hand.first[f + 1]):
             belief.past_w2[c] = walked + held
             belief.past[c] = (walked * state.x[c] + held * hidden.x[c]) / (walked + held)
-    walked_s = max((t_ns - state.seen_ns[0]) * 1e-9, settings.shortest_s)
     for i in range(3):
-        belief.palm_w2[i] = 1.0 / (settings.palm_walk_rad_s * walked_s) ** 2
-        belief.palm_w2[3 + i] = 1.0 / (settings.palm_walk_m_s * walked_s) ** 2
+        belief.palm_w2[i] = 1.0 / (settings.palm_walk_rad_s * age_s) ** 2
+        belief.palm_w2[3 + i] = 1.0 / (settings.palm_walk_m_s * age_s) ** 2
     copy(state.palm, belief.palm)
 
 
