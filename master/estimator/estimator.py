@@ -130,7 +130,7 @@ class Estimator:
     def recent(self, t_ns: int) -> bool:
         """Whether the state still says anything at `t_ns`."""
         age_s = (t_ns - int(self._now.t_ns[0])) * 1e-9
-        return self._continuous and bool(self._now.known[0]) and 0.0 < age_s <= self.settings.forget_s
+        return self._continuous and self.known and 0.0 < age_s <= self.settings.forget_s
 
     def pose(self, T: Float, angles_rad: Float) -> tuple[HandJoints, Float]:
         """Joints and markers (M, 3) [m], rig frame, of a palm (4, 4) and angles (5, 4) [rad].

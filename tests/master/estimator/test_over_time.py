@@ -341,7 +341,7 @@ def test_tracked_is_what_is_fresh_and_sure(tracked_m: float) -> None:
         fresh = (k * STEP_NS - told_ns[part]) * 1e-9 <= DEFAULT.tracked_age_s
         np.testing.assert_array_equal(hand.tracked, fresh & sure(hand, tracked_m))
         kept += int(hand.tracked.sum())
-    assert 20 < kept < 60 * 26
+    assert 40 < kept < 60 * 26
 
 
 @pytest.mark.parametrize("age_s", [0.0, 0.03, 0.2])
