@@ -86,11 +86,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in wanted:
         print(f"\n{SECTIONS[name]}", flush=True)
         start_s, everything[name] = monotonic(), []
-        for found in cast(Iterable[Row], importlib.import_module(f"bench.{name}").rows()):
+        section = importlib.import_module(f"bench.{name}")
+        for found in cast(Iterable[Row], section.rows()):
             row = Row(*found)
             everything[name].append(row)
             print(f"  {row.name:58s} {_number(row.value):>10s} {row.unit:8s} {row.note}", flush=True)
         print(f"  ({monotonic() - start_s:.0f} s)", flush=True)
+        if figures := cast(dict[str, str], getattr(section, "FIGURES", {})):
+            values = {row.name: row.value for row in everything[name]}
+            print(json.dumps({key: round(values[row], 4) for key, row in figures.items()}), flush=True)
     if options.json is not None:
         tables = {name: [_plain(row) for row in rows] for name, rows in everything.items()}
         options.json.write_text(json.dumps(tables, indent=1, allow_nan=False))

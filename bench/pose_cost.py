@@ -1,8 +1,11 @@
 """What a pose costs the master, stage by stage: processor time of one thread, no socket; or in turns with other code.
 
-    python -m bench.pose_cost                    each rig, stage by stage
+    python -m bench pose_cost                    each rig, stage by stage; its figures as a line of JSON at the end
     python -m bench.pose_cost --functions desk   where in the code, by the profiler (its own cost is in it)
     python -m bench.pose_cost --against DIR      this code and that of another checkout, some poses each in turns
+
+A pose is all that the master does from sealed datagrams to the bytes that it publishes, gestures among it. What senders
+do for it is not counted.
 
 Times of a machine that does other things change from minute to minute. Two processes that take turns every few poses
 meet the same minutes, so the ratio of their times says what the figures themselves do not.
@@ -12,88 +15,209 @@ import argparse
 import cProfile
 import os
 import pstats
+import random
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from bench.fusion_shown import shown
 from bench.row import Row
 from bench.scale_rig import ROOM, in_order, room, told
-from common.messages import ImuSample
+from common.messages import ImuSample, encode
+from master.app import told_at
+from master.link import MasterLink
 from master.rig import load_setups
-from master.rig_pipeline import pipeline_of
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from master.tuning import LivePipeline
 from master.world import World
+from slave.link import SlaveLink
 
 RIGS = {
     "desk": "two cameras at 60 Hz",
     "room": "16 cameras at 90 Hz",
     "fused": "two cameras and a wrist device with its IMU",
+    "wrist": "a wrist device with its IMU, a triple each",
 }
-_POSES, _TURN = 300, 10
+COLD, WARM = "kernels, compiled", "kernels, from the cache"
+FIGURES = {
+    "desk_ms": "desk",
+    "desk_estimator_ms": "desk: hand",
+    "desk_gestures_ms": "desk: gestures",
+    "room_ms": "room",
+    "fused_ms": "fused",
+    "wrist_triple_ms": "wrist",
+    "compile_cold_s": COLD,
+    "start_warm_s": WARM,
+}
+ROOT = Path(__file__).resolve().parents[1]
+_POSES, _TURN = 320, 10  # the first turn warms up
 _SCENE, _SEED = "grasp", 7
+_KEY, _MASTER, _BROADCAST = bytes(range(32)), ("10.0.0.1", 47801), ("10.0.0.255", 47800)
+_BEGIN_NS, _STEP_NS, _AFTER_NS, _START_NS = 10**12, 5_000_000, 2_000_000, 2 * 10**9
+# numba takes part of its time when it is imported, the rest where kernels are first called.
+_START = """
+from time import process_time
+import numpy
+began_s = process_time()
+import numba
+spent_s = process_time() - began_s
+from pathlib import Path
+from master.rig import load_setup
+from master.world import fresh_world
+setup, began_s = load_setup(Path("calib_json"), "desk"), process_time()
+fresh_world([setup])
+print(spent_s + process_time() - began_s)
+"""
 
-Feed = Callable[[Any], Iterable[object]]
+
+class _Clock:
+    """A clock that shows what it is set to."""
+
+    def __init__(self) -> None:
+        self.t_ns = _BEGIN_NS
+
+    def now_ns(self) -> int:
+        return self.t_ns
 
 
-def fed(rig: str, stages: StageTimes) -> tuple[Feed, Sequence[Any]]:
-    """What takes the messages of a rig and gives poses, and the messages of about `_POSES` poses.
+class Played:
+    """The master of a rig and its senders, all in one thread. Holds them, and the time that they believe it is."""
 
-    Gestures are part of a rig of cameras alone; of the fused one the line to the hand is measured.
-    """
-    if rig == "fused":
-        both = shown(_SCENE, _POSES / 60.0, _SEED)
-        setup = both.both.fused
-        line = pipeline_of(setup, stages)
+    def __init__(self, setups: Sequence[RigSetup], stages: StageTimes) -> None:
+        """Join them, and let them find each other.
 
-        def push(message: Any) -> Iterable[object]:
-            if not isinstance(message, ImuSample):
-                return line.push(message)
-            line.push_orientation(message.t_ns, message.orientation_wxyz, message.heading_sigma_rad)
-            return ()
+        Raises:
+            RuntimeError: The start did not come within two simulated seconds.
+        """
+        self._clock, source = _Clock(), random.Random(_SEED).randbytes
+        cameras = tuple(dict.fromkeys(name for setup in setups for name in setup.camera_names))
+        imus = tuple(name for setup in setups for name in setup.imus)
+        wrists = tuple(name for setup in setups for name in setup.wrist_cameras)
+        self.senders = (*cameras, *imus)
+        self._master = MasterLink(cameras, _KEY, self._clock, _BROADCAST, "", 0, source, imus, wrists)
+        self._slaves = {name: SlaveLink(name, _KEY, self._clock, source) for name in self.senders}
+        self._address = {name: (f"10.0.1.{k}", 5) for k, name in enumerate(self._slaves)}
+        self._world = World(setups, [LivePipeline(setup, stages) for setup in setups], stages)
+        while not all(slave.started for slave in self._slaves.values()):
+            if self._clock.t_ns > _BEGIN_NS + _START_NS:
+                raise RuntimeError("the master's start did not come within two simulated seconds")
+            self._clock.t_ns += _STEP_NS
+            self._keep()
+        self._since_ns = self._clock.t_ns
 
-        known = setup.cameras.keys() | setup.imus
-        return push, [m for m in both.messages if getattr(m, "source", getattr(m, "camera", "")) in known]
+    def sent(self, message: Any) -> tuple[bytes, tuple[str, int]]:
+        """What the sender of a message sends of it, and its address; times of messages are since the start.
+
+        Raises:
+            RuntimeError: The session has ended.
+        """
+        name = message.source if isinstance(message, ImuSample) else message.camera
+        slave, times = self._slaves[name], {"t_ns": self._since_ns + message.t_ns}
+        if not isinstance(message, ImuSample):
+            times["ready_t_ns"] = self._since_ns + message.ready_t_ns
+        self._clock.t_ns = max(self._clock.t_ns, max(times.values()) + _AFTER_NS)
+        self._keep()
+        sealed = slave.seal(replace(message, session=slave.process, **times))
+        if sealed is None:
+            raise RuntimeError(f"{name}: the session has ended")
+        return sealed[0], self._address[name]
+
+    def take(self, datagram: bytes, address: tuple[str, int]) -> int:
+        """Let the master take a datagram; return how many poses it published."""
+        message, poses = self._master.receive(datagram, address, self._clock.t_ns), 0
+        if message is None:
+            return 0
+        for solved in self._world.push(message):
+            encode(told_at(solved, self._clock.t_ns))
+            poses += hasattr(solved, "ready_t_ns")
+        return poses
+
+    def _keep(self) -> None:
+        """Carry what the links say to each other by themselves."""
+        t_ns = self._clock.t_ns
+        for datagram, to in self._master.due():
+            for name, slave in self._slaves.items():
+                if to == _BROADCAST:
+                    slave.hear_beacon(datagram, _MASTER, t_ns)
+                elif to == self._address[name]:
+                    slave.receive(datagram, _MASTER, t_ns)
+        for name, slave in self._slaves.items():
+            for datagram, _ in slave.due():
+                self._master.receive(datagram, self._address[name], t_ns)
+
+
+def played(rig: str, stages: StageTimes) -> tuple[Played, Sequence[Any]]:
+    """The master of a rig with its senders, and the messages of about `_POSES` poses."""
+    if rig in ("fused", "wrist"):
+        rate_hz = 60.0 if rig == "fused" else 30.0
+        both = shown(_SCENE, _POSES / rate_hz, _SEED)
+        one = Played([both.both.fused if rig == "fused" else both.both.wrist], stages)
+        first_ns = both.messages[0].t_ns
+        messages = [m for m in both.messages if getattr(m, "source", getattr(m, "camera", "")) in one.senders]
+        return one, [_since(message, first_ns) for message in messages]
     cameras, rate_hz = (16, 90.0) if rig == "room" else (2, 60.0)
     with tempfile.TemporaryDirectory() as name:
         setups = load_setups(room(Path(name), cameras, rate_hz), [ROOM])
-    world = World(setups, [LivePipeline(setup, stages) for setup in setups], stages)
-    return world.push, in_order(told(setups[0], rate_hz))[: cameras * _POSES]
+    return Played(setups, stages), in_order(told(setups[0], rate_hz))[: cameras * _POSES]
 
 
-def turns(push: Feed, messages: Sequence[Any]) -> Iterator[tuple[int, float]]:
-    """Poses of a turn and its processor time [ms], turn by turn."""
-    count, begun_ns = 0, time.thread_time_ns()
+def _since(message: Any, first_ns: int) -> Any:
+    """The message with times since the first one."""
+    if isinstance(message, ImuSample):
+        return replace(message, t_ns=message.t_ns - first_ns)
+    return replace(message, t_ns=message.t_ns - first_ns, ready_t_ns=message.ready_t_ns - first_ns)
+
+
+def turns(one: Played, messages: Sequence[Any]) -> Iterator[tuple[int, float]]:
+    """Poses of a turn and the master's processor time [ms], turn by turn."""
+    count, spent_ns = 0, 0
     for message in messages:
-        count += sum(hasattr(one, "ready_t_ns") for one in push(message))
+        sent = one.sent(message)
+        begun_ns = time.thread_time_ns()
+        count += one.take(*sent)
+        spent_ns += time.thread_time_ns() - begun_ns
         if count >= _TURN:
-            yield count, 1e-6 * (time.thread_time_ns() - begun_ns)
-            count, begun_ns = 0, time.thread_time_ns()
+            yield count, 1e-6 * spent_ns
+            count, spent_ns = 0, 0
 
 
 def rows() -> Iterator[Row]:
-    """Each rig, and its stages."""
+    """Each rig and its stages, then what kernels cost a process that starts."""
     for rig, what in RIGS.items():
         stages = StageTimes(time.thread_time_ns)
-        each = np.array([spent / poses for poses, spent in turns(*fed(rig, stages))][1:])
+        each = np.array([spent / poses for poses, spent in turns(*played(rig, stages))][1:])
         low, middle, high = np.percentile(each, [25, 50, 75])
-        yield Row(f"a pose, {what}", float(middle), "ms", f"middle half of turns {low:.2f} to {high:.2f}")
+        yield Row(rig, float(middle), "ms", f"{what}; middle half of turns {low:.2f} to {high:.2f}")
         for stage, total_us in stages.total_us().items():
-            yield Row(f"  {stage}", total_us / (_TURN * (len(each) + 1)), "us", "")
+            yield Row(f"{rig}: {stage}", 1e-3 * total_us / (_TURN * (len(each) + 1)), "ms", "mean")
+    with tempfile.TemporaryDirectory() as cache:
+        yield Row(COLD, _started_s(cache), "s", "of the processor, goal 30")
+        yield Row(WARM, _started_s(cache), "s", "of the processor, goal 0.8")
+
+
+def _started_s(cache: str) -> float:
+    """Processor time [s] of numba and the kernels of rig desk in a new process.
+
+    `cache`: the folder of machine code, empty or filled by such a process.
+    """
+    environment = os.environ | {"NUMBA_CACHE_DIR": cache}
+    command = [sys.executable, "-c", _START]
+    run = subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True, check=True)
+    return float(run.stdout)
 
 
 def against(checkout: Path) -> None:
     """Print the processor time of a pose of another checkout and of this one, and their ratio, in alternating turns."""
-    here = Path(__file__).resolve()
     for rig, what in RIGS.items():
-        both = [_child(rig, root) for root in (checkout.resolve(), here.parents[1])]
+        both = [_child(rig, root) for root in (checkout.resolve(), ROOT)]
         each: list[tuple[float, float]] = []
         while True:
             order = both if len(each) % 2 else both[::-1]
@@ -145,20 +269,21 @@ def main() -> None:
     if options.against is not None:
         against(options.against)
     elif options.turns is not None:
-        spent = turns(*fed(options.turns, StageTimes()))
+        spent = turns(*played(options.turns, StageTimes()))
         while sys.stdin.readline():
             poses, ms = next(spent, (0, 0.0))
             print(f"{ms / poses:.6f}" if poses else "", flush=True)
             if not poses:
                 break
     elif options.functions is not None:
-        push, messages = fed(options.functions, StageTimes())
+        one, messages = played(options.functions, StageTimes())
         profile = cProfile.Profile(time.thread_time)
-        profile.runcall(lambda: sum(poses for poses, _ in turns(push, messages)))
+        for message in messages:
+            profile.runcall(one.take, *one.sent(message))
         pstats.Stats(profile).sort_stats("tottime").print_stats(50)
     else:
         for row in rows():
-            print(f"{row.name:50s} {row.value:10.2f} {row.unit:4s} {row.note}")
+            print(f"{row.name:50s} {row.value:10.3f} {row.unit:4s} {row.note}")
 
 
 if __name__ == "__main__":
