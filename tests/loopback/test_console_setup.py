@@ -33,7 +33,7 @@ PATIENCE_MS = 120_000.0
 AGAIN_MS = 15_000.0
 VIEWS = 9
 POSES = 20
-MOST_TIPS = 4
+STILL_TIPS = 4  # of five: the PIP of the relaxed little finger is known to 23 mm, and TRACKED asks for 22
 STILL_M = 0.010  # mean of the joints that are valid, of a hand held still
 MOVING_M = 0.040  # of one that moves, with however few frames a busy machine draws
 MODE_PX = (640, 480)
@@ -171,12 +171,8 @@ def by_keyboard(page: Page, picture: Locator, uv: Float) -> None:
     page.keyboard.press("Enter")
 
 
-def poses(bus: str, count: int) -> list[HandPose]:
-    """Collect poses in which every marker is seen and at least four of five tips are TRACKED.
-
-    Seen markers do not make a tip TRACKED: its finger's PIP must be known to 22 mm as well, and that of the relaxed
-    little finger is known to 23.
-    """
+def poses(bus: str, count: int, least: int = 5) -> list[HandPose]:
+    """Collect poses in which every marker is seen and at least so many tips are TRACKED."""
     tips = [place for place, name in enumerate(JOINTS) if name.endswith("-tip")]
     link = ZenohBus(None, bus, beyond=True)
     try:
@@ -187,7 +183,7 @@ def poses(bus: str, count: int) -> list[HandPose]:
             message = feed.get(1.0)
             if not isinstance(message, HandPose) or np.isnan(message.markers_m).any():
                 continue
-            if message.valid[tips].all() and message.tracked[tips].sum() >= MOST_TIPS:
+            if message.valid[tips].all() and message.tracked[tips].sum() >= least:
                 found.append(message)
     finally:
         link.close()
@@ -248,14 +244,14 @@ def test_from_an_empty_folder_to_a_tracked_hand(console: tuple[str, str, Path], 
             pick_all(page, scene, camera)
             shot(page, f"setup_colours_{camera}")
         press(page, "Save colours", page.get_by_text("saved: left, right").first)
-        still, still_epoch_ns = poses(bus, POSES), epoch_ns(tree)
+        still, still_epoch_ns = poses(bus, POSES, STILL_TIPS), epoch_ns(tree)
         press(page, "Next: track", page.get_by_role("heading", name="Track"))
         press(page, "Start tracking", page.get_by_test_id("tracking").filter(has_text="A hand is tracked"))
         moving = poses(bus, POSES)
         page.get_by_text("6 of 6 markers seen").wait_for()
         page.get_by_role("button", name="Step 3: Start cameras, done").wait_for()  # they found its bus
         shot(page, "setup_track", 15.0)
-    assert [len(still), len(moving)] == [POSES, POSES], "no poses with all markers and four TRACKED tips"
+    assert [len(still), len(moving)] == [POSES, POSES], "no poses with tracked tips"
     joints_m, markers_m = error_m(still, scene, still_epoch_ns)
     assert joints_m < STILL_M
     assert markers_m < STILL_M
