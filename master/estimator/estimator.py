@@ -1,4 +1,4 @@
-"""The estimator: a hand at each epoch, predicted from the one before and fitted to what is measured."""
+"""Predict a hand from the epoch before, and fit it to what is measured."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -133,9 +133,9 @@ class Estimator:
         return self._continuous and self.known and 0.0 < age_s <= self.settings.forget_s
 
     def pose(self, T: Float, angles_rad: Float) -> tuple[HandJoints, Float]:
-        """Joints and markers (M, 3) [m], rig frame, of a palm (4, 4) and angles (5, 4) [rad].
+        """Place joints and markers (M, 3) [m], rig frame.
 
-        The angles are cut at their limits, in place.
+        Of a palm (4, 4) and angles (5, 4) [rad]. The angles are cut at their limits, in place.
         """
         position, rotation = np.empty((26, 3)), np.empty((26, 3, 3))
         places = np.empty((len(self._on_hand), 3))
@@ -174,7 +174,11 @@ class Estimator:
         return self._fitted(at, out, rests, anew=anew) if solved else _unknown(rests)
 
     def _solve(self, at: Epoch, out: Estimate, *, known: bool) -> tuple[bool, bool]:
-        """Fit an epoch and take it over; return whether there is a hand, and whether the one before was wrong."""
+        """Fit an epoch and take it over.
+
+        Returns:
+            Whether there is a hand, and whether the one before was wrong.
+        """
         if known:
             wrong, explained = self._go_on(at, may_leave=True)
             # Where nothing is better, what goes on is kept.
@@ -190,9 +194,11 @@ class Estimator:
         return True, known and not goes_on and not self._only_natural
 
     def _go_on(self, at: Epoch, *, may_leave: bool) -> tuple[float, bool]:
-        """Fit from the state; return chi square of the markers, and whether no hand that may take its place is better.
+        """Fit from the state.
 
-        Chi square is infinite where no motion explains the markers, but another hand does.
+        Returns:
+            Chi square of the markers, infinite where no motion explains them but another hand does; and whether no hand
+            that may take its place is better.
         """
         start, sensed, task = at.start, at.sensed, self._at.task
         task.turned[:] = _EYE
@@ -216,7 +222,7 @@ class Estimator:
         return bool((surprise > self.settings.explained).any())
 
     def _search(self, habits: Habits, *, rough: bool = False) -> float:
-        """Fit what is measured; return chi square of the markers, or the cost of a rough search."""
+        """Fit what is measured; return chi square, or the cost of a rough search."""
         self._at.task.rough[0] = rough
         return self._fit(self._model, habits, self._observed, self._blank, self._boxed_space)
 
@@ -236,9 +242,10 @@ class Estimator:
         self._count_rows(self._rig.mounts, self._observed, self._boxed_ground)
 
     def _begin(self, at: Epoch) -> float:
-        """Fit without the state, from the other hand or from several starts; return chi square of the markers.
+        """Fit without the state; return chi square of the markers.
 
-        A finger between two that show is rather bent as they are: no hand curls it alone. But straight it would show.
+        From the other hand, or from several starts. A finger between two that show is rather bent as they are: no hand
+        curls it alone. But straight it would show.
         """
         shown = frozenset(np.flatnonzero(self._at.ground.shown).tolist())
         like = frozenset(f for f in (2, 3) if f not in shown and {f - 1, f + 1} <= shown)
@@ -326,7 +333,7 @@ class Estimator:
             belief.sensed_constant[0] = sensed.constant
 
     def _enough(self, epoch: Epoch) -> bool:
-        """Whether the markers fix a hand: not all in one line, or in a line across `facing`.
+        """Tell whether the markers fix a hand: not in one line, or across `facing`.
 
         What faces the cameras turns the hand about a line of markers, but not about one that points at them. With an
         orientation that is known any one marker is enough.
@@ -350,24 +357,24 @@ class Estimator:
         )
 
     def _placed(self, epoch: Epoch) -> Bool:
-        """The hand's markers (M,) whose places are known: of points those that are measured."""
+        """Tell of which of the hand's markers (M,) the places are known."""
         if epoch.cov_m2 is not None:
             return self._observed.placed
         return np.isfinite(epoch.points_m[self._on_hand].sum(axis=1))
 
     def _knows_place(self) -> bool:
-        """Whether it is still known where the hand is, when nothing but its fingers is told."""
+        """Tell whether the place of a hand is known of which only fingers are told."""
         return self.known and float(np.trace(self._now.cov[3:6, 3:6])) < 3.0 * _SOMEWHERE_M**2
 
     def _habits_of(self, unlike: frozenset[int]) -> Habits:
-        """Habits while some fingers are bent unlike the others; each of the 32 sets is worked out once."""
+        """Habits while some fingers are bent unlike the others, worked out once."""
         if unlike not in self._habits:
             habits = habits_of(self.model, self.parameters, self.settings, unlike)
             self._habits[unlike] = habits.natural() if self._only_natural else habits
         return self._habits[unlike]
 
     def _with_laser(self, habits: Habits, sensed: Sensed) -> Habits:
-        """Habits where a laser point alone tells some PIPs: a natural hand has no belief about these by themselves."""
+        """Habits of a natural hand without those about PIPs that a laser point tells."""
         if not len(sensed.lit) or self.model.mcp_per_pip is None:
             return habits
         return habits.without(sensed.lit, self.settings.pip_mean_rad, self.settings.pip_rad)
@@ -428,5 +435,5 @@ def _unknown(rests: Int) -> Fitted:
 
 
 def _capacity(markers: int) -> int:
-    """Room for so many markers, in steps, so that kernels are compiled once for most rigs."""
+    """Round a count of markers up, so that kernels are compiled once for most rigs."""
     return -(-markers // _STEP) * _STEP
