@@ -1,0 +1,147 @@
+"""Shading of the samples: LEDs, the laser line with what it scatters in the skin, and the room's light.
+
+Everything is Lambert's law on smooth normals. The constants were fitted to the rendered recordings' pictures.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.wrist_mesh.line import Fan
+from bench.wrist_mesh.raster import SUPER, Samples
+from bench.wrist_mesh.skin import Posed, Skin
+from common.arrays import Float, Int
+from common.kernels import kernel
+
+LED_ROUGH = 0.75  # exponent of the cosine of incidence: skin is rough and scatters
+LED_LOBE = 1.86  # exponent of the cosine to the camera's axis: the LEDs' lobe, and the lens's vignetting
+
+
+class Optics(NamedTuple):
+    """Constants of the light, in grey values of the picture.
+
+    Attributes:
+        led: At 1 m below one LED, squarely lit [grey m^2].
+        core: Of the laser's line at 1 m [grey m].
+        core_m: Standard deviation of the line's thickness [m].
+        skirt: Of what the skin scatters beside the line [grey m].
+        skirt_m: Distance over which that falls to 1/e [m].
+        glow: What a length of the line lights on other parts of the hand [grey m].
+        shadow_m: How far beyond the first surface the laser still reaches [m].
+    """
+
+    led: float = 0.308
+    core: float = 129.0
+    core_m: float = 0.00052
+    skirt: float = 21.9
+    skirt_m: float = 0.00226
+    glow: float = 0.0
+    shadow_m: float = 0.0015
+
+
+def shade(
+    samples: Samples,
+    skin: Skin,
+    posed: Posed,
+    ambient: Float,
+    leds: Float,
+    fan: Fan,
+    reach_m: Float,
+    constants: Optics,
+) -> tuple[Float, Float, Float, Float]:
+    """Grey values (H, W) that the room, the laser and the LEDs add, black left out, and the hand's coverage (H, W).
+
+    Args:
+        samples: What the camera sees.
+        skin, posed: The hand.
+        ambient: The room's light on each vertex (V,) [grey].
+        leds: (L, 3) [m].
+        fan: The laser.
+        reach_m: How far its rays go, as in `Curve`.
+        constants: Of the light.
+    """
+    height, width = samples.face.shape[0] // SUPER, samples.face.shape[1] // SUPER
+    out = np.zeros((4, height, width))
+    sheet = np.stack([fan.origin, fan.normal, fan.forward, fan.across])
+    reach = np.where(np.isfinite(reach_m), reach_m, 1e9)
+    numbers = np.array(constants)
+    arrays = posed.verts, posed.normals, ambient, skin.faces
+    _shade(samples.face, samples.share, *arrays, leds, sheet, fan.half_rad, reach, numbers, out)
+    return out[0], out[1], out[2], out[3]
+
+
+@kernel
+def _shade(
+    face: Int,
+    share: Float,
+    verts: Float,
+    normals: Float,
+    ambient: Float,
+    faces: Int,
+    leds: Float,
+    sheet: Float,
+    half: float,
+    reach: Float,
+    numbers: Float,
+    out: Float,
+) -> None:
+    led, core, core_m, skirt, skirt_m, _, shadow_m = numbers
+    rows, columns = face.shape
+    part = 1.0 / (SUPER * SUPER)
+    step = 2.0 * half / (len(reach) - 1)
+    x, n = np.empty(3), np.empty(3)
+    for row in range(rows):
+        for column in range(columns):
+            f = face[row, column]
+            if f < 0:
+                continue
+            a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+            wb, wc = share[row, column, 0], share[row, column, 1]
+            wa = 1.0 - wb - wc
+            for k in range(3):
+                x[k] = wa * verts[a, k] + wb * verts[b, k] + wc * verts[c, k]
+                n[k] = wa * normals[a, k] + wb * normals[b, k] + wc * normals[c, k]
+            n /= np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])
+            v, u = row // SUPER, column // SUPER
+            out[0, v, u] += part * (wa * ambient[a] + wb * ambient[b] + wc * ambient[c])
+            out[3, v, u] += part
+            total = 0.0
+            for k in range(len(leds)):
+                dx, dy, dz = leds[k, 0] - x[0], leds[k, 1] - x[1], leds[k, 2] - x[2]
+                d2 = dx * dx + dy * dy + dz * dz
+                across = n[0] * dx + n[1] * dy + n[2] * dz
+                if across > 0.0 and dz < 0.0:
+                    d = np.sqrt(d2)
+                    total += (across / d) ** LED_ROUGH * (-dz / d) ** LED_LOBE / d2
+            out[2, v, u] += part * led * total
+            # The line: where the steepest way down the skin meets the plane, and whether the laser reaches that.
+            ox, oy, oz = x[0] - sheet[0, 0], x[1] - sheet[0, 1], x[2] - sheet[0, 2]
+            away = ox * sheet[1, 0] + oy * sheet[1, 1] + oz * sheet[1, 2]
+            if abs(away) > 0.012:
+                continue
+            tilt = n[0] * sheet[1, 0] + n[1] * sheet[1, 1] + n[2] * sheet[1, 2]
+            slope = max(1.0 - tilt * tilt, 0.04)
+            if abs(away) > 0.012 * np.sqrt(slope):
+                continue
+            go = away / slope
+            ox -= go * (sheet[1, 0] - tilt * n[0])
+            oy -= go * (sheet[1, 1] - tilt * n[1])
+            oz -= go * (sheet[1, 2] - tilt * n[2])
+            ahead = ox * sheet[2, 0] + oy * sheet[2, 1] + oz * sheet[2, 2]
+            aside = ox * sheet[3, 0] + oy * sheet[3, 1] + oz * sheet[3, 2]
+            if ahead <= 0.0:
+                continue
+            angle = np.arctan2(aside, ahead)
+            k = int(np.rint((angle + half) / step))
+            if k < 0 or k >= len(reach):
+                continue
+            far = np.sqrt(ahead * ahead + aside * aside)
+            past = far - reach[k]
+            if past > shadow_m + 0.5 * abs(go):
+                continue
+            cosine = -(n[0] * ox + n[1] * oy + n[2] * oz) / far
+            on = abs(go) * np.sqrt(slope)
+            glow = skirt * np.exp(-on / skirt_m) * max(cosine + 0.25, 0.0) / 1.25
+            if cosine > 0.0:
+                glow += core * np.exp(-0.5 * (away / core_m) ** 2) * cosine
+            out[1, v, u] += part * glow / far
