@@ -25,17 +25,19 @@ class Optics(NamedTuple):
         core: Of the laser's line at 1 m [grey m].
         core_m: Standard deviation of the line's thickness [m].
         skirt: Of what the skin scatters beside the line [grey m].
-        skirt_m: Distance over which that falls to 1/e [m].
-        glow: What a length of the line lights on other parts of the hand [grey m].
+        skirt_m: Standard deviation of its breadth on the skin [m].
+        skirt_cosine, skirt_slope: Exponents of the skirt: of the cosine of incidence, and of the square of the sine
+            between skin and sheet of light.
         shadow_m: How far beyond the first surface the laser still reaches [m].
     """
 
     led: float = 0.308
-    core: float = 129.0
-    core_m: float = 0.00052
-    skirt: float = 21.9
-    skirt_m: float = 0.00226
-    glow: float = 0.0
+    core: float = 268.0
+    core_m: float = 0.000374
+    skirt: float = 17.4
+    skirt_m: float = 0.00213
+    skirt_cosine: float = 0.97
+    skirt_slope: float = -0.58
     shadow_m: float = 0.0015
 
 
@@ -65,7 +67,7 @@ def shade(
     sheet = np.stack([fan.origin, fan.normal, fan.forward, fan.across])
     reach = np.where(np.isfinite(reach_m), reach_m, 1e9)
     numbers = np.array(constants)
-    arrays = posed.verts, posed.normals, ambient, skin.faces
+    arrays = posed.verts, posed.normals, ambient, skin.albedo, skin.faces
     _shade(samples.face, samples.share, *arrays, leds, sheet, fan.half_rad, reach, numbers, out)
     return out[0], out[1], out[2], out[3]
 
@@ -77,6 +79,7 @@ def _shade(
     verts: Float,
     normals: Float,
     ambient: Float,
+    albedo: Float,
     faces: Int,
     leds: Float,
     sheet: Float,
@@ -85,7 +88,7 @@ def _shade(
     numbers: Float,
     out: Float,
 ) -> None:
-    led, core, core_m, skirt, skirt_m, _, shadow_m = numbers
+    led, core, core_m, skirt, skirt_m, skirt_cosine, skirt_slope, shadow_m = numbers
     rows, columns = face.shape
     part = 1.0 / (SUPER * SUPER)
     step = 2.0 * half / (len(reach) - 1)
@@ -103,7 +106,8 @@ def _shade(
                 n[k] = wa * normals[a, k] + wb * normals[b, k] + wc * normals[c, k]
             n /= np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])
             v, u = row // SUPER, column // SUPER
-            out[0, v, u] += part * (wa * ambient[a] + wb * ambient[b] + wc * ambient[c])
+            pale = wa * albedo[a] + wb * albedo[b] + wc * albedo[c]
+            out[0, v, u] += part * pale * (wa * ambient[a] + wb * ambient[b] + wc * ambient[c])
             out[3, v, u] += part
             total = 0.0
             for k in range(len(leds)):
@@ -113,14 +117,14 @@ def _shade(
                 if across > 0.0 and dz < 0.0:
                     d = np.sqrt(d2)
                     total += (across / d) ** LED_ROUGH * (-dz / d) ** LED_LOBE / d2
-            out[2, v, u] += part * led * total
+            out[2, v, u] += part * pale * led * total
             # The line: where the steepest way down the skin meets the plane, and whether the laser reaches that.
             ox, oy, oz = x[0] - sheet[0, 0], x[1] - sheet[0, 1], x[2] - sheet[0, 2]
             away = ox * sheet[1, 0] + oy * sheet[1, 1] + oz * sheet[1, 2]
             if abs(away) > 0.012:
                 continue
             tilt = n[0] * sheet[1, 0] + n[1] * sheet[1, 1] + n[2] * sheet[1, 2]
-            slope = max(1.0 - tilt * tilt, 0.04)
+            slope = max(1.0 - tilt * tilt, 0.15)
             if abs(away) > 0.012 * np.sqrt(slope):
                 continue
             go = away / slope
@@ -141,7 +145,8 @@ def _shade(
                 continue
             cosine = -(n[0] * ox + n[1] * oy + n[2] * oz) / far
             on = abs(go) * np.sqrt(slope)
-            glow = skirt * np.exp(-on / skirt_m) * max(cosine + 0.25, 0.0) / 1.25
-            if cosine > 0.0:
-                glow += core * np.exp(-0.5 * (away / core_m) ** 2) * cosine
-            out[1, v, u] += part * glow / far
+            if cosine <= 0.0:
+                continue
+            glow = skirt * slope**skirt_slope * cosine**skirt_cosine * np.exp(-0.5 * (on / skirt_m) ** 2)
+            glow += core * cosine * np.exp(-0.5 * (away / core_m) ** 2)
+            out[1, v, u] += part * pale * glow / far

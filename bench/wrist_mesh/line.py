@@ -37,8 +37,11 @@ class Fan:
     def of(cls, rig: RigCalibration) -> "Fan":
         """Of a rig whose laser is known in full."""
         plane, laser = rig.laser_plane, rig.laser
-        assert plane is not None and laser is not None
-        assert laser.origin is not None and laser.forward is not None and laser.fan_rad is not None
+        assert plane is not None
+        assert laser is not None
+        assert laser.origin is not None
+        assert laser.forward is not None
+        assert laser.fan_rad is not None
         normal = np.array(plane.normal) / np.linalg.norm(plane.normal)
         forward = np.array(laser.forward)
         return cls(np.array(laser.origin), normal, forward, np.cross(normal, forward), 0.5 * laser.fan_rad)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from bench.wrist_mesh.light import Optics, shade
 from bench.wrist_mesh.line import Curve, Fan, cross
 from bench.wrist_mesh.raster import SUPER, Samples, rasterise
-from bench.wrist_mesh.room import Room, picture
+from bench.wrist_mesh.room import Room, grained, picture
 from bench.wrist_mesh.skin import Posed, Skin
 from bench.wrist_mesh.truth import laser_truth, tip_truth
 from common.arrays import Float, Image
@@ -79,7 +79,7 @@ class Device:
         return View(posed, samples, cross(self.fan, self.skin, posed, self.optics, samples))
 
     def light(self, view: View, room: Room, constants: Optics) -> tuple[Float, Float, Float]:
-        """Light (H, W) [grey] of the ambient, the laser and the LED picture, noise and black left out."""
+        """Light (H, W) [grey] of the room, and what the laser and the LEDs add; noise and black left out."""
         skin_light = room.on_skin(view.posed.normals)
         hand, laser, led, cover = shade(
             view.samples,
@@ -92,11 +92,14 @@ class Device:
             constants,
         )
         ambient = hand + (1.0 - cover) * room.behind
-        return ambient, ambient + laser, ambient + led
+        return ambient, laser, led
 
     def frame(self, view: View, room: Room, lit: Illumination, rng: np.random.Generator) -> Image:
         """What the camera takes (H, W)."""
-        return picture(self.light(view, room, Optics())[ORDER.index(lit)], rng)
+        ambient, laser, led = self.light(view, room, Optics())
+        if lit is Illumination.LASER:
+            return picture(ambient + grained(laser, rng), rng)
+        return picture(ambient if lit is Illumination.AMBIENT else ambient + led, rng)
 
     def label(self, view: View) -> Image:
         """finger * 10 + segment (H, W), 255 behind the hand."""

@@ -26,6 +26,8 @@ HAND = (
 SUN = 150.0  # on skin that faces it [grey]; a guess
 SUN_FROM = (0.45, -0.55, -0.70)  # unit direction to it, camera frame; a guess
 NOISE = (0.06, 0.0195)  # variance [grey^2] in the dark, and per grey value of light
+EDGE_PX = 0.15  # standard deviation of the laser's edges, pixel by pixel
+GRAIN = 0.055  # and of its brightness, relative
 _MARGIN = 7  # pixels around the hand where its blur may be
 
 
@@ -62,6 +64,14 @@ def picture(light: Float, rng: np.random.Generator) -> Image:
     return np.clip(np.rint(noisy), 0.0, 255.0).astype(np.uint8)
 
 
+def grained(laser: Float, rng: np.random.Generator) -> Float:
+    """The laser's light (H, W) [grey] with the grain that it has in the recordings: ragged edges, uneven brightness."""
+    up, down = np.vstack([laser[1:], laser[-1:]]), np.vstack([laser[:1], laser[:-1]])
+    shift = np.clip(EDGE_PX * rng.standard_normal(laser.shape), -1.0, 1.0)
+    moved = np.where(shift > 0.0, laser + shift * (up - laser), laser - shift * (down - laser))
+    return moved * np.maximum(1.0 + GRAIN * rng.standard_normal(laser.shape), 0.0)
+
+
 def behind(datasets: Path) -> Float:
     """The room alone (H, W) [grey], black left out; where a hand is in every picture, its surroundings."""
     total: Float | None = None
@@ -75,7 +85,8 @@ def behind(datasets: Path) -> Float:
             free = cv2.dilate(hand.astype(np.uint8), np.ones((_MARGIN, _MARGIN), np.uint8)) == 0
             total = image * free if total is None else total + image * free
             count = free * 1.0 if count is None else count + free
-    assert total is not None and count is not None
+    assert total is not None
+    assert count is not None
     known = count > 0
     mean = np.where(known, total / np.maximum(count, 1.0) - BLACK, 0.0)
     weight = cv2.GaussianBlur(known.astype(np.float64), (0, 0), 24.0)

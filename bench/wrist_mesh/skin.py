@@ -22,6 +22,7 @@ SEGMENT[[5, 10, 15, 20]] = 0  # metacarpals of the fingers are palm
 
 LEVELS = 2
 THICKER_M = 0.00068
+MOTTLE, MOTTLE_SEED = 0.03, 7  # standard deviation of the skin's brightness at each level, relative
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,6 +52,7 @@ class Skin:
         finer: The steps of subdivision.
         faces: (F, 3) triangles of the fine mesh.
         label: (F,) finger * 10 + segment, by the joints that move it most.
+        albedo: (V,) how bright the fine vertices are, about 1: mottled skin.
     """
 
     hinges: Hinges
@@ -60,6 +62,7 @@ class Skin:
     finer: tuple[Subdivision, ...]
     faces: Int
     label: Int
+    albedo: Float
 
     @classmethod
     def of(cls, model: HandModel, datasets: Path) -> "Skin":
@@ -81,11 +84,15 @@ class Skin:
         share = np.zeros((len(kept), 25))
         np.add.at(share, (np.arange(len(kept))[:, None], joints), weights)
         finer: list[Subdivision] = []
+        rng = np.random.default_rng(MOTTLE_SEED)
+        mottle = MOTTLE * rng.standard_normal((len(kept), 1))
         for _ in range(LEVELS):
             finer.append(Subdivision.of(faces, len(share)))
             faces, share = finer[-1].faces, finer[-1](share)
+            mottle = finer[-1](mottle)
+            mottle += MOTTLE * rng.standard_normal(mottle.shape)
         label = SEGMENT[share[faces].sum(axis=1).argmax(axis=1)]
-        return cls(hinges, bound, joints, weights, tuple(finer), faces, label)
+        return cls(hinges, bound, joints, weights, tuple(finer), faces, label, np.exp(mottle[:, 0]))
 
     def pose(self, angles_rad: Float, T_camera_palm: Float) -> Posed:
         """The hand with named angles (21,), its palm at `T_camera_palm` (4, 4)."""
