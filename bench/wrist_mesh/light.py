@@ -6,6 +6,7 @@ Everything is Lambert's law on smooth normals. The constants were fitted to the 
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from bench.wrist_mesh.line import Fan
 from bench.wrist_mesh.raster import SUPER, Samples
@@ -13,15 +14,16 @@ from bench.wrist_mesh.skin import Posed, Skin
 from common.arrays import Float, Int
 from common.kernels import kernel
 
-LED_ROUGH = 0.75  # exponent of the cosine of incidence: skin is rough and scatters
-LED_LOBE = 1.86  # exponent of the cosine to the camera's axis: the LEDs' lobe, and the lens's vignetting
+LED_ROUGH = 0.888  # exponent of the cosine of incidence: skin is rough and scatters
+LED_FALL = 1.81  # exponent of the distance; what the hand throws back onto itself is among it
+LED_LOBE = 1.22  # exponent of the cosine to the camera's axis: the LEDs' lobe, and the lens's vignetting
 
 
 class Optics(NamedTuple):
     """Constants of the light, in grey values of the picture.
 
     Attributes:
-        led: At 1 m below one LED, squarely lit [grey m^2].
+        led: At 1 m below one LED, squarely lit [grey m^1.81].
         core: Of the laser's line at 1 m [grey m].
         core_m: Standard deviation of the line's thickness [m].
         skirt: Of what the skin scatters beside the line [grey m].
@@ -31,7 +33,7 @@ class Optics(NamedTuple):
         shadow_m: How far beyond the first surface the laser still reaches [m].
     """
 
-    led: float = 0.308
+    led: float = 0.483
     core: float = 268.0
     core_m: float = 0.000374
     skirt: float = 17.4
@@ -74,8 +76,8 @@ def shade(
 
 @kernel
 def _shade(
-    face: Int,
-    share: Float,
+    face: npt.NDArray[np.int32],
+    share: npt.NDArray[np.float32],
     verts: Float,
     normals: Float,
     ambient: Float,
@@ -116,7 +118,7 @@ def _shade(
                 across = n[0] * dx + n[1] * dy + n[2] * dz
                 if across > 0.0 and dz < 0.0:
                     d = np.sqrt(d2)
-                    total += (across / d) ** LED_ROUGH * (-dz / d) ** LED_LOBE / d2
+                    total += (across / d) ** LED_ROUGH * (-dz / d) ** LED_LOBE / d**LED_FALL
             out[2, v, u] += part * pale * led * total
             # The line: where the steepest way down the skin meets the plane, and whether the laser reaches that.
             ox, oy, oz = x[0] - sheet[0, 0], x[1] - sheet[0, 1], x[2] - sheet[0, 2]

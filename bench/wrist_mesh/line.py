@@ -75,8 +75,8 @@ class Curve:
 
 def cross(fan: Fan, skin: Skin, posed: Posed, optics: CameraModel, samples: Samples) -> Curve:
     """Where the fan meets the posed hand, of which the camera has `samples`."""
-    away = (posed.verts - fan.origin) @ fan.normal
-    side = away[skin.faces] > 0.0
+    away: Float = (posed.verts - fan.origin) @ fan.normal
+    side: Bool = np.greater(away[skin.faces], 0.0)
     cut = np.flatnonzero(side.any(axis=1) & ~side.all(axis=1))
     reach = np.full(RAYS, np.inf)
     face = np.full(RAYS, -1, dtype=np.int64)

@@ -80,7 +80,7 @@ class Device:
 
     def light(self, view: View, room: Room, constants: Optics) -> tuple[Float, Float, Float]:
         """Light (H, W) [grey] of the room, and what the laser and the LEDs add; noise and black left out."""
-        skin_light = room.on_skin(view.posed.normals)
+        skin_light = room.on_skin(view.posed, self.skin.faces)
         hand, laser, led, cover = shade(
             view.samples,
             self.skin,

@@ -10,21 +10,52 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from common.arrays import Float, Image
+from bench.wrist_mesh.shadows import from_afar, sky
+from bench.wrist_mesh.skin import Posed
+from common.arrays import Float, Image, Int
 from common.frame_recording import Illumination, open_recording
 
 BLACK = 2.0
 RECORDINGS = ("curl", "mcp", "spread", "left_small")
 LEVELS = {"dark": 0.004, "indoor": 0.16, "bright": 0.45, "sun": 0.28}
 RECORDED = 0.16
-HAND = (
-    13.54,
-    0.37,
-    -6.61,
-    -5.85,
-)  # indoor light on skin with normal n [grey]: c + a . n; residual 3.3, shadows most
+EVERYWHERE = 7.3  # indoor light on all skin [grey]: what the hand and the room throw back
+FROM_SKY = (  # and from each direction of the sky, on skin that faces it; residual 2.1 grey
+    9.61,
+    0.0,
+    14.77,
+    0.0,
+    0.0,
+    8.17,
+    1.36,
+    2.01,
+    2.18,
+    0.0,
+    2.1,
+    0.0,
+    0.0,
+    1.58,
+    1.49,
+    0.0,
+    1.45,
+    0.0,
+    0.0,
+    1.48,
+    0.0,
+    1.65,
+    0.0,
+    0.94,
+    1.46,
+    0.0,
+    1.61,
+    2.12,
+    0.0,
+    5.95,
+    2.97,
+    2.18,
+)
 SUN = 150.0  # on skin that faces it [grey]; a guess
-SUN_FROM = (0.45, -0.55, -0.70)  # unit direction to it, camera frame; a guess
+SUN_FROM = np.array((0.451, -0.551, -0.702))  # unit direction to it, camera frame; a guess
 NOISE = (0.06, 0.0195)  # variance [grey^2] in the dark, and per grey value of light
 EDGE_PX = 0.15  # standard deviation of the laser's edges, pixel by pixel
 GRAIN = 0.055  # and of its brightness, relative
@@ -51,10 +82,14 @@ class Room:
         level = LEVELS[name] / RECORDED
         return cls(behind * level, level, SUN if name == "sun" else 0.0)
 
-    def on_skin(self, normals: Float) -> Float:
-        """Light (V,) [grey] on vertices with unit normals (V, 3)."""
-        even = HAND[0] + normals @ np.array(HAND[1:])
-        return self.level * np.maximum(even, 1.0) + self.sun * np.maximum(normals @ np.array(SUN_FROM), 0.0)
+    def on_skin(self, posed: Posed, faces: Int) -> Float:
+        """Light (V,) [grey] on the vertices of a posed hand of triangles (F, 3)."""
+        out = np.full(len(posed.verts), EVERYWHERE)
+        for direction, grey in zip(sky(), FROM_SKY, strict=True):
+            if grey > 0.0:
+                out += grey * from_afar(posed, faces, direction)
+        out *= self.level
+        return out + self.sun * from_afar(posed, faces, SUN_FROM) if self.sun > 0.0 else out
 
 
 def picture(light: Float, rng: np.random.Generator) -> Image:

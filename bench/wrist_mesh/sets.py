@@ -82,7 +82,7 @@ def _made(kind: str, datasets: Path, frames: int | None, rng: np.random.Generato
         poses = np.load(datasets / "wrist" / "left_small" / "truth.npz")["angles"]
         return Set(kind, "curl", "the six poses A-F", _still(poses[:frames]))
     count = 3 * (frames or 60)
-    t_s = PERIOD_S * np.arange(count)
+    t_s = np.arange(count, dtype=np.float64) * PERIOD_S
     if kind == "motion":
         angles = curling(t_s, rng.uniform(0.0, 2.0 * np.pi, 4))
         bends = np.zeros((count, 2))

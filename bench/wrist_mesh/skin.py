@@ -70,10 +70,10 @@ class Skin:
         hinges = Hinges.of(model)
         mesh = np.load(datasets / "webxr_hand" / f"{model.profile.side}_rest.npz")
         order = [mesh["names"].tolist().index(name) for name in WEBXR_JOINTS]
-        inverse = mesh["inv_bind"].astype(np.float64)[order]
-        bind = np.linalg.inv(inverse)[:, :3, 3]
+        inverse: Float = mesh["inv_bind"].astype(np.float64)[order]
+        bind: Float = np.linalg.inv(inverse)[:, :3, 3]
         scale = np.linalg.norm(hinges.rest_m[10] - hinges.rest_m[11]) / np.linalg.norm(bind[10] - bind[11])
-        every = mesh["verts"].astype(np.float64)
+        every: Float = mesh["verts"].astype(np.float64)
         # Vertices of one place are one: they differ in what a picture would be wrapped by.
         _, kept, welded = np.unique(np.round(every, 6), axis=0, return_index=True, return_inverse=True)
         faces = welded.ravel()[mesh["faces"].astype(np.int64)]

@@ -72,4 +72,5 @@ class Subdivision:
 def _sums(edges: Int, values: Float, count: int) -> Float:
     """Of each vertex, the sum (V, K) of the values of those that edges (E, 2) lead to."""
     start, stop = np.concatenate([edges, edges[:, ::-1]]).T
-    return np.stack([np.bincount(start, column[stop], count) for column in values.T], axis=1)
+    sums = [np.bincount(start, column[stop], count).astype(np.float64) for column in values.T]
+    return np.stack(sums, axis=1)

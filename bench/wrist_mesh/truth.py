@@ -82,5 +82,10 @@ def tip_truth(
             length = np.where(np.isfinite(far[:, 0]), np.linalg.norm(points, axis=1), np.inf)
             best = int(length.argmin())
             near[f], near_uv[f] = points[best], (columns[best], rows[best])
-    out = {"tip_xyz": tip, "tip_uv": uv, "tip_visible": visible, "seg_px": count}
+    out: dict[str, npt.NDArray[np.generic]] = {
+        "tip_xyz": tip,
+        "tip_uv": uv,
+        "tip_visible": visible,
+        "seg_px": count,
+    }
     return out | {"near_uv": near_uv, "near_xyz": near}
