@@ -101,9 +101,9 @@ def _seen(uv: Float, depth: Float, samples: Samples, size: tuple[int, int]) -> B
     """Which pixels (N, 2) lie in the picture and are not deeper (N,) [m] than what the samples around them show."""
     width, height = size
     inside = (uv > -0.5) & (uv < np.array([width, height]) - 0.5)
-    ok = inside.all(axis=1)
+    ok: Bool = np.asarray(inside.all(axis=1), dtype=np.bool_)
     fine = samples.depth.shape[0] // height
-    column, row = np.rint((np.where(ok[:, None], uv, 0.0) + 0.5) * fine - 0.5).astype(np.int64).T
+    column, row = np.rint((np.where(ok[:, np.newaxis], uv, 0.0) + 0.5) * fine - 0.5).astype(np.int64).T
     far = np.zeros(len(uv))
     for dv in (-1, 0, 1):
         for du in (-1, 0, 1):

@@ -71,7 +71,7 @@ class Skin:
         mesh = np.load(datasets / "webxr_hand" / f"{model.profile.side}_rest.npz")
         order = [mesh["names"].tolist().index(name) for name in WEBXR_JOINTS]
         inverse: Float = mesh["inv_bind"].astype(np.float64)[order]
-        bind: Float = np.linalg.inv(inverse)[:, :3, 3]
+        bind = np.linalg.inv(inverse)[:, :3, 3].astype(np.float64)
         scale = np.linalg.norm(hinges.rest_m[10] - hinges.rest_m[11]) / np.linalg.norm(bind[10] - bind[11])
         every: Float = mesh["verts"].astype(np.float64)
         # Vertices of one place are one: they differ in what a picture would be wrapped by.

@@ -10,6 +10,7 @@ from bench.wrist_mesh.light import Optics
 from bench.wrist_mesh.render import Device, Moment
 from bench.wrist_mesh.room import BLACK, Room
 from bench.wrist_mesh.sets import set_named, write_set
+from common.arrays import Image
 from common.frame_recording import load_manifest, open_recording
 
 
@@ -21,17 +22,25 @@ def test_mesh_is_where_the_rendered_recordings_have_it(datasets: Path, name: str
     label = device.label(view)
     mine = device.truth(view, label)
     assert np.abs(mine["joints"] - truth["joints"][k]).max() < 5e-6
-    theirs = cv2.imread(str(folder / f"label_{k:06d}.png"), cv2.IMREAD_GRAYSCALE)
+    theirs = _read(folder / f"label_{k:06d}.png")
     for finger in range(6):
         a, b = label // 10 == finger, theirs // 10 == finger
+        if b.sum() < 500:  # a hidden finger's edge
+            continue
         assert (a & b).sum() / (a | b).sum() > 0.97
     whole = truth["laser_len_vis"][k, 2:6] > 0.018
     off = np.abs(mine["laser_uv"] - truth["laser_uv"][k])[2:6][whole]
     assert off[:, 1].max() < 1.0
     ambient, _, led = device.light(view, Room.of("indoor", np.zeros(label.shape)), Optics())
-    lit = cv2.imread(str(folder / "wrist" / f"{3 * k + 2:06d}.png"), cv2.IMREAD_GRAYSCALE)
+    lit = _read(folder / "wrist" / f"{3 * k + 2:06d}.png")
     both = (label != 255) & (theirs != 255) & (lit < 250)
     assert np.abs(BLACK + ambient + led - lit)[both].mean() < 15.0
+
+
+def _read(path: Path) -> Image:
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    return np.asarray(image, dtype=np.uint8)
 
 
 def test_set_is_a_recording_that_repeats(datasets: Path, tmp_path: Path) -> None:
