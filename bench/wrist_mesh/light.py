@@ -15,6 +15,7 @@ from common.arrays import Float, Int
 from common.kernels import kernel
 
 LED_ROUGH = 0.888  # exponent of the cosine of incidence: skin is rough and scatters
+SKIRT_NEAR = 0.25  # the skirt falls with this power of the distance less than the line
 LED_FALL = 1.81  # exponent of the distance; what the hand throws back onto itself is among it
 LED_LOBE = 1.22  # exponent of the cosine to the camera's axis: the LEDs' lobe, and the lens's vignetting
 
@@ -26,7 +27,7 @@ class Optics(NamedTuple):
         led: At 1 m below one LED, squarely lit [grey m^1.81].
         core: Of the laser's line at 1 m [grey m].
         core_m: Standard deviation of the line's thickness [m].
-        skirt: Of what the skin scatters beside the line [grey m].
+        skirt: Of what the skin scatters beside the line [grey m^0.75].
         skirt_m: Standard deviation of its breadth on the skin [m].
         skirt_cosine, skirt_slope: Exponents of the skirt: of the cosine of incidence, and of the square of the sine
             between skin and sheet of light.
@@ -36,7 +37,7 @@ class Optics(NamedTuple):
     led: float = 0.483
     core: float = 268.0
     core_m: float = 0.000374
-    skirt: float = 17.4
+    skirt: float = 30.9
     skirt_m: float = 0.00213
     skirt_cosine: float = 0.97
     skirt_slope: float = -0.58
@@ -149,6 +150,12 @@ def _shade(
             on = abs(go) * np.sqrt(slope)
             if cosine <= 0.0:
                 continue
-            glow = skirt * slope**skirt_slope * cosine**skirt_cosine * np.exp(-0.5 * (on / skirt_m) ** 2)
+            glow = (
+                skirt
+                * far**SKIRT_NEAR
+                * slope**skirt_slope
+                * cosine**skirt_cosine
+                * np.exp(-0.5 * (on / skirt_m) ** 2)
+            )
             glow += core * cosine * np.exp(-0.5 * (away / core_m) ** 2)
             out[1, v, u] += part * pale * glow / far
