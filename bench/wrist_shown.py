@@ -15,7 +15,6 @@ from common.npz import read_npz
 from slave.cameras.replay import read_png
 from slave.cameras.source import Frame
 from slave.wrist.background import lit
-from slave.wrist.registration import led_shift, shifted
 from slave.wrist.strobe import Triple
 from slave.wrist.view import WristView
 
@@ -30,7 +29,7 @@ class Recorded:
 
     Attributes:
         view: Its device.
-        laser, led: Differences to the ambient frame, triple by triple; the LEDs' brought to where the laser's are.
+        laser, led: Differences to the ambient frame, triple by triple.
         truth: Arrays of its truth.npz, a row per triple.
     """
 
@@ -58,9 +57,8 @@ def recorded(data: Path, name: str) -> Recorded:
         for row in recording.frames_of(camera.name)
     ]
     triples = [Triple(*frames[k : k + 3]) for k in range(0, len(frames) - 2, 3)]
-    back = -led_shift(triples, view.optics)
     laser = [lit(triple.laser.image, triple.ambient.image) for triple in triples]
-    led = [shifted(lit(triple.led.image, triple.ambient.image), back) for triple in triples]
+    led = [lit(triple.led.image, triple.ambient.image) for triple in triples]
     return Recorded(view, laser, led, read_npz(folder / "truth.npz"))
 
 

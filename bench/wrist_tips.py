@@ -3,7 +3,6 @@ say they are, and the time they take.
 
 On the recordings, where they are, and on simulated hands and palm poses of other seeds in every light. A tip counts as
 found within 6 px of the end of its finger; false is a report more than 25 px from it, or of an end that is not seen.
-Where the LED frames of a recording lie beside its laser frames, registration finds that and takes it off.
 """
 
 from collections.abc import Iterator

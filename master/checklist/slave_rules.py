@@ -30,10 +30,8 @@ UNCOLOURED = "uncalibrated."  # count: 1 of a marker without a colour
 BESIDE_SHARE, BESIDE_WELL = 0.5, 0.1  # of the frames
 HOT_WELL_C = 5.0
 FLAGS = {1: "the supply is too weak", 2: "the clock is capped", 4: "it is throttled", 8: "it is too warm"}
-SLIPPED, SLIPPED_LEAST = (
-    0.04,
-    2,
-)  # share and number of the frames between two reports that the strobe has elsewhere
+CYCLE = 3  # frames: ambient, laser, LEDs
+SLIPPED, SLIPPED_LEAST = 0.04, 2  # share and number of the cycles between two reports that are out of order
 
 
 class SlaveRules:
@@ -185,19 +183,18 @@ def _background(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
 
 def _strobe(name: str, said: Said) -> Iterator[Verdict]:
     """Whether laser and LEDs are on in the frames in which they should be."""
-    frames, out = said.grown("frames"), said.grown("strobe.out_of_step")
-    unconfirmed, unlit = said.grown("strobe.unconfirmed"), said.grown("strobe.unlit")
+    frames, out, unlit = (said.grown(event) for event in ("frames", "strobe.out_of_step", "strobe.unlit"))
     if not frames or out is None:
         return
-    elsewhere = out + (unconfirmed or 0)
-    wrong = beyond(elsewhere / frames, SLIPPED, 0.5 * SLIPPED)
-    if wrong and (elsewhere < SLIPPED_LEAST or (unlit or 0) > 0.5 * frames):
+    cycles = frames / CYCLE
+    wrong = beyond(out / cycles, SLIPPED, 0.5 * SLIPPED)
+    if wrong and (out < SLIPPED_LEAST or (unlit or 0) > 0.5 * cycles):
         wrong = None  # one frame that slipped; or nothing is lit, because there is no hand
     yield Verdict(
         "strobe_slipped",
         name,
         wrong,
-        f"Wrist device {name}: in {elsewhere} of {frames} frames laser or LEDs are on in the wrong one.",
+        f"Wrist device {name}: in {out} of {cycles:.0f} strobe cycles laser or LEDs are on in the wrong frame.",
         "Check the wires of the lights and lead_us of the strobe; a slave that is too slow loses frames: see dropped.",
     )
 

@@ -20,13 +20,10 @@ from slave.wrist.fingertips import Fingertips, fingertips
 from slave.wrist.laser import LaserLines, laser_lines
 from slave.wrist.palm_turn import prepare
 from slave.wrist.reach import reach_of
-from slave.wrist.registration import shifted
 from slave.wrist.strobe import Strobe, Triple
 from slave.wrist.view import WristView
 
 RECENT = 4  # triples
-_NONE = np.zeros(2)
-_NONE.flags.writeable = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,18 +67,15 @@ class WristDetector:
     Of a pose nothing is used again: two triples have nothing to do with each other.
     """
 
-    def __init__(
-        self, view: WristView, frame_rate_hz: float, led_shift_px: Float = _NONE, engine: Engine = NUMPY
-    ) -> None:
+    def __init__(self, view: WristView, frame_rate_hz: float, engine: Engine = NUMPY) -> None:
         """Begin with no frame; it takes a second or two to prepare the view.
 
         Args:
             view: What the device knows of itself and of the hand.
             frame_rate_hz: Of the camera file: single frames per second, three per triple.
-            led_shift_px: (2,) how far the LED frames of a recording lie beside its laser frames.
             engine: What does the inner loops.
         """
-        self._strobe, self._led_shift = Strobe(frame_rate_hz), led_shift_px
+        self._strobe = Strobe(frame_rate_hz)
         self._engine = engine
         self._found: deque[tuple[int, Float, Float]] = deque(maxlen=RECENT)
         self._view = prepared(view, engine)
@@ -96,7 +90,7 @@ class WristDetector:
         triple = self._strobe.push(frame)
         if triple is None:
             return None
-        found = find(triple, self._view, self._led_shift, self._engine)
+        found = find(triple, self._view, self._engine)
         self._found.append((triple.led.t_ns, found.laser.uv, found.tips.uv))
         return found
 
@@ -121,14 +115,14 @@ def prepared(view: WristView, engine: Engine = NUMPY) -> WristView:
         corridors_of(turned)
         reach_of(turned)
     dark = Frame(0, 0, 0, np.zeros((view.optics.height_px, view.optics.width_px), np.uint8))
-    find(Triple(dark, dark, dark), view, engine=engine)
+    find(Triple(dark, dark, dark), view, engine)
     return view
 
 
-def find(triple: Triple, view: WristView, led_shift_px: Float = _NONE, engine: Engine = NUMPY) -> WristFound:
-    """What one triple shows of the five fingers; its LED frame lies `led_shift_px` (2,) beside its laser frame."""
+def find(triple: Triple, view: WristView, engine: Engine = NUMPY) -> WristFound:
+    """What one triple shows of the five fingers."""
     ambient = triple.ambient.image
-    led = shifted(lit(triple.led.image, ambient), -led_shift_px)
+    led = lit(triple.led.image, ambient)
     fingers = separate(led, view, engine)
     laser = laser_lines(lit(triple.laser.image, ambient), fingers, view, engine)
     return WristFound(triple, laser, fingertips(led, fingers, view))

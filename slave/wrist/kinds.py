@@ -1,4 +1,4 @@
-"""What frames of a strobed camera are, by what they show: LEDs on or off between two; ambient, laser, LED of three.
+"""Whether three frames of a strobed camera are ambient, laser and LED, in this order, by what they show.
 
 All is judged on a coarse image, cell by cell, by how far one frame is brighter than another *beyond* what noise, and
 ambient light that swings, explain:
@@ -9,13 +9,14 @@ ambient light that swings, explain:
 
 LEDs are told by broad light. The laser is told by a flash on what the LEDs light, or at its edge, and nowhere else: a
 window between moving fingers, a shadow, somebody who walks by are thin at times, or near, or there for one frame, and
-hardly ever all at once. Of three frames the ambient one is nowhere brighter, as light only adds.
+hardly ever all at once. Of three frames the ambient one is nowhere brighter, as light only adds. Nothing is compared
+with a frame before them, so it does not matter what the ambient light was then.
 Where both frames are saturated neither is brighter: such cells tell nothing and are not counted.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import Enum
+from functools import reduce
 from math import inf, log2
 
 import cv2
@@ -23,6 +24,7 @@ import numpy as np
 
 from common.arrays import Image
 
+_Cells = cv2.typing.MatLike  # of a coarse frame
 _SIZE = (80, 60)  # cells across and down: 8 x 8 px of 640 x 480
 _NOISE = 6  # levels: five standard deviations of a cell near saturation (16 px of 5 levels of shot noise)
 _SWING = 0.125  # of the ambient light: how far lamps on the mains swing between two frames
@@ -44,15 +46,6 @@ LASER_OF_ELSEWHERE = 2.0  # of flash elsewhere
 LASER_OF_OWN = 4.0  # of flash on the hand in the ambient frame: another laser frame has as many
 LASER_OF_EXCESS = 8.0  # of lines within the hand that the ambient frame has and another has not
 VALID_LEAST = 0.25  # share of the cells that are not saturated: with fewer nothing is told
-
-
-class Led(Enum):
-    """What became of the LEDs from one frame to another."""
-
-    ON = "on"
-    OFF = "off"
-    SAME = "same"
-    UNSURE = "unsure"
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,12 +70,15 @@ class Evidence:
         return min(self.led, self.laser, self.alone, self.steady)
 
 
+NO_EVIDENCE = Evidence(-inf, -inf, -inf, -inf)
+
+
 def coarse(image: Image) -> Image:
     """(60, 80) uint8 means over cells of a frame (H, W) or (H, W, 3).
 
     By halves as far as that goes: means of two by two are what a processor is quickest at.
     """
-    cells: cv2.typing.MatLike = image
+    cells: _Cells = image
     while cells.shape[1] % (2 * _SIZE[0]) == 0 and cells.shape[0] % (2 * _SIZE[1]) == 0:
         cells = cv2.resize(cells, (cells.shape[1] // 2, cells.shape[0] // 2), interpolation=cv2.INTER_AREA)
     if cells.shape[1::-1] != _SIZE:
@@ -90,88 +86,99 @@ def coarse(image: Image) -> Image:
     return np.asarray(cells if cells.ndim == 2 else cells.max(axis=2), np.uint8)
 
 
-def led_change(before: Image, after: Image) -> Led:
-    """What became of the LEDs between two coarse frames (60, 80)."""
-    valid = _valid(before, after)
-    if valid < VALID_LEAST * before.size:
-        return Led.UNSURE
-    on, off = (_broad(over, LED_NEVER * valid) / valid for over in _each_over(after, before))
-    if max(on, off) <= LED_NEVER:
-        return Led.SAME
-    if on >= LED_LEAST and off <= LED_NEVER:
-        return Led.ON
-    if off >= LED_LEAST and on <= LED_NEVER:
-        return Led.OFF
-    return Led.UNSURE
-
-
 def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
-    """Of three coarse frames (60, 80), each as what it should be."""
-    valid = _valid(ambient, led)
+    """Of three coarse frames (60, 80), each as what it should be; -inf: not looked at, as another is not positive."""
+    darker = cv2.min(ambient, led)
+    valid = _valid(darker)
     if valid < VALID_LEAST * ambient.size:
-        return Evidence(-inf, -inf, -inf, -inf)
-    (led_gain, led_loss), (laser_gain, laser_loss) = _each_over(led, ambient), _each_over(laser, ambient)
+        return NO_EVIDENCE
+    explained = cv2.LUT(darker, _EXPLAINED)
+    led_gain = cv2.subtract(cv2.subtract(led, ambient), explained)
+    if cv2.countNonZero(led_gain) <= LED_LEAST * valid:
+        return NO_EVIDENCE
+    lit = _octaves(_broad(led_gain) / valid, LED_LEAST)
+    laser_gain, laser_loss = _each_over(laser, ambient)
+    if not lit > 0.0 or cv2.countNonZero(laser_gain) <= LASER_LEAST:
+        return Evidence(lit, -inf, -inf, -inf)
+    led_loss = cv2.subtract(cv2.subtract(ambient, led), explained)
+    steady = -_octaves(max(_broad(over) for over in (laser_gain, laser_loss, led_loss)) / valid, LED_NEVER)
+    if not steady > 0.0:
+        return Evidence(lit, -inf, -inf, steady)
     led_over_laser, laser_over_led = _each_over(led, laser)
-    near = _near(np.minimum(led_gain, led_over_laser))
-    flash = _thin(np.minimum(laser_gain, laser_over_led))
+    flash = _thin(cv2.min(laser_gain, laser_over_led))
+    if cv2.countNonZero(flash) <= LASER_LEAST:
+        return Evidence(lit, -inf, -inf, steady)
+    near = _near(cv2.min(led_gain, led_over_laser))
     on_hand = cv2.countNonZero(cv2.bitwise_and(flash, near))
     elsewhere = cv2.countNonZero(cv2.subtract(flash, cv2.dilate(near, _AROUND)))
-    own = _shared(np.minimum(laser_loss, led_loss), lambda: _near(led_over_laser))
+    own = _shared(cv2.min(laser_loss, led_loss), lambda: _near(led_over_laser))
     excess = max(_shared(loss, lambda: _inside(led_gain)) for loss in (led_loss, laser_loss))
     rest = max(LASER_OF_ELSEWHERE * elsewhere, LASER_OF_OWN * own, LASER_OF_EXCESS * excess)
-    came_or_went = max(_broad(laser_gain), _broad(laser_loss), _broad(led_loss)) / valid
-    return Evidence(
-        _octaves(_broad(led_gain) / valid, LED_LEAST),
-        _octaves(on_hand, LASER_LEAST),
-        _octaves(on_hand, rest),
-        -_octaves(came_or_went, LED_NEVER),
-    )
+    return Evidence(lit, _octaves(on_hand, LASER_LEAST), _octaves(on_hand, rest), steady)
 
 
-def _valid(first: Image, second: Image) -> int:
-    """Number of cells in which one of the frames may be brighter than the other."""
-    return cv2.countNonZero(
-        cv2.threshold(cv2.min(first, second), _SATURATED - 1, 255, cv2.THRESH_BINARY_INV)[1]
-    )
+def unlit(frames: Sequence[Image]) -> bool:
+    """Whether no broad light comes or goes within these coarse frames (60, 80): the LEDs light none of them, or all."""
+    darkest = reduce(cv2.min, frames)
+    valid = _valid(darkest)
+    if valid < VALID_LEAST * darkest.size:
+        return False
+    gain = cv2.subtract(reduce(cv2.max, frames), darkest)
+    return _broad(cv2.subtract(gain, cv2.LUT(darkest, _EXPLAINED)), LED_NEVER * valid) <= LED_NEVER * valid
 
 
-def _each_over(first: Image, second: Image) -> tuple[Image, Image]:
+def brighter(frame: Image, other: Image) -> bool:
+    """Whether one coarse frame (60, 80) has broad light that the other has not, and lacks none: that of the LEDs."""
+    darker = cv2.min(frame, other)
+    valid = max(_valid(darker), VALID_LEAST * frame.size)
+    explained = cv2.LUT(darker, _EXPLAINED)
+    gain = cv2.subtract(cv2.subtract(frame, other), explained)
+    if _broad(gain, LED_LEAST * valid) <= LED_LEAST * valid:
+        return False
+    return _broad(cv2.subtract(cv2.subtract(other, frame), explained)) <= LED_NEVER * valid
+
+
+def _valid(darker: _Cells) -> int:
+    """Number of cells in which one frame may be brighter than another, of the darker of both."""
+    return cv2.countNonZero(cv2.threshold(darker, _SATURATED - 1, 255, cv2.THRESH_BINARY_INV)[1])
+
+
+def _each_over(first: _Cells, second: _Cells) -> tuple[_Cells, _Cells]:
     """How far each frame is brighter than the other beyond what noise and a swing of ambient light explain [levels]."""
     explained = cv2.LUT(cv2.min(first, second), _EXPLAINED)
-    pairs = ((first, second), (second, first))
-    one, other = (cv2.subtract(cv2.subtract(bright, dark), explained) for bright, dark in pairs)
-    return np.asarray(one, np.uint8), np.asarray(other, np.uint8)
+    one, other = cv2.subtract(first, second), cv2.subtract(second, first)
+    return cv2.subtract(one, explained), cv2.subtract(other, explained)
 
 
-def _lit(over: Image) -> cv2.typing.MatLike:
+def _lit(over: _Cells) -> _Cells:
     return cv2.threshold(over, 0, 255, cv2.THRESH_BINARY)[1]
 
 
-def _near(over: Image) -> cv2.typing.MatLike:
+def _near(over: _Cells) -> _Cells:
     """What the LEDs light, and a line's height above and below."""
     return cv2.dilate(cv2.morphologyEx(_lit(over), cv2.MORPH_OPEN, _SMALL), _LINE_HIGH)
 
 
-def _inside(over: Image) -> cv2.typing.MatLike:
+def _inside(over: _Cells) -> _Cells:
     """What lies within what the LEDs light, a line's height bridged."""
     return cv2.erode(cv2.morphologyEx(_lit(over), cv2.MORPH_CLOSE, _LINE_HIGH), _SMALL)
 
 
-def _broad(over: Image, least: float = 0.0) -> int:
+def _broad(over: _Cells, least: float = 0.0) -> int:
     """How many cells are broadly brighter; 0 where no more than `least` are brighter at all."""
     if cv2.countNonZero(over) <= least:
         return 0
     return cv2.countNonZero(cv2.morphologyEx(_lit(over), cv2.MORPH_OPEN, _SQUARE))
 
 
-def _shared(over: Image, where: Callable[[], cv2.typing.MatLike]) -> int:
+def _shared(over: _Cells, where: Callable[[], _Cells]) -> int:
     """How many cells of thin lines lie there; `where` is asked only if there can be any."""
     if cv2.minMaxLoc(over)[1] <= _LINE:
         return 0
     return cv2.countNonZero(cv2.bitwise_and(_thin(over), where()))
 
 
-def _thin(over: Image) -> cv2.typing.MatLike:
+def _thin(over: _Cells) -> _Cells:
     bright = cv2.threshold(over, _LINE, 255, cv2.THRESH_BINARY)[1]
     high = cv2.morphologyEx(bright, cv2.MORPH_OPEN, _COLUMN)
     return cv2.subtract(bright, high)

@@ -5,9 +5,8 @@ disagree it is counted, because one of them is wrong then.
 """
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -20,12 +19,10 @@ from common.messages import WristDetections
 from slave.cameras.replay import read_png
 from slave.cameras.source import Frame
 from slave.wrist.detector import WristDetector
-from slave.wrist.registration import led_shift
-from slave.wrist.strobe import Strobe, Triple
+from slave.wrist.strobe import Triple
 from slave.wrist.view import WristView
 
 _LOG = logging.getLogger(__name__)
-_TO_COMPARE = 30  # triples of which laser and LED frames are compared
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,14 +73,12 @@ class WristRecordingFound:
         frames: Frames read.
         counts: What the strobe counted: event -> how often.
         mislabelled: Frames of recognised triples that frames.csv says were lit otherwise.
-        led_shift_px: (2,) how far its LED frames lie beside its laser frames, which is taken into account.
     """
 
     detections: RecordedWristDetections
     frames: int
     counts: Mapping[str, int]
     mislabelled: int
-    led_shift_px: Float
 
     def summary(self) -> str:
         """One line for a person."""
@@ -96,12 +91,6 @@ class WristRecordingFound:
         if self.mislabelled:
             parts.append(
                 f"{self.mislabelled} frames lit otherwise than frames.csv says (its illumination is not used)"
-            )
-        if self.led_shift_px.any():
-            u, v = self.led_shift_px
-            parts.append(
-                f"LED frames lie ({u:+.1f}, {v:+.1f}) px beside the laser frames, as if their principal point was"
-                " mirrored: taken into account"
             )
         return ", ".join(parts)
 
@@ -173,27 +162,19 @@ def detect_wrist_recording(
     if not rows:
         raise RecordingError(f"{folder}/frames.csv: no frame of camera {camera!r}")
     own = recording.manifest.cameras[camera]
-
-    def frames() -> Iterator[Frame]:
-        for row in rows:
-            image = read_png(folder / row.file, (own.height_px, own.width_px), grey=True)
-            yield Frame(row.seq, row.t_ns, row.t_ns, image, row.illumination, exposure_us=own.exposure_us)
-
-    view, strobe = view_of(recording, rig, calibration, hand_file), Strobe(own.frame_rate_hz)
-    triples = (triple for frame in frames() if (triple := strobe.push(frame)) is not None)
-    shift_px = led_shift(islice(triples, _TO_COMPARE), view.optics)
-    detector = WristDetector(view, own.frame_rate_hz, shift_px)
-    found: list[
-        WristDetections
-    ] = []  # not their images, of which a long recording has more than memory holds
+    detector = WristDetector(view_of(recording, rig, calibration, hand_file), own.frame_rate_hz)
+    # Not their images, of which a long recording has more than memory holds.
+    found: list[WristDetections] = []
     mislabelled = 0
-    for i, frame in enumerate(frames()):
+    for i, row in enumerate(rows):
+        image = read_png(folder / row.file, (own.height_px, own.width_px), grey=True)
+        frame = Frame(row.seq, row.t_ns, row.t_ns, image, row.illumination, exposure_us=own.exposure_us)
         if (seen := detector.push(frame)) is not None:
             found.append(seen.message(camera, session=0))
             mislabelled += _mislabelled(seen.triple)
         progress(i + 1, len(rows))
     detections = RecordedWristDetections.of(found)
-    return WristRecordingFound(detections, len(rows), detector.counts, mislabelled, shift_px)
+    return WristRecordingFound(detections, len(rows), detector.counts, mislabelled)
 
 
 def _mislabelled(triple: Triple) -> int:

@@ -77,7 +77,7 @@ class Bench:
             f"beside.{marker}": 0.0 for marker in MARKERS
         }
         if name == "wrist":
-            usual = dict.fromkeys(("strobe.out_of_step", "strobe.unconfirmed", "strobe.unlit"), 0.0)
+            usual = dict.fromkeys(("strobe.out_of_step", "strobe.unlit"), 0.0)
         frames = {"frames": self.rate.get(name, 90.0) if name == "wrist" else rate}
         for event, number in (frames | usual | self.per_s.get(name, {})).items():
             self._add(name, event, dt_s * number)

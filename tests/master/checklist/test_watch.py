@@ -232,7 +232,7 @@ CASES = [
         "wrist",
         _event("wrist", "strobe.out_of_step", 20.0),
         _event("wrist", "strobe.out_of_step", 0.0),
-        "in the wrong one",
+        "in the wrong frame",
         "lead_us",
     ),
     Case(

@@ -210,8 +210,7 @@ def test_recorded_tips_are_found(datasets: Path, name: str, hidden: int) -> None
     assert (distance[reported] > ELSEWHERE_PX).mean() <= 0.02
     # A round end stays in sight while its foremost point has just turned behind it, and is reported: of the curl's 69
     # two by 2 and 4 px (triples 5 and 20) and five of the fist's last three triples, PIP 110 to 120 degrees, by 9 to
-    # 20 px; of the mcp's 12 two by 1 px (triple 7). The pictures before the repair, moved back by a fraction of a
-    # pixel, were blurred by that: the curl had 6 of 68, the little finger of triple 23 was not found in them.
+    # 20 px; of the mcp's 12 two by 1 px (triple 7).
     behind = reported & ~visible
     assert behind.sum() <= hidden
     for k, finger in np.argwhere(behind).tolist():

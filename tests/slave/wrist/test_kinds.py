@@ -10,7 +10,7 @@ import pytest
 
 from bench.wrist_strobe import Shown, rendered
 from common.arrays import Bool, Image
-from slave.wrist.kinds import LED_LEAST, Evidence, Led, coarse, evidence, led_change
+from slave.wrist.kinds import LED_LEAST, Evidence, brighter, coarse, evidence, unlit
 
 LIGHTS = ("dark", "indoor", "bright")
 
@@ -46,12 +46,17 @@ def test_no_other_three_kinds_are_taken_for_a_triple(ambient: str) -> None:
 
 
 @pytest.mark.parametrize("ambient", LIGHTS)
-def test_the_leds_are_seen_to_go_on_and_off(ambient: str) -> None:
+def test_it_is_seen_whether_the_leds_light_any_frame(ambient: str) -> None:
     found = cells(ambient)
     for dark, laser, led in zip(found[::3], found[1::3], found[2::3], strict=True):
-        assert led_change(dark, laser) is led_change(laser, dark) is Led.SAME
-        assert led_change(laser, led) is led_change(dark, led) is Led.ON
-        assert led_change(led, dark) is led_change(led, laser) is Led.OFF
+        assert unlit([dark, laser, dark])
+        assert unlit([led, led, led])
+        assert not any(
+            unlit(frames) for frames in ([dark, laser, led], [led, dark, laser], [dark, led, dark])
+        )
+        assert brighter(led, dark)
+        assert brighter(led, laser)
+        assert not any(brighter(*two) for two in ((dark, led), (laser, led), (laser, dark), (dark, laser)))
 
 
 def swinging(share: float) -> Callable[[Image], Image]:
@@ -71,7 +76,7 @@ def test_lamps_that_swing_neither_hide_a_triple_nor_make_one(share: float) -> No
     assert evidence(coarse(swung(dark)), coarse(laser), coarse(led)).margin > 0.25
     assert evidence(coarse(dark), coarse(swung(laser)), coarse(led)).margin > 0.25
     assert evidence(coarse(dark), coarse(laser), coarse(swung(led))).margin > 0.25
-    assert led_change(coarse(dark), coarse(swung(dark))) is Led.SAME
+    assert unlit([coarse(dark), coarse(swung(dark))])
     assert not evidence(coarse(dark), coarse(laser), coarse(swung(dark))).margin > 0.0
     assert not evidence(coarse(dark), coarse(swung(dark)), coarse(led)).margin > 0.0
 
@@ -108,13 +113,14 @@ def test_a_line_that_no_led_lights_is_no_laser() -> None:
 @pytest.mark.parametrize("level", [0, 2, 128, 255])
 def test_even_pictures_tell_nothing(level: int) -> None:
     even = coarse(np.full((480, 640), level, np.uint8))
-    assert led_change(even, even) in (Led.SAME, Led.UNSURE)
+    assert unlit([even, even, even]) is (level < 255)
     assert evidence(even, even, even).margin == -np.inf
 
 
 def test_saturated_pictures_are_unsure_and_not_unlit() -> None:
     white = coarse(np.full((480, 640), 255, np.uint8))
-    assert led_change(white, white) is Led.UNSURE
+    assert not unlit([white, white, white])
+    assert not brighter(white, white)
 
 
 def test_colour_and_grey_pictures_are_alike() -> None:

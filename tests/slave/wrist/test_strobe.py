@@ -1,6 +1,6 @@
 """Triples out of disordered streams: never of wrong kinds, never of two poses, and what is counted instead."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from bench.wrist_strobe import RATE_HZ, Delivered, Score, Shown, deliver, recorded, rendered, score
+from common.arrays import Image
 from common.frame_recording import Illumination
 from slave.cameras.source import Frame
 from slave.wrist.kinds import coarse, evidence
-from slave.wrist.strobe import Strobe, StrobeState, Triple
+from slave.wrist.strobe import Strobe, Triple
 
 RECORDINGS = ("curl", "mcp", "spread", "left_small")
 PERIOD_NS = 1e9 / RATE_HZ
@@ -52,11 +53,8 @@ def test_every_whole_triple_of_a_clean_stream_comes_through(ambient: str, start:
     triples, strobe = pushed(clean(ambient)[start:])
     first = 0 if start == 0 else 3
     assert seqs(triples) == [(k, k + 1, k + 2) for k in range(first, 36, 3)]
-    assert strobe.state is StrobeState.IN_STEP
     assert strobe.counts["triples"] == len(triples)
-    assert not any(
-        strobe.counts[event] for event in ("gaps", "out_of_step", "unsure", "unconfirmed", "unlit")
-    )
+    assert not any(strobe.counts[event] for event in ("gaps", "out_of_step", "unsure", "unlit"))
 
 
 def test_labels_are_not_looked_at() -> None:
@@ -74,7 +72,7 @@ def test_frames_dropped_doubled_and_swapped_make_no_wrong_triple(ambient: str, h
     assert found.wrong_kind == 0
     assert found.mixed == 0
     if ambient != "sun":
-        assert found.kept > 0.6 * found.whole > 0
+        assert found.kept > (0.6 if hidden else 0.99) * found.whole > 0
 
 
 def test_the_score_sees_a_planted_wrong_triple() -> None:
@@ -97,7 +95,7 @@ def test_recorded_poses_in_and_out_of_order(datasets: Path, name: str) -> None:
     for seed in range(8):
         score(frames, deliver(len(frames), seed), found)
     assert (found.wrong_kind, found.mixed) == (0, 0)
-    assert found.kept > 0.6 * found.whole
+    assert found.kept == found.whole > 0
 
 
 def test_a_lost_frame_costs_its_triple_alone() -> None:
@@ -135,7 +133,7 @@ def test_pictures_that_were_exchanged_under_their_times_do_not_join_two_poses() 
     triples, strobe = pushed(pictures(order))
     assert (14, 15, 16) not in seqs(triples)
     assert all(one[0] % 3 == 0 for one in seqs(triples))
-    assert strobe.counts["unconfirmed"] + strobe.counts["out_of_step"] > 0
+    assert strobe.counts["out_of_step"] > 0
 
 
 @pytest.mark.parametrize("order", [(A, E, L), (L, A, E), (L, E, A), (E, A, L), (E, L, A)])
@@ -174,12 +172,10 @@ def test_without_a_hand_nothing_is_told_and_said_to_be_unlit() -> None:
     strobe = Strobe(RATE_HZ)
     for place, image in enumerate(noisy):
         assert strobe.push(frame_of(Shown(0, Illumination.AMBIENT, image), place)) is None
-    assert strobe.state is StrobeState.UNLIT
-    assert strobe.counts["unlit"] >= 26
+    assert strobe.counts["unlit"] == 9  # of ten cycles; of the first nobody knows where it began
     assert strobe.counts["out_of_step"] == strobe.counts["unsure"] == 0
     found = [strobe.push(frame_of(one, 30 + place)) for place, one in enumerate(shown())]
-    assert sum(triple is not None for triple in found) >= 11
-    assert strobe.state is StrobeState.IN_STEP
+    assert sum(triple is not None for triple in found) == 12
 
 
 def test_black_white_and_random_pictures_are_ordinary_input() -> None:
@@ -213,3 +209,132 @@ def test_a_real_sensor_of_10_bits_whose_clock_and_black_level_are_not_as_stated(
     assert seqs(pushed(frames)[0]) == seqs(pushed(clean(ambient))[0])
     gap = pushed([*frames[:9], *frames[21:]])[0]  # four triples lost
     assert [one.led.seq for one in gap] == [2, 5, 8, *range(23, 36, 3)]
+
+
+@pytest.mark.parametrize(
+    ("order", "lost"),
+    [
+        ([12, 14, 13], None),
+        ([12, 14, 13], 14),
+        ([14, 13, 12], None),
+        ([12, 13, 12], None),
+        ([12, 12, 13], 13),
+    ],
+)
+def test_leds_that_are_on_in_another_frame_or_in_none_are_out_of_step(
+    order: list[int], lost: int | None
+) -> None:
+    """The fifth cycle shows these pictures; the frame of that place in it does not come."""
+    frames = pictures([*range(12), *order, *range(15, 36)])
+    triples, strobe = pushed([frame for frame in frames if frame.seq != lost])
+    assert seqs(triples) == [(k, k + 1, k + 2) for k in range(0, 36, 3) if k != 12]
+    assert strobe.counts["out_of_step"] == 1
+    assert strobe.counts["unsure"] == strobe.counts["unlit"] == 0
+
+
+def test_a_hand_that_leaves_is_out_of_step_once_and_then_unlit() -> None:
+    images = [one.image for one in shown()] + [shown()[k].image for k in (0, 1) for _ in range(15)]
+    noisy = [np.clip(image.astype(int) + k % 2, 0, 255).astype(np.uint8) for k, image in enumerate(images)]
+    triples, strobe = pushed([frame_of(Shown(0, Illumination.NONE, one), k) for k, one in enumerate(noisy)])
+    assert len(triples) == 12
+    assert (strobe.counts["out_of_step"], strobe.counts["unlit"]) == (1, 9)
+
+
+LIT = 30  # triples
+READABLE = (
+    "dark",
+    "indoor",
+    "indoor x 2",
+    "indoor x 5",
+    "bright",
+)  # the sun, and ten times the room, drown the LEDs
+
+
+@cache
+def in_light(name: str) -> list[Image]:
+    """The same poses in one light: those of a room, or of an indoor room some times as bright."""
+    room, _, times = name.partition(" x ")
+    images = [one.image for one in rendered(room, triples=LIT, seed=5)]
+    if not times:
+        return images
+    own = [image.astype(np.float64) for image in in_light("dark")]
+    lit = [dark + float(times) * (image - dark) for dark, image in zip(own, images, strict=True)]
+    return [np.clip(np.rint(image), 0, 255).astype(np.uint8) for image in lit]
+
+
+def under(light: Callable[[int], str]) -> tuple[set[int], Strobe]:
+    """Which poses of a stream come through whose frame k is taken in `light(k)`; none may be made of other frames."""
+    triples, strobe = pushed(
+        [frame_of(Shown(0, Illumination.NONE, in_light(light(k))[k]), k) for k in range(3 * LIT)]
+    )
+    found = seqs(triples)
+    assert set(found) <= {(k, k + 1, k + 2) for k in range(0, 3 * LIT, 3)}
+    return {first // 3 for first, _, _ in found}, strobe
+
+
+def in_one_light(light: Callable[[int], str]) -> set[int]:
+    """The poses whose three frames are taken in the same light, one that leaves the LEDs to be seen."""
+    lights = [{light(3 * pose + kind) for kind in range(3)} for pose in range(LIT)]
+    return {pose for pose, seen in enumerate(lights) if len(seen) == 1 and seen <= set(READABLE)}
+
+
+@pytest.mark.parametrize("every", [1, 2, 3, LIT // 2])
+@pytest.mark.parametrize("within", [A, L, E])
+@pytest.mark.parametrize(
+    "lights",
+    [
+        ("dark", "indoor"),
+        ("dark", "bright"),
+        ("indoor", "bright"),
+        ("indoor", "indoor x 2"),
+        ("indoor", "indoor x 5"),
+        ("indoor", "indoor x 10"),
+        ("dark", "sun"),
+    ],
+    ids=" | ".join,
+)
+@pytest.mark.parametrize("backwards", [False, True])
+def test_light_that_is_switched_costs_no_triple_but_the_one_it_is_switched_in(
+    lights: tuple[str, str], within: int, every: int, *, backwards: bool
+) -> None:
+    """Before frame A, L or E, every so many triples."""
+    one, other = reversed(lights) if backwards else lights
+
+    def light(k: int) -> str:
+        return one if (k - within) // (3 * every) % 2 == 0 else other
+
+    found, strobe = under(light)
+    assert in_one_light(light) <= found
+    if within == A and set(lights) <= set(READABLE):
+        assert len(found) == LIT
+        assert not any(strobe.counts[event] for event in ("gaps", "out_of_step", "unsure", "unlit"))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_light_that_is_another_in_every_triple_costs_none(seed: int) -> None:
+    lights = np.random.default_rng(seed).choice(READABLE, LIT).tolist()
+    assert len(under(lambda k: lights[k // 3])[0]) == LIT
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_light_that_is_another_in_any_frame_makes_no_wrong_triple(seed: int) -> None:
+    names = np.random.default_rng(seed).choice([*READABLE, "indoor x 10", "sun"], 3 * LIT).tolist()
+    steady = np.random.default_rng(seed + 100).random(LIT) < 0.5
+
+    def light(k: int) -> str:
+        return names[k - k % 3] if steady[k // 3] else names[k]
+
+    assert in_one_light(light) <= under(light)[0]
+
+
+def test_a_cycle_that_slips_under_light_that_is_switched_is_known_anew_within_two_triples() -> None:
+    """A frame of the fifth pose is lost, and no time tells of it; the light goes on before every second pose."""
+    for lost in range(12, 15):
+        order = [k for k in range(3 * LIT) if k != lost]
+        images = [in_light("indoor" if k // 3 % 2 == 0 else "dark")[k] for k in order]
+        triples, strobe = pushed(
+            [frame_of(Shown(0, Illumination.NONE, one), place) for place, one in enumerate(images)]
+        )
+        found = [tuple(order[seq] for seq in one) for one in seqs(triples)]
+        assert found == [(k, k + 1, k + 2) for k in range(0, 3 * LIT, 3) if k not in (12, 15)]
+        assert strobe.counts["out_of_step"] in (1, 2)  # that triple, and the cycle that ends where none does
