@@ -5,6 +5,20 @@ import numpy as np
 
 from common.arrays import Image
 
+WHITE = 250  # grey levels of a frame: as bright or brighter
+LEAST = 16  # grey levels that were added: less is noise beside what is white anyway
+
+
+def lit_line(frame: Image, ambient: Image) -> Image:
+    """As `lit` (H, W), for the laser's line: white where the light that was added made the frame white.
+
+    In the sun a line has less room up to white the brighter the skin is: what is left of it says nothing of the line.
+    """
+    out = lit(frame, ambient)
+    white = cv2.threshold(frame, WHITE - 1, 255, cv2.THRESH_BINARY)[1]
+    added = cv2.threshold(out, LEAST, 255, cv2.THRESH_BINARY)[1]
+    return np.asarray(cv2.max(out, cv2.bitwise_and(white, added)), np.uint8)
+
 
 def lit(frame: Image, ambient: Image) -> Image:
     """The light of the laser or the LEDs alone: a saturating difference, never below 0 (row D2).

@@ -1,7 +1,7 @@
 """The whole line of a wrist camera, from frames to what its laser and its LEDs show of five fingers.
 
-frame -> strobe -> triple -- LED less ambient ---> seams between the fingers, fingertips
-                         \\-- laser less ambient -> where the laser meets each finger
+frame -> strobe -> triple -- LED less ambient ---> seams between the fingers
+                         \\-- laser less ambient -> where the laser meets each finger -> fingertips
 """
 
 from collections import deque
@@ -12,13 +12,14 @@ import numpy as np
 from common.arrays import Float
 from common.messages import WristDetections
 from slave.cameras.source import Frame
-from slave.wrist.background import lit
+from slave.wrist.background import lit, lit_line
 from slave.wrist.corridors import corridors_of
 from slave.wrist.engine import NUMPY, Engine
 from slave.wrist.fingers import separate
-from slave.wrist.fingertips import Fingertips, fingertips
+from slave.wrist.fingertips import NO_TIPS, Fingertips, fingertips
 from slave.wrist.laser import LaserLines, laser_lines
 from slave.wrist.palm_turn import prepare
+from slave.wrist.postures import postures_of
 from slave.wrist.reach import reach_of
 from slave.wrist.strobe import Strobe, Triple
 from slave.wrist.view import WristView
@@ -111,6 +112,7 @@ def prepared(view: WristView, engine: Engine = NUMPY) -> WristView:
 
     A triple in which all is dark goes through the whole line, so that the first real one takes no longer than others.
     """
+    postures_of(view)
     for turned in prepare(view):
         corridors_of(turned)
         reach_of(turned)
@@ -124,5 +126,7 @@ def find(triple: Triple, view: WristView, engine: Engine = NUMPY) -> WristFound:
     ambient = triple.ambient.image
     led = lit(triple.led.image, ambient)
     fingers = separate(led, view, engine)
-    laser = laser_lines(lit(triple.laser.image, ambient), fingers, view, engine)
-    return WristFound(triple, laser, fingertips(led, fingers, view))
+    laser = laser_lines(lit_line(triple.laser.image, ambient), fingers, view, engine)
+    # A bent wrist turns fingers before the camera in ways that no posture of the tables has.
+    tips = fingertips(led, triple.led.image, laser.uv, view) if fingers.turn.straight else NO_TIPS
+    return WristFound(triple, laser, tips)

@@ -1,42 +1,64 @@
-"""Fingertips in the LED image: templates of bent fingers against what is seen along each finger (D15).
+"""Fingertips in the LED image, by analysis and synthesis: postures that the laser allows, compared with what is seen.
 
-The profile of nearness along each finger (`spines`) is compared with those of all its bends (`tip_bends`). From that
-comes where the end of the finger lies between the edges that are seen, the contour above and the step below, whose
-places are then measured at full resolution (`tip_ends`); and how likely that end is seen at all. A finger that points
-away ends behind its own horizon, one that is folded shows its back: no tip is reported. Nor is one of a bent wrist,
-which turns fingers before the camera in ways that no template has.
-
-The thumb is one more finger, read along its own way (`strips`). It shows its end where it is raised off the palm. Where
-a seam runs over skin and not through a crease, it cuts a finger, mostly the thumb before others: what lies beside it
-there is a part of something, and no finger is given its end.
+The laser gives a point of each finger's skin in space, and with it the abduction and one of the flexions: of the
+finger's table (`postures`) few rows are left. Each says how bright its samples would be; the scale of brightness comes
+from the laser points too, whose distance is known. The best ones are where the end of the finger may be, and its
+outline, measured at full resolution (`outline`), says which it is and where exactly.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from common.arrays import Bool, Float, Image
-from slave.wrist.fingers import Fingers
-from slave.wrist.half_spheres import half_spheres
-from slave.wrist.led_depth import SHRINK, Float32, LedOptics, depth_about, led_optics, nearness, shrink
-from slave.wrist.spines import borders, spines
-from slave.wrist.strips import ROW_PX, THUMB, Strips, strips_of
-from slave.wrist.tip_bends import Bend, bends_of, palm_gain, profiles
-from slave.wrist.tip_ends import LEAST_FACING, End, edges, full_profile, through_end
-from slave.wrist.tip_templates import templates_of
+from common.arrays import Bool, Float, Image, Int
+from slave.wrist.led_depth import SHRINK, Float32, depth_about, led_optics, nearness, shrink
+from slave.wrist.outline import DIRECTIONS as OUTLINE
+from slave.wrist.outline import fitted
+from slave.wrist.postures import (
+    ABOVE,
+    APEX,
+    BONES,
+    DIRECTIONS,
+    END,
+    HIGHEST,
+    Postures,
+    plane_axes,
+    postures_of,
+)
 from slave.wrist.view import WristView
 
-LEAST_SEEN = 0.65  # probability that the end of the finger is seen
-# Of thumb and fingers: where nothing is before it, the thumb is broad and plain; a finger behind another or behind the
-# thumb looks like none of the templates.
-LEAST_LIKENESS = 0.995, 0.985
-MOST_SIGMA = 0.5  # of a fingertip's radius
-VALLEY = 0.85  # of the nearness of a finger: a crease beside it is darker
-LAST_BONE = 1.0, 3.5  # of a fingertip's radius above its end and below: where its sides are looked at
-CUT = (
-    2,
-    4,
-)  # stations of thumb and finger there with skin at a side: a cut, not a spot where two fingers touch
+CLIPPED = 247  # grey levels of the LED frame, from which a sample may be brighter than it looks
+LEAST_NEAR = np.float32(1.5)  # roots of grey levels: noise
+SHADE = 0.96  # of the light of skin that faces the camera: what a finger returns at its laser point
+MOST_ABDUCTION = 1.7  # of the outer two of the table
+# How far a posture may meet the laser from where it was seen: flesh is off its cones.
+WITHIN_M, SIGMA_M = 4e-3, 2.5e-3
+MOST_OFF_M, SPREAD_M = 15e-3, 3e-3  # where no posture is as near as that
+ASIDE_M, MOST_ASIDE = 2.5e-3, 3.0  # standard deviation across the fingers, and deviations allowed
+UNSURE, VARIANT = 0.18, 1.2  # of the outer abductions: less is one; deviations of the other two
+MOST_OFF = 0.35  # of the logarithm of a fingertip's nearness
+THUMB_WITHIN_M, THUMB_SIGMA_M = 12e-3, 5e-3
+ABDUCTION_SIGMA = 0.5  # of the outer two
+OWN_SIGMA, OWN_MOST = 0.1, 9.0  # of the logarithm of nearness on the finger; squares of deviations that count
+SCALE_SIGMA = 0.12  # of that which all samples of a finger share
+DARKER, AS_BRIGHT = 0.65, 0.95  # of a finger's nearness: what is beyond its end costs nothing, costs all
+ABOVE_MOST, ABOVE_UNKNOWN = 9.0, 0.33  # and of the root of that where the image is saturated
+UNKNOWN_COST = 1.0  # of a sample outside of the image, or where that is saturated
+MOST_COMPARED = 250  # of all hypotheses
+MODES = 4  # places of a finger whose outlines are looked at
+MODE_WITHIN = 24.0  # what they may cost more than the best
+APART = 0.8  # of the radius of a fingertip: places that differ
+SHOWN_WORTH = 30.0  # what an outline that is not seen at all costs
+AT_SIGMA, SIZE_SIGMA = 0.35, 0.12  # of the radius: how far a posture's outline may be from the seen one
+ENDS_WITHIN = 40.0  # of the best posture's cost: those whose ends are averaged
+CORRELATED = 2.5  # samples that differ for one reason
+# Of an end that is reported; of the thumb, whose four angles are searched less finely, and of the fingers.
+LEAST_SEEN, LEAST_SHOWN, MOST_MISFIT = 0.15, np.array([0.75, 0.6]), np.array([15.0, 20.0])
+# Standard deviations: edges; of the radius, how far flesh is off its cones, and where on its disk an end is that faces
+# the camera; and the misfit at which they are twice as large.
+PIXEL, FLESH, PULP, DOUBTFUL = 0.7, 0.05, 0.08, 40.0
+OF_SPREAD = 0.6  # postures that are possible differ by more than the mean of them is off
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,78 +76,284 @@ class Fingertips:
     depth: Float
 
 
-def fingertips(led: Image, fingers: Fingers, view: WristView) -> Fingertips:
-    """Find them in the difference of LED and ambient frame (H, W)."""
-    uv, sigma, depth = np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan)
-    if not fingers.turn.straight:
-        return Fingertips(uv, sigma, depth)
-    optics, bank, strips = led_optics(view), templates_of(view), strips_of(view)
-    near = nearness(shrink(led), optics)
-    gain = palm_gain(near, bank)
-    if gain is None:
-        return Fingertips(uv, sigma, depth)
-    border, strip = borders(fingers, view), strips.beside(near)
-    lines = spines(strip, border, bank.unit.shape[2])
-    seen = profiles(strip, lines, border, bank)
-    bends = bends_of(seen, bank, gain)
-    skin = over_skin(strip, border, seen, strips)
-    ends: list[End] = []
-    for k, bend in enumerate(bends):
-        if bend is None or bend.seen < LEAST_SEEN or bend.likeness < LEAST_LIKENESS[min(k, 1)]:
-            continue
-        line = through_end(lines[k, : int(bank.rows[k])], bend)
-        ends += edges(k, *full_profile(led, line, k, strips), bend)
-    for end, middle in zip(ends, _middles(ends, near, optics, strips), strict=True):
-        at, spread = end.place(middle)
-        k, radius = end.finger, end.bend.radius_px
-        low, high = border[k, :, min(max(int(at[1]) // ROW_PX, 0), border.shape[2] - 1)].tolist()
-        if spread > MOST_SIGMA * radius or not low <= (at[0] - 0.5 * (SHRINK - 1)) / SHRINK <= high:
-            continue
-        last = _last_bone(end.bend, at[1])
-        if not seen[k, last].any() or np.count_nonzero(skin[k, last]) >= CUT[min(k, 1)]:
-            continue
-        found = strips.to_image(k, np.array(at))
-        uv[k], sigma[k] = found, spread
-        depth[k] = depth_about(near, optics, float(found[0]), float(found[1]), radius)
-    return Fingertips(uv, sigma, depth)
+NO_TIPS = Fingertips(np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan))
 
 
-def _middles(ends: list["End"], near: Float32, optics: LedOptics, strips: Strips) -> list[Float | None]:
-    """The middles (2,) of those fingertips that are seen whole, in their strips; None of the others."""
-    out: list[Float | None] = [None] * len(ends)
-    facing = [k for k, end in enumerate(ends) if end.bend.facing > LEAST_FACING]
-    if facing:
-        guess = np.array([strips.to_image(ends[k].finger, np.array(ends[k].middle)) for k in facing])
-        centres = half_spheres(near, optics, guess, np.array([ends[k].bend.radius_px for k in facing]))
-        for k, centre in zip(facing, centres, strict=True):
-            if np.isfinite(centre[0]):
-                out[k] = strips.of_image(ends[k].finger, centre)
+@dataclass(frozen=True, slots=True, eq=False)
+class LedImage:
+    """What samples are compared with: nearness (h, w) of the shrunken image, and where it is a lower bound (h, w)."""
+
+    near: Float32
+    clipped: Bool
+
+    def at(self, uv: Float32) -> tuple[Float32, Bool, Bool]:
+        """Nearness, bound and whether it is outside of the image, at pixels (..., 2)."""
+        height, width = self.near.shape
+        cell = ((uv + np.float32(0.5)) * np.float32(1.0 / SHRINK)).astype(np.int32)
+        column, row = cell[..., 0], cell[..., 1]
+        inside_column, inside_row = (
+            np.minimum(np.maximum(column, 0), width - 1),
+            np.minimum(np.maximum(row, 0), height - 1),
+        )
+        outside = (inside_column != column) | (inside_row != row)
+        at = inside_row * width + inside_column
+        return self.near.ravel()[at], self.clipped.ravel()[at], outside
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypotheses:
+    """N postures, finger by finger.
+
+    Attributes:
+        finger: (N,).
+        uv: (N, SAMPLES, 2) [px].
+        near, open, end: As of `Postures`.
+        cost: (N,) of what the laser says.
+    """
+
+    finger: Int
+    uv: Float32
+    near: Float32
+    open: Float32
+    end: Float32
+    cost: Float32
+
+
+def allowed(table: Postures, plane: Float32) -> tuple[Int, Float32, Float32]:
+    """Which rows meet the laser about where each finger (5, 2) [m] does; their abduction and what they cost.
+
+    The abduction is by Bayes' rule: of a finger that is bent up at its knuckle the laser tells little of it, and rows
+    come in three abductions.
+    """
+    x, z = plane[1:, :1], plane[1:, 1:]
+    (x0, z0), (x1, z1), (x2, z2) = table.laser
+    gain = x1 * np.float32(1.0 / ASIDE_M**2)
+    known = gain * x1
+    known += np.float32(1.0 / ABDUCTION_SIGMA**2)
+    gain /= known
+    aside = x - x0
+    share = aside * gain
+    share = (aside - x2 * share * share) * gain
+    off = np.abs(z0 + share * (z1 + share * z2) - z)
+    aside -= share * (x1 + share * x2)
+    aside *= np.float32(1.0 / ASIDE_M)
+    off[~((np.abs(share) < MOST_ABDUCTION) & (np.abs(aside) < MOST_ASIDE))] = np.inf
+    least = np.fmin.reduce(off, axis=1, keepdims=True, initial=np.inf)
+    least[~(least < MOST_OFF_M)] = -np.inf  # nothing is as near as that
+    rows = np.flatnonzero(off < np.maximum(WITHIN_M, least + SPREAD_M) * (least >= 0.0))
+    share, aside = share.ravel()[rows], aside.ravel()[rows]
+    off = (off - least).ravel()[rows] * np.float32(1.0 / SIGMA_M)
+    cost = off * off + (share * np.float32(1.0 / ABDUCTION_SIGMA)) ** 2 + aside * aside
+    spread = np.float32(VARIANT) / np.sqrt(known.ravel()[rows])
+    wide = np.flatnonzero(spread > VARIANT * UNSURE)
+    more = cost[wide] + np.float32(VARIANT**2)
+    spread = spread[wide]
+    off = table.thumb_laser - plane[0, :, None]
+    square = off[0] ** 2 + off[1] ** 2
+    thumb = np.flatnonzero(square < THUMB_WITHIN_M**2)
+    rows += table.thumb
+    return (
+        np.concatenate([thumb, rows, rows[wide], rows[wide]]),
+        np.concatenate([np.zeros(len(thumb), np.float32), share, share[wide] + spread, share[wide] - spread]),
+        np.concatenate([square[thumb] * np.float32(1.0 / THUMB_SIGMA_M**2), cost, more, more]),
+    )
+
+
+def hypotheses(laser_m: Float, image: LedImage, gain: float, view: WristView) -> Hypotheses | None:
+    """Postures that the laser points (5, 3) [m] allow, and whose fingertips are about as bright as they should be."""
+    table = postures_of(view)
+    rows, share, cost = allowed(table, (laser_m @ plane_axes(view).T).astype(np.float32))
+    seen, bound, outside = image.at(_at(table.middle[rows], share))
+    off = _logarithm(seen, table.near[rows, END] * np.float32(gain), bound)
+    kept = np.flatnonzero((np.abs(off) < MOST_OFF) & ~outside)
+    if not len(kept):
+        return None
+    kept = kept[np.argsort(rows[kept], kind="stable")]
+    rows, share = rows[kept], share[kept]
+    finger = np.maximum((rows - table.thumb) // table.laser.shape[-1] + 1, 0)
+    return Hypotheses(
+        finger, _at(table.uv[rows], share), table.near[rows], table.open[rows], table.end[rows], cost[kept]
+    )
+
+
+def _at(parabola: Float32, share: Float32) -> Float32:
+    """Values (N, ...) of parabolas (N, 3, ...) at abductions (N,)."""
+    by = share.reshape(-1, *[1] * (parabola.ndim - 2))
+    out = parabola[:, 2] * by
+    out += parabola[:, 1]
+    out *= by
+    out += parabola[:, 0]
     return out
 
 
-def _last_bone(bend: Bend, v: float) -> slice:
-    """The stations of a finger's last bone, whose end is at row v."""
-    above, below = (LAST_BONE[1], 0.0) if bend.down else LAST_BONE
-    first, last = (max(int((v + x * bend.radius_px) / ROW_PX), 0) for x in (-above, below))
-    return slice(first, last + 1)
+def _logarithm(seen: Float32, predicted: Float32, bound: Bool) -> Float32:
+    """Of nearness by what is predicted; where the image is saturated it may be as bright as predicted."""
+    off = np.log(np.maximum(seen, LEAST_NEAR) / np.maximum(predicted, np.float32(0.1)))
+    np.maximum(off, 0.0, out=off, where=bound)
+    return off
 
 
-def over_skin(strip: Float32, border: Float32, seen: Float32, strips: Strips) -> Bool:
-    """At which stations (5, R) a finger is as near at one of its borders as in its middle.
+def costs(some: Hypotheses, image: LedImage, gain: float) -> Float32:
+    """Minus twice the logarithm of the likelihood (N,) of hypotheses by laser and samples."""
+    seen, bound, outside = image.at(some.uv[:, :APEX])
+    predicted = some.near * np.float32(gain)
+    off = _logarithm(seen[:, BONES], predicted[:, BONES], bound[:, BONES])
+    most = np.float32(3.0 * OWN_SIGMA + SCALE_SIGMA)
+    count = off.shape[1]
+    weight = np.float32(1.0 / (count + (OWN_SIGMA / SCALE_SIGMA) ** 2))
+    scale = weight * np.minimum(np.maximum(off, -most), most).sum(axis=1)
+    square = ((off - scale[:, None]) * np.float32(1.0 / OWN_SIGMA)) ** 2
+    np.minimum(square, OWN_MOST, out=square)
+    np.maximum(square, UNKNOWN_COST, out=square, where=bound[:, BONES])
+    square[outside[:, BONES]] = UNKNOWN_COST
+    bright = (
+        seen[:, ABOVE] / np.maximum(predicted[:, HIGHEST, None], np.float32(0.1)) - DARKER
+    ) * np.float32(1.0 / (AS_BRIGHT - DARKER))
+    bright = np.minimum(np.maximum(bright, 0.0), 1.0)
+    bright[bound[:, ABOVE]] = ABOVE_UNKNOWN
+    bright[outside[:, ABOVE] | (predicted[:, ABOVE] > 0.0)] = 0.0
+    above = np.float32(ABOVE_MOST) * (bright * bright).sum(axis=1)
+    return some.cost + square.sum(axis=1) + above + (scale * np.float32(1.0 / SCALE_SIGMA)) ** 2
+
+
+def modes(some: Hypotheses, cost: Float32) -> Int:
+    """The best hypotheses (M,) of each finger at places that differ, best first."""
+    first = np.flatnonzero(np.diff(some.finger, prepend=-1))
+    least = np.repeat(np.minimum.reduceat(cost, first), np.diff(first, append=len(cost)))
+    more = cost - least
+    good = np.flatnonzero(more < MODE_WITHIN)
+    order = good[np.argsort(more[good])][:MOST_COMPARED]
+    u, v = some.uv[order, END].T.tolist()
+    near = (APART * some.end[order, 0]).tolist()
+    out: list[int] = []
+    kept: tuple[list[tuple[float, float, float]], ...] = ([], [], [], [], [])
+    for k, finger, x, y, r in zip(order.tolist(), some.finger[order].tolist(), u, v, near, strict=True):
+        others = kept[int(finger)]
+        if len(others) == MODES:
+            continue
+        if all((x - a) ** 2 + (y - b) ** 2 >= apart for a, b, apart in others):
+            others.append((x, y, r * r))
+            out.append(k)
+    return np.array(out, np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """The best end of each of K fingers.
+
+    Attributes:
+        finger: (K,).
+        uv: (K, 2) [px].
+        sigma_px: (K,).
+        radius_px: (K,) of its outline.
+        misfit: (K,) minus twice the logarithm of its likelihood, by samples and outline.
+        shown: (K,) share of the outline that is seen.
+        seen: (K,) probability that the finger itself leaves its end to be seen.
+    """
+
+    finger: Int
+    uv: Float
+    sigma_px: Float
+    radius_px: Float
+    misfit: Float
+    shown: Float
+    seen: Float
+
+
+def fingertips(led: Image, frame: Image, laser_uv: Float, view: WristView) -> Fingertips:
+    """Find them in one LED image.
 
     Args:
-        strip: (R or more, columns) nearness of the strips.
-        border: (5, 2, R or more) columns between which the fingers are.
-        seen: (5, R) their profiles.
-        strips: Whose.
+        led: (H, W) difference of LED and ambient frame.
+        frame: (H, W) the LED frame itself, which says where the image is saturated.
+        laser_uv: (5, 2) where the laser meets the fingers [px]; NaN: not seen, then its tip is not sought.
+        view: Device and hand; the wrist is straight.
     """
-    rows, width, first = seen.shape[1], strip.shape[1], int(strips.first_u) // SHRINK
-    low, high = np.full((5, 1, 1), 1), np.full((5, 1, 1), first - 2)
-    low[THUMB], high[THUMB] = first + 1, width - 2
-    column = np.rint(border[..., :rows]).astype(np.int64)
-    inside = (column >= low) & (column <= high)
-    at = column.clip(low, high) + np.arange(rows, dtype=np.int64) * width
-    flat = strip.ravel()
-    beside = np.minimum(np.minimum(flat[at - 1], flat[at]), flat[at + 1])
-    skin: Bool = (beside > VALLEY * seen[:, None]) & inside & (seen[:, None] > 0.0)
-    return skin[:, 0] | skin[:, 1]
+    out = Fingertips(np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan))
+    optics = led_optics(view)
+    near = nearness(shrink(led), optics)
+    found = candidates(led, LedImage(near, frame[1::SHRINK, 1::SHRINK] > CLIPPED), laser_uv, view)
+    if found is None:
+        return out
+    kind = np.minimum(found.finger, 1)
+    good = (found.seen > LEAST_SEEN) & (found.shown > LEAST_SHOWN[kind]) & (found.misfit < MOST_MISFIT[kind])
+    for k in np.flatnonzero(good).tolist():
+        finger, at = int(found.finger[k]), found.uv[k]
+        depth = depth_about(near, optics, float(at[0]), float(at[1]), float(found.radius_px[k]))
+        if np.isfinite(depth):
+            out.uv[finger], out.sigma_px[finger], out.depth[finger] = at, found.sigma_px[k], depth
+    return out
+
+
+def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) -> Candidates | None:
+    """What is most likely the end of each finger whose laser point is known; None: of no finger."""
+    laser_m = view.on_plane(laser_uv)
+    gain = light_scale(image, laser_uv, laser_m)
+    some = hypotheses(laser_m, image, gain, view) if gain is not None else None
+    if gain is None or some is None:
+        return None
+    cost = costs(some, image, gain)
+    best = modes(some, cost)
+    finger = some.finger[best]
+    outline = np.repeat(some.open[best], OUTLINE // DIRECTIONS, axis=1)
+    circle = fitted(led, some.uv[best, END], some.end[best, 0], outline)
+    misfit = cost[best] + SHOWN_WORTH * (1.0 - circle.shown)
+    order = np.lexsort((misfit, finger))
+    chosen = order[np.append(True, finger[order[1:]] != finger[order[:-1]])]
+    ends = _ends(some, cost, finger[chosen], circle.middle[chosen], circle.radius[chosen])
+    circle = fitted(led, circle.middle[chosen], circle.radius[chosen], outline[chosen])
+    radius = circle.radius
+    flesh = radius * np.sqrt(
+        FLESH**2 + (PULP * np.maximum(ends.facing, 0.0)) ** 2 + (OF_SPREAD * ends.spread) ** 2
+    )
+    sigma = np.sqrt(PIXEL**2 + flesh**2 + circle.sigma_px**2) * (1.0 + misfit[chosen] / DOUBTFUL)
+    at = circle.middle + ends.towards * radius[:, None]
+    return Candidates(finger[chosen], at, sigma, radius, misfit[chosen], circle.shown, ends.seen)
+
+
+class _Ends(NamedTuple):
+    """Of K fingers: where the end is from the middle of the outline (K, 2) and its spread (K,), in radii; how much it
+    faces the camera (K,), and how likely the finger leaves it to be seen (K,)."""
+
+    towards: Float
+    spread: Float
+    facing: Float
+    seen: Float
+
+
+def _ends(some: Hypotheses, cost: Float32, finger: Int, middle: Float, radius: Float) -> _Ends:
+    """Means over the hypotheses of each finger (K,), by their likelihood where the outline is a circle (K, 2), (K,)."""
+    least = np.full(5, np.inf)
+    first = np.flatnonzero(np.diff(some.finger, prepend=-1))
+    least[some.finger[first]] = np.minimum.reduceat(cost, first)
+    near = np.flatnonzero(cost < least[some.finger] + ENDS_WITHIN)
+    row = np.zeros(5, np.int64)
+    row[finger] = np.arange(len(finger))
+    of = row[some.finger[near]]
+    end, uv = some.end[near], some.uv[near]
+    away = (uv[:, END] - middle[of]) * (1.0 / (AT_SIGMA * radius))[of, None]
+    larger = np.log(end[:, 0] / radius[of]) * (1.0 / SIZE_SIGMA)
+    square = cost[near] + away[:, 0] ** 2 + away[:, 1] ** 2 + larger * larger
+    first = np.searchsorted(of, np.arange(len(finger)))
+    weight = np.exp((np.minimum.reduceat(square, first)[of] - square) * (0.5 / CORRELATED))
+    what = np.empty((len(of), 6))
+    what[:, 0] = 1.0
+    what[:, 1:3] = way = (uv[:, APEX] - uv[:, END]) / end[:, :1]
+    what[:, 3] = way[:, 0] ** 2 + way[:, 1] ** 2
+    what[:, 4:] = end[:, 1:]
+    sums = np.add.reduceat(what * weight[:, None], first)
+    mean = sums[:, 1:] / sums[:, :1]
+    variance = mean[:, 2] - mean[:, 0] ** 2 - mean[:, 1] ** 2
+    return _Ends(mean[:, :2], np.sqrt(np.maximum(0.5 * variance, 0.0)), mean[:, 3], mean[:, 4])
+
+
+def light_scale(image: LedImage, laser_uv: Float, laser_m: Float) -> float | None:
+    """Nearness [grey levels^0.5] of skin at 1 m that faces the camera, by where the laser meets fingers (5, 2) [px],
+    (5, 3) [m]; None: nothing is lit there."""
+    known = np.isfinite(laser_m[:, 0])
+    near, clipped, outside = image.at(laser_uv[known].astype(np.float32))
+    good = ~clipped & ~outside & (near > LEAST_NEAR)
+    if not good.any():
+        return None
+    distance = np.sqrt((laser_m[known][good] ** 2).sum(axis=1))
+    return float(np.median(near[good] * distance)) / SHADE

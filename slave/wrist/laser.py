@@ -21,10 +21,11 @@ from slave.wrist.view import WristView
 
 _LEAST_M = 2e-3  # of line that must be seen
 # Standard deviations, by what the centroids of simulated hands of several seeds are off by.
-_LINE_PX = 0.5  # one whole line
+_LINE_PX = 0.6  # one whole line
+_THUMB_PX = 1.5  # at least, of the thumb: its line runs into that of its ball
 _IN_PARTS_PX = 2.0  # at least, of a line in parts, some of which may be another's, or of one cut by the image
 _FAINT, _FAINT_PX = 3.0 * FLOOR, 5.0  # a line no brighter: what is left of one where the sun saturates
-_UNSHOWN_PX = 10.0  # half a finger: no seam was seen
+_UNSHOWN_PX = 4.0  # no seam was seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,7 +65,7 @@ def laser_lines(laser: Image, fingers: Fingers, view: WristView, engine: Engine 
         off, doubt = beyond_ball(runs, thumb, beyond)
         seen[0] = not (reach.bent and on_ball(beyond))
         uv[0] += off
-        sigma[0] = np.hypot(sigma[0], doubt)
+        sigma[0] = np.hypot(np.hypot(sigma[0], doubt), _THUMB_PX)
     uv[~seen], sigma[~seen], length[~seen] = np.nan, np.nan, np.nan
     return LaserLines(uv, sigma, length)
 

@@ -14,13 +14,13 @@ A pixel as dark as the noise of the difference has no depth (NaN); a saturated o
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TypeAlias
+from typing import TypeAlias, cast
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from common.arrays import Bool, Float, Image
+from common.arrays import Float, Image
 from common.flat_field import flat_of
 from slave.wrist.view import WristView
 
@@ -28,20 +28,6 @@ Float32: TypeAlias = npt.NDArray[np.float32]
 
 SHRINK = 4  # the LED image is read at a quarter of its resolution
 DARK = 4.0  # grey levels: what the noise of a difference of two frames leaves
-SATURATED = 250.0  # grey levels of a difference of two frames whose white is 255
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RelativeDepth:
-    """Of a shrunken LED image (h, w).
-
-    Attributes:
-        depth: (h, w) float32 along the optical axis, in units of an unknown constant; NaN: too dark to tell.
-        bound: (h, w) whether the pixel is saturated: it may be nearer than `depth`.
-    """
-
-    depth: Float32
-    bound: Bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,20 +47,15 @@ class LedOptics:
 
 def shrink(led: Image) -> Float32:
     """Grey levels (h, w) of the difference of LED and ambient frame at a quarter of its resolution."""
-    size = (led.shape[1] // SHRINK, led.shape[0] // SHRINK)
-    return cv2.resize(led, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    height, width = led.shape
+    half = cv2.resize(led, (width // 2, height // 2), interpolation=cv2.INTER_AREA)  # in halves it is fast
+    size = (width // SHRINK, height // SHRINK)
+    return cast(Float32, cv2.resize(half.astype(np.float32), size, interpolation=cv2.INTER_AREA))
 
 
 def nearness(grey: Float32, optics: LedOptics) -> Float32:
     """sqrt(I / F) (h, w) of grey levels >= 0, NaN where they are; h rows from the top of the image."""
     return np.sqrt(grey) * optics.level[: len(grey)]
-
-
-def relative_depth(grey: Float32, optics: LedOptics) -> RelativeDepth:
-    """Depth of grey levels (h, w)."""
-    lit = grey > DARK
-    near = nearness(np.where(lit, grey, np.float32(np.nan)), optics)
-    return RelativeDepth(optics.cosine / near, grey >= SATURATED)
 
 
 def depth_about(near: Float32, optics: LedOptics, u: float, v: float, radius_px: float) -> float:

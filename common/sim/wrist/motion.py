@@ -35,6 +35,11 @@ WEARER_S = 16.0
 KNUCKLES_S, FIST_S = (0.8, 7.2), (8.8, 15.2)  # of the two bends within it, there and back
 WOBBLE = np.radians(1.0)
 THUMB_OPEN_DEG, THUMB_CLOSED_DEG = (-6.0, -4.0, 0.0, 0.0), (-2.0, 18.0, 18.0, 26.0)
+RANDOM_POSES = 60
+RANDOM_DEG, RANDOM_DIP = (
+    ((-10.0, 10.0), (0.0, 80.0), (0.0, 100.0)),
+    (0.5, 0.9),
+)  # abduction, MCP, PIP; DIP / PIP
 FOREARM_TURN = np.radians(12.0)
 _HALF_BENT = ((8, 2, 6), (0, 22, 36), (0, 22, 36), (0, 22, 36), (0, 22, 36))
 _WIDE = ((24, -4, 0), (14, 8, 10), (0, 8, 10), (-12, 8, 10), (-15, 8, 10))
@@ -183,6 +188,37 @@ class GuidedWearer:
         return HandState(_forearm(self._model, t, np.zeros(3), np.zeros(3)), angles)
 
 
+class RandomPoses:
+    """Poses whose joints know nothing of each other, one after another. The state it holds is its script."""
+
+    def __init__(self, model: HandModel, seed: int) -> None:
+        """Draw them, in the ranges of `RANDOM_DEG` and `RANDOM_DIP`, and the thumb in its limits."""
+        rng = np.random.default_rng([seed, 14])
+        self._model = model
+        self._angles = np.empty((RANDOM_POSES, 5, 4))
+        share = rng.uniform(0.0, 1.0, (RANDOM_POSES, 4))
+        low, high = model.limits_rad[0].T
+        self._angles[:, 0] = low + share * (high - low)
+        of = (RANDOM_POSES, 4)
+        abduction, mcp, pip = (np.radians(rng.uniform(a, b, of)) for a, b in RANDOM_DEG)
+        self._angles[:, 1:] = np.stack([abduction, mcp, pip, rng.uniform(*RANDOM_DIP, of) * pip], axis=-1)
+
+    @property
+    def period_s(self) -> float:
+        """Time [s] after which the motion repeats."""
+        return PERIOD_S
+
+    def at(self, t_s: float) -> HandState:
+        """The hand at time `t_s` [s]; before 0 the pose of 0. The second half of each pose's time it stands still."""
+        t = max(t_s, 0.0) % PERIOD_S
+        each_s = PERIOD_S / RANDOM_POSES
+        place = min(int(t / each_s), RANDOM_POSES - 1)
+        share = smooth_step((t - place * each_s) / (0.5 * each_s))
+        before = self._angles[place - 1]
+        angles = before + share * (self._angles[place] - before)
+        return HandState(_forearm(self._model, t, np.zeros(3), np.zeros(3)), angles)
+
+
 class OnForearm:
     """A motion as the forearm makes it: where the palm would be if the wrist was straight. It holds the motion."""
 
@@ -206,12 +242,16 @@ class OnForearm:
         return replace(state, T_rig_palm=state.T_rig_palm @ back, bend_rad=STRAIGHT)
 
 
-def wrist_motion(name: str, model: HandModel, seed: int) -> Stations | GuidedCurl | GuidedWearer | None:
+def wrist_motion(
+    name: str, model: HandModel, seed: int
+) -> Stations | GuidedCurl | GuidedWearer | RandomPoses | None:
     """The motion of a scene's name; None: there is no such."""
     if name == "curl":
         return GuidedCurl(model)
     if name == "wearer":
         return GuidedWearer(model, seed)
+    if name == "random":
+        return RandomPoses(model, seed)
     if name == "standard":
         return Stations(model, _STANDARD, seed)
     if name == "spread":

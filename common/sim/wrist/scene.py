@@ -25,7 +25,7 @@ from common.wrist_bend import forearm_palm
 Ambient = Literal["dark", "indoor", "bright", "sun"]
 TIP_WITHIN_M = 0.003  # of its own finger before a tip: it lies 12 degrees behind the edge of a round tip
 AMBIENTS: tuple[Ambient, ...] = get_args(Ambient)
-MOTIONS = ("standard", "curl", "wearer", "poses", "spread")
+MOTIONS = ("standard", "curl", "wearer", "poses", "spread", "random")
 WRIST_NAMES = f"{' | '.join((*MOTIONS, *TOGETHER))}, each with @{' | @'.join(AMBIENTS)}"
 
 

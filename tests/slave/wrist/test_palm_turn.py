@@ -12,13 +12,15 @@ from common.sim.motion import FIST, REST, HandMotion, HandState, angles_of
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene, WristTruth
 from common.wrist_bend import STRAIGHT
+from slave.cameras.source import Frame
 from slave.cameras.synthetic import STROBE
 from slave.wrist.background import lit
+from slave.wrist.detector import find
 from slave.wrist.fingers import separate
-from slave.wrist.fingertips import fingertips
 from slave.wrist.laser import laser_lines
 from slave.wrist.led_depth import shrink
 from slave.wrist.palm_turn import bend_seen, palm_turn, prepare, turned
+from slave.wrist.strobe import Triple
 from tests.slave.wrist.wrist_frames import VIEW, scene
 
 BENDS = ((22.0, -8.0), (-16.0, 8.0), (0.0, 12.0), (0.0, -12.0), (12.0, 8.0), (-15.0, -8.0))
@@ -106,9 +108,10 @@ def test_the_palm_that_comes_into_the_plane_is_no_finger() -> None:
 
 def test_no_tip_is_told_of_a_bent_wrist() -> None:
     one = seen((0.0, -12.0))
-    fingers = separate(one.led, VIEW)
-    assert not fingers.turn.straight
-    assert np.isnan(fingertips(one.led, fingers, VIEW).uv).all()
+    assert not separate(one.led, VIEW).turn.straight
+    dark = np.zeros_like(one.led)
+    ambient, laser, led = (Frame(k, k, k, image) for k, image in enumerate((dark, one.laser, one.led)))
+    assert np.isnan(find(Triple(ambient, laser, led), VIEW).tips.uv).all()
 
 
 def test_a_view_is_ready_for_every_bend() -> None:
