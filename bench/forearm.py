@@ -1,21 +1,24 @@
 """The palm by an IMU on the forearm while markers tell, and after: heading, bend, orientation; exact truth.
 
 An arm turns and moves about all axes, and its wrist goes from posture to posture, within half a second, and wavers
-between. The raw samples of a simulated IMU go through the filter of its slave; its world lies anywhere. Palms by
-markers come at 60 Hz for ten seconds, with a standard deviation of 1 to 5 degrees per axis; then none come for five.
-Their error is plain noise, or one that stays for a second or two, as that of rendered hands does.
+between. The raw samples of a simulated IMU go through the filter of its slave; its world lies anywhere. Three markers
+on the back of the hand are told at 60 Hz for ten seconds, to a millimetre per axis; then none for five. Their error is
+plain noise, or one that stays for a second or two, as that of rendered hands does.
 """
 
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import atan2, pi, radians, remainder
 from time import perf_counter_ns
 from typing import Literal, NamedTuple
 
 import numpy as np
 
+from bench.fusion_scene import CALIBRATION
 from bench.imu import Gestures
 from bench.row import Row
+from bench.solved_hand import NO_RAY, TOWARDS
 from common.arrays import Float
 from common.calibration import ImuCalibration
 from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix, rigid, rotation_vector_to_matrix
@@ -24,13 +27,21 @@ from common.messages import ImuSample
 from common.sim.imu import SimulatedImu
 from common.sim.motion import HandState, smooth_step
 from common.wrist_bend import STRAIGHT, forearm_palm
-from master.fusion.forearm import Forearm
-from master.fusion.told_forearm import ToldForearm
+from master.estimator.epoch import Epoch, Fitted
+from master.estimator.estimator import Estimator
+from master.estimator.fused import WristSide
+from master.estimator.triple_reader import TripleReader
+from master.estimator.wrist_device import BEND, HEADING
+from master.estimator.wrist_model import WristModel, loosened
+from master.rig import load_setup
+from master.rig_setup import RigSetup
+from master.wrist_setup import WristSetup
 
 # Cameras that look down on a desk: the vertical is 30 degrees off the rig's -y.
 _WORLD = (float(np.cos(np.radians(60.0))), float(np.sin(np.radians(60.0))), 0.0, 0.0)
 IMU = ImuCalibration(q_palm_imu=(0.5, 0.5, -0.5, 0.5), q_rig_world=_WORLD, heading_drift_rad_s=radians(1.0))
 _SEEDS = range(201, 213)
+_SIGMA_M = 1e-3
 _REST_S, _TOLD_S, _GONE_S, _ROUNDS, _SETTLED_S = 3.0, 10.0, 5.0, 3, 3.0
 _AFTER_S = (0.0, 0.5, 1.0, 2.0, 5.0)
 _FRAME_S = 1.0 / 60.0
@@ -61,27 +72,46 @@ class BentWrist:
         return self._habit + before + share * (self._posture[k] - before) + waver
 
 
-class ToldPalm:
-    """Palms by markers: the truth and an error. Holds the error of this recording."""
+class ToldMarkers:
+    """Markers on the back of a hand, and an error. Holds the error of this recording."""
 
-    def __init__(self, seed: int, kind: Kind) -> None:
-        """An error of 1 to 5 degrees per axis."""
-        self._rng = np.random.default_rng([seed, 7])
-        turn = rotation_vector_to_matrix(self._rng.normal(size=3))
-        self._root = turn * np.radians(self._rng.uniform(1.0, 5.0, 3))
-        self._new = 1.0 if kind == "plain" else 1.0 - np.exp(-_FRAME_S / 1.0)
-        self._slow = self._fast = self._rng.normal(size=3)
+    def __init__(self, setup: RigSetup, seed: int, kind: Kind) -> None:
+        """An error of a millimetre per axis."""
+        self._hand, self._rng = setup.hand, np.random.default_rng([seed, 7])
+        self._markers = setup.hand_markers
+        self._on_back = np.array([self._hand.mount(name).joint is None for name in self._markers])
+        self._new = 1.0 if kind == "plain" else 1.0 - float(np.exp(-_FRAME_S / 1.0))
+        self._error = self._rng.normal(size=(len(self._markers), 3))
 
-    def of(self, palm: Float) -> tuple[Float, Float]:
-        """What is told of a palm (3, 3), and the covariance of that (3, 3) [rad^2], rig axes."""
-        if self._new == 1.0:
-            error = self._rng.normal(size=3)
-        else:
-            self._slow = self._slow * (1.0 - self._new) + np.sqrt(
-                self._new * (2.0 - self._new)
-            ) * self._rng.normal(size=3)
-            error = self._slow
-        return rotation_vector_to_matrix(self._root @ error) @ palm, self._root @ self._root.T
+    def of(self, palm: Float) -> Float:
+        """Places (M, 3) [m] of the markers of a hand whose palm is turned so (3, 3); NaN: on a finger."""
+        keep = 1.0 - self._new
+        self._error = keep * self._error + np.sqrt(1.0 - keep**2) * self._rng.normal(size=self._error.shape)
+        joints = self._hand.forward(rigid(palm, np.zeros(3)), np.zeros((5, 4)))
+        points = self._hand.marker_points(joints, self._markers) + _SIGMA_M * self._error
+        return np.where(self._on_back[:, None], points, np.nan)
+
+
+class Line:
+    """Push machine. Holds the estimator of a hand with a device on its forearm, and the device's side."""
+
+    def __init__(self, markers: RigSetup, wrist: WristSetup) -> None:
+        """Join them as a fused rig does."""
+        self._names = markers.hand_markers
+        model = WristModel.of(wrist, loose=True)
+        self.estimator = Estimator(
+            [NO_RAY], loosened(markers.hand), self._names, self._names, continuous=True, wrist=model
+        )
+        counts = Counter[str]()
+        self.side = WristSide(wrist, TripleReader(wrist, None, counts), counts, continuous=True)
+
+    def push(self, t_ns: int, points_m: Float) -> Fitted:
+        """Fit one epoch with markers (M, 3) [m], which may be NaN."""
+        turn = self.side.turn_at(t_ns, self.estimator)
+        cov = np.tile(_SIGMA_M**2 * np.eye(3), (len(points_m), 1, 1))
+        hand = self.estimator.push(Epoch(t_ns, points_m, TOWARDS, cov_m2=cov, turn=turn))
+        self.side.solved(t_ns, hand, self.estimator, turned=turn is not None)
+        return hand
 
 
 class TurnedArm(Gestures):
@@ -145,42 +175,44 @@ class Moment(NamedTuple):
     surprise: Float
 
 
-def moments(arm: Arm, kind: Kind) -> Iterator[Moment]:
-    """Play a recording; before every palm that is told, and at the given times after the last one, look."""
-    forearm, told, last = Forearm(IMU), ToldPalm(arm.seed, kind), STRAIGHT
+def moments(arm: Arm, kind: Kind, rigs: tuple[RigSetup, WristSetup]) -> Iterator[Moment]:
+    """Play a recording; now and then while markers are told, and at the given times after the last ones, look."""
+    line, told, last = Line(*rigs), ToldMarkers(rigs[0], arm.seed, kind), STRAIGHT
+    unseen = np.full((len(rigs[0].hand_markers), 3), np.nan)
     frame = 0
     for sample in arm.samples:
-        forearm.push(sample.t_ns, sample.orientation_wxyz, sample.heading_sigma_rad)
+        assert line.side.forearm is not None
+        line.side.forearm.push(sample.t_ns, sample.orientation_wxyz, sample.heading_sigma_rad)
         t_s = sample.seq / IMU.rate_hz
         if sample.seq % 2 == 0 or t_s < _REST_S:
             continue
         since_s = (t_s - _REST_S) % (_TOLD_S + _GONE_S)
         frame += 1
-        looked = [s for s in _AFTER_S[1:] if abs(since_s - _TOLD_S - s + 0.02) < 0.5 * _FRAME_S]
-        if since_s > _SETTLED_S and since_s <= _TOLD_S and frame % 15 == 0:
+        shown = since_s <= _TOLD_S
+        hand = line.push(sample.t_ns, told.of(arm.palm(t_s)) if shown else unseen)
+        if shown:
+            last = line.estimator.extras[BEND : BEND + 2].copy()
+        looked = [s for s in _AFTER_S[1:] if abs(since_s - _TOLD_S - s) < 0.5 * _FRAME_S]
+        if _SETTLED_S < since_s <= _TOLD_S and frame % 15 == 0:
             looked = [0.0]
         if looked:
-            yield _moment(arm, forearm, sample, looked[0], last)
-        if since_s <= _TOLD_S:
-            seen, cov = told.of(arm.palm(t_s))
-            forearm.saw(sample.t_ns, ToldForearm.of_palm(seen, cov))
-            last, _ = forearm.bend_at(sample.t_ns)
+            yield _moment(arm, line.estimator, hand, sample, looked[0], last)
 
 
-def _moment(arm: Arm, forearm: Forearm, sample: ImuSample, after_s: float, last: Float) -> Moment:
+def _moment(
+    arm: Arm, estimator: Estimator, hand: Fitted, sample: ImuSample, after_s: float, last: Float
+) -> Moment:
     t_s = sample.seq / IMU.rate_hz
-    found = forearm.palm_at(sample.t_ns)
-    bend, cov = forearm.bend_at(sample.t_ns)
-    if found is None:
+    if hand.solution is None:
         return Moment(after_s, np.full(5, 180.0), np.full(3, np.inf))
-    truth = arm.wrist.at(t_s)
-    heading = remainder(forearm.heading_rad - arm.heading(sample), 2.0 * pi)
-    bent = bend - truth
-    palm = matrix_to_rotation_vector(arm.palm(t_s) @ found.rotation.T)
+    z, cov, truth = estimator.extras, estimator.extras_cov, arm.wrist.at(t_s)
+    heading = remainder(z[HEADING] - arm.heading(sample), 2.0 * pi)
+    bent = z[BEND : BEND + 2] - truth
+    palm = matrix_to_rotation_vector(arm.palm(t_s) @ hand.solution.T_rig_palm[:3, :3].T)
     surprise = (
-        (heading / forearm.heading_sigma_rad) ** 2,
-        bent @ np.linalg.solve(cov, bent),
-        palm @ found.information @ palm,
+        heading**2 / cov[HEADING, HEADING],
+        bent @ np.linalg.solve(cov[BEND : BEND + 2, BEND : BEND + 2], bent),
+        palm @ np.linalg.solve(hand.solution.alone[:3, :3], palm),
     )
     off = [float(np.linalg.norm(one)) for one in (heading, bent, palm, last - truth, truth)]
     return Moment(after_s, np.degrees(off), np.array(surprise))
@@ -190,8 +222,9 @@ def rows() -> Iterator[Row]:
     """Measure; one row per figure."""
     seconds = _REST_S + _ROUNDS * (_TOLD_S + _GONE_S)
     arms = [Arm.of(seed, IMU, seconds) for seed in _SEEDS]
+    rigs = _rigs()
     for kind in KINDS:
-        found = [one for arm in arms for one in moments(arm, kind)]
+        found = [one for arm in arms for one in moments(arm, kind, rigs)]
         for after_s in _AFTER_S:
             group = [one for one in found if one.after_s == after_s]
             off = _rms(np.array([one.off_deg for one in group]))
@@ -201,25 +234,29 @@ def rows() -> Iterator[Row]:
             for k, what in enumerate(("heading", "bend", "palm")):
                 note = f"{inside[k]:.0f} % of {len(group)} inside 95 %{notes[k]}"
                 yield Row(f"{kind} error, {when}: {what}", float(off[k]), "deg rms", note)
-    yield _cost(arms[0])
+    yield _cost(arms[0], rigs)
 
 
-def _cost(arm: Arm) -> Row:
-    """Microseconds that a palm by markers costs."""
-    forearm, told = Forearm(IMU), ToldPalm(arm.seed, "plain")
+def _rigs() -> tuple[RigSetup, WristSetup]:
+    """Three markers on the back, and the device with this IMU."""
+    markers, worn = load_setup(CALIBRATION, "desk-back3"), load_setup(CALIBRATION, "wrist-back3")
+    assert worn.wrist is not None
+    return markers, replace(worn.wrist, imu=IMU)
+
+
+def _cost(arm: Arm, rigs: tuple[RigSetup, WristSetup]) -> Row:
+    """Microseconds that an epoch with markers and IMU costs."""
+    line, told = Line(*rigs), ToldMarkers(rigs[0], arm.seed, "plain")
+    assert line.side.forearm is not None
     spent: list[float] = []
     for sample in arm.samples[:1200]:
-        forearm.push(sample.t_ns, sample.orientation_wxyz, sample.heading_sigma_rad)
-        seen, cov = told.of(arm.palm(sample.seq / IMU.rate_hz))
+        line.side.forearm.push(sample.t_ns, sample.orientation_wxyz, sample.heading_sigma_rad)
+        points = told.of(arm.palm(sample.seq / IMU.rate_hz))
         start = perf_counter_ns()
-        forearm.saw(sample.t_ns, ToldForearm.of_palm(seen, cov))
+        line.push(sample.t_ns, points)
         spent.append((perf_counter_ns() - start) * 1e-3)
-    return Row(
-        "cost of a palm",
-        float(np.median(spent)),
-        "us",
-        f"{60e-4 * np.median(spent):.1f} % of a core at 60 Hz",
-    )
+    middle = float(np.median(spent))
+    return Row("cost of an epoch", middle, "us", f"{60e-4 * middle:.1f} % of a core at 60 Hz")
 
 
 def _rms(values: Float) -> Float:

@@ -11,6 +11,7 @@ wrist camera takes long.
     python -m bench.gestures --rigs desk-back3 desk4 --seeds 1 2 --seconds 75
     python -m bench.gestures --rigs desk-back3+wrist-back3 --seeds 7 --seconds 29
     python -m bench.gestures --exact --leap wave three-claps
+    python -m bench.gestures --rigs wrist --seeds --leap wave three-claps   a wrist device alone, messages made of truth
 """
 
 import argparse
@@ -24,6 +25,8 @@ from typing import cast
 import numpy as np
 
 from bench.fusion_kept import observed
+from bench.fusion_scene import Both
+from bench.fusion_shown import shown_of
 from bench.fusion_solved import solve as solve_both
 from bench.gesture_truth import GestureTruth
 from bench.played import START_NS, solve, times_of, watch
@@ -42,6 +45,7 @@ from master.rig_setup import RigSetup
 
 RATE_HZ = 60.0
 FUSED = "desk-back3+wrist-back3"
+WORN = "wrist"
 SILENT = ("wave", "HandSplay-110fps", "rollAndPitchWithEntry", "three-claps", "confidence-demo")
 _CALIBRATION = Path(__file__).parent.parent / "calib_json"
 _DATA = Path(os.environ.get("PHALANX_DATASETS", Path(__file__).parent.parent.parent / "shared/datasets"))
@@ -119,11 +123,12 @@ class Score:
 
 def rows() -> Iterator[Row]:
     """Two marker rigs over a minute and a quarter of one seed, the first with the wrist device over less, and the
-    silent recordings."""
+    silent recordings, as they are and before a wrist device."""
     for rig in ("desk-back3", "desk4"):
         yield from table(rig, scored(rig, (1,), 75.0, exact=False))
     yield from table(FUSED, scored(FUSED, (7,), 29.0, exact=False))
     yield from table("silent, true hands", silent(SILENT, None, 60.0))
+    yield from table("silent, wrist device alone", silent(SILENT, WORN, 25.0))
 
 
 def scored(rig: str, seeds: Sequence[int], seconds: float, *, exact: bool) -> Score:
@@ -150,14 +155,15 @@ def silent(names: Sequence[str], rig: str | None, seconds: float) -> Score:
     """Recorded hands that say nothing, each for so long: as they truly are, or rendered before a rig."""
     settings, score = default_gestures(), Score()
     for name in names:
-        setup = load_setup(_CALIBRATION, rig or "desk-back3")
+        setup = load_setup(_CALIBRATION, "desk-back3" if rig in (None, WORN) else rig)
         scene = f"leap:{_DATA / 'leapjs' / name}.npz"
         made = scene_by_name(scene, setup.rig, setup.cameras, setup.hand.profile, 1)
-        poses = (
-            true_poses(made.motion, made.model, seconds)
-            if rig is None
-            else seen_poses(setup, scene, 1, seconds)
-        )
+        if rig is None:
+            poses: Iterable[HandPose] = true_poses(made.motion, made.model, seconds)
+        elif rig == WORN:
+            poses = worn_poses(scene, 1, seconds)
+        else:
+            poses = seen_poses(setup, scene, 1, seconds)
         score.add_silent(told_of(poses, made.model, settings))
     return score
 
@@ -181,6 +187,12 @@ def fused_poses(rigs: tuple[str, str], seed: int, seconds: float) -> list[HandPo
     """The poses of the scene that a marker rig and a wrist device see together, rendered and detected."""
     shown = observed("gestures", seconds, seed, rigs=rigs)
     return solve_both(shown.both.fused, shown.messages)
+
+
+def worn_poses(name: str, seed: int, seconds: float) -> list[HandPose]:
+    """The poses of a scene by the wrist device alone, of messages made of the truth."""
+    shown = shown_of(Both.of(name, seed), seconds)
+    return solve_both(shown.both.wrist, shown.messages)
 
 
 def true_poses(motion: HandMotion, model: HandModel, seconds: float) -> Iterator[HandPose]:

@@ -133,15 +133,21 @@ def _absent(data: Path) -> str:
 
 def _makers(data: Path) -> tuple[dict[str, Maker], dict[str, Maker]]:
     """What makes each set: those of simulation, and those of the data folder."""
-    from bench import oracle_recorded, oracle_scenes  # only to freeze: these draw pictures
+    from bench import oracle_recorded, oracle_scenes, oracle_wrist  # only to freeze: these draw pictures
 
     simulated: dict[str, Maker] = {name: partial(oracle_scenes.scenes, name) for name in oracle_scenes.SCENES}
     simulated |= {"held": oracle_scenes.held, "room": oracle_scenes.in_room}
+    simulated |= {name: partial(oracle_wrist.fused, name) for name in oracle_wrist.FUSED}
     recorded: dict[str, Maker] = {
         name: partial(oracle_recorded.rendered, data, names)
         for name, names in oracle_recorded.RENDERED.items()
     }
-    return simulated, recorded | {"leap": partial(oracle_recorded.leap, data)}
+    recorded |= {"leap": partial(oracle_recorded.leap, data)}
+    recorded |= {
+        "wrist": partial(oracle_wrist.recorded, data),
+        "wrist_mesh": partial(oracle_wrist.meshes, data),
+    }
+    return simulated, recorded
 
 
 def solve(out: Path, runners: Sequence[Runner], sets: Sequence[str]) -> None:

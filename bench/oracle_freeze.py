@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bench.oracle_truth import FROZEN, Truth
-from common.messages import MarkerDetections
+from common.messages import ImuSample, MarkerDetections, WristDetections
 from common.recording import MessageWriter
 
 
@@ -17,21 +17,21 @@ class Piece:
 
     Attributes:
         name: Of the recording in its set.
-        rig: The rig that is solved.
+        rigs: The rig that is solved, or those of one hand.
         files: Files of calibration, by their path in a calibration tree.
         messages: In the order in which they are solved.
         truth: Exact.
     """
 
     name: str
-    rig: str
+    rigs: tuple[str, ...]
     files: dict[str, bytes]
-    messages: Sequence[MarkerDetections]
+    messages: Sequence[MarkerDetections | WristDetections | ImuSample]
     truth: Truth
 
 
 def calibration_files(tree: Path, rig: str) -> dict[str, bytes]:
-    """The files of one marker rig of a calibration tree, by their path in it."""
+    """The files of one rig of a calibration tree, by their path in it."""
     names = [f"rigs/{rig}.json"]
     about = json.loads((tree / names[0]).read_text())
     names += [f"cameras/{camera}.json" for camera in about["cameras"]]
@@ -50,10 +50,10 @@ def freeze(out: Path, set_name: str, pieces: Iterable[Piece]) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     for piece in pieces:
-        about = {"rigs": json.dumps([piece.rig]), "continuous": json.dumps(piece.truth.continuous)}
+        about = {"rigs": json.dumps(piece.rigs), "continuous": json.dumps(piece.truth.continuous)}
         writer = MessageWriter(folder / f"{piece.name}.mcap", piece.files, about)
         for message in piece.messages:
-            writer.write("taken", message, message.ready_t_ns)
+            writer.write("taken", message, getattr(message, "ready_t_ns", message.t_ns))
         writer.close()
         piece.truth.save(folder / f"{piece.name}.npz")
         print(f"{set_name}/{piece.name}: {len(piece.messages)} messages", flush=True)

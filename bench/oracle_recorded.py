@@ -66,7 +66,7 @@ def rendered(data: Path, names: Sequence[str]) -> Iterator[Piece]:
         (tree / "cameras").mkdir()
         for camera in ("left", "right"):
             target = tree / "cameras" / f"{camera}.json"
-            _slave("colours", data / "stereo/calib_colors", "--camera", camera, "-o", target)
+            slave("colours", data / "stereo/calib_colors", "--camera", camera, "-o", target)
         for one in names:
             yield _detected(data / "stereo" / one, tree, data / "hands")
 
@@ -80,12 +80,12 @@ def _detected(folder: Path, tree: Path, hands: Path) -> Piece:
     with tempfile.TemporaryDirectory() as name:
         for camera in rig.cameras:
             target = Path(name) / f"detections_{camera}.npz"
-            _slave("detect", folder, "--camera", camera, "--calibration", tree, "-o", target)
+            slave("detect", folder, "--camera", camera, "--calibration", tree, "-o", target)
             messages += recorded_detections(Path(name), camera, len(rig.markers))
             files[f"cameras/{camera}.json"] = msgspec.json.encode(recording.manifest.cameras[camera])
     messages.sort(key=lambda one: one.t_ns)
     truth = _rendered_truth(folder, recording.manifest.continuous)
-    return Piece(folder.name, rig.name, files, messages, truth)
+    return Piece(folder.name, (rig.name,), files, messages, truth)
 
 
 def _rendered_truth(folder: Path, continuous: bool) -> Truth:
@@ -95,10 +95,7 @@ def _rendered_truth(folder: Path, continuous: bool) -> Truth:
         t_ns: Int = 1_000_000_000 * (1 + np.arange(len(data["depth"])))
         return Truth(t_ns, np.full((len(t_ns), 26, 3), np.nan), np.full((len(t_ns), 5, 4), np.nan), False)
     t_ns = np.round(1e9 * (1.0 + np.asarray(data["t_ref"], np.float64))).astype(np.int64)
-    webxr = np.asarray(data["joints"], np.float64)
-    palm = webxr[:, [10, 11]].mean(axis=1, keepdims=True)  # between root and knuckle of the middle finger
-    joints_m = np.concatenate([palm, webxr], axis=1)
-    angles_rad = np.asarray(data["angles"], np.float64)[:, np.array(_FINGER_ANGLES)]
+    joints_m, angles_rad = hand_of(data["joints"]), angles_of(data["angles"])
     if len(t_ns) < 4 or not continuous:
         return Truth(t_ns, joints_m, angles_rad, continuous)
     steps: Int = int(t_ns[0]) + STEP_NS * np.arange(int(np.ptp(t_ns)) // STEP_NS)
@@ -110,7 +107,19 @@ def _rendered_truth(folder: Path, continuous: bool) -> Truth:
     return Truth(fine, found[0], found[1])
 
 
-def _slave(*arguments: object) -> None:
+def hand_of(webxr: Float) -> Float:
+    """Joints (T, 26, 3) of WebXR joints (T, 25, 3): the palm is between root and knuckle of the middle finger."""
+    palm = webxr[:, [10, 11]].mean(axis=1, keepdims=True)
+    return np.concatenate([palm, webxr], axis=1)
+
+
+def angles_of(angles_rad: Float) -> Float:
+    """Angles (T, 5, 4) as of a pose, of those of a recording (T, 21)."""
+    return angles_rad[:, np.array(_FINGER_ANGLES)]
+
+
+def slave(*arguments: object) -> None:
+    """Run a command of the slave."""
     command = [sys.executable, "-m", "slave", *map(str, arguments)]
     subprocess.run(command, check=True, capture_output=True, cwd=_ROOT)
 
@@ -210,7 +219,7 @@ def leap(data: Path) -> Iterator[Piece]:
         files[f"hands/{name}.json"] = msgspec.json.encode(profile)
         messages = [one for camera in scene.rig.cameras for one in _seen(scene, motion, camera, seed)]
         messages.sort(key=lambda one: one.t_ns)
-        yield Piece(name, DESK, files, messages, _leap_truth(motion))
+        yield Piece(name, (DESK,), files, messages, _leap_truth(motion))
 
 
 def _seen(scene: Scene, motion: Replayed, camera: str, seed: int) -> Iterator[MarkerDetections]:

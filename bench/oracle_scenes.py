@@ -67,7 +67,7 @@ def shown_piece(name: str, files: dict[str, bytes], scene: Scene, seconds: float
         times = times_of(scene, camera, seconds, rate)
         messages += markers_shown(scene, camera, times, 1.0 / rate, seed)[0]
     messages.sort(key=lambda one: one.t_ns)
-    return Piece(name, scene.rig.name, files, messages, truth_of(scene, seconds))
+    return Piece(name, (scene.rig.name,), files, messages, truth_of(scene, seconds))
 
 
 def truth_of(scene: Scene, seconds: float) -> Truth:

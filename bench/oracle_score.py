@@ -85,7 +85,8 @@ class Samples:
         joint_mm, tracked, inside: (N,) of each valid joint its error, whether it is TRACKED, and whether its 95 %
             region holds the truth; a joint without a covariance has no region.
         false: (N,) whether it is off by 15 mm, or the PIP of its finger by 20 degrees.
-        pip_deg: (P,) error of each PIP.
+        pip_deg: (P,) error of each PIP, `hidden_deg` (H,) of those of hidden fingers.
+        thumb_deg: (S,) error of each MCP of a thumb.
         rest_mm: (R,) length of a step that a joint makes while the truth rests.
         wanted: How many joints there are in truth, at all instants.
         instants, without, ghosts: With a hand in truth, those of them without one in the run, and the reverse.
@@ -98,6 +99,8 @@ class Samples:
     inside: Float = field(default_factory=_nothing)
     false: Float = field(default_factory=_nothing)
     pip_deg: Float = field(default_factory=_nothing)
+    hidden_deg: Float = field(default_factory=_nothing)
+    thumb_deg: Float = field(default_factory=_nothing)
     rest_mm: Float = field(default_factory=_nothing)
     spent_us: Float = field(default_factory=_nothing)
     misfit: Float = field(default_factory=lambda: np.zeros(len(LAGS_NS)))
@@ -111,7 +114,17 @@ class Samples:
         return Samples(
             *(
                 np.concatenate([getattr(self, name), getattr(other, name)])
-                for name in ("joint_mm", "tracked", "inside", "false", "pip_deg", "rest_mm", "spent_us")
+                for name in (
+                    "joint_mm",
+                    "tracked",
+                    "inside",
+                    "false",
+                    "pip_deg",
+                    "hidden_deg",
+                    "thumb_deg",
+                    "rest_mm",
+                    "spent_us",
+                )
             ),
             misfit=self.misfit + other.misfit,
             wanted=self.wanted + other.wanted,
@@ -139,7 +152,9 @@ def _piece(run: Solved, truth: Truth, other_ns: Int) -> Samples:
     mm = 1e3 * np.linalg.norm(off_m, axis=2)
     pip_deg = np.degrees(np.abs(run.angles_rad - angles_rad)[:, :, 2])
     shown = np.stack([valid[:, list(chain[1:])].all(axis=1) for chain in FINGER_JOINTS], axis=1)
+    thumb_deg = np.where(shown, pip_deg, np.nan)[:, 0]
     pip_deg = np.where(shown & (np.arange(5) > 0), pip_deg, np.nan)  # of the thumb it is another joint
+    hidden_deg = pip_deg[truth.hidden_at(run.t_ns)]
     bent_wrong = ((pip_deg > _FALSE_DEG)[:, None, :] & _OF_FINGER).any(axis=2)
     missed = _missing(run.t_ns, other_ns, truth)
     exists = np.asarray(known.any(axis=1), np.bool_)
@@ -149,6 +164,8 @@ def _piece(run: Solved, truth: Truth, other_ns: Int) -> Samples:
         inside=_inside(off_m[scored], run.cov_m2[scored]),
         false=((mm > _FALSE_MM) | bent_wrong)[scored].astype(np.float64),
         pip_deg=pip_deg[np.isfinite(pip_deg)],
+        hidden_deg=hidden_deg[np.isfinite(hidden_deg)],
+        thumb_deg=thumb_deg[np.isfinite(thumb_deg)],
         rest_mm=_rest_mm(run, truth, valid),
         spent_us=run.spent_us,
         misfit=_misfit(run, truth, scored & run.tracked),  # others are off by more than they lag
@@ -224,6 +241,8 @@ def figures(samples: Samples) -> dict[str, float]:
         "TRACKED mm": _mean(samples.joint_mm[tracked]),
         "its 99 %": _percentile(samples.joint_mm[tracked], 99.0),
         "PIP deg": _mean(samples.pip_deg),
+        "hidden": _mean(samples.hidden_deg),
+        "thumb deg": _mean(samples.thumb_deg),
         "cover %": 100.0 * _mean(samples.inside),
         "TRACKED cover %": 100.0 * _mean(samples.inside[tracked]),
         "valid %": 100.0 * len(samples.joint_mm) / samples.wanted if samples.wanted else np.nan,

@@ -21,6 +21,7 @@ from common.messages import HandPose, ImuSample
 from common.recording import open_messages
 from master.rig import load_setup
 from master.rig_pipeline import pipeline_of
+from master.rig_setup import RigSetup
 from master.stages import StageTimes
 
 FROZEN = "frozen"
@@ -31,16 +32,16 @@ _TURN_S = 0.25  # of a recording
 def solved(path: Path, solver: str | None) -> Iterator[tuple[HandPose, float] | None]:
     """The poses of one recording, each with the processor time since the one before [us]; None: a turn is over."""
     recording = open_messages(path)
-    (rig,) = json.loads(recording.about["rigs"])
+    rigs = json.loads(recording.about["rigs"])
     with tempfile.TemporaryDirectory(prefix="phalanx-") as name:
         tree = Path(name)
         for file, data in recording.files.items():
             (tree / file).parent.mkdir(exist_ok=True)
             (tree / file).write_bytes(data)
-        if solver is not None:
-            rig_file = tree / "rigs" / f"{rig}.json"
+        for rig_file in sorted((tree / "rigs").glob("*.json")) if solver is not None else ():
             rig_file.write_text(json.dumps(json.loads(rig_file.read_text()) | {"solver": solver}))
-        setup = load_setup(tree, rig)
+        setups = [load_setup(tree, rig) for rig in rigs]
+    setup = setups[0] if len(setups) == 1 else RigSetup.joined(setups)
     line = pipeline_of(setup, StageTimes(), continuous=json.loads(recording.about["continuous"]))
     messages: list[Any] = [one.message for one in recording.read(["taken"])]
     turn_ns, spent_ns = messages[0].t_ns, 0

@@ -7,13 +7,13 @@ import numpy as np
 from common.arrays import Float
 from common.camera_model import CameraModel
 from common.hand_model import HandModel
-from master.estimator.epoch import Epoch, Fitted, Sensed
+from master.estimator.epoch import Epoch, Fitted, Turn
 from master.estimator.estimator import Estimator
 from master.estimator.settings import DEFAULT, Settings
 
 TOWARDS = np.array([0.0, 0.0, -1.0])  # from hands to cameras that look along the rig's +z
 _SURE_RAD = np.radians(15.0)  # better known than this about every axis, a rotation says how the palm lies
-_NO_RAY = CameraModel(np.eye(3), np.zeros(5), np.eye(4), 640, 480, 0.0)
+NO_RAY = CameraModel(np.eye(3), np.zeros(5), np.eye(4), 640, 480, 0.0)
 
 
 class PointHand:
@@ -42,7 +42,7 @@ class PointHand:
         """
         settings = settings if faces else settings._replace(facing_rad=inf)
         self.estimator = Estimator(
-            [_NO_RAY],
+            [NO_RAY],
             model,
             markers,
             markers,
@@ -67,11 +67,9 @@ class PointHand:
             facing: (3,) unit vector from the hand to the cameras.
             turn: The palm's rotation (3, 3) by a sensor and its covariance (3, 3) [rad^2], rig axes; None: not known.
         """
-        sensed = None
+        told = None
         if turn is not None:
             rotation, cov_rad2 = turn
             sure = bool(np.linalg.eigvalsh(cov_rad2)[-1] < _SURE_RAD**2)
-            free = len(self.estimator.parameters.free)
-            information = np.asarray(np.linalg.inv(cov_rad2), np.float64)
-            sensed = Sensed.turn(rotation, information, free, sure=sure)
-        return self.estimator.push(Epoch(t_ns, points_m, facing, cov_m2=cov_m2, sensed=sensed))
+            told = Turn(rotation, np.asarray(np.linalg.inv(cov_rad2), np.float64), sure)
+        return self.estimator.push(Epoch(t_ns, points_m, facing, cov_m2=cov_m2, turn=told))

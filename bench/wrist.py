@@ -25,9 +25,9 @@ from common.frame_recording import open_recording
 from common.messages import WristDetections, encode
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
+from master.estimator.wrist_pipeline import WristPipeline
 from master.stages import StageTimes
-from master.wrist.pipeline import WristPipeline
-from master.wrist.setup import WristSetup
+from master.wrist_setup import WristSetup
 from slave.cameras.replay import read_png
 from slave.cameras.source import Frame
 from slave.cameras.synthetic import STROBE
@@ -116,7 +116,10 @@ def slave_steps(
         ),
         "of it fingers": _each(lights, lambda pair: separate(pair[1], view)),
         "of it laser": _each(with_fingers, lambda all_: laser_lines(all_[0][0], all_[1], view)),
-        "of it fingertips": _each(with_fingers, lambda all_: fingertips(all_[0][1], all_[1], view)),
+        "of it fingertips": _each(
+            list(zip(lights, found, strict=True)),
+            lambda all_: fingertips(all_[0][1], all_[1].triple.led.image, all_[1].laser.uv, view),
+        ),
         "of it message": _each(found, lambda one: encode(one.message(camera.name, 1))),
     } | _with_numba(camera, view, frames, lights, with_fingers)
 

@@ -35,8 +35,8 @@ from master.calibrate.wrist.palm_board import Mounting, palm_from_board
 from master.calibrate.wrist.placed import place_corners
 from master.calibrate.wrist.plane import PlaneFit, ViewLine, fit_plane
 from master.calibrate.wrist.wearer import Wearer, calibrate_wearer
-from master.wrist.pipeline import WristPipeline
-from master.wrist.setup import WristSetup
+from master.estimator.wrist_pipeline import WristPipeline
+from master.wrist_setup import WristSetup
 
 CALIB = Path("calib_json")
 SEEDS = range(100, 120)

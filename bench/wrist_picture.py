@@ -14,9 +14,9 @@ from common.calibration import CameraCalibration, HandProfile, RigCalibration, l
 from common.hand_model import CHAINS
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
+from master.estimator.wrist_pipeline import WristPipeline
 from master.stages import StageTimes
-from master.wrist.pipeline import WristPipeline
-from master.wrist.setup import WristSetup
+from master.wrist_setup import WristSetup
 from slave.cameras.source import Frame
 from slave.cameras.synthetic import STROBE
 from slave.wrist.background import lit

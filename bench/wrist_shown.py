@@ -30,12 +30,14 @@ class Recorded:
     Attributes:
         view: Its device.
         laser, led: Differences to the ambient frame, triple by triple.
+        frames: The LED frames themselves.
         truth: Arrays of its truth.npz, a row per triple.
     """
 
     view: WristView
     laser: list[Image]
     led: list[Image]
+    frames: list[Image]
     truth: dict[str, Float]
 
 
@@ -59,7 +61,9 @@ def recorded(data: Path, name: str) -> Recorded:
     triples = [Triple(*frames[k : k + 3]) for k in range(0, len(frames) - 2, 3)]
     laser = [lit(triple.laser.image, triple.ambient.image) for triple in triples]
     led = [lit(triple.led.image, triple.ambient.image) for triple in triples]
-    return Recorded(view, laser, led, read_npz(folder / "truth.npz"))
+    return Recorded(
+        view, laser, led, [triple.led.image for triple in triples], read_npz(folder / "truth.npz")
+    )
 
 
 def other_palm(rig: RigCalibration, rng: np.random.Generator) -> RigCalibration:

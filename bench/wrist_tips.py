@@ -16,16 +16,17 @@ from bench.row import Row, median_us
 from bench.wrist_shown import RECORDINGS, ROOT, datasets, other_palm, recorded
 from common.arrays import Bool, Float, Image
 from common.calibration import CameraCalibration, RigCalibration, load
-from common.frame_recording import Illumination
 from common.hand_profiles import generated_profile
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import AMBIENTS, WristScene
+from slave.cameras.synthetic import STROBE
 from slave.wrist.background import lit
 from slave.wrist.fingers import separate
-from slave.wrist.fingertips import Fingertips, fingertips
+from slave.wrist.fingertips import NO_TIPS, Fingertips, fingertips
+from slave.wrist.laser import laser_lines
 from slave.wrist.view import WristView
 
-MOTIONS = ("standard", "curl", "poses", "spread")
+MOTIONS = ("standard", "curl", "poses", "spread", "random")
 HAND_LENGTHS_M = (0.17, 0.185, 0.2)  # one for each seed
 SEEDS, POSES = (201, 202, 203), 14
 FOUND_PX, ELSEWHERE_PX = 6.0, 25.0
@@ -34,10 +35,13 @@ TOUCHING_PX, EDGE_PX = 45.0, 40.0  # between the ends of two fingers: a diameter
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shown:
-    """One difference of LED and ambient frame, its true ends of fingers (5, 2) [px], and which are seen (5,)."""
+    """One triple: differences to the ambient frame, the LED frame, true ends of fingers (5, 2) [px], and which are seen
+    (5,)."""
 
     view: WristView
+    laser: Image
     led: Image
+    frame: Image
     truth_px: Float
     seen: Bool
 
@@ -60,15 +64,16 @@ def rows() -> Iterator[Row]:
         ]
         yield from _scored(f"simulated, {ambient}", shown)
     one = max(shown, key=lambda each: int(each.seen.sum()))
-    fingers = separate(one.led, one.view)
-    middle, half = median_us(lambda: fingertips(one.led, fingers, one.view))
+    laser_uv = laser_lines(one.laser, separate(one.led, one.view), one.view).uv
+    middle, half = median_us(lambda: fingertips(one.led, one.frame, laser_uv, one.view))
     yield Row("fingertips of one triple", middle, "us", f"+-{half:.0f}; goal 600")
 
 
 def of_recording(data: Path, name: str) -> list[Shown]:
     """The triples of a recording."""
     all_of = recorded(data, name)
-    shown = zip(all_of.led, all_of.truth["tip_uv"], all_of.truth["tip_visible"], strict=True)
+    truth = all_of.truth
+    shown = zip(all_of.laser, all_of.led, all_of.frames, truth["tip_uv"], truth["tip_visible"], strict=True)
     return [Shown(all_of.view, *each) for each in shown]
 
 
@@ -83,14 +88,14 @@ def simulated(name: str, seed: int, hand_length_m: float) -> list[Shown]:
     renderer, view = WristRenderer(scene, camera.name), WristView.of(rig, camera, hand)
     out: list[Shown] = []
     for t in (np.arange(POSES) * scene.period_s / POSES).tolist():
-        led, ambient = (renderer.render(t, kind) for kind in (Illumination.LED, Illumination.AMBIENT))
+        ambient, laser, led = (renderer.render(t, kind) for kind in STROBE)
         truth = scene.truth(t)
-        out.append(Shown(view, lit(led, ambient), truth.tip_uv, truth.tip_visible))
+        out.append(Shown(view, lit(laser, ambient), lit(led, ambient), led, truth.tip_uv, truth.tip_visible))
     return out
 
 
 def _scored(name: str, shown: list[Shown]) -> Iterator[Row]:
-    found = [fingertips(one.led, separate(one.led, one.view), one.view) for one in shown]
+    found = [_found(one) for one in shown]
     off = np.array([tips.uv - one.truth_px for tips, one in zip(found, shown, strict=True)])
     sigma = np.array([tips.sigma_px for tips in found])
     seen = np.array([one.seen for one in shown])
@@ -132,6 +137,12 @@ def _scored(name: str, shown: list[Shown]) -> Iterator[Row]:
         "per 1000",
         "goal 0",
     )
+
+
+def _found(one: Shown) -> Fingertips:
+    fingers = separate(one.led, one.view)
+    laser_uv = laser_lines(one.laser, fingers, one.view).uv
+    return fingertips(one.led, one.frame, laser_uv, one.view) if fingers.turn.straight else NO_TIPS
 
 
 def _kinds(shown: list[Shown], reported: Bool, seen: Bool) -> dict[str, Bool]:

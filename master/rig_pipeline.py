@@ -12,11 +12,16 @@ from common.errors import CalibrationError
 from common.geometry import cross
 from common.messages import Detections
 from master.estimator.cameras import CameraArrays
+from master.estimator.cubic import CubicLaw
 from master.estimator.estimator import Estimator
+from master.estimator.fused import FusedPipeline, WristSide
 from master.estimator.gate import rehearse
-from master.estimator.pipeline import MarkerPipeline, OtherSensors, SolvedPose, Stage
+from master.estimator.pipeline import MarkerPipeline, SolvedPose, Stage
 from master.estimator.settings import Settings
 from master.estimator.smooth import HandOneEuro
+from master.estimator.triple_reader import TripleReader
+from master.estimator.wrist_model import WristModel, loosened
+from master.estimator.wrist_pipeline import WristPipeline
 from master.fabrik.caps import CapTables
 from master.fabrik.compile import log_if_slow
 from master.fabrik.depth import LAW_MISFIT, CalibrationResidual, depth_law, law_contradicts, law_misfit
@@ -26,9 +31,7 @@ from master.fabrik.rays import RayTriangulator
 from master.fabrik.solver import FabrikSolver
 from master.fabrik.sync import FrameSync
 from master.fabrik.triangulate import DepthTriangulator, Triangulate, disparity_tables
-from master.fusion.pipeline import FusedPipeline, WristSide
 from master.rig_setup import RigSetup
-from master.wrist.pipeline import WristPipeline
 
 _ANY_CURL_RAD = 100.0  # a finger that is not seen may be bent anyhow
 _MOUNTED_RAD = np.radians(0.5)  # standard deviation of the pitch of cameras mounted by eye
@@ -68,7 +71,8 @@ def _point_filter(setup: RigSetup) -> PointFilter:
 def _hand_filter(setup: RigSetup) -> HandOneEuro:
     """The filter of the solved hand, by the same settings."""
     lead_m_s = None if setup.wrist is None else _LEAD_M_S
-    return HandOneEuro(setup.hand, setup.hand_markers, OneEuroParameters.of(setup.rig.filter), lead_m_s)
+    hand = setup.hand if setup.wrist is None else loosened(setup.hand)
+    return HandOneEuro(hand, setup.hand_markers, OneEuroParameters.of(setup.rig.filter), lead_m_s)
 
 
 def _rays(setup: RigSetup) -> RayTriangulator | None:
@@ -84,18 +88,27 @@ def _rays(setup: RigSetup) -> RayTriangulator | None:
 
 
 def _estimator(
-    setup: RigSetup, *, continuous: bool, natural: bool = False, settings: Settings | None = None
+    setup: RigSetup,
+    *,
+    continuous: bool,
+    natural: bool = False,
+    settings: Settings | None = None,
+    fused: bool = False,
 ) -> Estimator:
-    """The estimator of a rig's hand; arguments as of `Estimator`."""
-    markers = setup.hand_markers
+    """The estimator of a rig's hand; arguments as of `Estimator`, `fused`: with the rows of a wrist device."""
+    markers, wrist = setup.hand_markers, None
+    if fused:
+        assert setup.wrist is not None
+        wrist = WristModel.of(setup.wrist, loose=setup.wrist.imu is not None)
     return Estimator(
         tuple(setup.models.values()),
-        setup.hand,
+        setup.hand if wrist is None else loosened(setup.hand),
         setup.rig.markers,
         markers,
         continuous=continuous,
         natural=natural,
         settings=settings or setup.settings,
+        wrist=wrist,
     )
 
 
@@ -152,17 +165,17 @@ def build_pipeline(
     stage: Stage,
     *,
     continuous: bool = True,
-    others: OtherSensors | None = None,
+    side: WristSide | None = None,
     counts: Counter[str] | None = None,
     shed: Callable[[], bool] | None = None,
 ) -> MarkerPipeline:
-    """The pipeline this marker rig's file describes; of a wrist device beside it nothing is used but through `others`.
+    """The pipeline this marker rig's file describes; of a wrist device beside it nothing is used but through `side`.
 
     Args:
         setup: The rig.
         stage: Measures the stages.
         continuous: False: every frame is an unrelated pose; no filter, no memory.
-        others: What else watches the hand; None: nothing does.
+        side: Wrist device and IMU; None: there are none, or they are left out.
         counts: Counted into; None: counts of its own.
         shed: Asked for each instant whether it is left out; None: none is.
 
@@ -173,8 +186,8 @@ def build_pipeline(
     if not setup.has_markers:
         raise CalibrationError(f"rig {rig.name!r}: kind is 'wrist', this needs a rig of 'markers'")
     refine = rig.solver == "estimator"
-    if not refine and (others is not None or rig.imu is not None):
-        beside = "an IMU" if others is None else "a wrist device"
+    if not refine and (side is not None or rig.imu is not None):
+        beside = "an IMU" if side is None else "a wrist device"
         raise CalibrationError(
             f"rig {rig.name!r}: solver 'fabrik' knows markers alone, but {beside} watches this hand too: set solver to"
             " 'estimator'"
@@ -187,12 +200,12 @@ def build_pipeline(
             line=line_of(setup, stage, continuous=continuous),
             rays=_rays(setup),
             rays_px=CalibrationResidual.of(rig).rays_px,
-            estimator=_estimator(setup, continuous=continuous) if refine else None,
+            estimator=_estimator(setup, continuous=continuous, fused=side is not None) if refine else None,
             smooth=_hand_filter(setup) if continuous and refine else None,
             stamp_offset_us=rig.stamp_offset_us,
             volume=rig.volume,
-            imu=rig.imu,
-            others=others,
+            imu=rig.imu if side is None else None,
+            side=side,
             counts=counts,
             stage=stage,
             shed=shed,
@@ -215,13 +228,16 @@ def pipeline_of(
         return cast(Pipeline, build_pipeline(setup, stage, continuous=continuous, shed=shed))
     try:
         if setup.has_markers:
-            side = WristSide.of(setup.wrist, counts := Counter[str](), stage, continuous=continuous)
-            markers = build_pipeline(
-                setup, stage, continuous=continuous, others=side, counts=counts, shed=shed
-            )
+            counts = Counter[str]()
+            cubic = CubicLaw(setup.wrist) if setup.wrist.cubic else None
+            reader = TripleReader(setup.wrist, cubic, counts)
+            side = WristSide(setup.wrist, reader, counts, continuous=continuous)
+            markers = build_pipeline(setup, stage, continuous=continuous, side=side, counts=counts, shed=shed)
             return FusedPipeline(
                 markers, side, min(setup.cameras[name].frame_rate_hz for name in setup.models)
             )
-        return cast(Pipeline, WristPipeline(setup.wrist, continuous=continuous, stage=stage))
+        return cast(
+            Pipeline, WristPipeline(setup.wrist, continuous=continuous, stage=stage, settings=setup.settings)
+        )
     except CalibrationError as error:
         raise CalibrationError(f"rig {setup.rig.name!r}: {error}") from error

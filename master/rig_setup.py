@@ -16,7 +16,7 @@ from common.object_profile import ObjectProfile
 from master.estimator.settings import DEFAULT, Settings
 from master.rig_merge import gestures_named, merged_rig, refuse_shared_senders
 from master.rig_objects import objects_of
-from master.wrist.setup import WristSetup
+from master.wrist_setup import WristSetup
 
 
 @dataclass(frozen=True, slots=True, eq=False)

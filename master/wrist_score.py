@@ -17,7 +17,7 @@ from common.messages import FINGER_COUNT, Level, WristDetections
 from common.recorded_files import TRUTH, has_truth, read_truth
 from master.outputs.poses import Poses
 from master.score import put
-from master.wrist.setup import WristSetup
+from master.wrist_setup import WristSetup
 
 GROUPS = ("palm", *FINGERS, "thenar")  # rows of the truth's laser line
 _OF_FINGERS = slice(1, 1 + FINGER_COUNT)

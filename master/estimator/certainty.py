@@ -25,7 +25,7 @@ MOST_TURNS = 12  # turns that count in arcs: those of the palm, which moves all 
 
 
 class Certainty:
-    """Room for N = 6 + n unknowns and M markers."""
+    """Room for N unknowns and M markers."""
 
     A: Float  # (N, N)
     L: Float  # (N, N)
@@ -51,9 +51,9 @@ class Certainty:
     joint_of: Int  # (5, 4) the joints of the chains
 
     @classmethod
-    def empty(cls, n: int, markers: int) -> "Certainty":
+    def empty(cls, N: int, markers: int) -> "Certainty":
         """Allocate it."""
-        N, K, pairs = 6 + n, 3 * markers, MOST_TURNS * (MOST_TURNS + 1) // 2
+        K, pairs = 3 * markers, MOST_TURNS * (MOST_TURNS + 1) // 2
         room = record(
             cls,
             A=(N, N),

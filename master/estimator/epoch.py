@@ -1,6 +1,5 @@
 """What the estimator is handed at an epoch, and what it says."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,7 +20,9 @@ class Epoch:
         variance_px2: (C, A) of each camera's own errors; NaN: not to be used.
         own_m2: (A, 3, 3) covariance of what is wrong with each marker itself, beside bones.
         facing: (3,) unit vector from the hand to the cameras that see its back.
-        sensed: What other sensors say of the palm's turn and of angles; None: nothing.
+        turn: How other sensors have the palm turned; None: they do not say.
+        wrist: What a wrist device sees of the fingers; None: nothing.
+        place: (3,) [m] where the palm is, of a wrist device alone; None: not known.
         start: Another hand of this epoch; None: there is none.
         second_order: Whether the joints' covariance is wanted to second order, as a hand that is published has it.
     """
@@ -33,45 +34,54 @@ class Epoch:
     uv: Float | None = None
     variance_px2: Float | None = None
     own_m2: Float | None = None
-    sensed: "Sensed | None" = None
+    turn: "Turn | None" = None
+    wrist: "WristRows | None" = None
+    place: Float | None = None
     start: SolvedHand | None = None
     second_order: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sensed:
-    """What other sensors say of the palm's turn and the free angles, as normal equations.
+class Turn:
+    """How other sensors have the palm turned.
 
     Attributes:
-        rotation: (3, 3) palm -> rig about which turns count; None: only angles are known.
+        rotation: (3, 3) palm -> rig frame; where `axes` is given that of a straight wrist.
+        information: (3, 3) [1/rad^2] about its turn, rig axes.
         sure: Whether it is known about every axis how the palm lies.
-        information, pull, constant: (3 + n, 3 + n), (3 + n,) and a number, of turn and free angles.
-        told: (5,) fingers that are told, and `level` (5,) from what (`Level`).
-        angles: (n,) the angles of those, where a search may begin.
-        lit: Columns of the PIPs of fingers that a laser point alone tells: they bend as their knuckles do.
-        weighed: The same with fingers counting less that a hand of angles (5, 4) contradicts; None: there are none.
-        belief: Where it is from.
+        axes: (3, 3) as rows, rig axes: about which tilt 2 and heading turn the forearm; None: the IMU is on the palm.
+        walked_rad2: Variance of what the heading has drifted since the epoch before.
     """
 
-    rotation: Float | None
-    sure: bool
+    rotation: Float
     information: Float
-    pull: Float
-    constant: float
-    told: Bool
-    level: Code
-    angles: Float
-    lit: Int = field(default_factory=lambda: np.zeros(0, np.int64))
-    weighed: "Callable[[Float], Sensed | None]" = lambda _: None
-    belief: object = None
+    sure: bool
+    axes: Float | None = None
+    walked_rad2: float = 0.0
 
-    @classmethod
-    def turn(cls, rotation: Float, information: Float, n: int, *, sure: bool) -> "Sensed":
-        """Of the palm's rotation (3, 3) alone, with information (3, 3) [1/rad^2] about it."""
-        both = np.zeros((3 + n, 3 + n))
-        both[:3, :3] = information
-        none, level = np.zeros(5, np.bool_), np.zeros(5, np.uint8)
-        return cls(rotation, sure, both, np.zeros(3 + n), 0.0, none, level, np.zeros(n))
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WristRows:
+    """What one triple of a wrist device shows of five fingers; x, y are those of undistorted rays (x, y, 1).
+
+    Attributes:
+        laser, tip: (5, 2) laser points and fingertips x, y; NaN: not seen.
+        laser_sigma_px, tip_sigma_px: (5,) their standard deviations per axis.
+        laser_px: (5,) lengths of the lines.
+        tip_depth: (5,) distances of the tips by light, in a unit of its own.
+        laser_s, tip_s: How much later than the epoch laser points and fingertips were seen.
+        law: (5,) PIPs [rad] by another law of the laser point; NaN: none.
+    """
+
+    laser: Float
+    laser_sigma_px: Float
+    laser_px: Float
+    tip: Float
+    tip_sigma_px: Float
+    tip_depth: Float
+    laser_s: float
+    tip_s: float
+    law: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,6 +96,7 @@ class FittedHand(SolvedHand):
         natural: Probability that the hand obeys habits.
         surprise: (M,) chi square of each marker.
         steps: Of the search.
+        twist: (5,) [rad] by which the hinges of each finger are rolled about its first bone.
     """
 
     alone: Float
@@ -94,6 +105,7 @@ class FittedHand(SolvedHand):
     natural: float
     surprise: Float
     steps: int
+    twist: Float = field(default_factory=lambda: np.zeros(5))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +119,10 @@ class Fitted:
             a finger the sum of `ON_MARKERS`, `BY_MARKERS` where its own is placed, and `ON_OTHERS` by its level; for
             the palm one of the former and which markers are seen.
         anew: The hand of a moment ago was wrong: nothing of it is in this one.
-        sensed: What other sensors said, as the fit took it; None: nothing.
+        level: (5,) `Level` codes of what a wrist device tells the fingers from, now.
+        ambiguous: (5,) whether another pose of the finger explains that as well.
+        turn_left_out: Whether the palm by markers contradicts how other sensors have it turned, which was left out.
+        refused, off: (5,) fingertips and laser points that no pose explains.
     """
 
     solution: FittedHand | None
@@ -116,4 +131,8 @@ class Fitted:
     source: Code
     rests: Int
     anew: bool = False
-    sensed: "Sensed | None" = None
+    level: Code = field(default_factory=lambda: np.zeros(5, np.uint8))
+    ambiguous: Bool = field(default_factory=lambda: np.zeros(5, np.bool_))
+    turn_left_out: bool = False
+    refused: Bool = field(default_factory=lambda: np.zeros(5, np.bool_))
+    off: Bool = field(default_factory=lambda: np.zeros(5, np.bool_))

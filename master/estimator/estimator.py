@@ -7,14 +7,15 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.camera_model import CameraModel
-from common.geometry import fit_rigid
-from common.hand_model import CHAINS, HandJoints, HandModel
+from common.geometry import fit_rigid, matrix_to_rotation_vector, rotation_vector_to_matrix
+from common.hand_model import HandJoints, HandModel
 from common.kernels import bound
-from common.messages import Source
 from common.records import boxed, fields
+from common.wrist_bend import forearm_palm
 from master.estimator.cameras import CameraArrays
-from master.estimator.epoch import Epoch, Fitted, FittedHand, Sensed
-from master.estimator.ground import ON_MARKERS, ON_OTHERS, count_rows
+from master.estimator.epoch import Epoch, Fitted, FittedHand
+from master.estimator.extras import usual_of
+from master.estimator.ground import ON_OTHERS, count_rows
 from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.hypotheses import Blank
 from master.estimator.kinematics import Scratch, pose
@@ -25,14 +26,11 @@ from master.estimator.residuals import Observations, observe_points, observe_ray
 from master.estimator.settings import DEFAULT, Settings
 from master.estimator.solve import MAX_ITERATIONS
 from master.estimator.state import HandState
-from master.estimator.update import (
-    Estimate,
-    Model,
-    Workspace,
-    fit_epoch,
-    predict_epoch,
-    take_over_epoch,
-)
+from master.estimator.update import Estimate, fit_epoch, predict_epoch, take_over_epoch
+from master.estimator.workspace import Model, Workspace
+from master.estimator.wrist_device import BEND, EXTRAS, HEADING, LIGHT, NO_EXTRAS, TILT, Device, observe_wrist
+from master.estimator.wrist_model import WristModel
+from master.estimator.wrist_update import prepare_epoch
 
 _BENDS_RAD = (0.1, 0.7, 1.3)  # of the PIP, from which a search afresh begins: open to closed
 _MCP_PER_PIP = 0.6
@@ -43,8 +41,13 @@ _LENGTH_M = 20e-3  # a line shorter than this has no direction
 _ACROSS = 0.9  # cosine to the sight, at most
 _EVEN = 0.5  # probability
 _SOMEWHERE_M = 0.1  # about each axis: a hand that is known no better than this is lost
+_STIFF_RAD = np.radians(1.0)  # of fingers that are taken to bend as their PIP does
+_SURE_RAD2 = 3.0 * np.radians(5.0) ** 2  # of the turn of a palm that markers place well
+_STANDS_M = 1e-4  # of a palm before the wrist device alone, whose frame is the rig's
 _EYE, _AT_ORIGIN = np.eye(3), np.eye(4)
 _NONE = frozenset[int]()
+_NOBODY, _NO_LEVEL = np.zeros(5, np.bool_), np.zeros(5, np.uint8)
+_NOBODY.flags.writeable = _NO_LEVEL.flags.writeable = False
 
 
 class Estimator:
@@ -60,6 +63,7 @@ class Estimator:
         continuous: bool = True,
         natural: bool = False,
         settings: Settings = DEFAULT,
+        wrist: WristModel | None = None,
     ) -> None:
         """Prepare.
 
@@ -72,6 +76,7 @@ class Estimator:
             natural: Whether the hand is taken to obey habits, and begins anew where markers are unexplained: the fit
                 of the card's line, which has no other hand to begin from.
             settings: Every number that tunes it.
+            wrist: A wrist device on the forearm of this hand; None: there is none.
 
         Raises:
             CalibrationError: The profile mounts no marker of one of the names.
@@ -80,12 +85,14 @@ class Estimator:
         self.parameters = HandParameters.of(model)
         self._on_hand = np.array([markers.index(name) for name in hand_markers], np.int64)
         mounts = Mounts.of(model, hand_markers)
-        self._rig = Rig(HandTables.of(model, self.parameters), mounts, CameraArrays.of(cameras))
+        self.wrist = wrist is not None
+        extras, device = (NO_EXTRAS, Device.none()) if wrist is None else (EXTRAS, wrist.device)
+        self._rig = Rig(HandTables.of(model, self.parameters), mounts, CameraArrays.of(cameras), device)
         n, count = len(self.parameters.free), len(hand_markers)
         self._observed = Observations.empty(len(cameras), count)
-        self._space = Workspace.empty(n, _capacity(count))
-        self._blank = Blank.of(n, len(cameras), count)
-        self.state = HandState.unknown(n)
+        self._space = Workspace.empty(n, extras, _capacity(count))
+        self._blank = Blank.of(n, extras, len(cameras), count)
+        self.state = HandState.unknown(n, extras)
         self._only_natural = natural
         self._habits: dict[frozenset[int], Habits] = {}
         self._finger = mounts.finger
@@ -93,6 +100,7 @@ class Estimator:
         bent[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (_MCP_PER_PIP, 1.0))[:, None]
         self._postures = np.array([self.parameters.of_angles(angles) for angles in bent])
         self._natural = self._likeliest()
+        self._natural_habits = self._habits_of(_NONE).natural()
         self._finger_of_free = self.parameters.free // 4
         self._turn: Float | None = None
         self._scratch = Scratch.empty()
@@ -101,10 +109,15 @@ class Estimator:
             boxed(settings.record()),
             self._rig.mounts,
             self._rig.cameras,
+            boxed(self._rig.device),
         )
         self._boxed_state, self._boxed_space = boxed(self.state), boxed(self._space)
         self._now, self._at = fields(self.state), fields(self._space)
         self._boxed_ground = self._boxed_space["ground"]
+        self._at.room.search.bend_share[0] = settings.bend_share
+        self._at.belief.z_info[0, 0] = 1.0  # of a rig without wrist device: one extra that means nothing
+        if wrist is not None:
+            self._lay_out(wrist)
         nothing = np.full((len(cameras), len(markers), 2), np.nan)
         own = np.zeros((len(markers), 3, 3))
         observed, room = self._observed, (np.empty((26, 3)), np.empty((26, 3, 3)), np.empty((count, 3)))
@@ -116,6 +129,13 @@ class Estimator:
         self._work = work = boxed(self._scratch)
         self._pose = bound(pose, self._model.hand, mounts, _AT_ORIGIN, np.zeros(20), work, *room)
         state, space = self._boxed_state, self._boxed_space
+        none = np.full((5, 2), np.nan)
+        self._sights = self._boxed_space["belief"]["sights"]
+        self._observe_wrist = bound(
+            observe_wrist, self._model.device, none, none[:, 0].copy(), none[:, 0].copy(), none, none[:, 0].copy(),
+            none[:, 0].copy(), 0.0, 0.0, 0.0, self._sights,
+        )  # fmt: skip
+        self._prepare = bound(prepare_epoch, self._model, state, space)
         self._predict = bound(predict_epoch, self._model, state, self._observed, space)
         self._fit = bound(fit_epoch, self._model, self._habits_of(_NONE), self._observed, self._blank, space)
         self._take_over = bound(
@@ -132,6 +152,28 @@ class Estimator:
         age_s = (t_ns - int(self._now.t_ns[0])) * 1e-9
         return self._continuous and self.known and 0.0 < age_s <= self.settings.forget_s
 
+    @property
+    def extras(self) -> Float:
+        """Mean (K,) of what other sensors leave open, as the last epoch left it."""
+        return self._now.z
+
+    @property
+    def extras_cov(self) -> Float:
+        """Its covariance (K, K)."""
+        return self._now.z_cov
+
+    def forget_heading(self) -> None:
+        """Let the heading of an IMU be any, and what was learnt with it."""
+        self._now.z_cov[BEND:LIGHT] = self._now.z_cov[:, BEND:LIGHT] = 0.0
+        self._now.z_cov[range(BEND, LIGHT), range(BEND, LIGHT)] = self._now.usual[BEND:LIGHT]
+
+    def begin_heading(self, heading_rad: float, variance_rad2: float) -> None:
+        """Take the heading of an IMU from a palm that was solved without it."""
+        self._now.z[HEADING] = heading_rad
+        self._now.z_cov[HEADING] = self._now.z_cov[:, HEADING] = 0.0
+        self._now.z_cov[HEADING, HEADING] = variance_rad2
+        self._turn = None
+
     def pose(self, T: Float, angles_rad: Float) -> tuple[HandJoints, Float]:
         """Place joints and markers (M, 3) [m], rig frame.
 
@@ -145,33 +187,82 @@ class Estimator:
 
     def push(self, at: Epoch) -> Fitted:
         """Fit one epoch."""
-        sensed, task, ground = at.sensed, self._at.task, self._at.ground
+        task, ground = self._at.task, self._at.ground
         self._observe(at)
-        if sensed is not None:
-            ground.shown[:] |= sensed.told
-            ground.numbers[0] += 3.0 * int(sensed.told.sum())
-        sure = sensed is not None and sensed.sure
-        palm_shown = bool(ground.by_markers[0]) or (sure and ground.seen[0] > 0)
-        task.t_ns[0], task.palm_shown[0], task.second_order[0] = at.t_ns, palm_shown, at.second_order
+        task.t_ns[0], task.second_order[0], task.continuous[0] = at.t_ns, at.second_order, self._continuous
+        task.walked_rad2[0] = 0.0 if at.turn is None else at.turn.walked_rad2
+        if self.wrist:
+            self._prepare(self._model, self._boxed_state, self._boxed_space)
+        told = self._told() if self.wrist else _NOBODY
+        if told.any():
+            ground.shown[:] |= told
+            ground.numbers[0] += 2.0 * (int(told.sum()) + int((self._at.belief.sights.shown > 0.0).sum()))
+        sure = at.turn is not None and at.turn.sure
+        palm_shown = bool(ground.by_markers[0]) or (sure and ground.seen[0] > 0) or at.place is not None
+        task.palm_shown[0] = palm_shown
         known = self.recent(at.t_ns)
         self._believe(at, known=known)
-        out = Estimate.empty()
-        before = None if sensed is None else self._boxed_state.copy()
+        out, left_out = Estimate.empty(), False
+        before = (
+            self._boxed_state.copy() if self.wrist and at.turn is not None and ground.by_markers[0] else None
+        )
         solved, anew = self._solve(at, out, known=known)
-        if (
-            solved
-            and sensed is not None
-            and (weighed := sensed.weighed(out.angles.reshape(5, 4))) is not None
-        ):
-            self._boxed_state[:], sensed = before, weighed
-            at = replace(at, sensed=sensed)
-            self._believe(at, known=known)
-            solved, anew = self._solve(at, out, known=known)
-        self._turn = None if sensed is None else sensed.rotation
-        if ground.seen[0] > 0 or (sensed is not None and bool(sensed.told.any()) and self._knows_place()):
+        if solved and before is not None and self._contradicts(at):
+            # What the IMU says is left out: it began anew, or the wrist was flicked. But not where it alone tells.
+            for turn in (None, at.turn):
+                self._boxed_state[:] = before
+                self._believe(replace(at, turn=turn), known=known)
+                solved, anew = self._solve(replace(at, turn=turn), out, known=known)
+                left_out = turn is None
+                if left_out and np.trace(self._at.found.cov[:3, :3]) < _SURE_RAD2:
+                    break
+        self._turn = None if left_out or at.turn is None else self._turned(at, learnt=True)
+        if ground.seen[0] > 0 or (told.any() and (at.place is not None or self._knows_place())):
             self._now.seen_ns[0] = at.t_ns
         rests = self._rests(at, palm_shown=palm_shown)
-        return self._fitted(at, out, rests, anew=anew) if solved else _unknown(rests)
+        return self._fitted(at, out, rests, anew=anew, left_out=left_out) if solved else _unknown(rests)
+
+    def _lay_out(self, wrist: WristModel) -> None:
+        """Write what is believed of fingers before a wrist device, and of what it leaves open."""
+        prior, state, s = self._at.prior, self._now, self.settings
+        prior.natural[:], prior.slope[:], prior.frame[:] = wrist.natural, wrist.slope, wrist.frame
+        prior.abduction[:], prior.flexion[:] = s.abduction_rad, s.coupled_rad
+        prior.abduction[0] = prior.flexion[0] = 0.5 * s.thumb_rad
+        if wrist.only_natural:
+            prior.only_natural[0], prior.flexion[:] = 1.0, _STIFF_RAD
+        state.usual[:] = usual_of(s, loose=wrist.loose, tilt_rad=wrist.tilt_rad)
+        state.z_cov[:] = np.diag(state.usual)
+        if wrist.heading_rad is not None:
+            state.z_cov[HEADING, HEADING] = wrist.heading_rad**2
+
+    def _contradicts(self, at: Epoch) -> bool:
+        """Tell whether the palm is too far from how other sensors have it turned, however extras are bent for it."""
+        assert at.turn is not None
+        belief, found = self._at.belief, self._at.found
+        off = found.z - belief.z
+        bent = at.turn.rotation @ forearm_palm(found.z[BEND : BEND + 2])
+        by_axes = rotation_vector_to_matrix(off[TILT : HEADING + 1] @ belief.axes)
+        q = matrix_to_rotation_vector(found.palm[:3, :3] @ (by_axes @ bent).T)
+        return float(q @ belief.turn_info @ q + off @ belief.z_info @ off) > self.settings.contrary
+
+    def _told(self) -> Bool:
+        """Tell which fingers (5,) a wrist device tells now."""
+        return self._at.belief.sights.lit > 0.0
+
+    def _turned(self, at: Epoch, *, learnt: bool = False) -> Float | None:
+        """How the palm is turned by other sensors (3, 3), with the bend that is believed; None: they do not say.
+
+        `learnt`: with tilt and heading as this epoch leaves them, so that what is learnt of these is no motion.
+        """
+        if at.turn is None:
+            return None
+        if at.turn.axes is None:
+            return at.turn.rotation
+        bent = at.turn.rotation @ forearm_palm(self._now.z[BEND : BEND + 2])
+        if not learnt:
+            return bent
+        off = self._now.z[TILT : HEADING + 1] - self._at.belief.z[TILT : HEADING + 1]
+        return rotation_vector_to_matrix(off @ at.turn.axes) @ bent
 
     def _solve(self, at: Epoch, out: Estimate, *, known: bool) -> tuple[bool, bool]:
         """Fit an epoch and take it over.
@@ -200,18 +291,21 @@ class Estimator:
             Chi square of the markers, infinite where no motion explains them but another hand does; and whether no hand
             that may take its place is better.
         """
-        start, sensed, task = at.start, at.sensed, self._at.task
-        task.turned[:] = _EYE
-        if sensed is not None and sensed.rotation is not None and self._turn is not None:
-            task.turned[:] = sensed.rotation @ self._turn.T
+        start, task = at.start, self._at.task
+        turned = None if at.turn is None else self._turned(at)
+        task.turned[:] = _EYE if turned is None or self._turn is None else turned @ self._turn.T
         task.may_leave[0] = may_leave and start is not None and self._enough(at)
         if start is not None:
             task.palm[:], task.angles[:] = start.T_rig_palm, start.angles_rad.reshape(20)
         limit = self._predict(self._model, self._boxed_state, self._observed, self._boxed_space)
         if limit < 0.0:
             return np.inf, False
-        habits = self._habits[_NONE]
-        wrong = self._search(habits if sensed is None else self._with_laser(habits, sensed))
+        room = self._at.room
+        if self.wrist:
+            room.start_x[:] = self._as_told(room.start_x.copy())
+        # Whether a hand obeys habits, fingers before a wrist device say by themselves.
+        habits = self._habits[_NONE] if self._at.ground.seen[0] > 0 else self._natural_habits
+        wrong = self._search(habits)
         if self._only_natural and may_leave:
             return wrong, not (self._unexplained() and self._enough(at))
         return wrong, not wrong > limit  # NaN: there is nothing to compare
@@ -228,7 +322,27 @@ class Estimator:
 
     def _observe(self, at: Epoch) -> None:
         """Write the rows of an epoch, and count them."""
-        if at.cov_m2 is not None:
+        if at.wrist is None:
+            self._at.belief.sights.rows[0] = 0.0
+            self._at.belief.sights.lit[:] = self._at.belief.sights.shown[:] = 0.0
+        else:
+            self._at.prior.law[:] = at.wrist.law
+            self._observe_wrist(
+                self._model.device,
+                at.wrist.laser,
+                at.wrist.laser_sigma_px,
+                at.wrist.laser_px,
+                at.wrist.tip,
+                at.wrist.tip_sigma_px,
+                at.wrist.tip_depth,
+                self.settings.light_rad,
+                at.wrist.laser_s,
+                at.wrist.tip_s,
+                self._sights,
+            )
+        if at.uv is None and at.cov_m2 is None:
+            self._observed.seen[:] = False
+        elif at.cov_m2 is not None:
             bones_m2 = self.settings.bones_m**2
             points, cov = at.points_m[self._on_hand], at.cov_m2[self._on_hand]
             self._observe_points(points, cov, bones_m2, self._observed)
@@ -263,17 +377,20 @@ class Estimator:
         belief.own_w2[:], belief.own[:] = curled(self.parameters, self.settings, fingers)
         task.natural[0], task.counts[0] = _EVEN, 0.0
         habits = self._habits_of(apart)
-        habits = habits if at.sensed is None else self._with_laser(habits, at.sensed)
         try:
             if start is not None:
                 shows = self._at.ground.shown[self._finger_of_free] > 0
                 x = np.where(shows, self.parameters.of_angles(start.angles_rad), self._natural)
-                room.start_T[:], room.start_x[:] = start.T_rig_palm, self._as_sensed(x, at.sensed)
+                room.start_T[:], room.start_x[:] = start.T_rig_palm, self._as_told(x)
                 chi2 = self._search(habits)
                 if self._at.found.steps[0] < MAX_ITERATIONS and not self._unexplained():
                     return chi2
             ends = list[tuple[float, Float, Float]]()
-            for T, x in self._starts(at):
+            starts = self._starts(at)
+            if len(starts) == 1:
+                room.start_T[:], room.start_x[:] = starts[0]
+                return self._search(habits)
+            for T, x in starts:
                 task.palm[:], task.x[:] = T, x
                 ends.append((self._search(habits, rough=True), task.palm.copy(), task.x.copy()))
             _, room.start_T[:], room.start_x[:] = min(ends, key=lambda end: end[0])
@@ -282,19 +399,23 @@ class Estimator:
             belief.own_w2[:] = 0.0
 
     def _starts(self, epoch: Epoch) -> list[tuple[Float, Float]]:
-        """Three hands, open to closed, each laid on the markers as a rigid body."""
-        sensed = epoch.sensed
+        """Three hands, open to closed, each laid on the markers as a rigid body; one where the palm is known."""
+        turned = self._turned(epoch)
+        if epoch.place is not None and turned is not None:
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = turned, epoch.place
+            return [(T, self._as_told(self._natural.copy()))]
         placed = self._placed(epoch)
         weight = np.where(self._finger[placed] >= 0, 1.0, _PALM_WEIGHT)
         observed = epoch.points_m[self._on_hand][placed]
         starts: list[tuple[Float, Float]] = []
         for posture in self._postures:
-            x = self._as_sensed(posture.copy(), sensed)
+            x = self._as_told(posture.copy())
             expected = self.pose(_AT_ORIGIN, self.parameters.angles(x))[1][placed]
-            if sensed is not None and sensed.sure and sensed.rotation is not None:
+            if turned is not None and epoch.turn is not None and epoch.turn.sure:
                 T = np.eye(4)
-                T[:3, :3] = sensed.rotation
-                T[:3, 3] = np.average(observed - expected @ sensed.rotation.T, axis=0, weights=weight)
+                T[:3, :3] = turned
+                T[:3, 3] = np.average(observed - expected @ turned.T, axis=0, weights=weight)
             elif self._at.belief.facing_w2[0] > 0.0:
                 # A point above the wrist stands for "the back of the hand faces the cameras".
                 above = expected.mean(axis=0) + np.array([0.0, _ABOVE_M, 0.0])
@@ -309,15 +430,17 @@ class Estimator:
             starts.append((np.ascontiguousarray(T), x))
         return starts
 
-    def _as_sensed(self, x: Float, sensed: Sensed | None) -> Float:
-        """Free angles (n,) with those of fingers that another sensor tells."""
-        if sensed is None or not sensed.told.any():
+    def _as_told(self, x: Float) -> Float:
+        """Free angles (n,) with those of fingers whose valley was searched."""
+        known = self._at.scan.known > 0.0
+        if not known.any():
             return x
-        return np.where(sensed.told[self._finger_of_free], sensed.angles, x)
+        scanned = self.parameters.of_angles(self._at.task.scanned.reshape(5, 4))
+        return np.where(known[self._finger_of_free], scanned, x)
 
     def _believe(self, epoch: Epoch, *, known: bool) -> None:
         """Write what is believed beside the past and habits."""
-        belief, ground, sensed = self._at.belief, self._at.ground, epoch.sensed
+        belief, ground, turn = self._at.belief, self._at.ground, epoch.turn
         belief.facing[:] = epoch.facing
         belief.facing_w2[0] = self.settings.facing_rad**-2.0 if ground.back[0] else 0.0
         belief.depth_w2[0] = 0.0
@@ -326,11 +449,14 @@ class Estimator:
             sight = self._now.palm[:3, 3] - alone
             belief.sight[:] = sight / np.sqrt(sight @ sight)
             belief.depth_w2[0] = self.settings.held_depth_m**-2.0
-        belief.sensed_known[0] = 0.0 if sensed is None else 1.0
-        if sensed is not None:
-            belief.turn[:] = _EYE if sensed.rotation is None else sensed.rotation
-            belief.sensed[:], belief.sensed_pull[:] = sensed.information, sensed.pull
-            belief.sensed_constant[0] = sensed.constant
+        belief.turned[0] = turn is not None
+        if turn is not None:
+            belief.forearm[:3, :3], belief.turn_info[:] = turn.rotation, turn.information
+            belief.on_forearm[0] = turn.axes is not None
+            belief.axes[:] = 0.0 if turn.axes is None else turn.axes
+        belief.place_w2[0] = 0.0
+        if epoch.place is not None:
+            belief.place[:], belief.place_w2[0] = epoch.place, _STANDS_M**-2.0
 
     def _enough(self, epoch: Epoch) -> bool:
         """Tell whether the markers fix a hand: not in one line, or across `facing`.
@@ -338,8 +464,10 @@ class Estimator:
         What faces the cameras turns the hand about a line of markers, but not about one that points at them. With an
         orientation that is known any one marker is enough.
         """
+        if epoch.place is not None:
+            return True
         points = epoch.points_m[self._on_hand][self._placed(epoch)]
-        if epoch.sensed is not None and epoch.sensed.sure:
+        if epoch.turn is not None and epoch.turn.sure:
             return len(points) > 0
         if len(points) < 2:
             return False
@@ -373,36 +501,33 @@ class Estimator:
             self._habits[unlike] = habits.natural() if self._only_natural else habits
         return self._habits[unlike]
 
-    def _with_laser(self, habits: Habits, sensed: Sensed) -> Habits:
-        """Habits of a natural hand without those about PIPs that a laser point tells."""
-        if not len(sensed.lit) or self.model.mcp_per_pip is None:
-            return habits
-        return habits.without(sensed.lit, self.settings.pip_mean_rad, self.settings.pip_rad)
-
     def _likeliest(self) -> Float:
         """Free angles (n,) of the natural hand."""
         habits = self._habits_of(_NONE)
         x = np.asarray(np.linalg.solve(habits.normal[0], habits.pull[0]), np.float64)
         return np.minimum(np.maximum(x, self.parameters.low), self.parameters.high)
 
+    def _levels(self, at: Epoch) -> Int:
+        """What a wrist device tells the fingers from (5,), now or in the triple before."""
+        age_s = (at.t_ns - self._now.told_ns[:5]) * 1e-9
+        return np.where(age_s <= self.settings.tracked_triple_s, self._now.level, 0).astype(np.int64)
+
     def _rests(self, at: Epoch, *, palm_shown: bool) -> Int:
         """What thumb ... little and the palm rest on now (6,), as of `Fitted`."""
-        ground, sensed = self._at.ground, at.sensed
+        ground = self._at.ground
         rests = ground.rests.copy()
-        if sensed is not None:
-            rests[:5] += ON_OTHERS * np.where(sensed.told, sensed.level, 0)
+        if self.wrist:
+            rests[:5] += ON_OTHERS * self._levels(at)
         if not palm_shown:
             rests[5] = 0
         elif not ground.by_markers[0]:
             rests[5] += ON_OTHERS
         return rests
 
-    def _fitted(self, at: Epoch, out: Estimate, rests: Int, *, anew: bool) -> Fitted:
-        found, sensed = self._at.found, at.sensed
+    def _fitted(self, at: Epoch, out: Estimate, rests: Int, *, anew: bool, left_out: bool) -> Fitted:
+        found, task = self._at.found, self._at.task
         recent = (at.t_ns - int(self._now.seen_ns[0])) * 1e-9 <= self.settings.forget_s
-        if sensed is not None:  # a tip that is measured stays so
-            by_others = CHAINS[sensed.told & (rests[:5] & ON_MARKERS == 0)]
-            out.source[by_others] = Source.WRIST
+        known = 6 + len(found.x)
         hand = FittedHand(
             T_rig_palm=out.palm,
             angles_rad=out.angles.reshape(5, 4),
@@ -410,12 +535,13 @@ class Estimator:
             cov_m2=out.cov,
             tilt_cov_rad2=out.tilt,
             tilt_walk_rad2_s2=out.tilt_walk,
-            alone=found.cov.copy(),
+            alone=found.cov[:known, :known].copy(),
             x=found.x.copy(),
             scale=float(found.scale[0]),
             natural=float(found.natural[0]),
             surprise=found.surprise[: len(self._on_hand)].copy(),
             steps=int(found.steps[0]),
+            twist=self._now.z[:5].copy() if self.wrist else np.zeros(5),
         )
         return Fitted(
             hand,
@@ -424,7 +550,11 @@ class Estimator:
             out.source,
             rests,
             anew,
-            sensed,
+            level=np.where(self._told(), task.level, 0).astype(np.uint8) if self.wrist else _NO_LEVEL,
+            ambiguous=task.ambiguous > 0,
+            turn_left_out=left_out,
+            refused=task.refused > 0,
+            off=task.off > 0,
         )
 
 
@@ -436,4 +566,4 @@ def _unknown(rests: Int) -> Fitted:
 
 def _capacity(markers: int) -> int:
     """Round a count of markers up, so that kernels are compiled once for most rigs."""
-    return -(-markers // _STEP) * _STEP
+    return max(-(-markers // _STEP), 1) * _STEP

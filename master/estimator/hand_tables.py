@@ -35,6 +35,10 @@ class HandTables:
         level: (26,) its place in the chain.
         middle: (26,) the PIP of its finger, a metacarpal's too; those of thumb, palm and wrist: themselves.
         rest_m, rest_R: (26, 3) [m], (26, 3, 3) place and rotation of those fixed to the palm, palm frame.
+        twist: (5,) [rad] by which the hinges of each finger are rolled about its first bone, in `swing` (`twist_hand`).
+        twist_axis: (5, 3) that bone, in the frame of the abduction.
+        untwisted: (3, 5, 3, 3) `swing` of the abductions with hinges as the profile has them.
+        turned: (3, 3) room.
     """
 
     swing: Float
@@ -57,6 +61,10 @@ class HandTables:
     middle: Int
     rest_m: Float
     rest_R: Float
+    twist: Float
+    twist_axis: Float
+    untwisted: Float
+    turned: Float
 
     @classmethod
     def of(cls, model: HandModel, parameters: HandParameters) -> "HandTables":
@@ -76,6 +84,7 @@ class HandTables:
             own = parameters.complete[4 * f : 4 * f + 4, first[f] : first[f + 1]]
             complete[4 * f : 4 * f + 4, : own.shape[1]] = own
         most = np.ascontiguousarray(model.limits_rad[:, 1, 1])
+        first_bone = np.einsum("fij,fj->fi", model.swing[:2, :, 1].sum(axis=0), model.bone_m[:, 0])
         tables: dict[str, Float | Int | Bool] = {
             "swing": model.swing,
             "tip_turn": model.turn[:, 2],
@@ -97,6 +106,10 @@ class HandTables:
             "middle": middle,
             "rest_m": model.rest_position_m,
             "rest_R": model.rest_rotation,
+            "twist": np.zeros(5),
+            "twist_axis": first_bone / np.linalg.norm(first_bone, axis=1, keepdims=True),
+            "untwisted": model.swing[:, :, 0],
+            "turned": np.zeros((3, 3)),
         }
         return filled(cls, tables)
 

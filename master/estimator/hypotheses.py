@@ -18,8 +18,8 @@ class Posterior:
     """A hand by one epoch.
 
     Attributes:
-        palm, x: (4, 4) palm, (n,) free angles.
-        cov: (N, N) of turn [rad], shift [m], rig axes, and free angles [rad], by this instant alone.
+        palm, x, z: (4, 4) palm, (n,) free angles, (K,) extras.
+        cov: (N, N) of turn [rad], shift [m], rig axes, free angles [rad] and extras, by this instant alone.
         surprise: (M,) chi square of each marker.
         steps: (1,) of the search.
         natural: (1,) probability that the hand obeys habits.
@@ -28,6 +28,7 @@ class Posterior:
 
     palm: Float
     x: Float
+    z: Float
     cov: Float
     surprise: Float
     steps: Float
@@ -35,13 +36,14 @@ class Posterior:
     scale: Float
 
     @classmethod
-    def empty(cls, n: int, markers: int) -> "Posterior":
+    def empty(cls, n: int, extras: int, markers: int) -> "Posterior":
         """Room for one."""
-        N = 6 + n
+        N = 6 + n + extras
         return record(
             cls,
             palm=(4, 4),
             x=n,
+            z=extras,
             cov=(N, N),
             surprise=markers,
             steps=1,
@@ -58,17 +60,17 @@ class Blank(NamedTuple):
     between: Observations
 
     @classmethod
-    def of(cls, n: int, cameras: int, markers: int) -> "Blank":
+    def of(cls, n: int, extras: int, cameras: int, markers: int) -> "Blank":
         """For a hand with n free angles."""
         nothing = Habits(np.zeros((1, n, n)), np.zeros((1, n)), np.zeros(1), np.zeros(1))
-        return cls(nothing, Belief.none(n), Observations.empty(cameras, markers))
+        return cls(nothing, Belief.none(n, extras), Observations.empty(cameras, markers))
 
 
 class Hypothesis:
-    """A hand of N = 6 + n unknowns and M markers under one hypothesis.
+    """A hand of N = 6 + n + K unknowns and M markers under one hypothesis.
 
     Attributes:
-        palm, x: (4, 4), (n,) where its search ended.
+        palm, x, z: (4, 4), (n,), (K,) where its search ended.
         gradient, normal: (N,), (N, N) there.
         surprise, information: (M,) chi square and (M, 3, 3) what is known of the place of each marker.
         cost, apart: (1,) half the sum of squares, and the half of what rays that do not meet have between them.
@@ -78,6 +80,7 @@ class Hypothesis:
 
     palm: Float
     x: Float
+    z: Float
     gradient: Float
     normal: Float
     surprise: Float
@@ -89,13 +92,14 @@ class Hypothesis:
     off: Float
 
     @classmethod
-    def empty(cls, n: int, markers: int) -> "Hypothesis":
+    def empty(cls, n: int, extras: int, markers: int) -> "Hypothesis":
         """Room for one."""
-        N = 6 + n
+        N = 6 + n + extras
         return record(
             cls,
             palm=(4, 4),
             x=n,
+            z=extras,
             gradient=N,
             normal=(N, N),
             surprise=markers,
@@ -109,11 +113,12 @@ class Hypothesis:
 
 
 class Room:
-    """Room for both hypotheses of N = 6 + n unknowns and M markers."""
+    """Room for both hypotheses of N = 6 + n + K unknowns and M markers."""
 
     each: Sequence[Hypothesis]  # (2,) natural and free
     start_T: Float  # (4, 4)
     start_x: Float  # (n,)
+    start_z: Float  # (K,)
     middle: Float  # (N,)
     A: Float  # (N, N)
     L: Float  # (N, N)
@@ -125,14 +130,15 @@ class Room:
     search: Search
 
     @classmethod
-    def empty(cls, n: int, markers: int) -> "Room":
+    def empty(cls, n: int, extras: int, markers: int) -> "Room":
         """Allocate it."""
-        N, M = 6 + n, markers
+        N, M = 6 + n + extras, markers
         return record(
             cls,
-            each=(Hypothesis.empty(n, markers), 2),
+            each=(Hypothesis.empty(n, extras, markers), 2),
             start_T=(4, 4),
             start_x=n,
+            start_z=extras,
             middle=N,
             A=(N, N),
             L=(N, N),
@@ -140,8 +146,8 @@ class Room:
             cov=(N, N),
             here=(M, 3),
             there=(M, 3),
-            cut=Cut.empty(n),
-            search=Search.empty(n, markers),
+            cut=Cut.empty(n, N),
+            search=Search.empty(n, extras, markers),
         )
 
 

@@ -133,33 +133,93 @@ def chains(tables: HandTables, T: Float, angles: Float, R: Float, P: Float) -> N
         R, P: Written: (5, 4, 3, 3) and (5, 4, 3) [m].
     """
     for f in range(5):
-        local = R[f, 3]  # until it is the tip's
+        finger_chain(tables, T, angles, f, R[f], P[f])
+
+
+@inner
+def finger_chain(tables: HandTables, T: Float, angles: Float, f: int, R: Float, P: Float) -> None:
+    """Write joint rotations and places of finger f alone, in the frame of the palm's pose.
+
+    Args:
+        tables: The hand.
+        T: (4, 4) palm.
+        angles: (20,) [rad].
+        f: Finger.
+        R, P: Written: (4, 3, 3) and (4, 3) [m].
+    """
+    local = R[3]  # until it is the tip's
+    for i in range(3):
+        P[0, i] = T[i, 3]
+        for j in range(3):
+            P[0, i] += T[i, j] * tables.root_m[f, j]
+    for k in range(4):
+        c, s = cos(angles[4 * f + k]), sin(angles[4 * f + k])
+        before, after = max(k - 2, 0), max(k - 1, 0)
         for i in range(3):
-            P[f, 0, i] = T[i, 3]
             for j in range(3):
-                P[f, 0, i] += T[i, j] * tables.root_m[f, j]
-        for k in range(4):
-            c, s = cos(angles[4 * f + k]), sin(angles[4 * f + k])
-            before, after = max(k - 2, 0), max(k - 1, 0)
+                turned = c * tables.swing[1, f, k, i, j] + s * tables.swing[2, f, k, i, j]
+                local[i, j] = tables.swing[0, f, k, i, j] + turned
+        for i in range(3):
+            a, b, d = R[before, i, 0], R[before, i, 1], R[before, i, 2]
+            if k == 0:
+                a, b, d = T[i, 0], T[i, 1], T[i, 2]
+            for j in range(3):
+                R[after, i, j] = a * local[0, j] + b * local[1, j] + d * local[2, j]
+    for i in range(3):
+        a, b, d = R[2, i, 0], R[2, i, 1], R[2, i, 2]
+        for j in range(3):
+            turned = a * tables.tip_turn[f, 0, j] + b * tables.tip_turn[f, 1, j]
+            R[3, i, j] = turned + d * tables.tip_turn[f, 2, j]
+    for k in range(3):
+        for i in range(3):
+            bone = R[k, i, 0] * tables.bone_m[f, k, 0] + R[k, i, 1] * tables.bone_m[f, k, 1]
+            P[k + 1, i] = P[k, i] + bone + R[k, i, 2] * tables.bone_m[f, k, 2]
+
+
+@inlined
+def abduction_axis(tables: HandTables, T: Float, f: int, out: Float) -> None:
+    """Write the axis (3,) about which finger f abducts, in the frame of the palm's pose."""
+    for i in range(3):
+        out[i] = 0.0
+        for j in range(3):
+            out[i] += T[i, j] * tables.abduction_axis[f, j]
+
+
+@inner
+def twist_hand(tables: HandTables, twist: Float) -> None:
+    """Roll the hinges of each finger about its first bone by (5,) [rad]: `HandTables.swing` of the abduction.
+
+    The axes of a hand file are those of a drawing, and a person's lie askew to them by a few degrees. Rodrigues.
+    """
+    for f in range(5):
+        if tables.twist[f] == twist[f]:
+            continue
+        tables.twist[f] = twist[f]
+        c, s = cos(twist[f]), sin(twist[f])
+        x, y, z = tables.twist_axis[f, 0], tables.twist_axis[f, 1], tables.twist_axis[f, 2]
+        Q = tables.turned
+        Q[0, 0], Q[0, 1], Q[0, 2] = (
+            c + x * x * (1.0 - c),
+            x * y * (1.0 - c) - z * s,
+            x * z * (1.0 - c) + y * s,
+        )
+        Q[1, 0], Q[1, 1], Q[1, 2] = (
+            y * x * (1.0 - c) + z * s,
+            c + y * y * (1.0 - c),
+            y * z * (1.0 - c) - x * s,
+        )
+        Q[2, 0], Q[2, 1], Q[2, 2] = (
+            z * x * (1.0 - c) - y * s,
+            z * y * (1.0 - c) + x * s,
+            c + z * z * (1.0 - c),
+        )
+        for part in range(3):
             for i in range(3):
                 for j in range(3):
-                    turned = c * tables.swing[1, f, k, i, j] + s * tables.swing[2, f, k, i, j]
-                    local[i, j] = tables.swing[0, f, k, i, j] + turned
-            for i in range(3):
-                a, b, d = R[f, before, i, 0], R[f, before, i, 1], R[f, before, i, 2]
-                if k == 0:
-                    a, b, d = T[i, 0], T[i, 1], T[i, 2]
-                for j in range(3):
-                    R[f, after, i, j] = a * local[0, j] + b * local[1, j] + d * local[2, j]
-        for i in range(3):
-            a, b, d = R[f, 2, i, 0], R[f, 2, i, 1], R[f, 2, i, 2]
-            for j in range(3):
-                turned = a * tables.tip_turn[f, 0, j] + b * tables.tip_turn[f, 1, j]
-                R[f, 3, i, j] = turned + d * tables.tip_turn[f, 2, j]
-        for k in range(3):
-            for i in range(3):
-                bone = R[f, k, i, 0] * tables.bone_m[f, k, 0] + R[f, k, i, 1] * tables.bone_m[f, k, 1]
-                P[f, k + 1, i] = P[f, k, i] + bone + R[f, k, i, 2] * tables.bone_m[f, k, 2]
+                    total = 0.0
+                    for k in range(3):
+                        total += tables.untwisted[part, f, i, k] * Q[k, j]
+                    tables.swing[part, f, 0, i, j] = total
 
 
 @inlined
@@ -371,3 +431,9 @@ def pose(
     joints(hand, work.palm, work.R, work.P, position, rotation)
     for m in range(mounts.finger.shape[0]):
         marker_point(mounts, m, work.palm, work.R, work.P, out[m])
+
+
+@kernel
+def twist_boxed(boxed_hand: Any, twist: Float) -> None:
+    """As `twist_hand`, of a hand in its array."""
+    twist_hand(boxed_hand[0], twist)

@@ -20,11 +20,12 @@ from common.hand_model import HandModel
 from common.kernels import bound
 from common.messages import HandPose, MarkerDetections, restamped
 from master.estimator.cameras import CameraArrays
-from master.estimator.epoch import Epoch, Fitted, Sensed
+from master.estimator.epoch import Epoch, Fitted, Turn, WristRows
 from master.estimator.estimator import Estimator
 from master.estimator.gate import Prior, among, associate
 from master.estimator.hand_tables import Mounts
 from master.estimator.kinematics import quaternions
+from master.estimator.palm_imu import OrientationTrack
 from master.estimator.pose import pose_of
 from master.estimator.smooth import HandOneEuro
 from master.fabrik.blob_bias import LensShift
@@ -33,23 +34,29 @@ from master.fabrik.intersection import triangulate
 from master.fabrik.rays import RayPositions, RayTriangulator
 from master.fabrik.solver import FabrikSolver
 from master.fabrik.sync import FrameSet
-from master.fusion.orientation import OrientationTrack
-from master.fusion.sensed_hand import MarkerCheck, SensedHand
 
 Stage = Callable[[str], AbstractContextManager[None]]
 _NAME = 64  # characters of a name in `Health`
 _NEVER_NS = -(2**62)
 
 
-class OtherSensors(Protocol):
-    """What watches the same hand beside the cameras: a wrist device and its IMU (`master.fusion`)."""
+class WristSideOf(Protocol):
+    """What a wrist device and its IMU say of the hand that the cameras watch (`master.estimator.fused`)."""
 
-    def at(self, t_ns: int) -> SensedHand | None:
-        """What they say of the hand at an epoch; None: nothing."""
+    def rows_at(self, t_ns: int) -> WristRows | None:
+        """The rows of a triple that no epoch had; None: there is none."""
         ...
 
-    def solved(self, t_ns: int, hand: Fitted) -> None:
-        """Learn from the hand as it was solved, with what they said in it."""
+    def turn_at(self, t_ns: int, estimator: Estimator) -> Turn | None:
+        """How the IMU has the palm turned; None: it does not say."""
+        ...
+
+    def solved(self, t_ns: int, hand: Fitted, estimator: Estimator, *, turned: bool) -> None:
+        """Learn from an epoch that was solved."""
+        ...
+
+    def told(self, pose: HandPose, estimator: Estimator) -> HandPose:
+        """The pose with what else is known of the hand."""
         ...
 
 
@@ -78,7 +85,7 @@ class MarkerPipeline:
         stamp_offset_us: Mapping[str, float] | None = None,
         volume: Volume | None = None,
         imu: ImuCalibration | None = None,
-        others: OtherSensors | None = None,
+        side: "WristSideOf | None" = None,
         counts: Counter[str] | None = None,
         stage: Stage = lambda name: nullcontext(),
         shed: Callable[[], bool] | None = None,
@@ -97,7 +104,7 @@ class MarkerPipeline:
             stamp_offset_us: Camera -> how much later its frames really are than their stamps; added to them.
             volume: What the rig states, or None; joints say whether they lie in it.
             imu: On the palm; its orientation is used where the rig says how it is mounted and how its world lies.
-            others: What else watches the hand; None: nothing does.
+            side: Wrist device and IMU on the forearm of this hand; None: there are none.
             counts: Counted into; None: counts of its own.
             stage: Opens a timer by stage name.
             shed: Asked for each epoch whether it is left out, for newer ones wait (`master.hurry`); None: none is.
@@ -113,10 +120,8 @@ class MarkerPipeline:
         joints = [model.mount(name).joint for name in self._hand_markers]
         self._joint = np.array([0 if joint is None else joint for joint in joints])  # 0: the palm
         self._finger_of = Mounts.of(model, self._hand_markers).finger
-        self._elsewhere = MarkerCheck(model, self._hand_markers)
-        self._stage, self._volume, self._shed = stage, volume, shed
+        self._stage, self._volume, self._shed, self._side = stage, volume, shed, side
         self._orientation = None if imu is None or not imu.placed else OrientationTrack(imu, self.counts)
-        self._others = others
         self._last_ns = -(2**63)
         self._late_ns = {name: round(1e3 * us) for name, us in (stamp_offset_us or {}).items()}
         self._last: Fitted | None = None
@@ -184,6 +189,8 @@ class MarkerPipeline:
         if found.apart.any() or found.left_out.any():
             self._count_outliers(found, frames)
         pose = pose_of(hand, self.model, t_ns, line.smooth_m, line.markers, self._volume)
+        if self._side is not None and self._estimator is not None:
+            pose = self._side.told(pose, self._estimator)
         if self._line.continuous:
             placed = np.isfinite(line.markers.points_m[:, 0])
             self._was_m[placed], self._was_ns[placed] = line.markers.points_m[placed], t_ns
@@ -213,11 +220,12 @@ class MarkerPipeline:
     ) -> Fitted:
         """The hand that explains the pixels of one epoch best."""
         with self._stage("hand"):
-            alone = self._orientation is None and self._others is None
             uv, variance = frames.uv, frames.sigma_px**2 + self._rays_px**2
             own = np.zeros((len(self.markers), 3, 3))
             if isinstance(found, RayPositions):
                 uv, variance, own = found.uv, found.variance_px2, found.own_m2
+            others = self._side is not None or self._orientation is not None
+            turn = self._turned(frames.t_ns, line) if others else None
             hand = estimator.push(
                 Epoch(
                     frames.t_ns,
@@ -226,37 +234,26 @@ class MarkerPipeline:
                     uv=uv,
                     variance_px2=variance,
                     own_m2=own,
-                    sensed=None if alone else self._sensed(estimator, frames.t_ns, line, found),
+                    turn=turn,
+                    wrist=None if self._side is None else self._side.rows_at(frames.t_ns),
                     start=line.solution if line.solved else None,
                 )
             )
             self._last = hand
-            if self._others is not None:
-                self._others.solved(frames.t_ns, hand)
+            if self._side is not None:
+                self._side.solved(frames.t_ns, hand, estimator, turned=turn is not None)
             if self._smooth is not None:
                 on_hand = self._on_hand
                 hand = self._smooth.push(frames.t_ns, hand, found.noise_m2[on_hand], found.points_m[on_hand])
             return hand
 
-    def _sensed(
-        self, estimator: Estimator, t_ns: int, line: HandEstimate, found: MarkerPositions
-    ) -> Sensed | None:
-        """What other sensors say of the hand at an epoch."""
-        if self._orientation is not None:
-            near = self._recent(t_ns) or line.solution
-            turned = self._orientation.at(t_ns, near)
-            if turned is None:
-                return None
-            n = len(estimator.parameters.free)
-            return Sensed.turn(turned.rotation, turned.information, n, sure=turned.sure)
-        said = None if self._others is None else self._others.at(t_ns)
-        if said is None:
+    def _turned(self, t_ns: int, line: HandEstimate) -> Turn | None:
+        """How an IMU on the palm, or on the forearm, has the palm turned at an epoch."""
+        if self._side is not None and self._estimator is not None:
+            return self._side.turn_at(t_ns, self._estimator)
+        if self._orientation is None:
             return None
-        points, cov = found.points_m[self._on_hand], found.cov_m2[self._on_hand]
-        if (last := self._recent(t_ns)) is not None:
-            wrong = self._elsewhere(said, last.T_rig_palm, points, cov)
-            said = said.without(wrong) if wrong.any() else said
-        return said.for_fit(estimator.parameters, self._finger_of[np.isfinite(points[:, 0])])
+        return self._orientation.at(t_ns, self._recent(t_ns) or line.solution)
 
     def _associated(self, frames: FrameSet) -> FrameSet:
         """The epoch with one place for each marker."""

@@ -49,6 +49,7 @@ def _solve_each(
     observed: Observations,
     T: Float,
     x: Float,
+    z: Float,
     room: Room,
 ) -> int:
     """Search under each hypothesis from one start; return the steps of the first."""
@@ -58,6 +59,8 @@ def _solve_each(
         copy(T, one.palm)
         for i in range(x.shape[0]):
             one.x[i] = x[i]
+        for i in range(z.shape[0]):
+            one.z[i] = z[i]
         _, taken = descend(
             rig,
             habits,
@@ -68,12 +71,13 @@ def _solve_each(
             settings.tolerance_share,
             one.palm,
             one.x,
+            one.z,
             one.gradient,
             one.normal,
             room.search,
         )
         one.cost[0] = linearise(
-            rig, habits, belief, observed, h, one.palm, one.x, one.gradient, one.normal, room.search
+            rig, habits, belief, observed, h, one.palm, one.x, one.z, one.gradient, one.normal, room.search
         )
         one.apart[0] = room.search.apart[0]
         for m in range(rig.mounts.finger.shape[0]):
@@ -132,14 +136,18 @@ def _covariance(
     for i in range(N):
         for j in range(i + 1):
             A[i, j] = one.normal[i, j]
-        A[i, i] += rig.hand.anywhere[i] - (belief.palm_w2[i] if i < 6 else belief.past_w2[i - 6])
+        if i < 6 + belief.past_w2.shape[0]:
+            A[i, i] += rig.hand.anywhere[i] - (belief.palm_w2[i] if i < 6 else belief.past_w2[i - 6])
     for i in range(3):
         for j in range(i + 1):
             A[3 + i, 3 + j] -= belief.depth_w2[0] * belief.sight[i] * belief.sight[j]
     if not cholesky(A, N, room.L):  # by rounding: nothing is known but limits
+        known = rig.hand.anywhere.shape[0]
         for i in range(N):
             for j in range(N):
-                room.cov[i, j] = 1.0 / rig.hand.anywhere[i] if i == j else 0.0
+                room.cov[i, j] = 0.0
+            w2 = rig.hand.anywhere[i] if i < known else belief.z_info[i - known, i - known]
+            room.cov[i, i] = 1.0 / w2
         return 1.0
     inverse(room.L, N, room.work, room.cov)
     past = past_cost(belief, one.palm, one.x, room.search.off)
@@ -185,6 +193,8 @@ def _mix(
                 one.off[3 + i] = one.palm[i, 3] - from_here.palm[i, 3]
             for i in range(n):
                 one.off[6 + i] = one.x[i] - from_here.x[i]
+            for i in range(out.z.shape[0]):
+                one.off[6 + n + i] = one.z[i] - from_here.z[i]
         out.scale[0] += share * _covariance(rig, settings, habits, belief, h, numbers, room)
         for i in range(N):
             for j in range(N):
@@ -255,6 +265,8 @@ def _onto(
     rotate_by(room.middle, likely.palm, out.palm)
     for i in range(n):
         out.x[i] = likely.x[i] + room.middle[6 + i]
+    for i in range(out.z.shape[0]):
+        out.z[i] = likely.z[i] + room.middle[6 + n + i]
     linearise(
         rig,
         blank.habits,
@@ -263,6 +275,7 @@ def _onto(
         _ONLY,
         out.palm,
         out.x,
+        out.z,
         search.gradient,
         search.normal,
         search,
@@ -277,6 +290,8 @@ def _onto(
         rotate_by(search.step, search.palm, out.palm)
         for i in range(n):
             out.x[i] += search.step[6 + i]
+        for i in range(out.z.shape[0]):
+            out.z[i] += search.step[6 + n + i]
     for i in range(n):
         out.x[i] = min(max(out.x[i], rig.hand.low[i]), rig.hand.high[i])
 
@@ -290,6 +305,7 @@ def posterior(
     observed: Observations,
     T: Float,
     x: Float,
+    z: Float,
     natural: float,
     counts: float,
     numbers: float,
@@ -301,13 +317,13 @@ def posterior(
 
     Args:
         rig, settings, habits, belief, observed: What is known.
-        palm, x: (4, 4), (n,) where both searches begin.
+        palm, x, z: (4, 4), (n,), (K,) where both searches begin.
         natural, counts: Probability of a natural hand a moment ago, and what that counts, 0 ... 1.
         numbers: How many numbers are measured.
         blank, room: Room.
         out: Written.
     """
-    out.steps[0] = _solve_each(rig, settings, habits, belief, observed, T, x, room)
+    out.steps[0] = _solve_each(rig, settings, habits, belief, observed, T, x, z, room)
     _weigh(habits, settings, natural, counts, room)
     out.natural[0] = room.each[0].share[0]
     best = _mix(rig, settings, habits, belief, numbers, room, out)
@@ -321,5 +337,7 @@ def posterior(
         copy(likely.palm, out.palm)
         for i in range(x.shape[0]):
             out.x[i] = likely.x[i]
+        for i in range(z.shape[0]):
+            out.z[i] = likely.z[i]
     for m in range(rig.mounts.finger.shape[0]):
         out.surprise[m] = likely.surprise[m]

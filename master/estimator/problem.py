@@ -2,19 +2,22 @@
 
 from typing import NamedTuple
 
-from common.arrays import Bool, Float
+from common.arrays import Bool, Float, Int
 from common.records import record
 from master.estimator.cameras import CameraArrays
+from master.estimator.finger_surface import Surface
 from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.kinematics import Scratch
+from master.estimator.wrist_device import Device, Sights
 
 
 class Rig(NamedTuple):
-    """What is the same at every epoch: the hand, its markers and the cameras."""
+    """What is the same at every epoch: the hand, its markers, the cameras, and a wrist device."""
 
     hand: HandTables
     mounts: Mounts
     cameras: CameraArrays
+    device: Device
 
 
 class Belief:
@@ -27,9 +30,13 @@ class Belief:
         palm_w2: (6,) inverse variances of turn [rad] and shift [m] from there; 0: nothing is believed.
         sight: (3,) unit vector along which depth is held, and `depth_w2` (1,) how firmly [1/m^2].
         facing: (3,) unit vector along which the back looks, and `facing_w2` (1,).
-        turn: (3, 3) the palm's rotation by other sensors.
-        sensed: (3 + n, 3 + n) information of turn from there and free angles, `sensed_pull` (3 + n,) and
-            `sensed_constant` (1,) as of `Habits`; `sensed_known` (1,) 1: there is any.
+        z, z_info: (K,), (K, K) mean and information of the extra unknowns (`master.estimator.wrist_device`).
+        turn_info: (3, 3) [1/rad^2] information about the palm's turn by other sensors, rig axes; `turned` (1,) whether
+            there is any.
+        forearm: (4, 4) the palm by these in its first rows and columns; where `on_forearm` (1,) that of a straight
+            wrist, and `axes` (3, 3) about which tilt and heading turn it, as rows, rig axes.
+        place: (3,) [m] where the palm is, and `place_w2` (1,) how firmly; 0: not known.
+        sights: What a wrist device sees of the fingers.
     """
 
     own_w2: Float
@@ -42,15 +49,20 @@ class Belief:
     depth_w2: Float
     facing: Float
     facing_w2: Float
-    turn: Float
-    sensed: Float
-    sensed_pull: Float
-    sensed_constant: Float
-    sensed_known: Float
+    z: Float
+    z_info: Float
+    turn_info: Float
+    turned: Float
+    forearm: Float
+    on_forearm: Float
+    axes: Float
+    place: Float
+    place_w2: Float
+    sights: Sights
 
     @classmethod
-    def none(cls, n: int) -> "Belief":
-        """Nothing is believed of a hand with n free angles."""
+    def none(cls, n: int, extras: int) -> "Belief":
+        """Nothing is believed of a hand with n free angles and so many extra unknowns."""
         return record(
             cls,
             own_w2=n,
@@ -63,16 +75,21 @@ class Belief:
             depth_w2=1,
             facing=3,
             facing_w2=1,
-            turn=(3, 3),
-            sensed=(3 + n, 3 + n),
-            sensed_pull=3 + n,
-            sensed_constant=1,
-            sensed_known=1,
+            z=extras,
+            z_info=(extras, extras),
+            turn_info=(3, 3),
+            turned=1,
+            forearm=(4, 4),
+            on_forearm=1,
+            axes=(3, 3),
+            place=3,
+            place_w2=1,
+            sights=Sights.empty(),
         )
 
 
 class Search:
-    """Room for a search, of N = 6 + n unknowns."""
+    """Room for a search, of N = 6 + n + K unknowns: the palm, n free angles, K extras."""
 
     gradient: Float  # (N,)
     normal: Float  # (N, N)
@@ -81,10 +98,24 @@ class Search:
     step: Float  # (N,)
     down: Float  # (N,)
     palm: Float  # (4, 4)
+    next_palm: Float  # (4, 4)
     x: Float  # (n,)
     off: Float  # (6,)
-    q: Float  # (3 + n,)
+    z: Float  # (K,)
+    q: Float  # (3,)
     J: Float  # (3, 3)
+    turned: Float  # (4, 4)
+    slope: Float  # (5, 3)
+    by_turn: Float  # (8, 3)
+    palm_camera: Float  # (4, 4)
+    bend_axes: Float  # (2, 3)
+    twist: Float  # (5,)
+    bend_share: Float  # (1,) as of `Settings`
+    local_J: Float  # (3, 8)
+    local_r: Float  # (3,)
+    local_w: Float  # (3,)
+    at: Int  # (8,)
+    surface: Surface
     held: Bool  # (N,)
     surprise: Float  # (M,)
     information: Float  # (M, 3, 3)
@@ -92,10 +123,10 @@ class Search:
     rows: Scratch
 
     @classmethod
-    def empty(cls, n: int, markers: int) -> "Search":
+    def empty(cls, n: int, extras: int, markers: int) -> "Search":
         """Allocate it."""
-        N = 6 + n
-        return record(
+        N = 6 + n + extras
+        room = record(
             cls,
             gradient=N,
             normal=(N, N),
@@ -104,13 +135,29 @@ class Search:
             step=N,
             down=N,
             palm=(4, 4),
+            next_palm=(4, 4),
             x=n,
             off=6,
-            q=3 + n,
+            z=extras,
+            q=3,
             J=(3, 3),
+            turned=(4, 4),
+            slope=(5, 3),
+            by_turn=(8, 3),
+            palm_camera=(4, 4),
+            bend_axes=(2, 3),
+            twist=5,
+            bend_share=1,
+            local_J=(3, 8),
+            local_r=3,
+            local_w=3,
+            at=("i8", 8),
+            surface=Surface.empty(),
             held=("u1", N),
             surprise=markers,
             information=(markers, 3, 3),
             apart=1,
             rows=Scratch.empty(),
         )
+        room.bend_share[0] = 1.0
+        return room

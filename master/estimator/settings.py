@@ -139,8 +139,103 @@ class Settings(NamedTuple):
     tracked_age_s: Annotated[
         float, Range("s", 0.0, 1.0, "how old the newest measurement of a TRACKED finger may be")
     ] = 0.03
+    tracked_triple_s: Annotated[
+        float, Range("s", 0.0, 1.0, "the same where a wrist device told it, of which triples come at 30 Hz")
+    ] = 0.055
     # What is shown.
     blend_s: Annotated[float, Range("s", 0.01, 1.0, "as long as a leap is seen as a motion")] = 0.1
+    # Fingers that a wrist device sees.
+    dip_rad: Annotated[
+        float, Range("rad", 0.005, 1.0, "of a DIP about its share of the PIP, of straight fingers")
+    ] = radians(3.0)
+    dip_share: Annotated[
+        float, Range("1", 0.01, 1.0, "and by so much of the PIP more; the papers' ratios")
+    ] = 0.13
+    habit_counts: Annotated[
+        float,
+        Range(
+            "1", 0.0, 1.0, "probability of a natural hand above which habit tells what a laser leaves open"
+        ),
+    ] = 0.05
+    coupled_rad: Annotated[
+        float, Range("rad", 0.005, 1.0, "of a natural MCP about its share of the PIP, of straight fingers")
+    ] = radians(5.0)
+    coupled_share: Annotated[float, Range("1", 0.0, 1.0, "and by so much of the PIP more")] = 0.2
+    thumb_coupled_rad: Annotated[
+        float, Range("rad", 0.01, 1.0, "of a thumb's IP about what goes with its MCP")
+    ] = radians(12.0)
+    mostly_natural: Annotated[float, Range("1", 0.01, 0.99, "hands before anything of them is seen")] = 0.6
+    straight_pip_rad: Annotated[
+        float, Range("rad", 0.02, 1.0, "by which fingers are bent that are stretched")
+    ] = radians(10.0)
+    unseen: Annotated[
+        float, Range("1", 0.0, 10.0, "log odds against a pose whose fingertip would be seen, and is not")
+    ] = 2.3
+    unseen_again: Annotated[
+        float, Range("1", 0.0, 10.0, "the same of a finger that was seen a moment ago: misses come in rows")
+    ] = 0.7
+    parted: Annotated[float, Range("1", 0.05, 0.95, "of the lower top, between two parts of a density")] = 0.4
+    other_part: Annotated[float, Range("1", 0.001, 0.5, "less probability than this is no other part")] = 0.05
+    goes_on_rad: Annotated[
+        float, Range("rad", 0.02, 2.0, "by which a PIP may have moved at least since the finger was seen")
+    ] = radians(8.0)
+    near_rad: Annotated[
+        float, Range("rad", 0.1, 3.0, "about its last PIP in which a finger that is well known is searched")
+    ] = radians(32.0)
+    search_again: Annotated[float, Range("1", 1.0, 100.0, "triples after which all of it is searched")] = 6.0
+    hinge_rad: Annotated[
+        float, Range("rad", 0.001, 0.5, "by which real hinges lie askew to those of a hand file")
+    ] = radians(4.0)
+    refused: Annotated[
+        float, Range("chi square", 4.0, 100.0, "of laser point and fingertip of a finger, beside any pose")
+    ] = 14.0
+    tracked_pip_rad: Annotated[
+        float,
+        Range(
+            "rad", 0.02, 1.0, "standard deviation of the PIP of a finger that is TRACKED by a wrist device"
+        ),
+    ] = radians(8.5)
+    contrary: Annotated[
+        float,
+        Range(
+            "chi square", 5.0, 200.0, "of a palm against the IMU on the forearm, beside any bend and heading"
+        ),
+    ] = 30.0
+    light_rad: Annotated[
+        float, Range("1", 0.01, 1.0, "of a distance by light: skin inclined by 25 degrees looks 5 % farther")
+    ] = 0.045
+    light_share: Annotated[
+        float,
+        Range(
+            "1", 0.0, 1.0, "of what distances by light tell, that teaches their unit: fingers err together"
+        ),
+    ] = 0.15
+    doubted: Annotated[
+        float,
+        Range("chi square", 1.0, 100.0, "of laser point and fingertip of a finger that teaches nothing"),
+    ] = 5.0
+    light_unit: Annotated[float, Range("1", 0.1, 10.0, "of the unit's logarithm, which may be any")] = 3.0
+    flexion_rad: Annotated[float, Range("rad", 0.01, 1.5, "of wrists; Palmer et al. 1985")] = radians(14.0)
+    deviation_rad: Annotated[float, Range("rad", 0.01, 1.5, "of wrists; Palmer et al. 1985")] = radians(11.0)
+    worn_rad: Annotated[
+        float, Range("rad", 0.001, 0.5, "of a palm that was calibrated before its device")
+    ] = radians(1.0)
+    bend_share: Annotated[
+        float, Range("1", 0.0, 1.0, "of what fingers tell of the wrist's bend: they err together")
+    ] = 0.6
+    strap_rad: Annotated[
+        float, Range("rad", 0.001, 0.5, "of a palm by markers, and of a device on skin, against the forearm")
+    ] = radians(2.5)
+    pace_1_s: Annotated[float, Range("1/s", 0.1, 30.0, "of wrists; Hansson et al. 2009")] = 3.0
+    habit_s: Annotated[float, Range("s", 1.0, 600.0, "as long as a posture of the wrist is kept")] = 20.0
+    tilt_s: Annotated[float, Range("s", 0.1, 600.0, "as long as an IMU has the vertical off")] = 5.0
+    errs_s: Annotated[float, Range("s", 0.01, 60.0, "as long as errors of shape and skin stay")] = 0.5
+    turn_errs_s: Annotated[
+        float,
+        Range(
+            "s", 0.001, 60.0, "as long as errors of a palm by markers stay, of what a wrist moves meanwhile"
+        ),
+    ] = 0.1
     # The search.
     tolerance: Annotated[float, Range("half chi square", 1e-12, 1.0, "what a step may leave")] = 1e-7
     tolerance_share: Annotated[float, Range("1", 0.0, 0.1, "of the cost, likewise")] = 1e-4

@@ -28,14 +28,17 @@ A hand that several kinds of sensors watch leaps more often, and is led in as `m
 Beside that the covariance is the solution's. Filtering takes noise away and adds lag; neither is in it.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from common.arrays import Float
 from common.hand_model import HandJoints, HandModel
 from common.kernels import bound
-from common.records import boxed
+from common.records import boxed, fields
 from master.estimator.epoch import Fitted, FittedHand
 from master.estimator.hand_tables import HandTables, Mounts
+from master.estimator.kinematics import twist_boxed
 from master.estimator.lead import Lead
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT, Settings
@@ -75,7 +78,9 @@ class HandOneEuro:
         self._t_ns, self._values, self._signals = state.t_ns, state.values, state.signals
         self._state = boxed(state)
         self._fresh = self._state.copy()
-        self._hand = boxed(HandTables.of(model, HandParameters.of(model)))
+        tables = HandTables.of(model, HandParameters.of(model))
+        self._hand, self._tables = boxed(tables), fields(tables)
+        twist_boxed(self._hand, np.zeros(5))  # compiled now
         rests, cov, room = np.zeros(6, np.int64), np.zeros((len(markers), 3, 3)), Pose.empty()
         none = np.zeros(26, np.bool_)
         self._kernel = bound(smooth, self._hand, self._state, WHOLE, 0, rests, cov, room, room, none)
@@ -102,6 +107,8 @@ class HandOneEuro:
             return hand
         at = solution.joints
         solved = Pose(solution.T_rig_palm, solution.angles_rad, at.position_m, at.rotation, solution.cov_m2)
+        if (self._tables.twist != solution.twist).any():
+            twist_boxed(self._hand, solution.twist)
         shown, cov_m2 = Pose.empty(), np.ascontiguousarray(cov_m2)
         lead, tracked, before, what = self._lead, hand.tracked.copy(), self._values.copy(), WHOLE
         if lead is not None and points_m is not None:
@@ -124,5 +131,6 @@ class HandOneEuro:
             natural=solution.natural,
             surprise=solution.surprise,
             steps=solution.steps,
+            twist=solution.twist,
         )
-        return Fitted(smooth_hand, hand.valid, tracked, hand.source, hand.rests, hand.anew, hand.sensed)
+        return replace(hand, solution=smooth_hand, tracked=tracked)

@@ -7,10 +7,9 @@ the sum of squares of the rows (`master.estimator.residuals`) and of what is bel
     own       single angles, of fingers that are curled out of sight
     past      single angles and the palm, from the state before; and its depth, where one camera sees all there is
     facing    the back of the hand looks towards the cameras that see a marker on it
-    sensed    the palm's turn and the angles as other sensors have them
+    extras    what other sensors leave open: hinges, the wrist's bend, tilt and heading, the unit of light
+    place     of a palm that stands still before a wrist device
 """
-
-from math import sqrt, tan
 
 from common.arrays import Float
 from common.kernels import inlined, inner
@@ -22,16 +21,18 @@ from master.estimator.kinematics import (
     marker_point,
     palm_slopes,
     rotate_by,
-    turn_between,
+    twist_hand,
 )
 from master.estimator.matrices import cholesky, copy, substitute
 from master.estimator.priors import Habits
 from master.estimator.problem import Belief, Rig, Search
 from master.estimator.residuals import Observations, marker_rows
+from master.estimator.wrist_device import BEND, EXTRAS, bent_palm
+from master.estimator.wrist_rows import finger_rows, turn_row
 
 MAX_ITERATIONS = 25
+_ROLLED_RAD = 0.25  # no hinges are askew by more
 _FIRST_DAMPING, _MOST_DAMPING = 1e-3, 1e6
-_SMALL_RAD = 1e-4  # below it a rotation vector counts as so long in the derivative
 
 
 @inlined
@@ -81,15 +82,16 @@ def _believed(
     h: int,
     T: Float,
     x: Float,
+    z: Float,
     gradient: Float,
     normal: Float,
     search: Search,
 ) -> float:
     """Write gradient and normal matrix of all that is believed; return its cost."""
-    n = x.shape[0]
-    for i in range(6 + n):
+    n, K = x.shape[0], z.shape[0]
+    for i in range(6 + n + K):
         gradient[i] = 0.0
-        for j in range(6 + n):
+        for j in range(6 + n + K):
             normal[i, j] = 0.0
     cost = past_cost(belief, T, x, search.off) + own_cost(habits, belief, h, x)
     depth = 0.0
@@ -110,6 +112,19 @@ def _believed(
         gradient[6 + i] = total - habits.pull[h, i] + belief.own_w2[i] * (x[i] - belief.own[i])
         gradient[6 + i] += belief.past_w2[i] * (x[i] - belief.past[i])
         normal[6 + i, 6 + i] += belief.own_w2[i] + belief.past_w2[i]
+    for i in range(K):
+        total = 0.0
+        for j in range(K):
+            normal[6 + n + i, 6 + n + j] = belief.z_info[i, j]
+            total += belief.z_info[i, j] * (z[j] - belief.z[j])
+        gradient[6 + n + i] = total
+        cost += 0.5 * total * (z[i] - belief.z[i])
+    if belief.place_w2[0] > 0.0:
+        for i in range(3):
+            off = T[i, 3] - belief.place[i]
+            cost += 0.5 * belief.place_w2[0] * off * off
+            gradient[3 + i] += belief.place_w2[0] * off
+            normal[3 + i, 3 + i] += belief.place_w2[0]
     return cost
 
 
@@ -130,55 +145,6 @@ def _faced(belief: Belief, T: Float, gradient: Float, normal: Float) -> float:
     return cost
 
 
-@inlined
-def _turn_slope(turn: Float, J: Float) -> None:
-    """Write the derivative (3, 3) of a rotation vector (3,) by a small turn in front of it.
-
-    The inverse of the left Jacobian of SO(3) (Sola, Deray, Atchuthan 2018, "A micro Lie theory", eq. 146).
-    """
-    squared = turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2]
-    angle = max(sqrt(squared), _SMALL_RAD)
-    factor = 1.0 / (angle * angle) - 0.5 / (angle * tan(0.5 * angle))
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        for c in range(3):
-            J[i, c] = factor * turn[i] * turn[c]
-        J[i, i] += 1.0 - factor * squared
-        J[i, j] += 0.5 * turn[k]
-        J[i, k] -= 0.5 * turn[j]
-
-
-@inner
-def _sensed(belief: Belief, T: Float, x: Float, gradient: Float, normal: Float, search: Search) -> float:
-    """Add what other sensors say of turn and angles; return its cost."""
-    n, q, J, A = x.shape[0], search.q, search.J, belief.sensed
-    turn_between(T, belief.turn, J, q)
-    for i in range(n):
-        q[3 + i] = x[i]
-    _turn_slope(q, J)
-    cost = belief.sensed_constant[0]
-    for a in range(3 + n):
-        pull = 0.0
-        for b in range(3 + n):
-            pull += A[a, b] * q[b]
-        cost += (0.5 * pull - belief.sensed_pull[a]) * q[a]
-        pull -= belief.sensed_pull[a]
-        if a >= 3:
-            gradient[3 + a] += pull
-            for b in range(3, 3 + n):
-                normal[3 + a, 3 + b] += A[a, b]
-            continue
-        for i in range(3):
-            gradient[i] += J[a, i] * pull
-            for b in range(3, 3 + n):
-                normal[i, 3 + b] += J[a, i] * A[a, b]
-                normal[3 + b, i] += J[a, i] * A[a, b]
-            for j in range(3):
-                for b in range(3):
-                    normal[i, j] += J[a, i] * A[a, b] * J[b, j]
-    return cost
-
-
 @inner
 def linearise(
     rig: Rig,
@@ -188,6 +154,7 @@ def linearise(
     h: int,
     T: Float,
     x: Float,
+    z: Float,
     gradient: Float,
     normal: Float,
     search: Search,
@@ -200,18 +167,26 @@ def linearise(
     Args:
         rig, habits, belief, observed: What is known.
         h: Hypothesis.
-        palm, x: (4, 4), (n,) the hand.
+        palm, x, z: (4, 4), (n,), (K,) the hand.
         gradient, normal: Written.
         search: Room.
     """
     work = search.rows
-    cost = _believed(habits, belief, h, T, x, gradient, normal, search)
+    cost = _believed(habits, belief, h, T, x, z, gradient, normal, search)
     if belief.facing_w2[0] > 0.0:
         cost += _faced(belief, T, gradient, normal)
-    if belief.sensed_known[0] > 0.0:
-        cost += _sensed(belief, T, x, gradient, normal, search)
+    if belief.turned[0] > 0.0:
+        cost += turn_row(belief, T, z, x.shape[0], gradient, normal, search)
     hand, mounts = rig.hand, rig.mounts
     angles_of(hand, x, work.angles, work.by)
+    if z.shape[0] == EXTRAS:
+        for f in range(5):
+            search.twist[f] = z[f]
+        twist_hand(hand, search.twist)
+        if belief.sights.rows[0] > 0.0:
+            bent_palm(rig.device.palm, z[BEND], z[BEND + 1], search.palm_camera, search.bend_axes)
+            for f in range(5):
+                cost += finger_rows(rig, belief, f, z, x.shape[0], gradient, normal, search)
     chains(hand, T, work.angles, work.R, work.P)
     search.apart[0] = 0.0
     for m in range(mounts.finger.shape[0]):
@@ -263,11 +238,11 @@ def _step(rig: Rig, x: Float, damping: float, gradient: Float, normal: Float, se
     Returns:
         By how much the cost should fall; negative: there is no step.
     """
-    N, hand = 6 + x.shape[0], rig.hand
+    n, N, hand = x.shape[0], search.step.shape[0], rig.hand
     down, damped, step, held = search.down, search.damped, search.step, search.held
     for i in range(N):
         down[i], held[i] = -gradient[i], False
-        if i >= 6:
+        if 6 <= i < 6 + n:
             c = i - 6
             held[i] = x[c] <= hand.low[c] if down[i] < 0.0 else x[c] >= hand.high[c]
         if held[i]:
@@ -296,6 +271,7 @@ def descend(
     share: float,
     T: Float,
     x: Float,
+    z: Float,
     gradient: Float,
     normal: Float,
     search: Search,
@@ -309,12 +285,12 @@ def descend(
     Args:
         rig, habits, belief, observed, h: What is known, and the hypothesis.
         tolerance, share: A search ends where a step gains less than tolerance and that share of the cost.
-        palm, x: (4, 4), (n,) where it begins, inside the limits, and then where it ended.
+        palm, x, z: (4, 4), (n,), (K,) where it begins, inside the limits, and then where it ended.
         gradient, normal: Written: (N,), (N, N) there, or before the last step.
         search: Room.
     """
-    n, hand = x.shape[0], rig.hand
-    cost = linearise(rig, habits, belief, observed, h, T, x, gradient, normal, search)
+    n, K, hand = x.shape[0], z.shape[0], rig.hand
+    cost = linearise(rig, habits, belief, observed, h, T, x, z, gradient, normal, search)
     damping, growth, iterations = _FIRST_DAMPING, 2.0, 0
     while iterations < MAX_ITERATIONS and damping <= _MOST_DAMPING:
         iterations += 1
@@ -323,16 +299,32 @@ def descend(
         if hoped < 0.0:
             damping, growth = damping * growth, 2.0 * growth
             continue
-        rotate_by(search.step, T, search.palm)
+        rotate_by(search.step, T, search.next_palm)
         for i in range(n):
             search.x[i] = min(max(x[i] + search.step[6 + i], hand.low[i]), hand.high[i])
+        for i in range(K):
+            search.z[i] = z[i] + search.step[6 + n + i]
+        for i in range(5 if K == EXTRAS else 0):
+            search.z[i] = min(max(search.z[i], -_ROLLED_RAD), _ROLLED_RAD)
         if damping <= _FIRST_DAMPING and hoped < little:
-            copy(search.palm, T)
+            copy(search.next_palm, T)
             for i in range(n):
                 x[i] = search.x[i]
+            for i in range(K):
+                z[i] = search.z[i]
             break
         there = linearise(
-            rig, habits, belief, observed, h, search.palm, search.x, search.gradient, search.normal, search
+            rig,
+            habits,
+            belief,
+            observed,
+            h,
+            search.next_palm,
+            search.x,
+            search.z,
+            search.gradient,
+            search.normal,
+            search,
         )
         gain = cost - there
         if not gain > 0.0:
@@ -340,11 +332,13 @@ def descend(
             continue
         damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain / hoped - 1.0) ** 3), 1e-9)
         growth, cost = 2.0, there
-        copy(search.palm, T)
+        copy(search.next_palm, T)
         copy(search.normal, normal)
         for i in range(n):
             x[i] = search.x[i]
-        for i in range(6 + n):
+        for i in range(K):
+            z[i] = search.z[i]
+        for i in range(6 + n + K):
             gradient[i] = search.gradient[i]
         if gain < little:
             break

@@ -16,7 +16,9 @@ one by one, and so does every hand its thumb.
 
 from math import exp, sqrt
 
-from common.arrays import Bool, Float, Int
+import numpy as np
+
+from common.arrays import Bool, Code, Float, Int
 from common.kernels import constant, inlined, inner
 from common.records import record
 from master.estimator.hand_tables import HandTables
@@ -41,7 +43,13 @@ class HandState:
         told_ns: (6,) when each finger, and the palm, was measured last.
         palm, x, angles: (4, 4) palm, (n,) free and (20,) all angles [rad].
         rates: (20,) [rad/s].
-        cov: (N, N) of turn [rad], shift [m], rig axes, and free angles [rad].
+        cov: (N, N) of turn [rad], shift [m], rig axes, free angles [rad] and extras.
+        z, z_cov: (K,), (K, K) mean and covariance of the extras, which are filtered (`master.estimator.extras`).
+        z_ns: (1,) when they were stepped last, `usual` (K,) variances that their doubt grows to, and `habit` (2,) [rad]
+            the bend of the wrist that is kept.
+        level: (5,) `Level` codes of what a wrist device told each finger from last; 0: markers told it since.
+        searched: (5,) triples since the whole valley of a finger was searched.
+        vague: (5,) whether that was not well enough to be tracked.
         natural: (1,) probability that it obeys habits.
         speed: (1,) [m/s] of the palm, and `lost_s` (1,) how long nothing tells where it is.
         hidden_ns: (5,) when each hidden finger was seen last; NEVER_NS: it is seen.
@@ -59,6 +67,14 @@ class HandState:
     angles: Float
     rates: Float
     cov: Float
+    z: Float
+    z_cov: Float
+    z_ns: Int
+    usual: Float
+    habit: Float
+    level: Code
+    searched: Int
+    vague: Bool
     natural: Float
     speed: Float
     lost_s: Float
@@ -68,9 +84,9 @@ class HandState:
     then_alike: Float
 
     @classmethod
-    def unknown(cls, n: int) -> "HandState":
+    def unknown(cls, n: int, extras: int) -> "HandState":
         """Nothing is known yet."""
-        N = 6 + n
+        N = 6 + n + extras
         state = record(
             cls,
             t_ns=("i8", 1),
@@ -83,6 +99,14 @@ class HandState:
             angles=20,
             rates=20,
             cov=(N, N),
+            z=extras,
+            z_cov=(extras, extras),
+            z_ns=("i8", 1),
+            usual=extras,
+            habit=2,
+            level=("u1", 5),
+            searched=("i8", 5),
+            vague=("u1", 5),
             natural=1,
             speed=1,
             lost_s=1,
@@ -91,8 +115,9 @@ class HandState:
             then_rates=(5, 20),
             then_alike=5,
         )
-        for never in (state.t_ns, state.seen_ns, state.placed_ns, state.told_ns, state.hidden_ns):
+        for never in (state.t_ns, state.z_ns, state.seen_ns, state.placed_ns, state.told_ns, state.hidden_ns):
             never[:] = NEVER_NS
+        state.z_cov[:] = np.eye(extras)
         return state
 
 

@@ -24,7 +24,7 @@ _ON_LIMIT_RAD = 1e-9
 
 
 class Cut:
-    """Room for the mean within limits, of N = 6 + n unknowns."""
+    """Room for the mean within limits, of N unknowns, of which n are angles."""
 
     weight: Float  # (n,)
     push: Float  # (n,)
@@ -35,9 +35,8 @@ class Cut:
     cov: Float  # (N, N)
 
     @classmethod
-    def empty(cls, n: int) -> "Cut":
+    def empty(cls, n: int, N: int) -> "Cut":
         """Allocate it."""
-        N = 6 + n
         return record(cls, weight=n, push=n, pull=N, total=(N, N), L=(N, N), work=(N, N), cov=(N, N))
 
 
@@ -77,7 +76,7 @@ def mean_within(hand: HandTables, normal: Float, gradient: Float, x: Float, cut:
         cut: Room.
         mean: Written: turn [rad], shift [m] and angles [rad]; the angles stay within the limits.
     """
-    n, N = x.shape[0], 6 + x.shape[0]
+    n, N = x.shape[0], cut.pull.shape[0]
     for i in range(N):
         cut.pull[i] = 0.0
     for i in range(n):
@@ -90,7 +89,7 @@ def mean_within(hand: HandTables, normal: Float, gradient: Float, x: Float, cut:
         for i in range(N):
             for j in range(i + 1):
                 cut.total[i, j] = normal[i, j]
-            if i >= 6:
+            if 6 <= i < 6 + n:
                 cut.total[i, i] += cut.weight[i - 6]
         if not cholesky(cut.total, N, cut.L):  # by rounding: nothing is known of where the mean is
             for i in range(N):
@@ -100,7 +99,7 @@ def mean_within(hand: HandTables, normal: Float, gradient: Float, x: Float, cut:
         for i in range(N):
             mean[i] = 0.0
             for j in range(N):
-                pushed = cut.push[j - 6] if j >= 6 else 0.0
+                pushed = cut.push[j - 6] if 6 <= j < 6 + n else 0.0
                 mean[i] += cut.cov[i, j] * (cut.pull[j] + pushed)
         if sweep == _SWEEPS:
             break

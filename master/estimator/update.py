@@ -5,16 +5,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from common.arrays import Bool, Code, Float, Int
+from common.arrays import Bool, Code, Float
 from common.kernels import inner, kernel
 from common.messages import Source
-from common.records import record
 from master.estimator.arcs import add_arcs
-from master.estimator.cameras import CameraArrays
-from master.estimator.certainty import Certainty, is_small, linear, only_limits, surer, tilts
+from master.estimator.certainty import is_small, linear, only_limits, surer, tilts
+from master.estimator.extras import keep_extras
 from master.estimator.ground import Ground
-from master.estimator.hand_tables import Mounts
-from master.estimator.hypotheses import Blank, Posterior, Room, likelier
+from master.estimator.hypotheses import Blank, likelier
 from master.estimator.kinematics import angles_of, chains, clamp, free_of, joints, marker_point
 from master.estimator.matrices import copy, inverse_3
 from master.estimator.posterior import posterior
@@ -23,9 +21,15 @@ from master.estimator.problem import Belief, Rig, Search
 from master.estimator.residuals import Observations, marker_rows
 from master.estimator.settings import Settings
 from master.estimator.solve import descend
-from master.estimator.state import NEVER_NS, PALM_PART, HandState, Hidden, grow, predict
+from master.estimator.state import NEVER_NS, PALM_PART, HandState, grow, predict
+from master.estimator.workspace import Model
+from master.estimator.wrist_device import EXTRAS
+from master.estimator.wrist_update import extras_alone, take_scanned
 
-_SOLVED, _MEASURED, _HELD = int(Source.SOLVED), int(Source.MEASURED), int(Source.HELD)
+_LONG_S = 10.0
+_SOLVED, _MEASURED, _HELD, _WRIST = (
+    int(source) for source in (Source.SOLVED, Source.MEASURED, Source.HELD, Source.WRIST)
+)
 
 
 class Estimate(NamedTuple):
@@ -63,78 +67,6 @@ class Estimate(NamedTuple):
             tilt_walk=np.empty(5),
             tracked=np.empty(26, np.bool_),
             source=np.empty(26, np.uint8),
-        )
-
-
-class Task:
-    """What is to be done at an epoch.
-
-    Attributes:
-        t_ns: (1,) the epoch.
-        palm_shown: (1,) whether something tells where the palm is.
-        turned: (3, 3) by how much sensors say that the palm has turned since.
-        palm, angles: (4, 4), (20,) another hand of the epoch [rad].
-        x: (n,) its free angles, inside the limits; or, with the palm, where a search begins.
-        may_leave: (1,) whether there is another, and it may take the place of the state.
-        rough: (1,) whether a search is to end early, in place, under the widest hypothesis alone.
-        natural: (1,) probability of a natural hand a moment ago, and `counts` (1,) what that counts, 0 ... 1.
-        second_order: (1,) whether covariance is wanted to second order.
-    """
-
-    t_ns: Int
-    palm_shown: Bool
-    turned: Float
-    palm: Float
-    angles: Float
-    x: Float
-    may_leave: Bool
-    rough: Bool
-    natural: Float
-    counts: Float
-    second_order: Bool
-
-    @classmethod
-    def empty(cls, n: int) -> "Task":
-        """Room for one."""
-        return record(
-            cls,
-            t_ns=("i8", 1),
-            palm_shown=("u1", 1),
-            turned=(3, 3),
-            palm=(4, 4),
-            angles=20,
-            x=n,
-            may_leave=("u1", 1),
-            rough=("u1", 1),
-            natural=1,
-            counts=1,
-            second_order=("u1", 1),
-        )
-
-
-class Workspace:
-    """Room for all kernels of one hand, what is to be done, and what is believed at the epoch."""
-
-    task: Task
-    ground: Ground
-    belief: Belief
-    hidden: Hidden
-    found: Posterior
-    room: Room
-    certainty: Certainty
-
-    @classmethod
-    def empty(cls, n: int, markers: int) -> "Workspace":
-        """Allocate it."""
-        return record(
-            cls,
-            task=Task.empty(n),
-            ground=Ground.empty(),
-            belief=Belief.none(n),
-            hidden=Hidden.none(n),
-            found=Posterior.empty(n, markers),
-            room=Room.empty(n, markers),
-            certainty=Certainty.empty(n, markers),
         )
 
 
@@ -185,10 +117,15 @@ def _judge(
     for joint in range(26):
         f = hand.finger[joint]
         part = f if f >= 0 else PALM_PART
-        fresh = (t_ns - state.told_ns[part]) * 1e-9 <= settings.tracked_age_s
-        out.tracked[joint] = fresh and is_small(hand, out.cov, joint, settings.tracked_m)
+        by_wrist = f >= 0 and state.level[f] > 0
+        most_s = settings.tracked_triple_s if by_wrist else settings.tracked_age_s
+        fresh = (t_ns - state.told_ns[part]) * 1e-9 <= most_s
+        sure = f < 0 or not state.vague[f]
+        out.tracked[joint] = fresh and sure and is_small(hand, out.cov, joint, settings.tracked_m)
         now = state.told_ns[part] == t_ns
         out.source[joint] = _SOLVED if now else _HELD
+        if by_wrist and fresh:
+            out.source[joint] = _WRIST
     for m in range(rig.mounts.finger.shape[0]):
         f = rig.mounts.finger[m]
         if f >= 0 and observed.rays[m] > 1 and rig.mounts.level[m] == 3:
@@ -217,15 +154,6 @@ def _drift(
                 out.cov[joint, i, j] += sigma_m * sigma_m * belief.sight[i] * belief.sight[j]
 
 
-class Model(NamedTuple):
-    """What is the same at every epoch; the hand and the settings in their arrays (`common.kernels.boxed`)."""
-
-    hand: Any
-    settings: Any
-    mounts: Mounts
-    cameras: CameraArrays
-
-
 @kernel
 def predict_epoch(model: Model, boxed_state: Any, observed: Observations, boxed_space: Any) -> float:
     """Write what the state says of an epoch, and where its search begins.
@@ -242,7 +170,7 @@ def predict_epoch(model: Model, boxed_state: Any, observed: Observations, boxed_
     """
     state, space, settings = boxed_state[0], boxed_space[0], model.settings[0]
     rig, task, belief, room = (
-        Rig(model.hand[0], model.mounts, model.cameras),
+        Rig(model.hand[0], model.mounts, model.cameras, model.device[0]),
         space.task,
         space.belief,
         space.room,
@@ -283,7 +211,7 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
     """
     space, settings = boxed_space[0], model.settings[0]
     rig, task, belief, room = (
-        Rig(model.hand[0], model.mounts, model.cameras),
+        Rig(model.hand[0], model.mounts, model.cameras, model.device[0]),
         space.task,
         space.belief,
         space.room,
@@ -300,6 +228,7 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
             settings.tolerance_share,
             task.palm,
             task.x,
+            room.start_z,
             room.each[0].gradient,
             room.each[0].normal,
             search,
@@ -313,6 +242,7 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
         observed,
         room.start_T,
         room.start_x,
+        room.start_z,
         task.natural[0],
         task.counts[0],
         space.ground.numbers[0],
@@ -320,6 +250,10 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
         room,
         found,
     )
+    if found.z.shape[0] == EXTRAS:
+        extras_alone(belief, found, search)
+    if belief.sights.rows[0] > 0.0:
+        take_scanned(rig, space.ground, space.scan, found, search.rows)
     return chi_square(rig, observed, found.palm, found.x, 0.0, search)
 
 
@@ -338,13 +272,13 @@ def take_over_epoch(
         out: Written.
     """
     state, space, settings = boxed_state[0], boxed_space[0], model.settings[0]
-    rig, task = Rig(model.hand[0], model.mounts, model.cameras), space.task
+    rig, task = Rig(model.hand[0], model.mounts, model.cameras, model.device[0]), space.task
     t_ns, shown, palm_shown = task.t_ns[0], space.ground.shown, task.palm_shown[0] > 0
     found, hidden, room, work = space.found, space.hidden, space.certainty, space.room.search.rows
     hand, n = rig.hand, found.x.shape[0]
     angles_of(hand, found.x, work.angles, work.by)
     clamp(hand, work.angles)
-    dt_s = (t_ns - state.t_ns[0]) * 1e-9
+    dt_s = (t_ns - state.t_ns[0]) * 1e-9 if state.t_ns[0] != NEVER_NS else 0.0
     lost = not palm_shown
     if goes_on:
         grow(hand, settings, state, dt_s, found.palm, palm_shown, hidden)
@@ -394,6 +328,15 @@ def take_over_epoch(
     if palm_shown:
         state.told_ns[PALM_PART] = t_ns
     copy(found.palm, state.palm)
+    since_s = dt_s if goes_on else _LONG_S  # what begins owes nothing to an epoch before
+    keep_extras(settings, state, since_s, space.belief, found.z, found.cov, found.scale[0], space.extras)
+    for f in range(5):
+        if space.ground.rests[f] > 0:
+            state.level[f], state.vague[f] = 0, False
+        elif space.scan.known[f] > 0.0:
+            state.level[f] = task.level[f]
+            pip2 = state.cov[6 + hand.first[f] + 2, 6 + hand.first[f] + 2]
+            state.vague[f] = task.ambiguous[f] or pip2 > settings.tracked_pip_rad**2
     copy(found.palm, out.palm)
     for a in range(20):
         out.angles[a] = state.angles[a] = work.angles[a]

@@ -5,7 +5,7 @@ import numpy as np
 from common.arrays import Float
 from common.calibration import RigCalibration
 from master.outputs.palette import Rgb
-from master.wrist.setup import WristSetup
+from master.wrist_setup import WristSetup
 
 LASER_RGB: Rgb = (235, 64, 52)
 _FAN_RAD = np.radians(105.0)  # of the laser line of Digits, where the rig does not say

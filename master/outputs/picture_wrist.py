@@ -24,7 +24,7 @@ from master.outputs.picture_panels import PAPER, style, unit
 from master.outputs.poses import Poses
 from master.outputs.truth import PosesTruth
 from master.rig_setup import RigSetup
-from master.wrist.setup import WristSetup
+from master.wrist_setup import WristSetup
 
 _BOX = (0.012, 0.03, 0.225, 0.30)  # left, bottom, width, height of the figure: an image of 4 to 3
 _FOREARM_M = 0.055  # of it

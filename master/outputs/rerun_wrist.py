@@ -31,7 +31,7 @@ from master.outputs.palette import RAY_RGB, SOURCE_RGB, TRUTH_RGB, pack, series_
 from master.outputs.poses import Poses
 from master.outputs.rerun_blueprint import WORLD, camera_path
 from master.outputs.rerun_columns import Columns, seen
-from master.wrist.setup import WristSetup
+from master.wrist_setup import WristSetup
 
 _FAN_LINE_M, _BONE_M = 0.0003, 0.0025
 _FOREARM_M = 0.16  # of it, as long as a hand

@@ -212,7 +212,14 @@ def test_without_the_data_the_simulated_sets_are_frozen(
     monkeypatch.setenv("PHALANX_DATASETS", str(tmp_path / "nowhere"))
     assert main(["oracle", "freeze", "--out", str(tmp_path)]) == 0
     assert "only the simulated sets" in capsys.readouterr().out
-    assert sets_of(tmp_path) == ["both-travel", "grasp", "held", "room", "standard"]
+    assert sets_of(tmp_path) == [
+        "both-travel",
+        *(f"fused-{name}" for name in ("curl", "grasp", "grip", "poses", "travel")),
+        "grasp",
+        "held",
+        "room",
+        "standard",
+    ]
     assert main(["oracle", "freeze", "--out", str(tmp_path), "--sets", "leap"]) == 2
     assert "PHALANX_DATASETS" in capsys.readouterr().err
 

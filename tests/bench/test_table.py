@@ -57,9 +57,7 @@ def test_what_a_pose_costs_ends_with_a_line_of_json(
     }
 
 
-@pytest.mark.parametrize(
-    ("rig", "stages"), [("desk", {"hand", "gestures"}), ("wrist", {"angles", "gestures"})]
-)
+@pytest.mark.parametrize(("rig", "stages"), [("desk", {"hand", "gestures"}), ("wrist", {"hand", "gestures"})])
 def test_what_a_pose_costs_is_measured_from_sealed_datagrams(rig: str, stages: set[str]) -> None:
     times = StageTimes()
     turns = list(islice(pose_cost.turns(*pose_cost.played(rig, times)), 3))

@@ -12,7 +12,7 @@ from common.errors import CalibrationError
 from common.hand_model import HandModel
 from common.wrist_calibration import Laser, LaserPlane
 from common.wrist_device import WristDevice
-from master.wrist.setup import WristSetup
+from master.wrist_setup import WristSetup
 from slave.wrist.view import WristView
 
 ROOT = Path(__file__).parents[2] / "calib_json"

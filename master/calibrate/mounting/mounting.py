@@ -25,8 +25,8 @@ from master.calibrate.mounting.sights import Sights
 from master.calibrate.mounting.start import started
 from master.calibrate.mounting.tracks import GAP_S, HandTrack, ImuTrack
 from master.calibrate.tree_files import provenance
-from master.wrist.laser_plane import in_image, laser_points
-from master.wrist.setup import WristSetup
+from master.estimator.laser_plane import in_image, laser_points
+from master.wrist_setup import WristSetup
 
 TOOL = "calibrate mounting"
 MOTION = (

@@ -1,7 +1,7 @@
 """What a wrist device sees of a hand: laser points and tips of four fingers, and how they move with what is unknown.
 
-The laser's cut and the tip are those that the master solves fingers with (`master.wrist.laser_cut`,
-`master.wrist.fingertip`), so that what is fitted is what will be used. Beside the palm's pose and the angles two
+The laser's cut and the tip are those that the master solves fingers with (`master.calibrate.laser_cut`,
+`common.fingertips`), so that what is fitted is what will be used. Beside the palm's pose and the angles two
 numbers of each finger are unknown, which a mounting must not take for its own: how thick its skin is, and where on the
 pulp its tip is seen.
 """
@@ -9,12 +9,12 @@ pulp its tip is seen.
 import numpy as np
 
 from common.arrays import Float
+from common.fingertips import Fingertips
 from common.geometry import rotation_vector_to_matrix
-from master.wrist.fingertip import Fingertips
-from master.wrist.laser_cut import LaserCut
-from master.wrist.laser_plane import PlaneAxes
-from master.wrist.setup import WristSetup
-from master.wrist.skin import Skin
+from common.hand_skin import Skin
+from master.calibrate.laser_cut import LaserCut
+from master.estimator.laser_plane import PlaneAxes
+from master.wrist_setup import WristSetup
 
 FINGERS = slice(1, 5)
 SEEN = 4  # numbers of a finger: laser point across and along [m], tip [px]

@@ -8,7 +8,7 @@ from common.arrays import Bool, Float
 from common.errors import FitError
 from common.hand_model import FINGERS
 from common.wrist_calibration import FingerLine
-from master.wrist.finger_lines import principal_line
+from master.estimator.finger_lines import principal_line
 
 MIN_POINTS = 20  # two thirds of a second of triples
 MIN_MOTION_M = (

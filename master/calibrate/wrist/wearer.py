@@ -21,7 +21,7 @@ from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.guided import FLAT, MOTION, Guided, guided
 from master.calibrate.wrist.wearer_fit import Fit, Sightings, fit_wearer, prior_sigma
 from master.calibrate.wrist.wearer_model import MCP, Unknown, WearerModel, wearing
-from master.wrist.setup import WristSetup
+from master.wrist_setup import WristSetup
 
 TOOL = "calibrate wearer"
 _NAMES = FINGERS[1:]

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
+from common.hand_skin import SPREAD
 from master.calibrate.wrist.guided import FLAT
 from master.calibrate.wrist.wearer_model import ABDUCTION, LOCAL, MCP, PIP, UNKNOWN, WearerModel
-from master.wrist.skin import SPREAD
 
 _LASER_SIGMA_M = 8e-4  # of skin of another shape than the cones
 _TIP_SIGMA_M = 2e-3  # what is seen as the tip of a finger is anywhere on its pulp

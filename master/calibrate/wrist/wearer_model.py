@@ -2,8 +2,8 @@
 
 Unknown of the wearer (26) are the palm's pose, and of each of the four fingers where its knuckle is, how thick it is
 and how long. Unknown in each triple are three angles of each finger; the DIP follows the PIP. What is seen are the
-laser point on its plane and the fingertip. Both are reckoned as the master does it (`master.wrist.laser_cut`,
-`master.wrist.fingertip`), so that what is fitted is what will be used.
+laser point on its plane and the fingertip. Both are reckoned as the master does it (`master.calibrate.laser_cut`,
+`common.fingertips`), so that what is fitted is what will be used.
 """
 
 from dataclasses import dataclass
@@ -14,14 +14,14 @@ from msgspec.structs import replace
 
 from common.arrays import Float
 from common.calibration import Finger, HandProfile
+from common.fingertips import Fingertips
 from common.geometry import rigid, rotation_vector_to_matrix, transform
 from common.hand_model import CHAINS, JOINTS, Chains, HandModel
-from master.wrist.fingertip import Fingertips
-from master.wrist.forward import DIP, NaturalCurve
-from master.wrist.laser_cut import LaserCut
-from master.wrist.laser_plane import PlaneAxes
-from master.wrist.setup import WristSetup
-from master.wrist.skin import Skin
+from common.hand_skin import Skin
+from master.calibrate.laser_cut import LaserCut
+from master.estimator.laser_plane import PlaneAxes
+from master.estimator.natural_curve import DIP, NaturalCurve
+from master.wrist_setup import WristSetup
 
 FINGERS = slice(1, 5)
 UNKNOWN, LOCAL = 26, 3

@@ -2,19 +2,25 @@
 
 from typing import Any
 
+import numpy as np
+
 from common.arrays import Bool, Float
 from common.kernels import kernel
 from master.estimator.arcs import add_arcs
 from master.estimator.cameras import CameraArrays, project
 from master.estimator.certainty import Certainty, linear, surer
-from master.estimator.kinematics import Scratch, angles_of, chains
+from master.estimator.extras import keep_extras, predict_extras
+from master.estimator.finger_surface import MOVES, cut, look
+from master.estimator.kinematics import Scratch, angles_of, chains, twist_hand
 from master.estimator.priors import Habits
 from master.estimator.problem import Rig
 from master.estimator.residuals import Observations, marker_rows
 from master.estimator.solve import linearise
 from master.estimator.state import grow, hide
 from master.estimator.truncated import mean_within
-from master.estimator.update import Model
+from master.estimator.workspace import Model
+from master.estimator.wrist_device import bent_palm
+from master.estimator.wrist_rows import turn_slope
 
 __all__ = ["Certainty", "Scratch"]
 
@@ -42,13 +48,14 @@ def linearise_at(
     h: int,
     T: Float,
     x: Float,
+    z: Float,
     gradient: Float,
     normal: Float,
     boxed_search: Any,
 ) -> float:
     """`master.estimator.solve.linearise`; records in their arrays."""
-    rig = Rig(model.hand[0], model.mounts, model.cameras)
-    return linearise(rig, habits, boxed_belief[0], observed, h, T, x, gradient, normal, boxed_search[0])
+    rig = Rig(model.hand[0], model.mounts, model.cameras, model.device[0])
+    return linearise(rig, habits, boxed_belief[0], observed, h, T, x, z, gradient, normal, boxed_search[0])
 
 
 @kernel
@@ -102,9 +109,61 @@ def joint_covariances(
 ) -> None:
     """Write the joints' covariances (26, 3, 3) [m^2] by derivatives alone, and with arcs."""
     hand, settings, work, room = model.hand[0], model.settings[0], boxed_work[0], boxed_room[0]
-    rig = Rig(hand, model.mounts, model.cameras)
+    rig = Rig(hand, model.mounts, model.cameras, model.device[0])
     angles_of(hand, x, work.angles, work.by)
     chains(hand, T, work.angles, work.R, work.P)
     linear(hand, T, cov, work, room, straight)
     linear(hand, T, cov, work, room, whole)
     add_arcs(rig, settings, T, cov, seen, information, work, room, whole)
+
+
+@kernel
+def turn_slope_at(turn: Float, J: Float) -> None:
+    """`master.estimator.wrist_rows.turn_slope`."""
+    turn_slope(turn, J)
+
+
+@kernel
+def look_at(
+    boxed_hand: Any,
+    boxed_device: Any,
+    bend: Float,
+    twist: Float,
+    angles: Float,
+    f: int,
+    boxed_work: Any,
+) -> int:
+    """`master.estimator.finger_surface.look` at a wrist that is bent by (2,) and hinges rolled by (5,)."""
+    T, axes, hand, device = np.zeros((4, 4)), np.zeros((2, 3)), boxed_hand[0], boxed_device[0]
+    twist_hand(hand, twist)
+    bent_palm(device.palm, bend[0], bend[1], T, axes)
+    return look(hand, device, T, axes, angles, f, MOVES, boxed_work[0])
+
+
+@kernel
+def cut_at(boxed_device: Any, f: int, boxed_work: Any) -> float:
+    """`master.estimator.finger_surface.cut`, after `look_at`."""
+    return cut(boxed_device[0], f, boxed_work[0])
+
+
+@kernel
+def predict_extras_at(
+    boxed_settings: Any, boxed_state: Any, dt_s: float, walked_rad2: float, boxed_belief: Any, boxed_room: Any
+) -> None:
+    """`master.estimator.extras.predict_extras`; records in their arrays."""
+    predict_extras(boxed_settings[0], boxed_state[0], dt_s, walked_rad2, boxed_belief[0], boxed_room[0])
+
+
+@kernel
+def keep_extras_at(
+    boxed_settings: Any,
+    boxed_state: Any,
+    dt_s: float,
+    boxed_belief: Any,
+    z: Float,
+    cov: Float,
+    scale: float,
+    boxed_room: Any,
+) -> None:
+    """`master.estimator.extras.keep_extras`; records in their arrays."""
+    keep_extras(boxed_settings[0], boxed_state[0], dt_s, boxed_belief[0], z, cov, scale, boxed_room[0])

@@ -16,7 +16,8 @@ from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.kinematics import Scratch
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT
-from master.estimator.update import Model
+from master.estimator.workspace import Model
+from master.estimator.wrist_device import Device
 from tests.hand_helpers import LEFT, MARKERS, RIGHT, natural_angles, palm, small_cov
 from tests.master.estimator.fitted import PAIR, fit, forgetful, found, places
 from tests.master.estimator.kernels import joint_covariances
@@ -36,9 +37,15 @@ def solution(model: HandModel = RIGHT) -> FittedHand:
 def covariances(hand: FittedHand, cov: Float, seen: Bool, model: HandModel = RIGHT) -> tuple[Float, Float]:
     """Of the joints (26, 3, 3): by derivatives alone, and with arcs; markers that are seen hold their places."""
     tables = HandTables.of(model, HandParameters.of(model))
-    rig = Model(boxed(tables), boxed(DEFAULT.record()), Mounts.of(model, MARKERS), CameraArrays.of(PAIR))
+    rig = Model(
+        boxed(tables),
+        boxed(DEFAULT.record()),
+        Mounts.of(model, MARKERS),
+        CameraArrays.of(PAIR),
+        boxed(Device.none()),
+    )
     straight, whole = np.empty((26, 3, 3)), np.empty((26, 3, 3))
-    room, information = Certainty.empty(len(hand.x), 16), np.asarray(np.linalg.inv(small_cov()), np.float64)
+    room, information = Certainty.empty(len(cov), 16), np.asarray(np.linalg.inv(small_cov()), np.float64)
     T, scratch = hand.T_rig_palm, boxed(Scratch.empty())
     joint_covariances(rig, T, hand.x, cov, seen, information, scratch, boxed(room), straight, whole)
     return straight, whole

@@ -31,7 +31,7 @@ def palm_errors_deg(side: str, names: tuple[str, ...], *, imu: bool = False) -> 
         points = model.marker_points(joints, EIGHT) + noise
         seen = points[[EIGHT.index(name) for name in names]]
         told = turned(Rotation.from_rotvec(turn).as_matrix() @ T[:3, :3], IMU_RAD**2 * np.eye(3))
-        errors.append(palm_deg(fit(seen, cov, by=machine, sensed=told if imu else None), T))
+        errors.append(palm_deg(fit(seen, cov, by=machine, turn=told if imu else None), T))
     return np.array(errors)
 
 

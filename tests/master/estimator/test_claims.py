@@ -25,7 +25,7 @@ CENTRE = np.array([0.0, 0.0, 0.5])
 def surer(now: Float, past: Float) -> Float:
     """In each direction that of the surer of two covariances (n, n)."""
     out = np.empty_like(now)
-    surer_at(now, past, boxed(Certainty.empty(len(now) - 6, 2)), out)
+    surer_at(now, past, boxed(Certainty.empty(len(now), 2)), out)
     return out
 
 
@@ -130,7 +130,7 @@ def test_what_moves_on_an_arc_is_as_wide_as_drawn_hands_are() -> None:
     last = found(hands[-1].solution)
     cov = np.array(machine.state.cov)
     draws = np.random.default_rng(2).multivariate_normal(np.zeros(len(cov)), cov, 4000)
-    drawn = PARAMETERS.angles(last.x + draws[:, 6:])
+    drawn = PARAMETERS.angles(last.x + draws[:, 6 : 6 + len(last.x)])
     tips = RIGHT.forward(last.T_rig_palm, drawn).position_m[:, TIPS[INDEX]]
     off = tips - last.joints.position_m[TIPS[INDEX]]
     claimed = last.cov_m2[TIPS[INDEX]]

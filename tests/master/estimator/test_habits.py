@@ -14,7 +14,7 @@ from common.geometry import rotation_vector_to_matrix
 from common.hand_model import PALM, HandModel
 from common.hand_presets import preset_limits
 from common.messages import Source
-from master.estimator.epoch import FittedHand, Sensed
+from master.estimator.epoch import FittedHand, Turn
 from master.estimator.estimator import Estimator
 from master.estimator.settings import DEFAULT
 from tests.hand_helpers import RIGHT, natural_angles, palm, small_cov
@@ -51,10 +51,8 @@ def with_couplings(**keys: object) -> HandModel:
     return HandModel.of(msgspec.structs.replace(RIGHT.profile, couplings=couplings))
 
 
-def solved(
-    machine: Estimator, T: Float, angles: Float, noise: Float, sensed: Sensed | None = None
-) -> FittedHand:
-    return found(fit(places(T, angles) + noise, COV, by=machine, sensed=sensed))
+def solved(machine: Estimator, T: Float, angles: Float, noise: Float, turn: Turn | None = None) -> FittedHand:
+    return found(fit(places(T, angles) + noise, COV, by=machine, turn=turn))
 
 
 # -- natural or free --------------------------------------------------------------------------------------------
@@ -167,8 +165,8 @@ def test_the_dip_follows_exactly_loosely_or_not_at_all(spread_deg: float, free: 
     truth[1:, 1], truth[1:, 2], truth[1:, 3] = 0.4, 0.8, 0.8 * 2 / 3
     truth[2, 3] += np.radians(8.0)
     machine = forgetful(model)
-    sure = turned(palm()[:3, :3], 1e-6 * np.eye(3), n=len(machine.parameters.free))
-    hand = found(fit(places(palm(), truth, model), small_cov(), by=machine, sensed=sure))
+    sure = turned(palm()[:3, :3], 1e-6 * np.eye(3))
+    hand = found(fit(places(palm(), truth, model), small_cov(), by=machine, turn=sure))
     strayed = np.degrees(hand.angles_rad[1:, 3] - hand.angles_rad[1:, 2] * 2 / 3)
     if spread_deg == 0.0 and not free:
         np.testing.assert_allclose(strayed, 0.0, atol=1e-9)
@@ -292,10 +290,10 @@ def test_one_marker_is_enough_where_the_orientation_is_known() -> None:
     points = places(T, truth)
     points[:5] = np.nan
     assert fit(points, small_cov()) is None
-    hand = found(fit(points, small_cov(), sensed=turned(T[:3, :3], 1e-4 * np.eye(3))))
+    hand = found(fit(points, small_cov(), turn=turned(T[:3, :3], 1e-4 * np.eye(3))))
     assert palm_deg(hand, T) < 1.0
     assert np.linalg.norm(hand.joints.position_m[1] - T[:3, 3]) < 5e-3
-    assert fit(points, small_cov(), sensed=turned(T[:3, :3], np.eye(3), sure=False)) is None
+    assert fit(points, small_cov(), turn=turned(T[:3, :3], np.eye(3), sure=False)) is None
 
 
 def test_a_palm_turns_with_the_imu_between_frames() -> None:
@@ -307,6 +305,6 @@ def test_a_palm_turns_with_the_imu_between_frames() -> None:
         points = places(T, truth)
         if k >= 20:
             points[:5] = np.nan
-        hand = push(machine, k * STEP_NS, points, sensed=turned(T[:3, :3], wide, sure=True))
+        hand = push(machine, k * STEP_NS, points, turn=turned(T[:3, :3], wide, sure=True))
         assert palm_deg(hand.solution, T) < 12.0
         assert hand.source[PALM] == Source.SOLVED

@@ -15,7 +15,6 @@ from common.geometry import rigid, rotation_vector_to_matrix
 from common.hand_model import CHAINS, TIPS, HandModel
 from common.hand_presets import preset_couplings, preset_limits
 from common.hand_profiles import generated_profile
-from master.estimator.epoch import Sensed
 from master.estimator.estimator import Estimator
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT, Settings
@@ -113,7 +112,7 @@ def test_a_turned_palm_does_not_become_a_wrong_hand() -> None:
         T = palm(turn)
         truth = RIGHT.forward(T, angles).position_m
         points = places(T, angles) + rng.normal(0.0, 1.0, (6, 3)) * [3e-4, 3e-4, 1e-3]
-        hand, assumed = (fit(points, small_cov(), sensed=one) for one in (None, straight))
+        hand, assumed = (fit(points, small_cov(), turn=one) for one in (None, straight))
         ours.append(joint_mm(hand, truth)[1:].mean())
         theirs.append(joint_mm(assumed, truth)[1:].mean())
         turns.append(palm_deg(hand, T))
@@ -139,21 +138,6 @@ def test_an_unseen_finger_is_believed_curled_and_not_flat() -> None:
     points = places(palm(), np.zeros((5, 4)))
     points[2] = np.nan
     assert np.degrees(found(fit(points, small_cov())).angles_rad[2, 2]) > 60.0
-
-
-def test_what_another_sensor_says_of_an_unseen_finger_is_taken() -> None:
-    angles, _ = believed(RIGHT)
-    points = places(palm(), angles)
-    points[2] = np.nan
-    belief = angles.copy()
-    belief[2] = np.radians([0.0, 30.0, 40.0, 40.0 * 2 / 3])
-    x, own = PARAMETERS.of_angles(belief), PARAMETERS.free // 4 == 2
-    weight = np.concatenate([np.zeros(3), own / np.radians(1.0) ** 2])
-    pull, level = weight * np.concatenate([np.zeros(3), x]), np.zeros(5, np.uint8)
-    constant = 0.5 * float(pull[3:] @ x)
-    sensed = Sensed(None, False, np.diag(weight), pull, constant, np.arange(5) == 2, level, x)
-    hand = found(fit(points, small_cov(), sensed=sensed))
-    np.testing.assert_allclose(np.degrees(hand.angles_rad[2, 1:3]), [30.0, 40.0], atol=2.0)
 
 
 # -- too little, too strange ------------------------------------------------------------------------------------

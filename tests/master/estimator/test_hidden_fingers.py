@@ -11,6 +11,7 @@ from common.records import boxed
 from master.estimator.hand_tables import HandTables
 from master.estimator.settings import DEFAULT
 from master.estimator.state import HandState, Hidden
+from master.estimator.wrist_device import NO_EXTRAS
 from tests.hand_helpers import RIGHT, within
 from tests.master.estimator.fitted import FREE, PARAMETERS, STEP_NS
 from tests.master.estimator.kernels import hide_at
@@ -33,7 +34,7 @@ class Memory:
     """The state of a hand, of which only the angles are set."""
 
     def __init__(self, natural: float = 1.0) -> None:
-        self.state = HandState.unknown(FREE)
+        self.state = HandState.unknown(FREE, NO_EXTRAS)
         self.state.natural[0] = natural
 
     def moved(self, before_rad: Float, after_rad: Float, dt_s: float) -> None:

@@ -1,55 +1,27 @@
 """Laws of the estimator's kernels: each derivative against finite differences, rows against plain algebra."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.arrays import Float
-from common.calibration import Couplings
 from common.camera_model import CameraModel
 from common.geometry import rigid, rotation_vector_to_matrix
-from common.hand_model import HandModel
-from common.hand_presets import preset_couplings, preset_limits
-from common.hand_profiles import generated_profile
-from common.kernels import constant
 from common.records import boxed
 from master.estimator.attached import Attached
 from master.estimator.cameras import CameraArrays
-from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.kinematics import Scratch
 from master.estimator.parameters import HandParameters
-from master.estimator.priors import habits_of
-from master.estimator.problem import Belief, Search
 from master.estimator.residuals import Observations
-from master.estimator.settings import DEFAULT
-from master.estimator.update import Model
-from tests.hand_helpers import FACING, MARKERS, any_rotation, natural_angles, palm
+from tests.hand_helpers import FACING, MARKERS, any_rotation
 from tests.master.estimator.fitted import PAIR
-from tests.master.estimator.kernels import linearise_at, marker_rows_at, project_at
+from tests.master.estimator.kernels import marker_rows_at, project_at
+from tests.master.estimator.whole import CAMERAS, MODELS, H, Whole, silent
 
 seeds = st.integers(0, 2**32 - 1)
-LENS = np.array([-0.3, 0.12, 1e-3, -2e-3, -0.02])
-CAMERAS = (PAIR[0], replace(PAIR[1], distortion=LENS))
-H = 1e-6
-
-
-def made(side: str, preset: str, coupled: bool) -> HandModel:
-    profile = generated_profile("made", side)
-    limits = preset_limits("K" if preset == "K" else "D")
-    couplings = preset_couplings("D") if coupled else Couplings(dip_per_pip=None)
-    return HandModel.of(msgspec.structs.replace(profile, limits_rad=limits, couplings=couplings))
-
-
-MODELS = {
-    "right K": made("right", "K", True),
-    "left D": made("left", "D", True),
-    "free": made("right", "K", False),
-}
 
 
 # -- cameras -------------------------------------------------------------------------------------------------------
@@ -164,59 +136,6 @@ def test_points_move_with_the_angles_as_the_jacobian_says(name: str, seed: int) 
             np.testing.assert_allclose(J[:, :, k], (place(x + e) - place(x - e)) / (2 * H), atol=1e-8)
 
 
-class Whole:
-    """A hand somewhere, of which nothing is believed or measured until it is said."""
-
-    def __init__(self, name: str, seed: int) -> None:
-        self.model, self.rng, self.h = MODELS[name], np.random.default_rng(seed), constant(seed % 2)
-        self.parameters = HandParameters.of(self.model)
-        n = self.n = len(self.parameters.free)
-        self.T, angles = palm(self.rng.uniform(-30.0, 30.0, 3)), natural_angles(self.rng)
-        low, high = self.parameters.low, self.parameters.high
-        self.x = np.clip(self.parameters.of_angles(angles), low + 0.02, high - 0.02)
-        self.points = self.model.marker_points(
-            self.model.forward(self.T, self.parameters.angles(self.x)), MARKERS
-        )
-        self.habits = habits_of(self.model, self.parameters)
-        self.belief, self.search = Belief.none(n), Search.empty(n, 16)
-        self.observed = Observations.empty(2, 6)
-        self.rig = Model(
-            boxed(HandTables.of(self.model, self.parameters)),
-            boxed(DEFAULT.record()),
-            Mounts.of(self.model, MARKERS),
-            CameraArrays.of(CAMERAS),
-        )
-
-    def cost(self, T: Float, x: Float) -> tuple[float, Float, Float]:
-        gradient, normal = np.empty(6 + self.n), np.empty((6 + self.n, 6 + self.n))
-        cost = linearise_at(
-            self.rig, self.habits, boxed(self.belief), self.observed, self.h, T, x, gradient, normal,
-            boxed(self.search),
-        )  # fmt: skip
-        return float(cost), gradient, normal
-
-    def check(self, share: float) -> None:
-        """The gradient against finite differences, to a share of its largest component."""
-
-        def cost(step: Float) -> float:
-            R = rotation_vector_to_matrix(step[:3]) @ self.T[:3, :3]
-            return self.cost(rigid(R, self.T[:3, 3] + step[3:6]), self.x + step[6:])[0]
-
-        _, gradient, normal = self.cost(self.T, self.x)
-        numeric = np.array([(cost(H * e) - cost(-H * e)) / (2 * H) for e in np.eye(6 + self.n)])
-        size = np.array([3, 3, self.n])  # turn, shift and angles have units of their own
-        largest = np.repeat([max(float(np.abs(part).max()), 1e-3) for part in
-                             np.split(numeric, np.cumsum(size)[:-1])], size)  # fmt: skip
-        np.testing.assert_array_less(np.abs(gradient - numeric), share * largest)
-        np.testing.assert_allclose(normal, normal.T, atol=1e-9 * np.abs(normal).max())
-        assert np.linalg.eigvalsh(normal).min() > -1e-9 * np.abs(normal).max()
-
-
-def silent(whole: Whole) -> None:
-    for table in whole.habits:
-        table[:] = 0.0
-
-
 def past(whole: Whole) -> None:
     rng, belief = whole.rng, whole.belief
     belief.own_w2[:], belief.own[:] = rng.uniform(0.0, 9.0, whole.n), rng.normal(size=whole.n)
@@ -232,12 +151,21 @@ def facing(whole: Whole) -> None:
     whole.belief.facing[:], whole.belief.facing_w2[0] = FACING, 7.0
 
 
-def sensed(whole: Whole) -> None:
+def turn(whole: Whole) -> None:
+    """Of an IMU on the palm."""
     rng, belief = whole.rng, whole.belief
-    belief.turn[:] = rotation_vector_to_matrix(rng.normal(0.0, 0.8, 3)) @ whole.T[:3, :3]
-    root = rng.normal(size=(3 + whole.n, 3 + whole.n))
-    belief.sensed[:], belief.sensed_pull[:] = root @ root.T, rng.normal(size=3 + whole.n)
-    belief.sensed_constant[0], belief.sensed_known[0] = 3.0, 1.0
+    belief.forearm[:3, :3] = rotation_vector_to_matrix(rng.normal(0.0, 0.8, 3)) @ whole.T[:3, :3]
+    root = rng.normal(size=(3, 3))
+    belief.turn_info[:], belief.turned[0] = root @ root.T, 1.0
+
+
+def place(whole: Whole) -> None:
+    whole.belief.place[:], whole.belief.place_w2[0] = whole.rng.normal(0.0, 0.1, 3), 9.0
+
+
+def extras(whole: Whole) -> None:
+    root = whole.rng.normal(size=(len(whole.z), len(whole.z)))
+    whole.belief.z_info[:], whole.belief.z[:] = root @ root.T, whole.rng.normal(size=len(whole.z))
 
 
 def points(whole: Whole) -> None:
@@ -258,13 +186,22 @@ def rays(whole: Whole) -> None:
 
 @pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize(
-    ("what", "share"), [(past, 1e-4), (facing, 1e-6), (sensed, 1e-5), (points, 1e-5), (rays, 1e-4)]
+    ("what", "share"),
+    [
+        (past, 1e-4),
+        (facing, 1e-6),
+        (turn, 1e-5),
+        (place, 1e-6),
+        (extras, 1e-6),
+        (points, 1e-5),
+        (rays, 1e-4),
+    ],
 )
 def test_the_gradient_of_each_kind_of_row_is_the_derivative_of_its_cost(
     name: str, what: Callable[[Whole], None], share: float
 ) -> None:
     for seed in range(6):
-        whole = Whole(name, seed)
+        whole = Whole(MODELS[name], seed)
         silent(whole)
         what(whole)
         whole.check(share)
@@ -273,23 +210,23 @@ def test_the_gradient_of_each_kind_of_row_is_the_derivative_of_its_cost(
 @pytest.mark.parametrize("name", MODELS)
 def test_the_gradient_of_habits_is_the_derivative_of_their_cost(name: str) -> None:
     for seed in range(6):
-        Whole(name, seed).check(1e-5)
+        Whole(MODELS[name], seed).check(1e-5)
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_all_kinds_of_rows_add_up(name: str) -> None:
     """Each by itself, with numbers drawn anew, and then all of them on one hand."""
-    whole, kinds = Whole(name, 3), (past, facing, sensed, points)
+    whole, kinds = Whole(MODELS[name], 3), (past, facing, turn, place, extras, points)
     habits = whole.habits
-    _, total, _ = whole.cost(whole.T, whole.x)
+    _, total, _ = whole.cost()
     for kind in kinds:
-        one = Whole(name, 3)
+        one = Whole(MODELS[name], 3)
         silent(one)
         one.rng = np.random.default_rng(7)
         kind(one)
-        total = total + one.cost(one.T, one.x)[1]
+        total = total + one.cost()[1]
         whole.rng = np.random.default_rng(7)
         kind(whole)
     assert whole.habits is habits
-    _, gradient, _ = whole.cost(whole.T, whole.x)
+    _, gradient, _ = whole.cost()
     np.testing.assert_allclose(gradient, total, atol=1e-9 * np.abs(total).max())

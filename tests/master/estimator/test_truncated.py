@@ -24,7 +24,7 @@ def mean_within(
     """The step (22,) to the mean of a hand with those limits; `rests`: its fingers rest at their low ones."""
     tables, mean = HandTables.of(RIGHT, PARAMETERS), np.empty(SIZE)
     tables.low[:], tables.high[:], tables.rests[:] = low, high, rests
-    mean_within_at(boxed(tables), normal, gradient, x, boxed(Cut.empty(FREE)), mean)
+    mean_within_at(boxed(tables), normal, gradient, x, boxed(Cut.empty(FREE, SIZE)), mean)
     return mean
 
 

@@ -15,7 +15,7 @@ from master.calibrate.mounting.sights import Sights
 from master.calibrate.mounting.tracks import HandTrack, ImuTrack
 from master.calibrate.mounting.unknown import UNKNOWN, Unknown, believed
 from master.calibrate.mounting.wrists import bends, bends_by_turn
-from master.wrist.setup import WristSetup
+from master.wrist_setup import WristSetup
 from tests.master.calibrate.mounting.moved import CAMERA_LATE_NS, IMU_LATE_NS, ZERO_NS, moved
 
 EYE = np.eye(3)

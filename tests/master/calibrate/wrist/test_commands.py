@@ -21,7 +21,7 @@ from common.sim.wrist_board import WristBoardScene, record_wrist_board
 from master.calibrate.cameras.boards import Checkerboard
 from master.calibrate.cli import calibrate_app
 from master.calibrate.wrist.palm_board import Mounting
-from master.wrist.setup import WristSetup
+from master.wrist_setup import WristSetup
 from tests.conftest import ROOT
 from tests.master.calibrate.wrist.devices import CAMERA, RIG, angle_deg, plane_of, scene_of
 

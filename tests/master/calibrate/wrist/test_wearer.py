@@ -15,6 +15,7 @@ from common.calibration import HandProfile, RigCalibration, load, parse, save
 from common.errors import CalibrationError, FitError
 from common.geometry import rotation_vector_to_matrix, transform
 from common.hand_model import CHAINS, HandModel
+from common.hand_skin import Skin
 from common.messages import WristDetections
 from common.npz import write_npz
 from master.calibrate.cameras.lens_files import matrix_of
@@ -24,8 +25,7 @@ from master.calibrate.wrist.guided import FLAT, guided
 from master.calibrate.wrist.wearer import Wearer, calibrate_wearer
 from master.calibrate.wrist.wearer_fit import fists_of
 from master.calibrate.wrist.wearer_model import UNKNOWN, Unknown, WearerModel, wearing
-from master.wrist.setup import WristSetup
-from master.wrist.skin import Skin
+from master.wrist_setup import WristSetup
 
 ANGLES = np.radians(
     [[[2.0, 0.0, 0.0]] * 4, [[0.0, 50.0, 4.0]] * 4, [[-3.0, 85.0, 0.0]] * 4, [[1.0, 30.0, 60.0]] * 4]

@@ -1,0 +1,196 @@
+"""Kernels of what other sensors leave open, and that is filtered: how it goes on by itself, and what an epoch leaves.
+
+    twist    of the hinges of each finger about its first bone: of the person, all but constant
+    bend     of the wrist, flexion and deviation, and their rates: motion about a posture that somebody keeps for a
+             while, a Gauss-Markov process of second order (Matern 3/2), stepped exactly (Hartikainen, Saerkkae 2010,
+             "Kalman filtering and smoothing solutions to temporal Gaussian process regression models")
+    tilt     what the IMU has the vertical off by, for seconds
+    heading  walks as far as the IMU is told to
+    light    logarithm of the unit of distances by light: of the device and its wearer, all but constant
+
+Wrists at work flex by a median of 1.4...54 deg/s about a median posture of -30...3 deg (43 types of work; Hansson et
+al. 2009, Int. J. Ind. Ergonomics 39, 221); most of what hands do daily takes 5 deg of flexion, 30 of extension, 10 and
+15 of deviation (Palmer et al. 1985, J. Hand Surg. 10A, 39).
+
+What an epoch says errs as the last one did: shape, skin and hidden fingers hardly change from frame to frame. So of
+the information that it gains on what is constant only a share counts, as much as is new in that time.
+"""
+
+from math import exp, sqrt
+
+import numpy as np
+
+from common.arrays import Float
+from common.kernels import inlined, inner
+from common.records import record
+from master.estimator.matrices import cholesky, inverse
+from master.estimator.problem import Belief
+from master.estimator.settings import Settings
+from master.estimator.state import HandState
+from master.estimator.wrist_device import BEND, EXTRAS, HEADING, LIGHT, RATE, TILT
+
+_CONSTANT_S = 1e4
+
+
+class ExtrasRoom:
+    """Room for the extras' steps."""
+
+    M: Float  # (K, K)
+    A: Float  # (K, K)
+    B: Float  # (K, K)
+    L: Float  # (K, K)
+
+    @classmethod
+    def empty(cls, extras: int) -> "ExtrasRoom":
+        """Allocate it."""
+        K = extras
+        return record(cls, M=(K, K), A=(K, K), B=(K, K), L=(K, K))
+
+
+def usual_of(settings: Settings, *, loose: bool, tilt_rad: float) -> Float:
+    """Variances (K,) that doubt grows to; the heading's is that at the beginning.
+
+    Args:
+        settings: Widths.
+        loose: Whether the wrist may bend; False: the palm was calibrated and stands still.
+        tilt_rad: Of the IMU's vertical.
+    """
+    usual = np.zeros(EXTRAS)
+    usual[:BEND] = settings.hinge_rad**2
+    usual[:1] = 1e-6  # a thumb's hinges are no parallel ones
+    bend = np.array([settings.flexion_rad, settings.deviation_rad] if loose else 2 * [settings.worn_rad])
+    usual[BEND : BEND + 2] = bend**2
+    usual[RATE : RATE + 2] = (settings.pace_1_s * bend) ** 2
+    usual[TILT : TILT + 2] = max(tilt_rad, 1e-3) ** 2
+    usual[HEADING] = np.pi**2 / 3.0
+    usual[LIGHT] = settings.light_unit**2
+    return usual
+
+
+@inlined
+def _lasts(settings: Settings, i: int) -> float:
+    return settings.tilt_s if TILT <= i < TILT + 2 else _CONSTANT_S
+
+
+@inner
+def predict_extras(
+    settings: Settings, state: HandState, dt_s: float, walked_rad2: float, belief: Belief, room: ExtrasRoom
+) -> None:
+    """Step the extras to an epoch, in the state, and write `Belief.z` and `z_info`.
+
+    Args:
+        settings: Paces.
+        state: Changed.
+        dt_s: Since they were stepped last.
+        walked_rad2: Variance of what the heading has drifted in that time.
+        belief, room: Written.
+    """
+    K, z, P, M = state.z.shape[0], state.z, state.z_cov, room.M
+    if K < EXTRAS:
+        belief.z[0], belief.z_info[0, 0] = 0.0, 1.0
+        return
+    away = min(max(dt_s, 0.0), 1e3)
+    for i in range(K):
+        for j in range(K):
+            M[i, j] = 0.0
+        M[i, i] = 1.0 if i == HEADING else exp(-away / _lasts(settings, i))
+    paced = settings.pace_1_s * away
+    decay = exp(-paced)
+    for b in range(2):
+        at, rate = BEND + b, RATE + b
+        M[at, at], M[at, rate] = (1.0 + paced) * decay, away * decay
+        M[rate, at], M[rate, rate] = -(settings.pace_1_s**2) * away * decay, (1.0 - paced) * decay
+        z[at] -= state.habit[b]
+    for i in range(K):
+        total = 0.0
+        for j in range(K):
+            total += M[i, j] * z[j]
+            inside = 0.0
+            for k in range(K):
+                usual = state.usual[k] if k == j and k != HEADING else 0.0
+                inside += M[i, k] * (P[k, j] - usual)
+            room.A[i, j] = inside
+        room.B[0, i] = total
+    for i in range(K):
+        z[i] = room.B[0, i]
+    for i in range(K):
+        for j in range(K):
+            total = 0.0
+            for k in range(K):
+                total += room.A[i, k] * M[j, k]
+            P[i, j] = total
+    for i in range(K):
+        if i != HEADING:
+            P[i, i] += state.usual[i]
+    P[HEADING, HEADING] += walked_rad2
+    for b in range(2):
+        z[BEND + b] += state.habit[b]
+    for i in range(K):
+        belief.z[i] = z[i]
+        for j in range(i + 1):
+            room.A[i, j] = 0.5 * (P[i, j] + P[j, i])
+    if cholesky(room.A, K, room.L):
+        inverse(room.L, K, room.B, belief.z_info)
+        return
+    for i in range(K):  # by rounding: nothing is known
+        for j in range(K):
+            P[i, j] = state.usual[i] if i == j else 0.0
+            belief.z_info[i, j] = 1.0 / state.usual[i] if i == j else 0.0
+
+
+@inner
+def keep_extras(
+    settings: Settings,
+    state: HandState,
+    dt_s: float,
+    belief: Belief,
+    z: Float,
+    cov: Float,
+    scale: float,
+    room: ExtrasRoom,
+) -> None:
+    """Take over what an epoch leaves of the extras.
+
+    The epoch's own information is what its posterior has beyond `Belief.z_info`; so much of it counts as is new.
+
+    Args:
+        settings: How much of it is new.
+        state: Changed.
+        dt_s: Since the last epoch.
+        belief: What was believed before.
+        z: (K,) their mean.
+        cov: (N, N) covariance, with theirs last, and `scale` by how much the misfit has scaled it.
+        room: Room.
+    """
+    K, P, A, B, new = state.z.shape[0], state.z_cov, room.A, room.B, room.M[0]
+    if K < EXTRAS:
+        return
+    first = cov.shape[0] - K
+    for i in range(K):
+        # What the palm tells and what fingers tell are two blocks: within one, as much is new of everything.
+        errs_s = settings.turn_errs_s if BEND <= i < LIGHT else settings.errs_s
+        new[i] = 1.0 - exp(-min(dt_s, 10.0) / errs_s)
+        for j in range(K):
+            A[i, j] = cov[first + i, first + j] / scale
+    if not cholesky(A, K, room.L):
+        return
+    inverse(room.L, K, B, A)  # the posterior's information
+    for i in range(K):
+        pull = 0.0
+        for j in range(K):
+            pull += A[i, j] * (z[j] - belief.z[j])
+        room.M[1, i] = new[i] * pull
+    for i in range(K):
+        for j in range(K):
+            gained = A[i, j] - belief.z_info[i, j]
+            B[i, j] = belief.z_info[i, j] + sqrt(new[i] * new[j]) * gained
+    if not cholesky(B, K, room.L):
+        return
+    inverse(room.L, K, A, P)
+    for i in range(K):
+        state.z[i] = belief.z[i]
+        for j in range(K):
+            state.z[i] += P[i, j] * room.M[1, j]
+    share = 1.0 - exp(-min(dt_s, 10.0) / settings.habit_s)
+    for b in range(2):
+        state.habit[b] += share * (state.z[BEND + b] - state.habit[b])

@@ -1,0 +1,194 @@
+"""Kernels of what is believed of a finger along its valley: densities by hand, and the pose that is taken.
+
+Three hands are weighed (`master.estimator.finger_scan`): natural, straight and free ones. Fingers whose tips are seen
+tell which of them it is. A density may have several parts; the one that weighs most, by where the finger was, is taken,
+and the covariance holds all of them.
+"""
+
+from math import exp, inf, isfinite, log, nan, pi
+
+from common.arrays import Float
+from common.kernels import inlined, inner
+from master.estimator.finger_scan import FINE, HANDS, NODES, ROWS, Prior, Scan
+from master.estimator.hand_tables import HandTables
+from master.estimator.settings import Settings
+from master.estimator.wrist_device import Sights
+
+_NATURAL, _STRAIGHT, _FREE = 0, 1, 2
+_FAR = 1e9  # logarithm of what is not searched
+
+
+@inlined
+def _normal_log(off: float, variance: float) -> float:
+    return -0.5 * off * off / variance - 0.5 * log(2.0 * pi * variance)
+
+
+@inner
+def _densities(hand: HandTables, settings: Settings, prior: Prior, f: int, unseen: bool, scan: Scan) -> None:
+    """Write the logarithm of the density of finger f (3, 61), by hand."""
+    low, high = hand.limits[f, 2, 0], hand.limits[f, 2, 1]
+    span = log(hand.limits[f, 1, 1] - hand.limits[f, 1, 0])
+    for k in range(FINE * (NODES - 1) + 1):
+        node = min(k // FINE, NODES - 2)
+        share = k / FINE - node
+        pip = low + (high - low) * k / (FINE * (NODES - 1))
+        if node < scan.first[f] or node + 1 > scan.last[f]:
+            for h in range(HANDS):
+                scan.log_p[h, k] = -_FAR
+            scan.on_curve[k] = -_FAR
+            continue
+        chi2 = 0.0
+        for i in range(ROWS):
+            row = (1.0 - share) * scan.rows[f, node, i] + share * scan.rows[f, node + 1, i]
+            chi2 += row * row
+        base = -0.5 * chi2 + (1.0 - share) * scan.volume[f, node] + share * scan.volume[f, node + 1]
+        flexion = (1.0 - share) * scan.x[f, node, 1] + share * scan.x[f, node + 1, 1]
+        flexion2 = (1.0 - share) * scan.flexion2[f, node] + share * scan.flexion2[f, node + 1]
+        if unseen:
+            shows = (1.0 - share) * scan.showing[f, node] + share * scan.showing[f, node + 1]
+            base -= (settings.unseen_again if prior.recent[f] > 0.0 else settings.unseen) * shows
+        off = flexion - prior.natural[f, 1] - prior.slope[f, 1] * pip
+        sigma = prior.flexion[f]
+        if f > 0 and prior.only_natural[0] == 0.0:
+            sigma += settings.coupled_share * max(pip, 0.0)
+        natural = _normal_log(off, sigma * sigma + flexion2)
+        scan.log_p[_NATURAL, k] = base + natural - log(high - low)
+        scan.on_curve[k] = base + _normal_log(off, prior.flexion[f] ** 2 + flexion2)
+        free = _normal_log(pip - settings.free_pip_mean_rad, settings.free_pip_rad**2) - span
+        scan.log_p[_FREE, k] = base + free
+        straight = log(2.0) + _normal_log(pip, settings.straight_pip_rad**2) - span
+        scan.log_p[_STRAIGHT, k] = base + (straight if f > 0 else free)
+
+
+@inner
+def weigh_hands(hand: HandTables, settings: Settings, sights: Sights, prior: Prior, scan: Scan) -> None:
+    """Write the evidence of each hand by each finger, and the probabilities of the hands.
+
+    A finger of which the laser alone tells has no say: it is explained by any.
+    """
+    others = 0
+    for f in range(1, 5):
+        others += 1 if sights.shown[f] > 0.0 else 0
+    scan.share[_NATURAL] = log(settings.mostly_natural)
+    scan.share[_STRAIGHT] = scan.share[_FREE] = log(0.5 * (1.0 - settings.mostly_natural))
+    for f in range(5):
+        if scan.known[f] == 0.0:
+            continue
+        _densities(hand, settings, prior, f, others > 0 and sights.shown[f] == 0.0, scan)
+        for h in range(HANDS):
+            top = -inf
+            for k in range(FINE * (NODES - 1) + 1):
+                top = max(top, scan.log_p[h, k])
+            total = 0.0
+            for k in range(FINE * (NODES - 1) + 1):
+                total += exp(scan.log_p[h, k] - top)
+            scan.hand[f, h] = log(total) + top
+            if f > 0 and sights.shown[f] > 0.0:
+                scan.share[h] += scan.hand[f, h]
+    if prior.only_natural[0] > 0.0:
+        scan.share[_STRAIGHT] = scan.share[_FREE] = -inf
+    top = max(scan.share[0], max(scan.share[1], scan.share[2]))
+    total = 0.0
+    for h in range(HANDS):
+        scan.share[h] = exp(scan.share[h] - top)
+        total += scan.share[h]
+    for h in range(HANDS):
+        scan.share[h] /= total
+
+
+@inlined
+def _at(scan: Scan, f: int, place: float, out: Float) -> None:
+    """Write the pose (5,) of finger f at a place along its valley, counted in fine steps."""
+    node = min(int(place / FINE), NODES - 2)
+    share = place / FINE - node
+    for k in range(5):
+        out[k] = (1.0 - share) * scan.x[f, node, k] + share * scan.x[f, node + 1, k]
+
+
+@inner
+def choose(hand: HandTables, settings: Settings, sights: Sights, prior: Prior, f: int, scan: Scan) -> None:
+    """Write what is believed of finger f: the median of the part that weighs most, its likeliest pose, and the spread.
+
+    Two tops are of one part where the density does not fall clearly between them. Where frames follow each other, a
+    part near to where the finger was is believed rather.
+    """
+    count, p = FINE * (NODES - 1) + 1, scan.p
+    others = 0
+    for g in range(1, 5):
+        others += 1 if sights.shown[g] > 0.0 else 0
+    _densities(hand, settings, prior, f, others > 0 and sights.shown[f] == 0.0, scan)
+    low, high = hand.limits[f, 2, 0], hand.limits[f, 2, 1]
+    step = (high - low) / (count - 1)
+    total = 0.0
+    for k in range(count):
+        p[k] = 0.0
+        for h in range(HANDS):
+            if scan.share[h] > 0.0:
+                p[k] += scan.share[h] * exp(scan.log_p[h, k] - scan.hand[f, h])
+        total += p[k]
+    # A laser point alone leaves the PIP to habit: where the hand may be natural, it is taken where habit has it.
+    by_habit = sights.shown[f] == 0.0 and scan.share[_NATURAL] > settings.habit_counts
+    top = -inf
+    for k in range(count):
+        p[k] /= total
+        top = max(top, scan.on_curve[k])
+    for k in range(count):
+        off = (low + k * step - prior.last[f]) / prior.walked[f]
+        scan.near[k] = exp(scan.on_curve[k] - top) if by_habit else p[k]
+        if prior.recent[f] > 0.0:
+            scan.near[k] *= exp(-0.5 * off * off)
+    # Parts: the density is walked from top to top.
+    begin, best_begin, best_end, best, second, second_at, parts = 0, 0, count, -1.0, -1.0, -1.0, 0
+    while begin < count:
+        # From `begin` up to the lowest place before another top, if the density clearly falls below both.
+        near = scan.near
+        crest, lowest, low_at, end = near[begin], inf, begin, count
+        for k in range(begin, count):
+            if lowest < settings.parted * min(crest, near[k]):
+                end = low_at
+                break
+            if near[k] > crest:
+                crest, lowest = near[k], inf
+            elif near[k] < lowest:
+                lowest, low_at = near[k], k
+        weight = likely = 0.0
+        for k in range(begin, end):
+            weight += p[k]
+            likely += scan.near[k]
+        if weight > settings.other_part:
+            parts += 1
+        if likely > best:
+            if best >= 0.0:
+                second, second_at = best, 0.5 * (best_begin + best_end)
+            best, best_begin, best_end = likely, begin, end
+        elif likely > second:
+            second, second_at = likely, 0.5 * (begin + end)
+        begin = end
+    half, place, crest, crest_at = 0.0, float(best_begin), -1.0, best_begin
+    found = False
+    for k in range(best_begin, best_end):
+        if p[k] > crest:
+            crest, crest_at = p[k], k
+        if not found and half + scan.near[k] >= 0.5 * best:
+            place = k - 0.5 + (0.5 * best - half) / max(scan.near[k], 1e-300)
+            found = True
+        half += scan.near[k]
+    place = min(max(place, 0.0), count - 1.0)
+    _at(scan, f, place, scan.out[f])
+    _at(scan, f, float(crest_at), scan.mode[f])
+    node = min(max(int(place / FINE), 0), NODES - 2)
+    away = scan.x[f, node + 1, 2] - scan.x[f, node, 2]
+    for k in range(5):
+        scan.way[f, k] = (scan.x[f, node + 1, k] - scan.x[f, node, k]) / away
+    scan.pip2[f] = 0.0
+    for k in range(count):
+        off = low + k * step - scan.out[f, 2]
+        scan.pip2[f] += p[k] * off * off
+    scan.parts[f] = parts
+    scan.rival[f] = low + second_at * step if parts > 1 else nan
+    if isfinite(prior.law[f]):
+        for k in range(1, 4):
+            scan.out[f, k] = scan.mode[f, k] = prior.natural[f, k] + prior.slope[f, k] * prior.law[f]
+    share = place / FINE - node
+    for i in range(2):
+        sights.lack[f, i] = (1.0 - share) * scan.lack[f, node, i] + share * scan.lack[f, node + 1, i]

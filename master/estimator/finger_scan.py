@@ -1,0 +1,402 @@
+"""Kernels of the search along a finger's valley: for every PIP the best of the other angles, and how likely it is.
+
+Laser point and fingertip hold a finger's angles in some directions well and in others hardly: near the turn of a
+fingertip's way in the image straighter and more bent fingers show almost the same, and without a tip nothing but habit
+tells. So a finger's posterior may be long, bent, and in two parts, and no descent from one start finds that. For every
+PIP of a grid the other unknowns (abduction, flexion, DIP and the twist of its hinges) are brought to the least misfit;
+what is left of the residuals is interpolated between the nodes; and the density over the PIP is, with the others
+integrated out (Laplace; MacKay, "Information Theory, Inference, and Learning Algorithms", 27),
+
+    exp(-misfit / 2) |S|^1/2 p(flexion, PIP)       S: covariance of the others at that PIP
+
+p is a mixture of three hands: a *natural* one, whose flexion follows the PIP, a *straight* one, whose fingers are
+stretched while they bend in their knuckles ("intrinsic plus" in hand surgery), and a *free* one, whose joints know
+nothing of each other. All fingers tell which of them it is.
+"""
+
+from math import inf, log, sqrt
+from typing import Any
+
+from common.arrays import Float, Int
+from common.kernels import inlined, inner
+from common.records import record
+from master.estimator.finger_surface import OWN_MOVES, Surface, cut, first_hit, look
+from master.estimator.hand_tables import HandTables
+from master.estimator.kinematics import twist_hand
+from master.estimator.matrices import cholesky, substitute
+from master.estimator.settings import Settings
+from master.estimator.wrist_device import Sights
+
+NODES, FINE = 16, 4
+ROWS = 8  # laser 2, tip 2, depth, abduction, DIP, twist
+HANDS = 3
+_STEPS, _STEPS_AFRESH = 3, 5  # from the pose of the PIP before, and from one that was tried
+_AFRESH = 5  # every so many nodes others are tried
+_FARTHEST_RAD = 0.3  # of one step
+_COARSE_RAD = (0.15, 0.6, 1.05, 1.4)  # flexions that are tried
+_COARSE = 4
+_ROLLED_RAD = 0.25  # no hinges are askew by more
+_ANYWHERE_RAD = 2.0  # of a flexion of which nothing is known
+_HIDDEN_M = 1.5e-3  # of a fingertip behind the skin that the camera sees: its own roundness
+
+
+class Prior:
+    """What is believed of fingers before a triple is seen.
+
+    Attributes:
+        palm: (4, 4) palm, camera frame, and `bend_axes` (2, 3) as of `bent_palm`.
+        twist, twist2: (5,) mean and variance of the twist of the hinges [rad].
+        light, light2: (1,) mean and variance of the logarithm of the light's unit.
+        natural, slope: (5, 4) natural angles by the PIP: natural + slope PIP.
+        abduction, flexion: (5,) standard deviations of abduction and flexion about them [rad].
+        last: (5,) PIPs where the fingers are expected, `walked` (5,) how far from there they may be, and `recent` (5,)
+            whether they are expected anywhere.
+        near_rad: (5,) how far from there a finger that is well known is searched; 0: everywhere.
+        only_natural: (1,) 1 where fingers are taken to bend naturally, whatever is seen (level "fk").
+        law: (5,) PIPs by another law; NaN: none.
+        frame: (4,) least and most x and y of a fingertip that is clearly in the image.
+    """
+
+    palm: Float
+    bend_axes: Float
+    twist: Float
+    twist2: Float
+    light: Float
+    light2: Float
+    natural: Float
+    slope: Float
+    abduction: Float
+    flexion: Float
+    last: Float
+    walked: Float
+    recent: Float
+    near_rad: Float
+    only_natural: Float
+    law: Float
+    frame: Float
+
+    @classmethod
+    def empty(cls) -> "Prior":
+        """Allocate it."""
+        return record(
+            cls,
+            palm=(4, 4),
+            bend_axes=(2, 3),
+            twist=5,
+            twist2=5,
+            light=1,
+            light2=1,
+            natural=(5, 4),
+            slope=(5, 4),
+            abduction=5,
+            flexion=5,
+            last=5,
+            walked=5,
+            recent=5,
+            near_rad=5,
+            only_natural=1,
+            law=5,
+            frame=4,
+        )
+
+
+class Scan:
+    """What is known of five fingers along their valleys.
+
+    Attributes:
+        x: (5, NODES, 5) angles and twist [rad] at each PIP.
+        rows: (5, NODES, 8) residuals in their standard deviations.
+        volume: (5, NODES) logarithm of |S|^1/2, and `flexion2` (5, NODES) variance of the flexion.
+        length_px: (5, NODES) of the laser's line.
+        lack: (5, NODES, 2) of the ridge to the cut.
+        hand: (5, 3) logarithm of the evidence of each hand.
+        share: (3,) probabilities of the hands.
+        p: (61,) density of one finger, fine, and `log_p` (3, 61) by hand.
+        near: (61,) density by which its place is chosen, and `on_curve` (61,) the logarithm of that of habit alone.
+        out: (5, 5) angles and twist chosen, and `mode` (5, 5) of the most likely pose of that part.
+        way: (5, 5) derivative of these by the PIP there.
+        pip2: (5,) variance of the PIP.
+        misfit: (5,) chi square of the best node; of none: infinite.
+        parts: (5,) how many parts a density has that count, and `rival` (5,) the PIP of the next best; NaN: none.
+        known: (5,) whether the finger was scanned.
+        first, last: (5,) nodes between which the valley was searched.
+        showing: (5, NODES) 1 where the fingertip would be in sight.
+    """
+
+    x: Float
+    rows: Float
+    volume: Float
+    flexion2: Float
+    length_px: Float
+    lack: Float
+    hand: Float
+    share: Float
+    p: Float
+    near: Float
+    on_curve: Float
+    log_p: Float
+    out: Float
+    mode: Float
+    way: Float
+    pip2: Float
+    misfit: Float
+    parts: Float
+    rival: Float
+    known: Float
+    first: Int
+    last: Int
+    showing: Float
+    angles: Float  # (20,)
+    H: Float  # (4, 4)
+    L: Float  # (4, 4)
+    g: Float  # (4,)
+    S: Float  # (4, 4)
+    J: Float  # (8, 4)
+    r: Float  # (8,)
+    twist: Float  # (5,)
+    surface: Surface
+
+    @classmethod
+    def empty(cls) -> "Scan":
+        """Allocate it."""
+        fine = FINE * (NODES - 1) + 1
+        return record(
+            cls,
+            x=(5, NODES, 5),
+            rows=(5, NODES, ROWS),
+            volume=(5, NODES),
+            flexion2=(5, NODES),
+            length_px=(5, NODES),
+            lack=(5, NODES, 2),
+            hand=(5, HANDS),
+            share=HANDS,
+            p=fine,
+            near=fine,
+            on_curve=fine,
+            log_p=(HANDS, fine),
+            out=(5, 5),
+            mode=(5, 5),
+            way=(5, 5),
+            pip2=5,
+            misfit=5,
+            parts=5,
+            rival=5,
+            known=5,
+            first=("i8", 5),
+            last=("i8", 5),
+            showing=(5, NODES),
+            angles=20,
+            H=(4, 4),
+            L=(4, 4),
+            g=4,
+            S=(4, 4),
+            J=(8, 4),
+            r=8,
+            twist=5,
+            surface=Surface.empty(),
+        )
+
+
+@inlined
+def _column(u: int) -> int:
+    """Which of `MOVES` unknown u is: abduction, flexion, DIP, twist."""
+    return u if u < 2 else u + 1
+
+
+@inlined
+def _dip_sigma(settings: Settings, f: int, pip: float) -> float:
+    """Standard deviation of the DIP, of a thumb its IP, about what goes with the PIP."""
+    return (
+        sqrt(settings.dip_rad**2 + (settings.dip_share * pip) ** 2) if f > 0 else settings.thumb_coupled_rad
+    )
+
+
+@inner
+def _rows(
+    hand: HandTables,
+    device: Any,
+    settings: Settings,
+    sights: Sights,
+    prior: Prior,
+    f: int,
+    tip: bool,
+    moved: bool,
+    scan: Scan,
+) -> float:
+    """Write residuals (8,) and derivatives (8, 4) at `scan.angles`, `scan.twist`; return half chi square."""
+    if moved:  # else what was seen of it is in `scan.surface` still
+        look(hand, device, prior.palm, prior.bend_axes, scan.angles, f, OWN_MOVES, scan.surface)
+    seen, G, r, J, a = scan.surface.seen, scan.surface.J, scan.r, scan.J, scan.angles
+    for i in range(ROWS):
+        r[i] = 0.0
+        for u in range(4):
+            J[i, u] = 0.0
+    W = sights.laser_W[f]
+    p = sqrt(W[0, 0])
+    q = W[1, 0] / p
+    d = sqrt(max(W[1, 1] - q * q, 0.0))
+    r0 = seen[0] + sights.lack[f, 0] - sights.laser[f, 0]
+    r1 = seen[1] + sights.lack[f, 1] - sights.laser[f, 1]
+    r[0], r[1] = p * r0 + q * r1, d * r1
+    for u in range(4):
+        c = _column(u)
+        J[0, u], J[1, u] = p * G[0, c] + q * G[1, c], d * G[1, c]
+    if tip:
+        p = sqrt(sights.tip_W[f, 0, 0])
+        r[2], r[3] = p * (seen[2] - sights.tip[f, 0]), p * (seen[3] - sights.tip[f, 1])
+        w = sights.depth_w2[f]
+        if w > 0.0 and prior.light2[0] < 1.0:
+            w = sqrt(1.0 / (1.0 / w + prior.light2[0]))
+            r[4] = w * (seen[4] + prior.light[0] - sights.depth[f])
+        else:
+            w = 0.0
+        for u in range(4):
+            c = _column(u)
+            J[2, u], J[3, u], J[4, u] = p * G[2, c], p * G[3, c], w * G[4, c]
+    pip = a[4 * f + 2]
+    r[5] = (a[4 * f] - prior.natural[f, 0] - prior.slope[f, 0] * pip) / prior.abduction[f]
+    J[5, 0] = 1.0 / prior.abduction[f]
+    sigma = _dip_sigma(settings, f, pip)
+    r[6] = (a[4 * f + 3] - prior.natural[f, 3] - prior.slope[f, 3] * pip) / sigma
+    J[6, 2] = 1.0 / sigma
+    r[7] = (scan.twist[f] - prior.twist[f]) / sqrt(prior.twist2[f])
+    J[7, 3] = 1.0 / sqrt(prior.twist2[f])
+    total = 0.0
+    for i in range(ROWS):
+        total += r[i] * r[i]
+    return 0.5 * total
+
+
+@inner
+def _normal(scan: Scan) -> bool:
+    """Factor the normal matrix (4, 4) of the rows; write the gradient."""
+    for u in range(4):
+        scan.g[u] = 0.0
+        for v in range(4):
+            scan.H[u, v] = _ANYWHERE_RAD**-2 if u == v and u == 1 else 0.0
+        for i in range(ROWS):
+            scan.g[u] += scan.J[i, u] * scan.r[i]
+            for v in range(u + 1):
+                scan.H[u, v] += scan.J[i, u] * scan.J[i, v]
+    return cholesky(scan.H, 4, scan.L)
+
+
+@inlined
+def _put(hand: HandTables, f: int, x0: float, x1: float, x3: float, twist: float, scan: Scan) -> None:
+    """Set abduction, flexion, DIP and twist of finger f, inside the limits."""
+    a = scan.angles
+    a[4 * f] = min(max(x0, hand.limits[f, 0, 0]), hand.limits[f, 0, 1])
+    a[4 * f + 1] = min(max(x1, hand.limits[f, 1, 0]), hand.limits[f, 1, 1])
+    a[4 * f + 3] = min(max(x3, hand.limits[f, 3, 0]), hand.limits[f, 3, 1])
+    scan.twist[f] = min(max(twist, -_ROLLED_RAD), _ROLLED_RAD)
+    twist_hand(hand, scan.twist)
+
+
+@inner
+def scan_finger(
+    hand: HandTables,
+    device: Any,
+    settings: Settings,
+    sights: Sights,
+    prior: Prior,
+    f: int,
+    tip: bool,
+    scan: Scan,
+) -> None:
+    """Write the valley of finger f, from `Scan.x` to `misfit`."""
+    a, x = scan.angles, scan.x
+    low, high = hand.limits[f, 2, 0], hand.limits[f, 2, 1]
+    scan.misfit[f] = inf
+    scan.first[f], scan.last[f] = 0, NODES - 1
+    if prior.near_rad[f] > 0.0:
+        step = (high - low) / (NODES - 1)
+        scan.first[f] = min(max(int((prior.last[f] - prior.near_rad[f] - low) / step), 0), NODES - 3)
+        scan.last[f] = min(
+            max(int((prior.last[f] + prior.near_rad[f] - low) / step) + 1, scan.first[f] + 2), NODES - 1
+        )
+    for node in range(scan.first[f], scan.last[f] + 1):
+        pip = low + (high - low) * node / (NODES - 1)
+        a[4 * f + 2] = pip
+        sights.lack[f, 0] = sights.lack[f, 1] = 0.0
+        dip, aside = (
+            prior.natural[f, 3] + prior.slope[f, 3] * pip,
+            prior.natural[f, 0] + prior.slope[f, 0] * pip,
+        )
+        best, at = inf, _COARSE
+        if (node - scan.first[f]) % _AFRESH == 0:
+            for start in range(_COARSE):
+                _put(hand, f, aside, _COARSE_RAD[start], dip, prior.twist[f], scan)
+                cost = _rows(hand, device, settings, sights, prior, f, tip, True, scan)
+                if cost < best:
+                    best, at = cost, start
+        if node > scan.first[f]:
+            before = x[f, node - 1]
+            _put(hand, f, before[0], before[1], before[3], before[4], scan)
+            if at < _COARSE and _rows(hand, device, settings, sights, prior, f, tip, True, scan) < best:
+                at = _COARSE
+        if at < _COARSE:
+            _put(hand, f, aside, _COARSE_RAD[at], dip, prior.twist[f], scan)
+        steps = _STEPS if at == _COARSE else _STEPS_AFRESH
+        length = cost = 0.0
+        for k in range(steps + 1):
+            cost = _rows(hand, device, settings, sights, prior, f, tip, True, scan)
+            if k == steps - 1:
+                length = cut(device, f, scan.surface)
+                if length > 0.0:
+                    c = scan.surface.cut
+                    sights.lack[f, 0] = c[0] / c[2] - scan.surface.seen[0]
+                    sights.lack[f, 1] = c[1] / c[2] - scan.surface.seen[1]
+                    cost = _rows(hand, device, settings, sights, prior, f, tip, False, scan)
+            if not _normal(scan) or k == steps:
+                break
+            for u in range(4):
+                scan.S[0, u] = -scan.g[u]
+            substitute(scan.L, 4, scan.S[0])
+            for u in range(4):
+                scan.S[0, u] = min(max(scan.S[0, u], -_FARTHEST_RAD), _FARTHEST_RAD)
+            _put(
+                hand,
+                f,
+                a[4 * f] + scan.S[0, 0],
+                a[4 * f + 1] + scan.S[0, 1],
+                a[4 * f + 3] + scan.S[0, 2],
+                scan.twist[f] + scan.S[0, 3],
+                scan,
+            )
+        for k in range(4):
+            x[f, node, k] = a[4 * f + k]
+        x[f, node, 4] = scan.twist[f]
+        volume = 0.0
+        for u in range(4):
+            volume -= log(scan.L[u, u])
+        sigma = _dip_sigma(settings, f, pip)
+        scan.volume[f, node] = volume - log(sigma)
+        for u in range(4):
+            scan.S[0, u] = 1.0 if u == 1 else 0.0
+        substitute(scan.L, 4, scan.S[0])
+        scan.flexion2[f, node] = scan.S[0, 1]
+        scan.length_px[f, node] = length
+        scan.lack[f, node, 0], scan.lack[f, node, 1] = sights.lack[f, 0], sights.lack[f, 1]
+        for i in range(ROWS):
+            scan.rows[f, node, i] = scan.r[i]
+        scan.misfit[f] = min(scan.misfit[f], 2.0 * cost)
+        scan.showing[f, node] = 1.0 if _shows(device, prior, length, scan) else 0.0
+    scan.known[f] = 1.0
+
+
+@inner
+def _shows(device: Any, prior: Prior, length: float, scan: Scan) -> bool:
+    """Tell whether the fingertip that `look` left is clearly in sight."""
+    t = scan.surface.tip
+    if not t[2] > 0.0:
+        return False
+    x, y = t[0] / t[2], t[1] / t[2]
+    if not (prior.frame[0] < x < prior.frame[1] and prior.frame[2] < y < prior.frame[3]):
+        return False
+    if length == 0.0:
+        return True
+    away = sqrt(t[0] * t[0] + t[1] * t[1] + t[2] * t[2])
+    for k in range(7):
+        if first_hit(scan.surface.camera[k], t[0] / away, t[1] / away, t[2] / away) < away - _HIDDEN_M:
+            return False
+    return True

@@ -1,0 +1,383 @@
+"""Kernels of a finger before a wrist device: its skin, where the laser meets it, and its tip.
+
+The skin of a finger is a chain of round cones (`common.hand_skin`), cut by the plane of the laser. What the camera
+makes of the cut is the centroid of the part that is lit and seen. It lies near a *ridge*: the points of the spheres
+that face the laser, pulled in to 0.77 of the radius, for the mean of a cosine over the half circle that faces the light
+lies there (pi / 4, less what is seen at a slant). Where the chain of ridge points crosses the plane nearest to the
+laser is the laser point, within 0.2 mm where one phalanx alone is in the light. The ridge has derivatives in closed
+form; the exact cut (`cut`) tells what it lacks.
+
+A body that turns about an axis moves its point q on the plane by v, and the plane then meets the chain, of direction s,
+at q + v - s (n . v) / (n . s), with n the normal of the plane.
+"""
+
+from math import atan2, cos, inf, log, sin, sqrt
+from typing import Any
+
+import numpy as np
+
+from common.arrays import Float
+from common.kernels import inlined, inner
+from common.records import record
+from master.estimator.hand_tables import HandTables
+from master.estimator.kinematics import abduction_axis, finger_chain
+
+MOVES, OWN_MOVES = 7, 5  # abduction, flexion, PIP, DIP, twist, and the wrist's flexion and deviation
+_BONE = np.array([0, 0, 0, 0, 1, 1, 2, 2])
+_PULLED_IN = 0.77
+_CAP_ALONG, _CAP_OUT = 0.7, 0.5  # radii from the last sphere to where the skin turns away
+_LEVEL = 0.05  # a chain less inclined to the plane slides along it without an end
+_FARTHEST = 6.0  # lengths of its last stretch that a chain which ends before the plane is prolonged
+_ROOT = 4  # spheres of the first bone, which of a thumb is in its ball
+RAYS = 16
+_SEEN_M = 3e-4  # a lit point this near behind the first the camera sees is seen
+_STRETCH = 0.5  # share of the finger's breadth that one chord may span: more is a jump from part to part
+
+
+class Surface:
+    """Room for one finger."""
+
+    S: Float  # (8, 3) spheres
+    Q: Float  # (9, 3) ridge
+    along: Float  # (8, 3)
+    q: Float  # (3,) laser point
+    way: Float  # (3,) of the chain there
+    laser: Float  # (7, 12) terms of the cones from the laser
+    camera: Float  # (7, 12) and from the camera
+    ray: Float  # (3,)
+    lit: Float  # (RAYS, 5) x, y, z, clearness, body
+    reached: Float  # (7,) whether the plane comes near a cone
+    cut: Float  # (3,) point of the exact cut
+    R: Float  # (4, 3, 3) joints, camera frame
+    P: Float  # (4, 3)
+    axis: Float  # (7, 3) about which each of `MOVES` turns what is beyond
+    tip: Float  # (3,)
+    seen: Float  # (5,) laser x, y, tip x, y, logarithm of the tip's distance
+    J: Float  # (5, 7) its derivatives by `MOVES`
+
+    @classmethod
+    def empty(cls) -> "Surface":
+        """Allocate it."""
+        return record(
+            cls,
+            S=(8, 3),
+            Q=(9, 3),
+            along=(8, 3),
+            q=3,
+            way=3,
+            laser=(7, 12),
+            camera=(7, 12),
+            ray=3,
+            lit=(RAYS, 5),
+            reached=7,
+            cut=3,
+            R=(4, 3, 3),
+            P=(4, 3),
+            axis=(7, 3),
+            tip=3,
+            seen=5,
+            J=(5, MOVES),
+        )
+
+
+@inner
+def spheres(device: Any, f: int, work: Surface) -> None:
+    """Write the spheres of finger f of joints `work.R`, `work.P`, and the way of the chain."""
+    S, along, R, P = work.S, work.along, work.R, work.P
+    for k in range(8):
+        b = _BONE[k]
+        if k == 4 or k == 6:
+            x = y = z = 0.0
+            for other in range(b - 1, b + 1):
+                for j in range(3):
+                    d = device.back[f, other, j]
+                    x += R[other, 0, j] * d
+                    y += R[other, 1, j] * d
+                    z += R[other, 2, j] * d
+            scale = device.deep[f, k] / sqrt(x * x + y * y + z * z)
+            S[k, 0], S[k, 1], S[k, 2] = P[b, 0] + scale * x, P[b, 1] + scale * y, P[b, 2] + scale * z
+            continue
+        for i in range(3):
+            total = P[b, i]
+            for j in range(3):
+                total += R[b, i, j] * device.local[f, k, j]
+            S[k, i] = total
+    for k in range(8):
+        x = y = z = 0.0
+        for first in range(max(k - 1, 0), min(k, 6) + 1):
+            dx, dy, dz = (
+                S[first + 1, 0] - S[first, 0],
+                S[first + 1, 1] - S[first, 1],
+                S[first + 1, 2] - S[first, 2],
+            )
+            scale = 1.0 / sqrt(dx * dx + dy * dy + dz * dz)
+            x, y, z = x + scale * dx, y + scale * dy, z + scale * dz
+        scale = 1.0 / sqrt(x * x + y * y + z * z)
+        along[k, 0], along[k, 1], along[k, 2] = scale * x, scale * y, scale * z
+
+
+@inner
+def crossing(device: Any, f: int, work: Surface) -> int:
+    """Write where the ridge of finger f, of `work.S`, crosses the plane, and its way there.
+
+    Returns:
+        The stretch on which it does, plus 16 where the chain does not reach the plane and was prolonged.
+    """
+    S, Q, along, laser = work.S, work.Q, work.along, device.laser_m
+    for k in range(8):
+        x, y, z = laser[0] - S[k, 0], laser[1] - S[k, 1], laser[2] - S[k, 2]
+        dot = x * along[k, 0] + y * along[k, 1] + z * along[k, 2]
+        x, y, z = x - dot * along[k, 0], y - dot * along[k, 1], z - dot * along[k, 2]
+        scale = device.radius[f, k] / sqrt(x * x + y * y + z * z)
+        for_ridge = _PULLED_IN * scale
+        Q[k, 0], Q[k, 1], Q[k, 2] = S[k, 0] + for_ridge * x, S[k, 1] + for_ridge * y, S[k, 2] + for_ridge * z
+        if k == 7:
+            out, ahead = _CAP_OUT * scale, _CAP_ALONG * device.radius[f, k]
+            Q[8, 0] = S[7, 0] + out * x + ahead * along[7, 0]
+            Q[8, 1] = S[7, 1] + out * y + ahead * along[7, 1]
+            Q[8, 2] = S[7, 2] + out * z + ahead * along[7, 2]
+    n, offset = device.plane[2], device.offset[0]
+    best, at, share = inf, -1, 0.0
+    near = n[0] * Q[0, 0] + n[1] * Q[0, 1] + n[2] * Q[0, 2] - offset
+    first = near
+    for k in range(8):
+        far = n[0] * Q[k + 1, 0] + n[1] * Q[k + 1, 1] + n[2] * Q[k + 1, 2] - offset
+        if (near > 0.0) != (far > 0.0) and not (f == 0 and k < _ROOT - 1):
+            part = near / (near - far)
+            away = 0.0
+            for i in range(3):
+                off = Q[k, i] + part * (Q[k + 1, i] - Q[k, i]) - laser[i]
+                away += off * off
+            if away < best:
+                best, at, share = away, k, part
+        near = far
+    met = at >= 0
+    if not met:
+        at = 7 if device.before[0] * near > 0.0 else 0
+    x, y, z = Q[at + 1, 0] - Q[at, 0], Q[at + 1, 1] - Q[at, 1], Q[at + 1, 2] - Q[at, 2]
+    rise, length = n[0] * x + n[1] * y + n[2] * z, sqrt(x * x + y * y + z * z)
+    least = _LEVEL * length
+    held = rise
+    if abs(rise) < least:
+        held = least if rise >= 0.0 else -least
+    if not met:
+        height = near if at == 7 else first
+        if at == 7:
+            height -= rise  # of the beginning of the stretch
+        share = min(max(-height / held, -_FARTHEST), _FARTHEST)
+    for i in range(3):
+        w = Q[at + 1, i] - Q[at, i]
+        work.q[i] = Q[at, i] + share * w
+        work.way[i] = w + (held - rise) * n[i]
+    return at if met else at + 16
+
+
+@inlined
+def _terms(S: Float, k: int, r1: float, r2: float, ox: float, oy: float, oz: float, out: Float) -> None:
+    """Write what `_first` needs of the cone between spheres k and k + 1, seen from a point."""
+    ax, ay, az = S[k + 1, 0] - S[k, 0], S[k + 1, 1] - S[k, 1], S[k + 1, 2] - S[k, 2]
+    wx, wy, wz = ox - S[k, 0], oy - S[k, 1], oz - S[k, 2]
+    bx, by, bz = ox - S[k + 1, 0], oy - S[k + 1, 1], oz - S[k + 1, 2]
+    narrowing = r1 - r2
+    m0, m1, m5 = ax * ax + ay * ay + az * az, ax * wx + ay * wy + az * wz, wx * wx + wy * wy + wz * wz
+    d2 = m0 - narrowing * narrowing
+    out[0], out[1], out[2], out[3], out[4], out[5] = ax, ay, az, wx, wy, wz
+    out[6] = d2
+    out[7] = d2 * m5 - m1 * m1 + 2.0 * m1 * narrowing * r1 - m0 * r1 * r1
+    out[8], out[9] = narrowing * r1 - m1, m1 - r1 * narrowing
+    out[10], out[11] = m5 - r1 * r1, bx * bx + by * by + bz * bz - r2 * r2
+
+
+@inlined
+def first_hit(t: Float, dx: float, dy: float, dz: float) -> float:
+    """How far along a unit ray the cone of terms (12,) begins; inf: it is missed (`common.round_cones`)."""
+    m2, m3 = dx * t[0] + dy * t[1] + dz * t[2], dx * t[3] + dy * t[4] + dz * t[5]
+    best, d2 = inf, t[6]
+    k2, k1 = d2 - m2 * m2, d2 * m3 + m2 * t[8]
+    h = k1 * k1 - t[7] * k2
+    if h >= 0.0 and k2 > 1e-6 * d2:
+        side = (-sqrt(h) - k1) / k2
+        foot = t[9] + side * m2
+        if foot > 0.0 and foot < d2:
+            best = side
+    h = m3 * m3 - t[10]
+    if h >= 0.0:
+        best = min(best, -m3 - sqrt(h))
+    m3 -= m2
+    h = m3 * m3 - t[11]
+    if h >= 0.0:
+        best = min(best, -m3 - sqrt(h))
+    return best if best > 0.0 else inf
+
+
+@inner
+def cut(device: Any, f: int, work: Surface) -> float:
+    """Write the centroid of the line that is lit and seen on finger f, of `work.S`, to `work.cut` (3,) [m].
+
+    Returns:
+        Length of that line in the undistorted image [px]; 0: the laser misses the finger, or it is not seen.
+    """
+    S, laser, lit = work.S, device.laser_m, work.lit
+    a0, a1, a2 = device.plane[0, 0], device.plane[0, 1], device.plane[0, 2]
+    c0, c1, c2 = device.plane[1, 0], device.plane[1, 1], device.plane[1, 2]
+    n, offset = device.plane[2], device.offset[0]
+    low, high, broad = inf, -inf, 0.0
+    for k in range(7):
+        r1, r2 = device.radius[f, k], device.radius[f, k + 1]
+        _terms(S, k, r1, r2, laser[0], laser[1], laser[2], work.laser[k])
+        _terms(S, k, r1, r2, 0.0, 0.0, 0.0, work.camera[k])
+    near = 0.0
+    for k in range(7):
+        work.reached[k] = 0.0
+    for k in range(8):
+        r = device.radius[f, k]
+        x, y, z = S[k, 0] - laser[0], S[k, 1] - laser[1], S[k, 2] - laser[2]
+        height = n[0] * S[k, 0] + n[1] * S[k, 1] + n[2] * S[k, 2] - offset
+        broad = max(broad, 2.0 * r)
+        crosses = k > 0 and (height > 0.0) != (near > 0.0)
+        if abs(height) < r or crosses:
+            work.reached[max(k - 1, 0)] = 1.0
+            work.reached[min(k, 6)] = 1.0
+        if crosses:
+            share = near / (near - height)
+            bx = S[k - 1, 0] + share * (S[k, 0] - S[k - 1, 0]) - laser[0]
+            by = S[k - 1, 1] + share * (S[k, 1] - S[k - 1, 1]) - laser[1]
+            bz = S[k - 1, 2] + share * (S[k, 2] - S[k - 1, 2]) - laser[2]
+            across, ahead = a0 * bx + a1 * by + a2 * bz, c0 * bx + c1 * by + c2 * bz
+            turn, thick = atan2(across, ahead), max(r, device.radius[f, k - 1])
+            wide = 1.3 * thick / sqrt(across * across + ahead * ahead)
+            low, high = min(low, turn - wide), max(high, turn + wide)
+        if abs(height) < r:
+            across, ahead = a0 * x + a1 * y + a2 * z, c0 * x + c1 * y + c2 * z
+            wide = sqrt(r * r - height * height) / sqrt(across * across + ahead * ahead)
+            turn = atan2(across, ahead)
+            low, high = min(low, turn - 1.1 * wide), max(high, turn + 1.1 * wide)
+        near = height
+    if not low < high:
+        return 0.0
+    step = (high - low) / (RAYS - 1)
+    first = _ROOT - 1 if f == 0 else 0
+    for ray in range(RAYS):
+        turn = low + ray * step
+        s, c = sin(turn), cos(turn)
+        dx, dy, dz = s * a0 + c * c0, s * a1 + c * c1, s * a2 + c * c2
+        far, body = inf, -1
+        for k in range(7):
+            if work.reached[k] > 0.0:
+                t = first_hit(work.laser[k], dx, dy, dz)
+                if t < far:
+                    far, body = t, k
+        lit[ray, 3], lit[ray, 4] = -inf, body
+        if body < first:
+            continue
+        x, y, z = laser[0] + far * dx, laser[1] + far * dy, laser[2] + far * dz
+        lit[ray, 0], lit[ray, 1], lit[ray, 2] = x, y, z
+        distance = sqrt(x * x + y * y + z * z)
+        if not z > 0.0:
+            continue
+        ex, ey, ez, seen = x / distance, y / distance, z / distance, inf
+        for k in range(7):
+            seen = min(seen, first_hit(work.camera[k], ex, ey, ez))
+        lit[ray, 3] = min(seen - distance, 0.0) + _SEEN_M
+    total = u = v = 0.0
+    for ray in range(RAYS - 1):
+        here, there = lit[ray, 3], lit[ray + 1, 3]
+        if not (here > -inf and there > -inf) or (here <= 0.0 and there <= 0.0):
+            continue
+        dx, dy, dz = (
+            lit[ray + 1, 0] - lit[ray, 0],
+            lit[ray + 1, 1] - lit[ray, 1],
+            lit[ray + 1, 2] - lit[ray, 2],
+        )
+        if dx * dx + dy * dy + dz * dz > (_STRETCH * broad) ** 2:
+            continue
+        begin, end = 0.0, 1.0
+        if here <= 0.0:
+            begin = here / (here - there)
+        if there <= 0.0:
+            end = here / (here - there)
+        x0, y0 = lit[ray, 0] / lit[ray, 2], lit[ray, 1] / lit[ray, 2]
+        x1, y1 = lit[ray + 1, 0] / lit[ray + 1, 2], lit[ray + 1, 1] / lit[ray + 1, 2]
+        weight = (end - begin) * sqrt((x1 - x0) ** 2 + (y1 - y0) ** 2)
+        middle = 0.5 * (begin + end)
+        u += weight * (x0 + middle * (x1 - x0))
+        v += weight * (y0 + middle * (y1 - y0))
+        total += weight
+    if not total > 0.0:
+        return 0.0
+    u, v = u / total, v / total
+    far = offset / (n[0] * u + n[1] * v + n[2])
+    work.cut[0], work.cut[1], work.cut[2] = far * u, far * v, far
+    return total * device.focal[0]
+
+
+@inner
+def look(
+    hand: HandTables,
+    device: Any,
+    T: Float,
+    bend_axes: Float,
+    angles: Float,
+    f: int,
+    moves: int,
+    work: Surface,
+) -> int:
+    """Write what is seen of finger f by ridge and tip, and derivatives.
+
+    Args:
+        hand, device: What is looked at, and by what.
+        T: (4, 4) palm, camera frame, and `bend_axes` (2, 3) about which the wrist bends (`bent_palm`).
+        angles: (20,) [rad].
+        f: Finger.
+        moves: By how many of `MOVES` derivatives are wanted.
+        work: Written: `seen`, `J`, and what leads to them.
+
+    Returns:
+        The stretch of the ridge that is lit, as of `crossing`.
+    """
+    R, P, A, J, seen = work.R, work.P, work.axis, work.J, work.seen
+    finger_chain(hand, T, angles, f, R, P)
+    spheres(device, f, work)
+    at = crossing(device, f, work)
+    bone = _BONE[min(at & 15, 7)]
+    n, q, w, t = device.plane[2], work.q, work.way, work.tip
+    rise = n[0] * w[0] + n[1] * w[1] + n[2] * w[2]
+    for i in range(3):
+        t[i] = P[2, i]
+        for j in range(3):
+            t[i] += R[2, i, j] * device.tip[f, j]
+    abduction_axis(hand, T, f, A[0])
+    for i in range(3):
+        A[1, i], A[2, i], A[3, i] = -R[0, i, 0], -R[1, i, 0], -R[2, i, 0]
+        A[4, i] = 0.0
+        A[5, i], A[6, i] = bend_axes[0, i], bend_axes[1, i]
+    # The twist turns about the first bone as it is before the flexion.
+    c, s = cos(angles[4 * f + 1]), sin(angles[4 * f + 1])
+    swing, u = hand.swing, hand.twist_axis[f]
+    for k in range(3):
+        along = 0.0
+        for j in range(3):
+            along += (swing[0, f, 1, j, k] + c * swing[1, f, 1, j, k] + s * swing[2, f, 1, j, k]) * u[j]
+        for i in range(3):
+            A[4, i] += R[0, i, k] * along
+    x, y = q[0] / q[2], q[1] / q[2]
+    tx, ty = t[0] / t[2], t[1] / t[2]
+    seen[0], seen[1], seen[2], seen[3], seen[4] = x, y, tx, ty, log(max(t[2], 1e-3))
+    for k in range(moves):
+        ax, ay, az = A[k, 0], A[k, 1], A[k, 2]
+        ox, oy, oz, carried = P[0, 0], P[0, 1], P[0, 2], True
+        if k == 2 or k == 3:
+            ox, oy, oz, carried = P[k - 1, 0], P[k - 1, 1], P[k - 1, 2], bone >= k - 1
+        elif k >= 5:
+            ox, oy, oz = T[0, 3], T[1, 3], T[2, 3]
+        J[0, k] = J[1, k] = 0.0
+        if carried:
+            dx, dy, dz = q[0] - ox, q[1] - oy, q[2] - oz
+            vx, vy, vz = ay * dz - az * dy, az * dx - ax * dz, ax * dy - ay * dx
+            slide = (n[0] * vx + n[1] * vy + n[2] * vz) / rise
+            vz -= slide * w[2]
+            J[0, k], J[1, k] = (vx - slide * w[0] - x * vz) / q[2], (vy - slide * w[1] - y * vz) / q[2]
+        dx, dy, dz = t[0] - ox, t[1] - oy, t[2] - oz
+        vx, vy, vz = ay * dz - az * dy, az * dx - ax * dz, ax * dy - ay * dx
+        J[2, k], J[3, k], J[4, k] = (vx - tx * vz) / t[2], (vy - ty * vz) / t[2], vz / t[2]
+    return at

@@ -1,0 +1,166 @@
+"""The palm by an IMU that sits on the forearm, through a wrist that bends.
+
+The IMU tells how the forearm lies in a world of its own, whose z axis is up; the hand hangs on it by the wrist:
+
+    R_rig_palm = R_rig_world exp(tilt) R_z(heading) R_world_forearm R_forearm_palm(bend)
+
+`imu.q_rig_world` says where up is in the rig. Tilt, heading and bend are unknowns of the estimator
+(`master.estimator.extras`); here is what comes and goes: samples, sessions and clocks.
+
+An IMU that restarts lies in a new world, and the heading begins anew. Mostly it tells so: silent for a while, it begins
+to count its drift again. If not, palms that contradict for long say it.
+"""
+
+from collections import Counter
+from math import atan2, hypot, nan, pi, sqrt
+
+import numpy as np
+
+from common.arrays import Float
+from common.calibration import ImuCalibration
+from common.geometry import (
+    axis_rotation,
+    matrix_to_quaternion,
+    quaternion_to_matrix,
+    rotation_vector_to_matrix,
+)
+from common.wrist_bend import forearm_palm
+from master.estimator.epoch import Turn
+from master.estimator.imu_samples import Between, OrientationSamples
+from master.estimator.palm_imu import SURE_RAD, turn_of
+from master.estimator.settings import DEFAULT
+from master.estimator.wrist_device import BEND, HEADING, TILT
+
+ANYWHERE_RAD = pi / sqrt(3.0)  # standard deviation of a uniform circle
+LOST_RAD = 1.0  # a heading less sure than this may point anywhere
+_WALK2, _MOST2 = np.radians([0.2, 5.0]) ** 2  # [rad^2/s] a heading walks at least and, unless evenly, at most
+_CONTRARY_NS, _CONTRARY = 500_000_000, 5  # what contradicts for so long, and so often, is right
+_RESTARTED_S = 0.25  # an IMU that begins anew is silent for longer, until it knows where up is
+NO_WORLD = np.full(4, np.nan), np.full(2, np.nan)
+
+
+class Forearm:
+    """Push machine. Holds the samples of an IMU, and since when palms contradict it.
+
+    Attributes:
+        lost: Whether the IMU began anew since `turn_at` was asked.
+        counts: `orientation.used`, epochs that had a sample, `orientation.absent`, those farther than 50 ms from any;
+            samples left out, as of `OrientationSamples`; `forearm.begun`, how often the heading began anew, and
+            `forearm.outlier`, palms that contradicted it.
+    """
+
+    def __init__(self, imu: ImuCalibration, counts: Counter[str] | None = None) -> None:
+        """Follow the IMU of a rig file, counting into `counts` if given.
+
+        Raises:
+            CalibrationError: The file does not say how it is mounted.
+        """
+        self.counts: Counter[str] = Counter() if counts is None else counts
+        self._imu, self._imu_forearm = imu, turn_of("q_palm_imu", imu.q_palm_imu).T
+        self._rig_world = None if imu.q_rig_world is None else turn_of("q_rig_world", imu.q_rig_world)
+        self._samples = OrientationSamples(self.counts, imu.heading_drift_rad_s, imu.stamp_offset_us)
+        self._sample_ns, self._sample_drift_rad = 0, nan
+        self._asked_ns: int | None = None
+        self._drift_rad = 0.0
+        self._contrary_ns: list[int] = []
+        self.lost = False
+
+    @property
+    def placed(self) -> bool:
+        """Whether the file says where up is in the rig."""
+        return self._rig_world is not None
+
+    def push(self, t_ns: int, wxyz: Float, heading_sigma_rad: float = nan) -> None:
+        """Take one sample: quaternion (4,), IMU axes -> its world, and how far its heading has drifted if told."""
+        self._samples.push(t_ns, wxyz, heading_sigma_rad)
+        if np.isnan(wxyz).any():
+            return
+        silent_s = 1e-9 * abs(t_ns - self._sample_ns)
+        if silent_s > _RESTARTED_S and heading_sigma_rad < self._sample_drift_rad:
+            # A drift does not shrink in silence: the IMU counts from a new beginning, in a new world.
+            self.lost, self._drift_rad = True, heading_sigma_rad
+        self._sample_ns, self._sample_drift_rad = t_ns, heading_sigma_rad
+
+    def turn_at(self, t_ns: int, z: Float, z_cov: Float) -> Turn | None:
+        """How the forearm turns the palm at an epoch; None: no sample is near, or the rig does not place its world.
+
+        Args:
+            t_ns: The epoch.
+            z, z_cov: The estimator's extras.
+        """
+        found = self._between(t_ns)
+        if found is None or self._rig_world is None:
+            return None
+        walked = self._walked_rad2(t_ns, found)
+        tilted = self._rig_world @ rotation_vector_to_matrix(np.array([*z[TILT : TILT + 2], 0.0]))
+        rotation = tilted @ axis_rotation(2, z[HEADING]) @ self._forearm(found)
+        sigma = hypot(DEFAULT.strap_rad, DEFAULT.palm_walk_rad_s * found.away_s)
+        axes = np.stack([self._rig_world[:, 0], self._rig_world[:, 1], tilted[:, 2]])
+        wide = z_cov[HEADING, HEADING] + walked + np.trace(z_cov[BEND : BEND + 2, BEND : BEND + 2])
+        return Turn(rotation, np.eye(3) / sigma**2, bool(wide < SURE_RAD**2), axes, walked)
+
+    def heading_of(self, t_ns: int, R_rig_palm: Float, z: Float) -> float | None:
+        """The heading that comes nearest to a palm (3, 3) [rad]; None: no sample is near."""
+        found = self._samples.between(t_ns)
+        if found is None or self._rig_world is None:
+            return None
+        tilted = self._rig_world @ rotation_vector_to_matrix(np.array([*z[TILT : TILT + 2], 0.0]))
+        turn = tilted.T @ R_rig_palm @ (self._forearm(found) @ forearm_palm(z[BEND : BEND + 2])).T
+        return atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+
+    def contradicted(self, t_ns: int, *, by_palm: bool) -> bool:
+        """Note whether the palm contradicts at an epoch; return whether it did so for long, and is right."""
+        if not by_palm:
+            self._contrary_ns.clear()
+            return False
+        self.counts["forearm.outlier"] += 1
+        self._contrary_ns.append(t_ns)
+        long = abs(t_ns - self._contrary_ns[0]) > _CONTRARY_NS
+        return long and len(self._contrary_ns) >= _CONTRARY
+
+    def world_at(self, t_ns: int, bend_rad: Float, bend_cov: Float) -> tuple[Float, Float]:
+        """The palm at an instant in the IMU's own world, which needs no heading.
+
+        Args:
+            t_ns: The instant.
+            bend_rad, bend_cov: (2,), (2, 2) of the wrist.
+
+        Returns:
+            Quaternion (4,), palm axes -> the IMU's world, and standard deviations (2,) [rad]: tilt per axis, heading;
+            NaN: not known.
+        """
+        found = self._between(t_ns)
+        if found is None:
+            return NO_WORLD
+        turned = DEFAULT.palm_walk_rad_s * found.away_s
+        forearm = self._forearm(found)
+        deviation = axis_rotation(1, bend_rad[1])
+        axes = forearm @ np.stack([deviation[:, 0], np.array([0.0, 1.0, 0.0])], axis=1)
+        x, y, z = np.vecdot(axes @ bend_cov, axes).tolist()
+        tilt = hypot(self._imu.orientation_sigma_rad, turned, sqrt(0.5 * (x + y)))
+        heading = hypot(self._imu.heading_sigma_rad or 0.0, found.drift_rad, turned, sqrt(z))
+        palm = matrix_to_quaternion(forearm @ forearm_palm(bend_rad))
+        return palm, np.array([tilt, min(heading, ANYWHERE_RAD)])
+
+    def _between(self, t_ns: int) -> Between | None:
+        found = self._samples.between(t_ns)
+        self.counts["orientation.absent" if found is None else "orientation.used"] += 1
+        return found
+
+    def _forearm(self, found: Between) -> Float:
+        """The forearm (3, 3) in the IMU's world."""
+        return quaternion_to_matrix(found.q_wxyz) @ self._imu_forearm
+
+    def _walked_rad2(self, t_ns: int, found: Between) -> float:
+        """Variance [rad^2] of what the heading has drifted since the epoch before.
+
+        Drifts that a filter tells are no walks: mostly a bias that nobody knows, whose variance grows with the square
+        of the time. Of a long silence that counts; from epoch to epoch it is a walk, of as much as can be followed.
+        """
+        since_s = 0.0 if self._asked_ns is None else 1e-9 * abs(t_ns - self._asked_ns)
+        even_rad = abs(found.drift_rad - self._drift_rad)
+        walked = found.drift_rad**2 - self._drift_rad**2
+        if found.drift_rad >= ANYWHERE_RAD:  # as much as is ever told
+            even_rad, walked = max(even_rad, self._imu.heading_drift_rad_s * since_s), _MOST2 * since_s
+        self._asked_ns, self._drift_rad = t_ns, found.drift_rad
+        return float(max(even_rad**2, min(max(walked, _WALK2 * since_s), _MOST2 * since_s)))

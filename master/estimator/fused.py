@@ -1,0 +1,189 @@
+"""One hand from marker cameras, a wrist device and its IMU: rows of one fit.
+
+`FusedPipeline` is a push machine without clock, socket or thread. An epoch of the cameras takes the rows of the triple
+before it, if there is a new one, and how the IMU has the forearm turned; where the cameras are silent, epochs are those
+of the triples. A sensor that says nothing adds no row: there is no state in which one is used and another not.
+"""
+
+from collections import Counter, deque
+from math import nan
+
+import msgspec
+import numpy as np
+
+from common.arrays import Bool, Code, Float
+from common.hand_model import FINGERS
+from common.messages import Detections, HandPose, WristDetections
+from master.estimator.epoch import Fitted, Turn, WristRows
+from master.estimator.estimator import Estimator
+from master.estimator.forearm import LOST_RAD, Forearm
+from master.estimator.ground import ON_MARKERS
+from master.estimator.pipeline import MarkerPipeline, SolvedPose
+from master.estimator.triple_reader import TripleReader
+from master.estimator.wrist_device import BEND, HEADING
+from master.wrist_setup import WristSetup
+
+_SILENT_FRAMES = 2.2  # of the slowest camera: when so long no epoch came, the device's triples lead
+_FRESH_NS = 70_000_000  # an older triple says nothing of fingers now
+_OWN_NS = 17_000_000  # half of the time from triple to triple: of epochs that are unrelated
+_KEPT = 8
+
+
+class WristSide:
+    """Push machine. Holds triples that wait for an epoch, the last one, and the samples of the IMU.
+
+    Attributes:
+        forearm: Of the IMU; None: there is none, or it is not known how it is mounted or placed.
+    """
+
+    def __init__(
+        self, setup: WristSetup, reader: TripleReader, counts: Counter[str], *, continuous: bool
+    ) -> None:
+        """Join the parts.
+
+        Args:
+            setup: Device and hand.
+            reader: Makes rows of triples.
+            counts: Counted into, by event and finger: `late`, `outside`, `no_plane`, `tip_refused`, `off`, `ambiguous`;
+                and as of `Forearm`.
+            continuous: False: every message is an unrelated pose.
+        """
+        self.counts, self._setup, self._continuous = counts, setup, continuous
+        forearm = None if setup.imu is None else Forearm(setup.imu, counts)
+        self.forearm = forearm if forearm is not None and forearm.placed else None
+        self.reader = reader
+        self._waiting: deque[WristDetections] = deque(maxlen=_KEPT)
+        self._last_ns = -(2**62)
+        self.laser_m, self.laser_ns = np.full((5, 3), nan), -(2**62)
+        self.level, self.ambiguous = np.zeros(5, np.uint8), np.zeros(5, np.bool_)
+
+    def push(self, message: WristDetections) -> int | None:
+        """Take a triple; return its time, or None: it is not later than the last."""
+        t_ns = message.t_ns + self._setup.late_ns
+        if t_ns <= self._last_ns:
+            self.counts["late"] += 1
+            return None
+        self._last_ns = t_ns
+        self._waiting.append(message)
+        return t_ns
+
+    def rows_at(self, t_ns: int) -> WristRows | None:
+        """The rows of the newest triple that no epoch had, for one at `t_ns`; None: there is none that is fresh."""
+        late_ns, message = self._setup.late_ns, None
+        if not self._continuous:
+            near = min(self._waiting, key=lambda one: abs(one.t_ns + late_ns - t_ns), default=None)
+            message = near if near is not None and abs(near.t_ns + late_ns - t_ns) <= _OWN_NS else None
+        else:
+            while self._waiting and self._waiting[0].t_ns + late_ns <= t_ns:
+                message = self._waiting.popleft()
+            if message is not None and t_ns - message.t_ns - late_ns > _FRESH_NS:
+                message = None
+        if message is None:
+            return None
+        rows, self.laser_m = self.reader.read(message, t_ns)
+        self.laser_ns = message.t_ns + late_ns
+        return rows
+
+    def turn_at(self, t_ns: int, estimator: Estimator) -> Turn | None:
+        """How the IMU has the palm turned at an epoch; None: it does not say, or its heading may be any."""
+        if self.forearm is None:
+            return None
+        if self.forearm.lost:
+            self.forearm.lost = False
+            estimator.forget_heading()
+        turn = self.forearm.turn_at(t_ns, estimator.extras, estimator.extras_cov)
+        unknown = estimator.extras_cov[HEADING, HEADING] > LOST_RAD**2
+        return None if unknown else turn
+
+    def solved(self, t_ns: int, hand: Fitted, estimator: Estimator, *, turned: bool) -> None:
+        """Learn from an epoch that was solved.
+
+        Args:
+            t_ns: The epoch.
+            hand: As it was solved.
+            estimator: What solved it.
+            turned: Whether it had a TURN row to begin with.
+        """
+        if hand.level.any():
+            self.level, self.ambiguous = hand.level, hand.ambiguous
+        self._count("tip_refused", hand.refused)
+        self._count("off", hand.off)
+        self._count("ambiguous", hand.ambiguous)
+        if self.forearm is None or hand.solution is None or not hand.rests[5] & ON_MARKERS:
+            return
+        if turned and self.forearm.contradicted(t_ns, by_palm=hand.turn_left_out):
+            estimator.forget_heading()
+            turned = False
+        if turned:
+            return
+        heading = self.forearm.heading_of(t_ns, hand.solution.T_rig_palm[:3, :3], estimator.extras)
+        if heading is not None:
+            self.counts["forearm.begun"] += 1
+            bend = estimator.extras_cov[BEND : BEND + 2, BEND : BEND + 2]
+            estimator.begin_heading(heading, float(np.trace(bend) + np.trace(hand.solution.alone[:3, :3])))
+
+    def told(self, pose: HandPose, estimator: Estimator) -> HandPose:
+        """The pose with what else is known of the hand."""
+        changes: dict[str, Float | Code | Bool] = {}
+        if self.forearm is not None:
+            bend, cov = (
+                estimator.extras[BEND : BEND + 2].copy(),
+                estimator.extras_cov[BEND : BEND + 2, BEND : BEND + 2],
+            )
+            changes["wrist_bend_rad"], changes["wrist_bend_sigma_rad"] = bend, np.sqrt(np.diag(cov))
+            world = self.forearm.world_at(pose.t_ns, bend, cov)
+            changes["palm_world_wxyz"], changes["palm_world_sigma_rad"] = world
+        if abs(pose.t_ns - self.laser_ns) <= _FRESH_NS:
+            changes["laser_m"], changes["level"], changes["ambiguous"] = (
+                self.laser_m,
+                self.level,
+                self.ambiguous,
+            )
+        return msgspec.structs.replace(pose, **changes)
+
+    def _count(self, event: str, fingers: Bool) -> None:
+        if not fingers.any():
+            return
+        for f in np.flatnonzero(fingers):
+            self.counts[f"{event}.{FINGERS[f]}"] += 1
+
+
+class FusedPipeline:
+    """Push machine. Holds the marker line, whose wrist side it feeds, and when the cameras last made a pose."""
+
+    def __init__(self, markers: MarkerPipeline, side: WristSide, slowest_hz: float) -> None:
+        """Join the parts.
+
+        Args:
+            markers: The marker line with that wrist side; both count into the same.
+            side: Wrist device and IMU.
+            slowest_hz: Frame rate of the slowest marker camera.
+        """
+        self.counts, self._markers, self._side = markers.counts, markers, side
+        self._silent_ns = round(_SILENT_FRAMES * 1e9 / slowest_hz)
+        self._last_ns: int | None = None
+
+    def push(self, message: Detections) -> list[SolvedPose]:
+        """Take what one camera saw; return the poses it completes, oldest first."""
+        if not isinstance(message, WristDetections):
+            poses = self._markers.push(message)
+            if poses:
+                self._last_ns = poses[-1].pose.t_ns
+            return poses
+        t_ns = self._side.push(message)
+        if t_ns is None or (self._last_ns is not None and t_ns - self._last_ns <= self._silent_ns):
+            return []
+        solved = self._markers.blind(t_ns, message.ready_t_ns)
+        self.counts["poses_by_wrist"] += 1
+        return [] if solved is None else [solved]
+
+    def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
+        """Take what the IMU on the forearm says of its own orientation (4,)."""
+        if self._side.forearm is None:
+            self.counts["orientation.unplaced"] += 1
+        else:
+            self._side.forearm.push(t_ns, orientation_wxyz, heading_sigma_rad)
+
+    def flush(self) -> list[SolvedPose]:
+        """At the end of a recording: the poses that still wait for a camera."""
+        return self._markers.flush()

@@ -1,0 +1,123 @@
+"""What kernels of an epoch work on: what is the same at every one, the task, and room."""
+
+from typing import Any, NamedTuple
+
+from common.arrays import Bool, Code, Float, Int
+from common.records import record
+from master.estimator.cameras import CameraArrays
+from master.estimator.certainty import Certainty
+from master.estimator.extras import ExtrasRoom
+from master.estimator.finger_scan import Prior, Scan
+from master.estimator.ground import Ground
+from master.estimator.hand_tables import Mounts
+from master.estimator.hypotheses import Posterior, Room
+from master.estimator.problem import Belief
+from master.estimator.state import Hidden
+
+
+class Task:
+    """What is to be done at an epoch.
+
+    Attributes:
+        t_ns: (1,) the epoch.
+        palm_shown: (1,) whether something tells where the palm is.
+        turned: (3, 3) by how much sensors say that the palm has turned since.
+        palm, angles: (4, 4), (20,) another hand of the epoch [rad].
+        x: (n,) its free angles, inside the limits; or, with the palm, where a search begins.
+        may_leave: (1,) whether there is another, and it may take the place of the state.
+        rough: (1,) whether a search is to end early, in place, under the widest hypothesis alone.
+        natural: (1,) probability of a natural hand a moment ago, and `counts` (1,) what that counts, 0 ... 1.
+        second_order: (1,) whether covariance is wanted to second order.
+        walked_rad2: (1,) variance of what the heading has drifted since the last epoch.
+        continuous: (1,) whether epochs follow each other.
+        scanned: (20,) angles of fingers whose valley was searched, where it is likeliest.
+        refused: (5,) fingertips, and `off` (5,) laser points, that no pose explains.
+        level: (5,) `Level` codes of what fingers are told from.
+        ambiguous: (5,) whether another pose explains as much.
+    """
+
+    t_ns: Int
+    palm_shown: Bool
+    turned: Float
+    palm: Float
+    angles: Float
+    x: Float
+    may_leave: Bool
+    rough: Bool
+    natural: Float
+    counts: Float
+    second_order: Bool
+    walked_rad2: Float
+    continuous: Bool
+    scanned: Float
+    refused: Bool
+    off: Bool
+    level: Code
+    ambiguous: Bool
+
+    @classmethod
+    def empty(cls, n: int) -> "Task":
+        """Room for one."""
+        return record(
+            cls,
+            t_ns=("i8", 1),
+            palm_shown=("u1", 1),
+            turned=(3, 3),
+            palm=(4, 4),
+            angles=20,
+            x=n,
+            may_leave=("u1", 1),
+            rough=("u1", 1),
+            natural=1,
+            counts=1,
+            second_order=("u1", 1),
+            walked_rad2=1,
+            continuous=("u1", 1),
+            scanned=20,
+            refused=("u1", 5),
+            off=("u1", 5),
+            level=("u1", 5),
+            ambiguous=("u1", 5),
+        )
+
+
+class Workspace:
+    """Room for all kernels of one hand, what is to be done, and what is believed at the epoch."""
+
+    task: Task
+    ground: Ground
+    belief: Belief
+    hidden: Hidden
+    found: Posterior
+    room: Room
+    certainty: Certainty
+    prior: Prior
+    scan: Scan
+    extras: ExtrasRoom
+
+    @classmethod
+    def empty(cls, n: int, extras: int, markers: int) -> "Workspace":
+        """Allocate it."""
+        return record(
+            cls,
+            task=Task.empty(n),
+            ground=Ground.empty(),
+            belief=Belief.none(n, extras),
+            hidden=Hidden.none(n),
+            found=Posterior.empty(n, extras, markers),
+            room=Room.empty(n, extras, markers),
+            certainty=Certainty.empty(6 + n + extras, markers),
+            prior=Prior.empty(),
+            scan=Scan.empty(),
+            extras=ExtrasRoom.empty(extras),
+        )
+
+
+class Model(NamedTuple):
+    """What is the same at every epoch; hand, settings and device in their arrays (`common.records.boxed`)."""
+
+    hand: Any
+    settings: Any
+    mounts: Mounts
+    cameras: CameraArrays
+    device: Any

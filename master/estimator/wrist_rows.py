@@ -1,0 +1,186 @@
+"""Kernels of the rows of a wrist device: LASER, TIP, TIP_DEPTH of its camera, and TURN of its IMU.
+
+    LASER      where the laser meets the finger's skin [x, y of the ray], minus where it was seen
+    TIP        the fingertip, minus where it was seen
+    TIP_DEPTH  logarithm of its distance in the unit of the light, minus that by its brightness
+    TURN       rotation vector from where the sensors have the palm to where it is
+
+What was seen before or after the epoch is brought to it by the rates of the angles (`master.estimator.update`).
+A finger is seen from the forearm, so the first three move with its own angles, the twist of its hinges and the bend of
+the wrist, and not with where the hand is in the room. Of the bend they tell a little only (`bend_share`), for that all
+fingers seem bent by as much is mostly an error that they share; what its doubt makes of them is in their noise.
+"""
+
+from math import sqrt, tan
+
+from common.arrays import Float
+from common.kernels import inlined, inner
+from master.estimator.finger_surface import MOVES, look
+from master.estimator.kinematics import turn_between
+from master.estimator.problem import Belief, Rig, Search
+from master.estimator.wrist_device import BEND, LIGHT, TILT, bent_palm
+
+_SMALL_RAD = 1e-4  # below it a rotation vector counts as so long in the derivative
+
+
+@inlined
+def turn_slope(turn: Float, J: Float) -> None:
+    """Write the derivative (3, 3) of a rotation vector (3,) by a small turn in front of it.
+
+    The inverse of the left Jacobian of SO(3) (Sola, Deray, Atchuthan 2018, "A micro Lie theory", eq. 146).
+    """
+    squared = turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2]
+    angle = max(sqrt(squared), _SMALL_RAD)
+    factor = 1.0 / (angle * angle) - 0.5 / (angle * tan(0.5 * angle))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for c in range(3):
+            J[i, c] = factor * turn[i] * turn[c]
+        J[i, i] += 1.0 - factor * squared
+        J[i, j] += 0.5 * turn[k]
+        J[i, k] -= 0.5 * turn[j]
+
+
+@inner
+def turn_row(
+    belief: Belief, T: Float, z: Float, n: int, gradient: Float, normal: Float, search: Search
+) -> float:
+    """Add the TURN row; return its cost.
+
+    The palm by the sensors is  exp(axes . (tilt, heading less the believed)) forearm R_y(deviation) R_x(flexion); of
+    an IMU on the palm itself it is `forearm`.
+    """
+    R, J, q, slope, F = search.turned, search.J, search.q, search.slope, belief.forearm
+    K = 0
+    if belief.on_forearm[0] > 0.0:
+        K = 5
+        bent_palm(F, z[BEND], z[BEND + 1], R, search.bend_axes)
+        for i in range(3):  # how the rig turns the sensed palm by each unknown, in rig axes
+            for a in range(3):
+                slope[a, i] = belief.axes[a, i]
+            slope[3, i], slope[4, i] = search.bend_axes[0, i], search.bend_axes[1, i]
+        for i in range(3):
+            search.off[i] = 0.0
+            for a in range(3):
+                search.off[i] += belief.axes[a, i] * (z[TILT + a] - belief.z[TILT + a])
+        turn_by(search.off, R, search.palm)
+    else:
+        for i in range(3):
+            for j in range(3):
+                search.palm[i, j] = F[i, j]
+    turn_between(T, search.palm, J, q)
+    turn_slope(q, J)
+    L, w = belief.turn_info, search.off
+    cost = 0.0
+    for i in range(3):
+        w[i] = L[i, 0] * q[0] + L[i, 1] * q[1] + L[i, 2] * q[2]
+        cost += 0.5 * w[i] * q[i]
+    # Rows of the unknowns: the palm's turn in front of T by J, the sensed palm's by -J' (from behind).
+    D = search.by_turn
+    for i in range(3):
+        for c in range(3):
+            D[i, c] = J[c, i]
+    for a in range(K):
+        for c in range(3):
+            D[3 + a, c] = -(J[0, c] * slope[a, 0] + J[1, c] * slope[a, 1] + J[2, c] * slope[a, 2])
+    for a in range(3 + K):
+        ia = a if a < 3 else _column(n, a - 3)
+        gradient[ia] += D[a, 0] * w[0] + D[a, 1] * w[1] + D[a, 2] * w[2]
+        for b in range(3 + K):
+            ib = b if b < 3 else _column(n, b - 3)
+            total = 0.0
+            for i in range(3):
+                for j in range(3):
+                    total += D[a, i] * L[i, j] * D[b, j]
+            normal[ia, ib] += total
+    return cost
+
+
+@inlined
+def _column(n: int, a: int) -> int:
+    """The unknown of tilt 2, heading, flexion, deviation."""
+    return 6 + n + (TILT + a if a < 3 else BEND + a - 3)
+
+
+@inlined
+def turn_by(turn: Float, R: Float, out: Float) -> None:
+    """Write R (3, 3) turned in front by a rotation vector (3,) that is small: to second order."""
+    x, y, z = turn[0], turn[1], turn[2]
+    for j in range(3):
+        a, b, c = R[0, j], R[1, j], R[2, j]
+        u, v, w = y * c - z * b, z * a - x * c, x * b - y * a
+        out[0, j] = a + u + 0.5 * (y * w - z * v)
+        out[1, j] = b + v + 0.5 * (z * u - x * w)
+        out[2, j] = c + w + 0.5 * (x * v - y * u)
+
+
+@inner
+def finger_rows(
+    rig: Rig, belief: Belief, f: int, z: Float, n: int, gradient: Float, normal: Float, search: Search
+) -> float:
+    """Add the rows of finger f, of angles `search.rows.angles`; return their cost.
+
+    `search.palm_camera` and `search.bend_axes` are those of the bend.
+    """
+    hand, sights, work, surface = rig.hand, belief.sights, search.rows, search.surface
+    start = hand.first[f]
+    count, base = hand.first[f + 1] - start, 6 + n
+    J, r, w, at = search.local_J, search.local_r, search.local_w, search.at
+    for c in range(count):
+        at[c] = 6 + start + c
+    at[count], at[count + 1], at[count + 2], at[count + 3] = (
+        base + f,
+        base + BEND,
+        base + BEND + 1,
+        base + LIGHT,
+    )
+    size, cost = count + 4, 0.0
+    if sights.lit[f] == 0.0 and sights.shown[f] == 0.0:
+        return 0.0
+    look(hand, rig.device, search.palm_camera, search.bend_axes, work.angles, f, MOVES, surface)
+    for what in range(2):
+        if (what == 0 and sights.lit[f] == 0.0) or (what == 1 and sights.shown[f] == 0.0):
+            continue
+        rows, first = 2, 0
+        if what == 0:
+            W = sights.laser_W[f]
+            r[0] = surface.seen[0] + sights.lack[f, 0] - sights.laser[f, 0]
+            r[1] = surface.seen[1] + sights.lack[f, 1] - sights.laser[f, 1]
+        else:
+            W, first = sights.tip_W[f], 2
+            r[0], r[1] = surface.seen[2] - sights.tip[f, 0], surface.seen[3] - sights.tip[f, 1]
+            if sights.depth_w2[f] > 0.0:
+                rows = 3
+                r[2] = surface.seen[4] + z[LIGHT] - sights.depth[f]
+        for i in range(rows):
+            for c in range(count):
+                J[i, c] = 0.0
+                for k in range(4):
+                    J[i, c] += surface.J[first + i, k] * work.by[4 * f + k, c]
+            for c in range(3):
+                J[i, count + c] = surface.J[first + i, 4 + c]
+            J[i, count] *= sights.teaches[f]
+            J[i, count + 3] = 1.0 if i == 2 else 0.0
+        for i in range(rows):
+            if i == 2:
+                w[2] = sights.depth_w2[f] * r[2]
+            else:
+                w[i] = W[i, 0] * r[0] + W[i, 1] * r[1]
+            cost += 0.5 * w[i] * r[i]
+        for a in range(size):
+            # What fingers tell of the bend counts for little: they err together, as the device is put on.
+            of_bend = a == count + 1 or a == count + 2
+            share = search.bend_share[0] if of_bend else 1.0
+            for i in range(rows):
+                gradient[at[a]] += share * J[i, a] * w[i]
+            p0 = W[0, 0] * J[0, a] + W[0, 1] * J[1, a]
+            p1 = W[1, 0] * J[0, a] + W[1, 1] * J[1, a]
+            p2 = sights.depth_w2[f] * J[2, a] if rows == 3 else 0.0
+            for b in range(size):
+                total = p0 * J[0, b] + p1 * J[1, b]
+                if rows == 3:
+                    total += p2 * J[2, b]
+                if b == count + 1 or b == count + 2 or of_bend:
+                    total *= search.bend_share[0]
+                normal[at[a], at[b]] += total
+    return cost

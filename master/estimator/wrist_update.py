@@ -1,0 +1,188 @@
+"""Kernels of one epoch for what a wrist device sees: before the fit, and after it."""
+
+from typing import Any
+
+from common.kernels import inner, kernel
+from common.messages import Level
+from master.estimator.extras import predict_extras
+from master.estimator.finger_density import choose, weigh_hands
+from master.estimator.finger_scan import Prior, Scan, scan_finger
+from master.estimator.finger_surface import MOVES, look
+from master.estimator.ground import Ground
+from master.estimator.hand_tables import HandTables
+from master.estimator.hypotheses import Posterior
+from master.estimator.kinematics import Scratch, angles_of, clamp, free_of
+from master.estimator.problem import Belief, Rig, Search
+from master.estimator.settings import Settings
+from master.estimator.solve import palm_off
+from master.estimator.state import NEVER_NS, HandState
+from master.estimator.workspace import Model, Task
+from master.estimator.wrist_device import BEND, EXTRAS, LIGHT, Sights, bent_palm, loosen
+
+_FK, _IK = int(Level.FK), int(Level.IK)
+
+
+@inner
+def _expected(
+    hand: HandTables,
+    device: Any,
+    settings: Settings,
+    state: HandState,
+    task: Task,
+    sights: Sights,
+    scan: Scan,
+    prior: Prior,
+) -> None:
+    """Write what is believed of the fingers before a triple; bring what was seen to the epoch, by their rates."""
+    dt_s = (task.t_ns[0] - state.t_ns[0]) * 1e-9
+    fresh = task.continuous[0] > 0 and state.known[0] > 0 and 0.0 < dt_s <= settings.forget_s
+    prior.light[0], prior.light2[0] = state.z[LIGHT], state.z_cov[LIGHT, LIGHT]
+    for f in range(5):
+        prior.twist[f], prior.twist2[f] = state.z[f], max(state.z_cov[f, f], 1e-8)
+        told_s = (task.t_ns[0] - state.told_ns[f]) * 1e-9
+        recent = fresh and told_s <= settings.forget_s
+        prior.recent[f] = 1.0 if recent else 0.0
+        known = recent and state.level[f] > 0 and state.vague[f] == 0 and told_s <= settings.tracked_triple_s
+        state.searched[f] = state.searched[f] + 1 if known else 0
+        known = known and state.searched[f] % settings.search_again != 0
+        prior.near_rad[f] = settings.near_rad if known else 0.0
+        for k in range(4 * f, 4 * f + 4):
+            scan.angles[k] = settings.curled_rad  # somewhere
+            if recent:
+                scan.angles[k] = state.angles[k]
+        prior.last[f] = scan.angles[4 * f + 2]
+        prior.walked[f] = max(settings.walk_rad_s * told_s, settings.goes_on_rad)
+        if sights.lit[f] == 0.0 and sights.shown[f] == 0.0:
+            continue
+        look(hand, device, prior.palm, prior.bend_axes, scan.angles, f, MOVES, scan.surface)
+        J = scan.surface.J
+        loosen(sights.laser_W[f], J, 0, state.z_cov)
+        loosen(sights.tip_W[f], J, 2, state.z_cov)
+        if not recent:
+            continue
+        for k in range(4):
+            rate = state.rates[4 * f + k]
+            for i in range(2):
+                sights.laser[f, i] -= J[i, k] * rate * sights.laser_s[0]
+                sights.tip[f, i] -= J[2 + i, k] * rate * sights.tip_s[0]
+            sights.depth[f] -= J[4, k] * rate * sights.tip_s[0]
+
+
+@kernel
+def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
+    """Step the extras to an epoch, and search the valleys of the fingers that a wrist device sees.
+
+    What no pose explains is no row: a fingertip that is another thing, a laser point on one.
+
+    Args:
+        model: What is the same at every epoch.
+        boxed_state: (1,) `HandState` of the epoch before; its extras are stepped.
+        boxed_space: (1,) `Workspace`, with the task and what is seen.
+    """
+    state, space, settings = boxed_state[0], boxed_space[0], model.settings[0]
+    hand, device, task, belief = model.hand[0], model.device[0], space.task, space.belief
+    sights, scan, prior = belief.sights, space.scan, space.prior
+    dt_s = 0.0 if state.z_ns[0] == NEVER_NS else (task.t_ns[0] - state.z_ns[0]) * 1e-9
+    predict_extras(settings, state, dt_s, task.walked_rad2[0], belief, space.extras)
+    state.z_ns[0] = task.t_ns[0]
+    for i in range(state.z.shape[0]):
+        space.room.start_z[i] = state.z[i]
+    for f in range(5):
+        scan.known[f] = sights.teaches[f] = 0.0
+        task.refused[f] = task.off[f] = task.ambiguous[f] = False
+        task.level[f] = 0
+    if state.z.shape[0] < EXTRAS or sights.rows[0] == 0.0:
+        return
+    bent_palm(device.palm, state.z[BEND], state.z[BEND + 1], prior.palm, prior.bend_axes)
+    _expected(hand, device, settings, state, task, sights, scan, prior)
+    for f in range(5):
+        if sights.lit[f] == 0.0:
+            if prior.recent[f] == 0.0:
+                sights.shown[f] = 0.0
+            continue
+        scan_finger(hand, device, settings, sights, prior, f, sights.shown[f] > 0.0, scan)
+        if prior.near_rad[f] > 0.0 and scan.misfit[f] > settings.refused:
+            prior.near_rad[f] = 0.0
+            scan_finger(hand, device, settings, sights, prior, f, sights.shown[f] > 0.0, scan)
+        if scan.misfit[f] > settings.refused and sights.depth_w2[f] > 0.0:
+            sights.depth_w2[f] = 0.0  # a tip may shine, or lie in shade: what it is off then is its light
+            scan_finger(hand, device, settings, sights, prior, f, True, scan)
+        explained = settings.refused if sights.depth_w2[f] > 0.0 else settings.doubted
+        if scan.misfit[f] > explained and sights.shown[f] > 0.0:
+            task.refused[f], sights.shown[f] = True, 0.0
+            scan_finger(hand, device, settings, sights, prior, f, False, scan)
+        if scan.misfit[f] > settings.refused:
+            task.off[f], sights.lit[f], scan.known[f] = True, 0.0, 0.0
+    weigh_hands(hand, settings, sights, prior, scan)
+    for f in range(5):
+        if scan.known[f] > 0.0:
+            choose(hand, settings, sights, prior, f, scan)
+            for k in range(4):
+                task.scanned[4 * f + k] = scan.mode[f, k]
+            task.level[f] = _IK if sights.shown[f] > 0.0 else _FK
+            task.ambiguous[f] = scan.parts[f] > 1.5
+            # The unit of light is learnt a little at a time, and nothing of a finger that is in doubt.
+            doubted = task.ambiguous[f] or scan.misfit[f] > settings.doubted
+            sights.teaches[f] = 1.0 if sights.shown[f] > 0.0 and not doubted else 0.0
+            sights.depth_w2[f] *= 0.0 if doubted else settings.light_share
+
+
+@inner
+def extras_alone(belief: Belief, found: Posterior, search: Search) -> None:
+    """Move the extras to where this instant alone has them, as its covariance has it.
+
+    At the solution the pull of the past is that of the instant, reversed: a Newton step without it.
+    """
+    n, K, off = found.x.shape[0], found.z.shape[0], search.off
+    palm_off(found.palm, belief.palm, off)
+    depth = 0.0
+    for i in range(3):
+        depth += belief.sight[i] * off[3 + i]
+    for i in range(6):
+        search.step[i] = belief.palm_w2[i] * off[i]
+        if i >= 3:
+            search.step[i] += belief.depth_w2[0] * depth * belief.sight[i - 3]
+    for i in range(n):
+        search.step[6 + i] = belief.past_w2[i] * (found.x[i] - belief.past[i])
+    for k in range(K):
+        total = 0.0
+        for j in range(6 + n):
+            total += found.cov[6 + n + k, j] * search.step[j]
+        found.z[k] += total / found.scale[0]
+
+
+@inner
+def take_scanned(rig: Rig, ground: Ground, scan: Scan, found: Posterior, work: Scratch) -> None:
+    """Take fingers without markers from their valleys: the median, and a covariance that holds all of it.
+
+    What the others know of the finger beside its PIP, the fit's covariance given the PIP says.
+    """
+    hand, cov = rig.hand, found.cov
+    angles_of(hand, found.x, work.angles, work.by)
+    for f in range(5):
+        if scan.known[f] > 0.0 and ground.rests[f] == 0:
+            for k in range(4):
+                work.angles[4 * f + k] = scan.out[f, k]
+    clamp(hand, work.angles)
+    free_of(hand, work.angles, found.x)
+    for f in range(5):
+        if scan.known[f] == 0.0 or ground.rests[f] > 0:
+            continue
+        first, count = 6 + hand.first[f], hand.first[f + 1] - hand.first[f]
+        pip, N = first + 2, cov.shape[0]
+        was = cov[pip, pip]
+        for i in range(N):
+            work_i = cov[i, pip] / was
+            if first <= i < first + count:
+                continue
+            for c in range(count):  # with the rest of the hand it varies as its PIP does
+                cov[i, first + c] = cov[first + c, i] = work_i * scan.way[f, c] * min(was, scan.pip2[f])
+        for c in range(count):
+            for d in range(c + 1):
+                if c == 2 or d == 2:
+                    continue
+                given = cov[first + c, first + d] - cov[first + c, pip] * cov[first + d, pip] / was
+                cov[first + c, first + d] = given + scan.pip2[f] * scan.way[f, c] * scan.way[f, d]
+                cov[first + d, first + c] = cov[first + c, first + d]
+        for c in range(count):
+            cov[first + c, pip] = cov[pip, first + c] = scan.pip2[f] * scan.way[f, c]

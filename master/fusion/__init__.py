@@ -1,1 +1,0 @@
-"""One hand from several sensors at once: marker rigs, the wrist device, and the IMU on its forearm."""

@@ -1,0 +1,170 @@
+"""The fused line through its own door: streams that go and come back, and what it says of itself meanwhile."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from bench.fusion_scene import Both, Observed
+from bench.fusion_shown import shown
+from bench.fusion_solved import Solved, solve
+from bench.played import START_NS
+from common.arrays import Bool
+from common.hand_model import CHAINS
+from common.messages import HandPose, ImuSample, Level, MarkerDetections, Source, WristDetections
+from master.estimator.fused import FusedPipeline
+from master.estimator.settings import DEFAULT
+from master.rig_pipeline import pipeline_of
+from master.stages import StageTimes
+
+SECONDS, GONE_S, BACK_S = 3.2, 1.8, 2.5
+Seen = tuple[Both, list[Observed]]
+
+
+@pytest.fixture(scope="module")
+def seen() -> Seen:
+    """What all sensors say of a hand that curls."""
+    both = shown("both-curl", SECONDS, 3)
+    assert any(isinstance(message, ImuSample) for message in both.messages)
+    return both.both, both.messages
+
+
+def gone(message: Observed) -> bool:
+    """Whether a message falls into the time in which a stream is cut off."""
+    return GONE_S < 1e-9 * (message.t_ns - START_NS) < BACK_S
+
+
+def without(seen: Seen, left_out: Callable[[Observed], bool]) -> Solved:
+    both, messages = seen
+    return Solved.of(both, solve(both.fused, [one for one in messages if not left_out(one)]), both.fused)
+
+
+@pytest.fixture(scope="module")
+def whole(seen: Seen) -> Solved:
+    return without(seen, lambda _: False)
+
+
+@pytest.fixture(scope="module")
+def cut(seen: Seen) -> Solved:
+    """With the marker cameras away for a while."""
+    return without(seen, lambda message: isinstance(message, MarkerDetections) and gone(message))
+
+
+def away(cut: Solved) -> Bool:
+    """Poses while no marker camera spoke."""
+    return (cut.t_s > GONE_S + 0.05) & (cut.t_s < BACK_S - 0.05)
+
+
+def test_poses_come_at_the_triples_while_the_cameras_are_silent(whole: Solved, cut: Solved) -> None:
+    assert (np.diff(cut.poses.t_ns) > 0).all()
+    alone = cut.t_s[away(cut)]
+    assert np.diff(alone) == pytest.approx(1.0 / 30.0, abs=2e-3)
+    assert np.diff(whole.t_s).max() < 0.02
+
+
+def test_fingers_are_seen_and_the_palm_is_held_meanwhile(cut: Solved) -> None:
+    at = away(cut)
+    assert (cut.poses.source[at][:, CHAINS[1:].ravel()] == Source.WRIST).mean() > 0.7
+    tracked = cut.poses.tracked[at]
+    # Nobody sees where the hand is, and it may have gone.
+    assert not tracked[cut.t_s[at] > GONE_S + 0.25].any()
+    if tracked.any():
+        assert cut.off_mm[at][tracked[:, 1:]].max() < 1e3 * DEFAULT.tracked_m
+    assert cut.poses.valid[at].all()
+    assert np.nanmean(cut.pip_deg[at][:, 1:]) < 12.0
+
+
+def test_nothing_leaps_when_the_cameras_go_or_come_back(cut: Solved) -> None:
+    steps = cut.steps_mm
+    about = (np.abs(cut.t_s[1:] - GONE_S) < 0.2) | (np.abs(cut.t_s[1:] - BACK_S) < 0.4)
+    assert np.nanmax(steps[about]) < 8.0
+    assert cut.poses.tracked[cut.t_s > SECONDS - 0.15].mean() > 0.6
+
+
+def test_a_palm_that_nobody_sees_is_doubted_more_and_more(cut: Solved) -> None:
+    at = away(cut)
+    spread = np.sqrt(np.trace(cut.poses.cov_m2[at][:, 1], axis1=1, axis2=2))
+    assert (np.diff(spread) > 0.0).all()
+    assert (np.linalg.eigvalsh(cut.poses.cov_m2[at][:, 1]) > 0.0).all()
+
+
+def test_bend_and_turn_of_the_palm_are_told_with_their_doubt(seen: Seen, whole: Solved) -> None:
+    truth = np.array([seen[0].scene.motion.at(t).bend_rad for t in whole.t_s.tolist()])
+    off = np.abs(whole.poses.wrist_bend_rad - truth)
+    assert np.isfinite(whole.poses.wrist_bend_sigma_rad).all()
+    assert (off < 4.0 * whole.poses.wrist_bend_sigma_rad).mean() > 0.9
+    assert np.isfinite(whole.poses.palm_world_wxyz).all()
+
+
+def test_without_the_wrist_device_the_cameras_go_on_by_themselves(seen: Seen, whole: Solved) -> None:
+    lone = without(seen, lambda message: isinstance(message, WristDetections) and gone(message))
+    at = (lone.t_s > GONE_S + 0.1) & (lone.t_s < BACK_S)
+    np.testing.assert_array_equal(lone.t_s, whole.t_s)
+    assert not (lone.poses.level[at] > 0).any()
+    assert lone.poses.valid[at].all()
+    assert np.nanmedian(lone.off_mm[at]) < 8.0
+    assert (lone.poses.level[lone.t_s > BACK_S + 0.1] > 0).any()
+
+
+def test_without_the_imu_the_palm_is_that_of_the_markers(seen: Seen, whole: Solved) -> None:
+    lone = without(seen, lambda message: isinstance(message, ImuSample) and gone(message))
+    at = (lone.t_s > GONE_S + 0.1) & (lone.t_s < BACK_S - 0.1)
+    assert np.isnan(lone.poses.palm_world_wxyz[at]).all()
+    assert np.isfinite(lone.poses.palm_world_wxyz[lone.t_s > BACK_S + 0.1]).all()
+    assert np.nanmedian(lone.off_mm[at]) < 1.5 * np.nanmedian(whole.off_mm[at]) + 1.0
+
+
+def test_fingers_are_better_with_the_wrist_device_than_without(seen: Seen, whole: Solved) -> None:
+    """Of a hand that closes before cameras that lose its tips."""
+    markers = Solved.of(seen[0], solve(seen[0].markers, seen[1]), seen[0].markers)
+    assert np.nanmean(whole.pip_deg[:, 1:]) < np.nanmean(markers.pip_deg[:, 1:])
+
+
+def door(seen: Seen) -> FusedPipeline:
+    found = pipeline_of(seen[0].fused, StageTimes())
+    assert isinstance(found, FusedPipeline)
+    return found
+
+
+def pushed(pipeline: FusedPipeline, messages: list[Observed]) -> list[HandPose]:
+    out: list[HandPose] = []
+    for message in messages:
+        if isinstance(message, ImuSample):
+            pipeline.push_orientation(message.t_ns, message.orientation_wxyz, message.heading_sigma_rad)
+        else:
+            out += [one.pose for one in pipeline.push(message)]
+    return out
+
+
+def test_late_and_doubled_triples_are_counted_and_change_nothing(seen: Seen) -> None:
+    some = [message for message in seen[1] if 1e-9 * (message.t_ns - START_NS) < 1.0]
+    doubled: list[Observed] = []
+    before: WristDetections | None = None
+    for message in some:
+        doubled.append(message)
+        if isinstance(message, WristDetections):
+            doubled.append(message)
+            if before is not None:
+                doubled.append(before)
+            before = message
+    plain, troubled = door(seen), door(seen)
+    expected, got = pushed(plain, some), pushed(troubled, doubled)
+    assert len(got) == len(expected) > 40
+    for a, b in zip(expected, got, strict=True):
+        np.testing.assert_array_equal(a.position_m, b.position_m)
+    assert troubled.counts["late"] == len(doubled) - len(some)
+    assert plain.counts["late"] == 0
+
+
+def test_the_same_messages_make_the_same_poses(seen: Seen) -> None:
+    some = [message for message in seen[1] if 1e-9 * (message.t_ns - START_NS) < 0.6]
+    for a, b in zip(pushed(door(seen), some), pushed(door(seen), some), strict=True):
+        np.testing.assert_array_equal(a.position_m, b.position_m)
+        np.testing.assert_array_equal(a.cov_m2, b.cov_m2)
+
+
+def test_levels_are_told_with_the_poses(whole: Solved) -> None:
+    told = whole.poses.level[whole.t_s > 1.2]
+    assert (told[:, 1:] > 0).mean() > 0.8
+    assert (told[:, 1:] == Level.IK).any()
+    assert np.isfinite(whole.poses.laser_m[whole.t_s > 1.2]).mean() > 0.7

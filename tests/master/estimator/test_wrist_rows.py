@@ -1,0 +1,186 @@
+"""Rows of a wrist device and of its IMU: gradient and normal equations of each kind against finite differences."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common.arrays import Float
+from common.geometry import axis_rotation, matrix_to_rotation_vector, rotation_vector_to_matrix
+from common.wrist_bend import forearm_palm
+from master.estimator.wrist_device import BEND, HEADING, LIGHT, TILT
+from tests.hand_helpers import any_rotation
+from tests.master.estimator.kernels import turn_slope_at
+from tests.master.estimator.whole import Whole, silent
+from tests.master.estimator.worn import Seen, Worn
+
+seeds = st.integers(0, 2**32 - 1)
+BENT = np.radians([-8.0, 4.0])
+
+
+@pytest.fixture(scope="module")
+def worn(root: Path) -> Worn:
+    return Worn.of(root)
+
+
+def hand(worn: Worn, seed: int) -> tuple[Whole, Seen]:
+    """One before the device, of which nothing is believed, and what is seen of it."""
+    whole = Whole(worn.model, seed, worn.device)
+    silent(whole)
+    whole.z[:5], whole.z[BEND : BEND + 2] = whole.rng.normal(0.0, 0.05, 5), BENT
+    whole.z[LIGHT] = whole.rng.normal()
+    angles = whole.parameters.angles(whole.x)
+    return whole, worn.looks(angles, BENT, whole.z[:5])
+
+
+def spd(rng: np.random.Generator, n: int) -> Float:
+    root = rng.normal(size=(n, n))
+    return root @ root.T + 0.1 * np.eye(n)
+
+
+def laser(whole: Whole, seen: Seen, off: float) -> None:
+    sights = whole.belief.sights
+    sights.rows[0], sights.lit[:], sights.teaches[:] = 1.0, 1.0, 1.0
+    sights.lack[:] = whole.rng.normal(0.0, 0.02, (5, 2))
+    sights.laser[:] = seen.ridge + sights.lack + off * whole.rng.normal(size=(5, 2))
+    sights.laser_W[:] = [spd(whole.rng, 2) for _ in range(5)]
+
+
+def tip(whole: Whole, seen: Seen, off: float) -> None:
+    sights = whole.belief.sights
+    sights.rows[0], sights.shown[:], sights.teaches[:] = 1.0, 1.0, 1.0
+    sights.tip[:] = seen.tip + off * whole.rng.normal(size=(5, 2))
+    sights.tip_W[:] = [spd(whole.rng, 2) for _ in range(5)]
+
+
+def tip_depth(whole: Whole, seen: Seen, off: float) -> None:
+    tip(whole, seen, off)
+    sights = whole.belief.sights
+    sights.depth[:] = np.log(seen.depth_m) + whole.z[LIGHT] + off * whole.rng.normal(size=5)
+    sights.depth_w2[:] = whole.rng.uniform(1.0, 9.0, 5)
+
+
+def turn(whole: Whole, seen: Seen, off: float) -> None:
+    """Of a forearm that is turned `off` from where it would put the palm; tilt and heading are as they were."""
+    belief, rng = whole.belief, whole.rng
+    palm = rotation_vector_to_matrix(off * rng.normal(size=3)) @ whole.T[:3, :3]
+    belief.forearm[:3, :3] = palm @ forearm_palm(BENT).T
+    belief.turn_info[:], belief.turned[0], belief.on_forearm[0] = spd(rng, 3), 1.0, 1.0
+    belief.axes[:] = any_rotation(rng)
+    whole.z[TILT : HEADING + 1] = belief.z[TILT : HEADING + 1] = rng.normal(0.0, 0.2, 3)
+
+
+def largest(whole: Whole, numeric: Float) -> Float:
+    """The largest of turn, shift, angles, and extras, each with a unit of its own."""
+    size = np.array([3, 3, whole.n, len(whole.z)])
+    parts = np.split(np.abs(numeric).reshape(len(numeric), -1), np.cumsum(size)[:-1])
+    return np.repeat([max(float(part.max()), 1e-3) for part in parts], size)
+
+
+KINDS = [(laser, 0.35), (tip, 1e-5), (tip_depth, 1e-5), (turn, 1e-5)]
+
+
+@pytest.mark.parametrize(("kind", "share"), KINDS[1:])
+def test_the_gradient_of_each_kind_of_row_is_the_derivative_of_its_cost(
+    worn: Worn, kind: Callable[[Whole, Seen, float], None], share: float
+) -> None:
+    for seed in range(6):
+        whole, seen = hand(worn, seed)
+        kind(whole, seen, 0.3)
+        _, gradient, normal = whole.cost()
+        numeric = whole.slope()
+        assert np.abs(numeric).max() > 0.01
+        np.testing.assert_array_less(np.abs(gradient - numeric), share * largest(whole, numeric))
+        np.testing.assert_allclose(normal, normal.T, atol=1e-9 * np.abs(normal).max())
+        assert np.linalg.eigvalsh(normal).min() > -1e-9 * np.abs(normal).max()
+
+
+def test_the_laser_row_is_that_of_ridge_and_lack(worn: Worn) -> None:
+    """Of what `look` says of angles, twist and bend, by plain algebra."""
+    for seed in range(4):
+        whole, seen = hand(worn, seed)
+        laser(whole, seen, 0.3)
+        sights, n = whole.belief.sights, whole.n
+        by_free = whole.parameters.by_angles(whole.x).reshape(5, 4, n)
+        expected, cost = np.zeros(6 + n + len(whole.z)), 0.0
+        for f in range(5):
+            r = seen.ridge[f] + sights.lack[f] - sights.laser[f]
+            pull = seen.by[f, :2].T @ sights.laser_W[f] @ r
+            expected[6 : 6 + n] += by_free[f].T @ pull[:4]
+            expected[6 + n + f] += pull[4]
+            expected[6 + n + BEND : 6 + n + BEND + 2] += pull[5:]
+            cost += 0.5 * r @ sights.laser_W[f] @ r
+        found, gradient, _ = whole.cost()
+        assert found == pytest.approx(cost, rel=1e-9)
+        np.testing.assert_allclose(gradient, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(("kind", "share"), KINDS)
+def test_the_normal_matrix_is_the_bend_of_the_cost_where_nothing_is_off(
+    worn: Worn, kind: Callable[[Whole, Seen, float], None], share: float
+) -> None:
+    for seed in range(3):
+        whole, seen = hand(worn, seed)
+        kind(whole, seen, 0.0)
+        cost, gradient, normal = whole.cost()
+        assert abs(cost) < 1e-12
+        np.testing.assert_allclose(gradient, 0.0, atol=1e-6)
+        numeric = whole.bend_of_cost()
+        np.testing.assert_allclose(normal, numeric, atol=share * np.abs(numeric).max())
+
+
+def test_rows_that_are_not_seen_say_nothing(worn: Worn) -> None:
+    whole, seen = hand(worn, 1)
+    tip_depth(whole, seen, 0.3)
+    laser(whole, seen, 0.3)
+    whole.belief.sights.lit[:] = whole.belief.sights.shown[:] = 0.0
+    cost, gradient, normal = whole.cost()
+    assert cost == 0.0
+    assert not gradient.any()
+    assert not normal.any()
+
+
+@pytest.mark.parametrize("teaches", [True, False])
+def test_a_finger_tells_its_own_angles_and_twist_and_the_bend(worn: Worn, teaches: bool) -> None:
+    """One that is in doubt teaches nothing of its hinges."""
+    whole, seen = hand(worn, 2)
+    tip_depth(whole, seen, 0.3)
+    laser(whole, seen, 0.3)
+    sights = whole.belief.sights
+    sights.lit[:] = sights.shown[:] = np.arange(5) == 2
+    sights.teaches[:] = teaches
+    _, gradient, _ = whole.cost()
+    own, extras = np.flatnonzero(whole.parameters.free // 4 == 2), 6 + whole.n
+    moved = set(np.flatnonzero(gradient).tolist())
+    allowed = {*(6 + own).tolist(), extras + BEND, extras + BEND + 1, extras + LIGHT}
+    assert moved <= (allowed | {extras + 2})
+    assert {extras + BEND, extras + BEND + 1, extras + LIGHT} <= moved
+    assert (extras + 2 in moved) == teaches
+
+
+def test_tilt_and_heading_away_from_the_believed_turn_the_palm(worn: Worn) -> None:
+    """To second order: of a few degrees the cost's slope is right to a few percent."""
+    for seed in range(4):
+        whole, seen = hand(worn, seed)
+        turn(whole, seen, 0.1)
+        whole.z[TILT : HEADING + 1] += whole.rng.normal(0.0, 0.05, 3)
+        _, gradient, _ = whole.cost()
+        numeric = whole.slope()
+        np.testing.assert_array_less(np.abs(gradient - numeric), 0.1 * largest(whole, numeric))
+
+
+@given(seeds, st.sampled_from([0.0, 1e-6, 0.1, 1.0, 3.0]))
+def test_a_small_turn_changes_the_rotation_vector_as_its_derivative_says(seed: int, angle_rad: float) -> None:
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=3)
+    vector = angle_rad * axis / np.linalg.norm(axis)
+    by, rotation = np.empty((3, 3)), rotation_vector_to_matrix(vector)
+    turn_slope_at(vector, by)
+    for k in range(3):
+        ends = [
+            matrix_to_rotation_vector(axis_rotation(k, way * 1e-5) @ rotation) / 2e-5 for way in (1.0, -1.0)
+        ]
+        np.testing.assert_allclose(ends[0] - ends[1], by[:, k], atol=1e-4)

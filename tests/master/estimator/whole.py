@@ -1,0 +1,111 @@
+"""A hand of which tests say what is believed and measured, and its normal equations against finite differences."""
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+
+from common.arrays import Float
+from common.calibration import Couplings
+from common.geometry import rigid, rotation_vector_to_matrix
+from common.hand_model import HandModel
+from common.hand_presets import preset_couplings, preset_limits
+from common.hand_profiles import generated_profile
+from common.kernels import constant
+from common.records import boxed
+from master.estimator.cameras import CameraArrays
+from master.estimator.hand_tables import HandTables, Mounts
+from master.estimator.parameters import HandParameters
+from master.estimator.priors import habits_of
+from master.estimator.problem import Belief, Search
+from master.estimator.residuals import Observations
+from master.estimator.settings import DEFAULT
+from master.estimator.workspace import Model
+from master.estimator.wrist_device import EXTRAS, NO_EXTRAS, Device
+from tests.hand_helpers import MARKERS, natural_angles, palm
+from tests.master.estimator.fitted import PAIR
+from tests.master.estimator.kernels import linearise_at
+
+LENS = np.array([-0.3, 0.12, 1e-3, -2e-3, -0.02])
+CAMERAS = (PAIR[0], replace(PAIR[1], distortion=LENS))
+H = 1e-6
+
+
+def made(side: str, preset: str, coupled: bool) -> HandModel:
+    profile = generated_profile("made", side)
+    limits = preset_limits("K" if preset == "K" else "D")
+    couplings = preset_couplings("D") if coupled else Couplings(dip_per_pip=None)
+    return HandModel.of(msgspec.structs.replace(profile, limits_rad=limits, couplings=couplings))
+
+
+MODELS = {
+    "right K": made("right", "K", True),
+    "left D": made("left", "D", True),
+    "free": made("right", "K", False),
+}
+
+
+class Whole:
+    """A hand somewhere, of which nothing is believed or measured until it is said."""
+
+    def __init__(self, model: HandModel, seed: int, device: Device | None = None) -> None:
+        self.model, self.rng, self.h = model, np.random.default_rng(seed), constant(seed % 2)
+        self.parameters = HandParameters.of(model)
+        n, K = len(self.parameters.free), NO_EXTRAS if device is None else EXTRAS
+        self.n = n
+        self.T, angles = palm(self.rng.uniform(-30.0, 30.0, 3)), natural_angles(self.rng)
+        low, high = self.parameters.low, self.parameters.high
+        self.x = np.clip(self.parameters.of_angles(angles), low + 0.02, high - 0.02)
+        self.z = np.zeros(K)
+        self.points = model.marker_points(model.forward(self.T, self.parameters.angles(self.x)), MARKERS)
+        self.habits = habits_of(model, self.parameters)
+        self.belief, self.search = Belief.none(n, K), Search.empty(n, K, 16)
+        self.observed = Observations.empty(2, 6)
+        self.rig = Model(
+            boxed(HandTables.of(model, self.parameters)),
+            boxed(DEFAULT.record()),
+            Mounts.of(model, MARKERS),
+            CameraArrays.of(CAMERAS),
+            boxed(Device.none() if device is None else device),
+        )
+
+    def cost(self, step: Float | None = None) -> tuple[float, Float, Float]:
+        """Cost, gradient and normal matrix at a step (N,) from the hand."""
+        N = 6 + self.n + len(self.z)
+        by = np.zeros(N) if step is None else step
+        T = rigid(rotation_vector_to_matrix(by[:3]) @ self.T[:3, :3], self.T[:3, 3] + by[3:6])
+        gradient, normal = np.empty(N), np.empty((N, N))
+        cost = linearise_at(
+            self.rig, self.habits, boxed(self.belief), self.observed, self.h, T,
+            self.x + by[6 : 6 + self.n], self.z + by[6 + self.n :], gradient, normal, boxed(self.search),
+        )  # fmt: skip
+        return float(cost), gradient, normal
+
+    def slope(self, step_size: float = H) -> Float:
+        """The gradient (N,) by central differences."""
+        N = 6 + self.n + len(self.z)
+        steps = step_size * np.eye(N)
+        return np.array([(self.cost(e)[0] - self.cost(-e)[0]) / (2.0 * step_size) for e in steps])
+
+    def bend_of_cost(self, step_size: float = H) -> Float:
+        """The second derivatives (N, N) of the cost, as central differences of its gradient."""
+        N = 6 + self.n + len(self.z)
+        steps = step_size * np.eye(N)
+        return np.array([(self.cost(e)[1] - self.cost(-e)[1]) / (2.0 * step_size) for e in steps])
+
+    def check(self, share: float) -> None:
+        """The gradient against finite differences, to a share of its largest component."""
+        _, gradient, normal = self.cost()
+        numeric = self.slope()
+        size = np.array([3, 3, self.n, len(self.z)])  # turn, shift, angles and extras have units of their own
+        largest = np.repeat([max(float(np.abs(part).max()), 1e-3) for part in
+                             np.split(numeric, np.cumsum(size)[:-1])], size)  # fmt: skip
+        np.testing.assert_array_less(np.abs(gradient - numeric), share * largest)
+        np.testing.assert_allclose(normal, normal.T, atol=1e-9 * np.abs(normal).max())
+        assert np.linalg.eigvalsh(normal).min() > -1e-9 * np.abs(normal).max()
+
+
+def silent(whole: Whole) -> None:
+    """Let habits say nothing."""
+    for table in whole.habits:
+        table[:] = 0.0
