@@ -78,11 +78,11 @@ class Found:
         off, tracked = self.off_deg[:, 1:], self.tracked[:, 1:]
         known = np.isfinite(off)
         sure = off[tracked & known]
-        mean = float(sure.mean()) if len(sure) else np.nan
-        thumb = self.off_deg[:, 0]
+        thumb = self.off_deg[np.isfinite(self.off_deg[:, 0]), 0]
+        mean, of_thumb = (float(one.mean()) if len(one) else np.nan for one in (sure, thumb))
         said = (
             f"valid {100.0 * known.mean():.0f} %; TRACKED {100.0 * tracked.mean():.0f} %, off by {mean:.1f}, false"
-            f" {int((sure >= FALSE_DEG).sum())} of {len(sure)}; thumb {float(np.nanmean(thumb)):.1f}, TRACKED"
+            f" {int((sure >= FALSE_DEG).sum())} of {len(sure)}; thumb {of_thumb:.1f}, TRACKED"
             f" {100.0 * self.tracked[:, 0].mean():.0f} %"
         )
         return Row(name, self.pip_deg, "deg", f"{said}; {note}" if note else said)
