@@ -40,9 +40,10 @@ _SMALL = np.ones((3, 3), np.uint8)  # narrower than a finger, wider than a windo
 
 LED_LEAST = 0.08  # share of the cells that LEDs light broadly: a palm fills a sixth of the picture or more
 LED_NEVER = 0.04  # share up to which it is none: the halo of a laser on a near thumb, a hand that moved
+HALO = 0.5  # of the light of the LEDs: what a line scatters over near skin is mostly less
 LASER_LEAST = 8  # cells of flash: the line on one finger
 # How many times as many cells of flash on the hand as there are
-LASER_OF_ELSEWHERE = 2.0  # of flash elsewhere
+LASER_OF_ELSEWHERE = 4.0  # of flash elsewhere
 LASER_OF_OWN = 4.0  # of flash on the hand in the ambient frame: another laser frame has as many
 LASER_OF_EXCESS = 8.0  # of lines within the hand that the ambient frame has and another has not
 VALID_LEAST = 0.25  # share of the cells that are not saturated: with fewer nothing is told
@@ -101,11 +102,13 @@ def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
     if not lit > 0.0 or cv2.countNonZero(laser_gain) <= LASER_LEAST:
         return Evidence(lit, -inf, -inf, -inf)
     led_loss = cv2.subtract(cv2.subtract(ambient, led), explained)
-    steady = -_octaves(max(_broad(over) for over in (laser_gain, laser_loss, led_loss)) / valid, LED_NEVER)
+    beside_halo = cv2.subtract(laser_gain, cv2.multiply(led_gain, HALO))
+    steady = -_octaves(max(_broad(over) for over in (beside_halo, laser_loss, led_loss)) / valid, LED_NEVER)
     if not steady > 0.0:
         return Evidence(lit, -inf, -inf, steady)
     led_over_laser, laser_over_led = _each_over(led, laser)
-    flash = _thin(cv2.min(laser_gain, laser_over_led))
+    line = cv2.subtract(_above_column(laser_gain), cv2.add(_above_column(led_gain), _LINE))
+    flash = _thin(cv2.max(cv2.min(laser_gain, laser_over_led), line))
     if cv2.countNonZero(flash) <= LASER_LEAST:
         return Evidence(lit, -inf, -inf, steady)
     near = _near(cv2.min(led_gain, led_over_laser))
@@ -182,6 +185,11 @@ def _thin(over: _Cells) -> _Cells:
     bright = cv2.threshold(over, _LINE, 255, cv2.THRESH_BINARY)[1]
     high = cv2.morphologyEx(bright, cv2.MORPH_OPEN, _COLUMN)
     return cv2.subtract(bright, high)
+
+
+def _above_column(over: _Cells) -> _Cells:
+    """How far cells are brighter than what is about as bright above or below them."""
+    return cv2.morphologyEx(over, cv2.MORPH_TOPHAT, _COLUMN)
 
 
 def _octaves(value: float, threshold: float) -> float:
