@@ -102,12 +102,12 @@ def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
     if not lit > 0.0 or cv2.countNonZero(laser_gain) <= LASER_LEAST:
         return Evidence(lit, -inf, -inf, -inf)
     led_loss = cv2.subtract(cv2.subtract(ambient, led), explained)
-    beside_halo = cv2.subtract(laser_gain, cv2.multiply(led_gain, HALO))
+    beside_halo = cv2.subtract(laser_gain, cv2.convertScaleAbs(led_gain, alpha=HALO))
     steady = -_octaves(max(_broad(over) for over in (beside_halo, laser_loss, led_loss)) / valid, LED_NEVER)
     if not steady > 0.0:
         return Evidence(lit, -inf, -inf, steady)
     led_over_laser, laser_over_led = _each_over(led, laser)
-    line = cv2.subtract(_above_column(laser_gain), cv2.add(_above_column(led_gain), _LINE))
+    line = cv2.subtract(_above_column(laser_gain), cv2.convertScaleAbs(_above_column(led_gain), beta=_LINE))
     flash = _thin(cv2.max(cv2.min(laser_gain, laser_over_led), line))
     if cv2.countNonZero(flash) <= LASER_LEAST:
         return Evidence(lit, -inf, -inf, steady)
