@@ -62,7 +62,7 @@ class Device:
     def of(cls, setup: WristSetup) -> "Device":
         """Lay out a device."""
         model, skin, axes = setup.model, Skin.of(setup.model), PlaneAxes.of(setup)
-        beyond_m = Fingertips.of(model).beyond_m
+        tips = Fingertips.of(model)
         deep = skin.radius_m - skin.palmar_m
         back, local = np.zeros((5, 3, 3)), np.zeros((5, len(PLACES), 3))
         up = np.array([0.0, 1.0, 0.0])
@@ -89,9 +89,9 @@ class Device:
                 "deep": deep,
                 "local": local,
                 "back": back,
-                "tip": last * (1.0 + beyond_m / length)[:, None],
+                "tip": last * (1.0 + tips.beyond_m / length)[:, None] + tips.dorsal_m * back[:, 2],
                 "skin2": (SPREAD * skin.palmar_m.mean(axis=1)) ** 2,
-                "tip2": (SPREAD * beyond_m) ** 2 + _PALM_M**2,
+                "tip2": (SPREAD * tips.beyond_m) ** 2 + _PALM_M**2,
             },
         )
 

@@ -128,5 +128,7 @@ def find(triple: Triple, view: WristView, engine: Engine = NUMPY) -> WristFound:
     fingers = separate(led, view, engine)
     laser = laser_lines(lit_line(triple.laser.image, ambient), fingers, view, engine)
     # A bent wrist turns fingers before the camera in ways that no posture of the tables has.
-    tips = fingertips(led, triple.led.image, laser.uv, view) if fingers.turn.straight else NO_TIPS
+    tips = NO_TIPS
+    if fingers.turn.straight:
+        tips = fingertips(led, triple.led.image, laser.uv, view, engine.candidates)
     return WristFound(triple, laser, tips)

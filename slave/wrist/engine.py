@@ -7,6 +7,7 @@ from typing import TypeAlias
 from common.arrays import Bool, Image, Int
 from slave.engines import engine_of
 from slave.wrist.corridors import Float32
+from slave.wrist.fingertips import Search, candidates
 from slave.wrist.paths import least_paths
 from slave.wrist.pieces import Pieces, measure
 from slave.wrist.runs import Runs, lines
@@ -27,15 +28,17 @@ class Engine:
         least_paths: As `paths.least_paths`.
         lines: As `runs.lines`.
         measure: As `pieces.measure`.
+        candidates: As `fingertips.candidates`.
     """
 
     energy: Energy
     least_paths: LeastPaths
     lines: Lines
     measure: Measure
+    candidates: Search
 
 
-NUMPY = Engine(energy, least_paths, lines, measure)
+NUMPY = Engine(energy, least_paths, lines, measure, candidates)
 
 
 def engine_named(name: str) -> Engine:

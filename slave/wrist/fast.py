@@ -9,7 +9,7 @@ import numpy as np
 
 from common.arrays import Image, Int
 from slave.markers.fast_compile import compiled
-from slave.wrist import paths, valleys
+from slave.wrist import fast_tips, paths, valleys
 from slave.wrist.corridors import MARGIN, Float32
 from slave.wrist.engine import Engine
 from slave.wrist.fast_lines import lines, measure
@@ -103,6 +103,7 @@ def prepare() -> None:
     measure(runs, np.zeros(len(runs.column), np.int64), drawn.shape[1])
     strips = np.zeros((2, len(valleys.PRIOR)), np.uint8)
     least_paths(energy(strips, 0), (len(valleys.PRIOR),))
+    fast_tips.prepare()
 
 
-NUMBA = Engine(energy, least_paths, lines, measure)
+NUMBA = Engine(energy, least_paths, lines, measure, fast_tips.candidates)

@@ -6,15 +6,16 @@ from the laser points too, whose distance is known. The best ones are where the 
 outline, measured at full resolution (`outline`), says which it is and where exactly.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from common.arrays import Bool, Float, Image, Int
 from slave.wrist.led_depth import SHRINK, Float32, depth_about, led_optics, nearness, shrink
 from slave.wrist.outline import DIRECTIONS as OUTLINE
-from slave.wrist.outline import fitted
+from slave.wrist.outline import Circles, fitted
 from slave.wrist.postures import (
     ABOVE,
     APEX,
@@ -45,16 +46,18 @@ SCALE_SIGMA = 0.12  # of that which all samples of a finger share
 DARKER, AS_BRIGHT = 0.65, 0.95  # of a finger's nearness: what is beyond its end costs nothing, costs all
 ABOVE_MOST, ABOVE_UNKNOWN = 9.0, 0.33  # and of the root of that where the image is saturated
 UNKNOWN_COST = 1.0  # of a sample outside of the image, or where that is saturated
-MOST_COMPARED = 250  # of all hypotheses
 MODES = 4  # places of a finger whose outlines are looked at
 MODE_WITHIN = 24.0  # what they may cost more than the best
 APART = 0.8  # of the radius of a fingertip: places that differ
 SHOWN_WORTH = 30.0  # what an outline that is not seen at all costs
 AT_SIGMA, SIZE_SIGMA = 0.35, 0.12  # of the radius: how far a posture's outline may be from the seen one
+AT_SURE, LASER_SURE_M = 0.1, 8e-4  # how well an outline is seen, of the radius, and a laser point
+TWIST_SIGMA = 0.05  # rad: of the hinges of real fingers
 ENDS_WITHIN = 40.0  # of the best posture's cost: those whose ends are averaged
 CORRELATED = 2.5  # samples that differ for one reason
-# Of an end that is reported; of the thumb, whose four angles are searched less finely, and of the fingers.
-LEAST_SEEN, LEAST_SHOWN, MOST_MISFIT = 0.15, np.array([0.75, 0.6]), np.array([15.0, 20.0])
+# Of an end that is reported, of the thumb, whose four angles are searched less finely, and of the fingers; the misfit
+# of one that is sure to be seen, and of others in proportion.
+LEAST_SHOWN, MOST_MISFIT = np.array([[0.75, 0.6], [15.0, 22.0]])
 # Standard deviations: edges; of the radius, how far flesh is off its cones, and where on its disk an end is that faces
 # the camera; and the misfit at which they are twice as large.
 PIXEL, FLESH, PULP, DOUBTFUL = 0.7, 0.05, 0.08, 40.0
@@ -105,22 +108,26 @@ class Hypotheses:
     """N postures, finger by finger.
 
     Attributes:
+        table: Of postures.
+        rows: (N,) of it.
         finger: (N,).
+        abduction: (N,) by ABDUCTION_RAD.
+        aside: (N,) how far the laser's point is beside where the posture has it [m].
         uv: (N, SAMPLES, 2) [px].
-        near, open, end: As of `Postures`.
         cost: (N,) of what the laser says.
     """
 
+    table: Postures
+    rows: Int
     finger: Int
+    abduction: Float32
+    aside: Float32
     uv: Float32
-    near: Float32
-    open: Float32
-    end: Float32
     cost: Float32
 
 
-def allowed(table: Postures, plane: Float32) -> tuple[Int, Float32, Float32]:
-    """Which rows meet the laser about where each finger (5, 2) [m] does; their abduction and what they cost.
+def allowed(table: Postures, plane: Float32) -> tuple[Int, Float32, Float32, Float32]:
+    """Which rows meet the laser about where each finger (5, 2) [m] does; `abduction`, `aside` and `cost` of them.
 
     The abduction is by Bayes' rule: of a finger that is bent up at its knuckle the laser tells little of it, and rows
     come in three abductions.
@@ -148,6 +155,8 @@ def allowed(table: Postures, plane: Float32) -> tuple[Int, Float32, Float32]:
     wide = np.flatnonzero(spread > VARIANT * UNSURE)
     more = cost[wide] + np.float32(VARIANT**2)
     spread = spread[wide]
+    aside *= np.float32(ASIDE_M)
+    moved = spread * x1.ravel()[rows[wide]]
     off = table.thumb_laser - plane[0, :, None]
     square = off[0] ** 2 + off[1] ** 2
     thumb = np.flatnonzero(square < THUMB_WITHIN_M**2)
@@ -155,14 +164,20 @@ def allowed(table: Postures, plane: Float32) -> tuple[Int, Float32, Float32]:
     return (
         np.concatenate([thumb, rows, rows[wide], rows[wide]]),
         np.concatenate([np.zeros(len(thumb), np.float32), share, share[wide] + spread, share[wide] - spread]),
+        np.concatenate([np.zeros(len(thumb), np.float32), aside, aside[wide] - moved, aside[wide] + moved]),
         np.concatenate([square[thumb] * np.float32(1.0 / THUMB_SIGMA_M**2), cost, more, more]),
     )
+
+
+def on_plane(laser_m: Float, view: WristView) -> Float32:
+    """Laser points (5, 3) [m] in the coordinates of the laser's plane (5, 2) [m]."""
+    return (laser_m @ plane_axes(view).T).astype(np.float32)
 
 
 def hypotheses(laser_m: Float, image: LedImage, gain: float, view: WristView) -> Hypotheses | None:
     """Postures that the laser points (5, 3) [m] allow, and whose fingertips are about as bright as they should be."""
     table = postures_of(view)
-    rows, share, cost = allowed(table, (laser_m @ plane_axes(view).T).astype(np.float32))
+    rows, share, aside, cost = allowed(table, on_plane(laser_m, view))
     seen, bound, outside = image.at(_at(table.middle[rows], share))
     off = _logarithm(seen, table.near[rows, END] * np.float32(gain), bound)
     kept = np.flatnonzero((np.abs(off) < MOST_OFF) & ~outside)
@@ -171,9 +186,7 @@ def hypotheses(laser_m: Float, image: LedImage, gain: float, view: WristView) ->
     kept = kept[np.argsort(rows[kept], kind="stable")]
     rows, share = rows[kept], share[kept]
     finger = np.maximum((rows - table.thumb) // table.laser.shape[-1] + 1, 0)
-    return Hypotheses(
-        finger, _at(table.uv[rows], share), table.near[rows], table.open[rows], table.end[rows], cost[kept]
-    )
+    return Hypotheses(table, rows, finger, share, aside[kept], _at(table.uv[rows], share), cost[kept])
 
 
 def _at(parabola: Float32, share: Float32) -> Float32:
@@ -196,7 +209,7 @@ def _logarithm(seen: Float32, predicted: Float32, bound: Bool) -> Float32:
 def costs(some: Hypotheses, image: LedImage, gain: float) -> Float32:
     """Minus twice the logarithm of the likelihood (N,) of hypotheses by laser and samples."""
     seen, bound, outside = image.at(some.uv[:, :APEX])
-    predicted = some.near * np.float32(gain)
+    predicted = some.table.near[some.rows] * np.float32(gain)
     off = _logarithm(seen[:, BONES], predicted[:, BONES], bound[:, BONES])
     most = np.float32(3.0 * OWN_SIGMA + SCALE_SIGMA)
     count = off.shape[1]
@@ -222,9 +235,9 @@ def modes(some: Hypotheses, cost: Float32) -> Int:
     least = np.repeat(np.minimum.reduceat(cost, first), np.diff(first, append=len(cost)))
     more = cost - least
     good = np.flatnonzero(more < MODE_WITHIN)
-    order = good[np.argsort(more[good])][:MOST_COMPARED]
+    order = good[np.argsort(more[good])]
     u, v = some.uv[order, END].T.tolist()
-    near = (APART * some.end[order, 0]).tolist()
+    near = (APART * some.table.end[some.rows[order], 0]).tolist()
     out: list[int] = []
     kept: tuple[list[tuple[float, float, float]], ...] = ([], [], [], [], [])
     for k, finger, x, y, r in zip(order.tolist(), some.finger[order].tolist(), u, v, near, strict=True):
@@ -260,29 +273,7 @@ class Candidates:
     seen: Float
 
 
-def fingertips(led: Image, frame: Image, laser_uv: Float, view: WristView) -> Fingertips:
-    """Find them in one LED image.
-
-    Args:
-        led: (H, W) difference of LED and ambient frame.
-        frame: (H, W) the LED frame itself, which says where the image is saturated.
-        laser_uv: (5, 2) where the laser meets the fingers [px]; NaN: not seen, then its tip is not sought.
-        view: Device and hand; the wrist is straight.
-    """
-    out = Fingertips(np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan))
-    optics = led_optics(view)
-    near = nearness(shrink(led), optics)
-    found = candidates(led, LedImage(near, frame[1::SHRINK, 1::SHRINK] > CLIPPED), laser_uv, view)
-    if found is None:
-        return out
-    kind = np.minimum(found.finger, 1)
-    good = (found.seen > LEAST_SEEN) & (found.shown > LEAST_SHOWN[kind]) & (found.misfit < MOST_MISFIT[kind])
-    for k in np.flatnonzero(good).tolist():
-        finger, at = int(found.finger[k]), found.uv[k]
-        depth = depth_about(near, optics, float(at[0]), float(at[1]), float(found.radius_px[k]))
-        if np.isfinite(depth):
-            out.uv[finger], out.sigma_px[finger], out.depth[finger] = at, found.sigma_px[k], depth
-    return out
+Search: TypeAlias = Callable[[Image, LedImage, Float, WristView], Candidates | None]
 
 
 def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) -> Candidates | None:
@@ -294,24 +285,18 @@ def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) ->
         return None
     cost = costs(some, image, gain)
     best = modes(some, cost)
-    finger = some.finger[best]
-    outline = np.repeat(some.open[best], OUTLINE // DIRECTIONS, axis=1)
-    circle = fitted(led, some.uv[best, END], some.end[best, 0], outline)
+    finger, rows = some.finger[best], some.rows[best]
+    outline = np.repeat(some.table.open[rows], OUTLINE // DIRECTIONS, axis=1)
+    circle = fitted(led, some.uv[best, END], some.table.end[rows, 0], outline)
+    circle = fitted(led, circle.middle, circle.radius, outline)
     misfit = cost[best] + SHOWN_WORTH * (1.0 - circle.shown)
     order = np.lexsort((misfit, finger))
     chosen = order[np.append(True, finger[order[1:]] != finger[order[:-1]])]
-    ends = _ends(some, cost, finger[chosen], circle.middle[chosen], circle.radius[chosen])
-    circle = fitted(led, circle.middle[chosen], circle.radius[chosen], outline[chosen])
-    radius = circle.radius
-    flesh = radius * np.sqrt(
-        FLESH**2 + (PULP * np.maximum(ends.facing, 0.0)) ** 2 + (OF_SPREAD * ends.spread) ** 2
-    )
-    sigma = np.sqrt(PIXEL**2 + flesh**2 + circle.sigma_px**2) * (1.0 + misfit[chosen] / DOUBTFUL)
-    at = circle.middle + ends.towards * radius[:, None]
-    return Candidates(finger[chosen], at, sigma, radius, misfit[chosen], circle.shown, ends.seen)
+    circle, misfit, finger = Circles(*(each[chosen] for each in circle)), misfit[chosen], finger[chosen]
+    return reported(finger, circle, misfit, _ends(some, cost, finger, circle))
 
 
-class _Ends(NamedTuple):
+class Ends(NamedTuple):
     """Of K fingers: where the end is from the middle of the outline (K, 2) and its spread (K,), in radii; how much it
     faces the camera (K,), and how likely the finger leaves it to be seen (K,)."""
 
@@ -321,8 +306,19 @@ class _Ends(NamedTuple):
     seen: Float
 
 
-def _ends(some: Hypotheses, cost: Float32, finger: Int, middle: Float, radius: Float) -> _Ends:
-    """Means over the hypotheses of each finger (K,), by their likelihood where the outline is a circle (K, 2), (K,)."""
+def reported(finger: Int, circle: Circles, misfit: Float, ends: Ends) -> Candidates:
+    """Ends of K fingers, by the circles about them."""
+    radius = circle.radius
+    flesh = radius * np.sqrt(
+        FLESH**2 + (PULP * np.maximum(ends.facing, 0.0)) ** 2 + (OF_SPREAD * ends.spread) ** 2
+    )
+    sigma = np.sqrt(PIXEL**2 + flesh**2 + circle.sigma_px**2) * (1.0 + misfit / DOUBTFUL)
+    at = circle.middle + ends.towards * radius[:, None]
+    return Candidates(finger, at, sigma, radius, misfit, circle.shown, ends.seen)
+
+
+def _ends(some: Hypotheses, cost: Float32, finger: Int, circle: Circles) -> Ends:
+    """Means over the hypotheses of each finger (K,), by their likelihood where its outline is that circle."""
     least = np.full(5, np.inf)
     first = np.flatnonzero(np.diff(some.finger, prepend=-1))
     least[some.finger[first]] = np.minimum.reduceat(cost, first)
@@ -330,21 +326,50 @@ def _ends(some: Hypotheses, cost: Float32, finger: Int, middle: Float, radius: F
     row = np.zeros(5, np.int64)
     row[finger] = np.arange(len(finger))
     of = row[some.finger[near]]
-    end, uv = some.end[near], some.uv[near]
-    away = (uv[:, END] - middle[of]) * (1.0 / (AT_SIGMA * radius))[of, None]
-    larger = np.log(end[:, 0] / radius[of]) * (1.0 / SIZE_SIGMA)
-    square = cost[near] + away[:, 0] ** 2 + away[:, 1] ** 2 + larger * larger
+    end, uv, radius = some.table.end[some.rows[near]], some.uv[near], circle.radius[of]
+    off = (circle.middle[of] - uv[:, END]) / radius[:, None]
+    larger = np.log(end[:, 0] / radius) * (1.0 / SIZE_SIGMA)
+    square = cost[near] + (off[:, 0] ** 2 + off[:, 1] ** 2) * (1.0 / AT_SIGMA**2) + larger * larger
+    sigma = AT_SURE + circle.sigma_px / circle.radius
     first = np.searchsorted(of, np.arange(len(finger)))
     weight = np.exp((np.minimum.reduceat(square, first)[of] - square) * (0.5 / CORRELATED))
     what = np.empty((len(of), 6))
     what[:, 0] = 1.0
-    what[:, 1:3] = way = (uv[:, APEX] - uv[:, END]) / end[:, :1]
+    what[:, 1:3] = way = (uv[:, APEX] - uv[:, END]) / end[:, :1] + _turned(some, near, off, sigma[of])
     what[:, 3] = way[:, 0] ** 2 + way[:, 1] ** 2
     what[:, 4:] = end[:, 1:]
     sums = np.add.reduceat(what * weight[:, None], first)
     mean = sums[:, 1:] / sums[:, :1]
     variance = mean[:, 2] - mean[:, 0] ** 2 - mean[:, 1] ** 2
-    return _Ends(mean[:, :2], np.sqrt(np.maximum(0.5 * variance, 0.0)), mean[:, 3], mean[:, 4])
+    return Ends(mean[:, :2], np.sqrt(np.maximum(0.5 * variance, 0.0)), mean[:, 3], mean[:, 4])
+
+
+def _turned(some: Hypotheses, which: Int, off: Float, sigma: Float) -> Float:
+    """How ends (M, 2) turn about the middles of outlines, which lie `off` (M, 2) by `sigma` (M,), in radii.
+
+    An outline lies beside where it should be for abduction, which the laser tells, or for a twist of the finger.
+    """
+    table, rows, by = some.table, some.rows[which], some.abduction[which]
+    radius = table.end[rows, :1].astype(np.float64)
+    uv, laser = table.uv[rows], np.zeros((2, len(rows)))
+    finger = rows >= table.thumb
+    across = table.laser[:, 0].reshape(3, -1)[:, rows[finger] - table.thumb]
+    laser[0, finger] = across[1] + 2.0 * by[finger] * across[2]
+    laser[1] = table.twist[rows, 4]
+    laser *= 1.0 / LASER_SURE_M
+    moved = uv[:, 1] + (2.0 * by)[:, None, None] * uv[:, 2]
+    at = np.stack([moved[:, END], table.twist[rows, :2]]) / radius
+    tip = np.stack([moved[:, APEX], table.twist[rows, 2:4]]) / radius
+    sure = sigma**-2
+    a = sure * np.vecdot(at[0], at[0]) + laser[0] ** 2 + ABDUCTION_SIGMA**-2
+    b = sure * np.vecdot(at[0], at[1]) + laser[0] * laser[1]
+    c = sure * np.vecdot(at[1], at[1]) + laser[1] ** 2 + TWIST_SIGMA**-2
+    aside = some.aside[which] * (1.0 / LASER_SURE_M)
+    p = sure * np.vecdot(at[0], off) + laser[0] * aside - by * ABDUCTION_SIGMA**-2
+    q = sure * np.vecdot(at[1], off) + laser[1] * aside
+    scale = 1.0 / (a * c - b * b)
+    abduction, twist = (c * p - b * q) * scale, (a * q - b * p) * scale
+    return abduction[:, None] * (tip[0] - at[0]) + twist[:, None] * (tip[1] - at[1])
 
 
 def light_scale(image: LedImage, laser_uv: Float, laser_m: Float) -> float | None:
@@ -357,3 +382,32 @@ def light_scale(image: LedImage, laser_uv: Float, laser_m: Float) -> float | Non
         return None
     distance = np.sqrt((laser_m[known][good] ** 2).sum(axis=1))
     return float(np.median(near[good] * distance)) / SHADE
+
+
+def fingertips(
+    led: Image, frame: Image, laser_uv: Float, view: WristView, search: Search = candidates
+) -> Fingertips:
+    """Find them in one LED image.
+
+    Args:
+        led: (H, W) difference of LED and ambient frame.
+        frame: (H, W) the LED frame itself, which says where the image is saturated.
+        laser_uv: (5, 2) where the laser meets the fingers [px]; NaN: not seen, then its tip is not sought.
+        view: Device and hand; the wrist is straight.
+        search: The engine's.
+    """
+    out = Fingertips(np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan))
+    optics = led_optics(view)
+    near = nearness(shrink(led), optics)
+    image = LedImage(near, frame[1::SHRINK, 1::SHRINK] > CLIPPED)
+    found = search(led, image, laser_uv, view)
+    if found is None:
+        return out
+    kind = np.minimum(found.finger, 1)
+    good = (found.shown > LEAST_SHOWN[kind]) & (found.misfit < MOST_MISFIT[kind] * found.seen)
+    for k in np.flatnonzero(good).tolist():
+        finger, at = int(found.finger[k]), found.uv[k]
+        depth = depth_about(near, optics, float(at[0]), float(at[1]), float(found.radius_px[k]))
+        if np.isfinite(depth):
+            out.uv[finger], out.sigma_px[finger], out.depth[finger] = at, found.sigma_px[k], depth
+    return out

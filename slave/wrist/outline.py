@@ -16,27 +16,24 @@ from slave.wrist.led_depth import Float32
 DIRECTIONS = 16
 _STEPS = 24
 _FIRST, _LAST = 0.45, 1.75  # of the radius: where an edge is sought
-_DARK = np.float32(6.0)  # grey levels
+LOG = np.log(np.arange(256, dtype=np.float32) + 6.0).astype(np.float32)  # of grey levels and what is dark
 _EXPECTED = 0.35  # of the radius: how far off edges are, standard deviation
-_LEAST_DROP, _FIRM_DROP = (
-    0.12,
-    0.4,
-)  # of the logarithm of light over an edge: none; so much more is a sure one
+LEAST_DROP, FIRM_DROP = 0.12, 0.4  # of the logarithm of light over an edge: none; so much more is a sure one
 _TINY = 1e-6
-_RIM = 0.05  # of the radius: how far light falls off within the outline
-_WIDTH = 3  # steps of an edge
-_MIDDLE_SIGMA, _RADIUS_SIGMA = 0.6, 0.12  # of the radius: how well the middle and the radius are predicted
-_EDGE_SIGMA = 0.08  # of the radius: how far skin is off a circle
-_WIDTHS = 0.45, 0.25, 0.18  # of the radius: beyond that an edge counts less
+RIM = 0.05  # of the radius: how far light falls off within the outline
+WIDTH = 3  # steps of an edge
+MIDDLE_SIGMA, RADIUS_SIGMA = 0.6, 0.12  # of the radius: how well the middle and the radius are predicted
+EDGE_SIGMA = 0.08  # of the radius: how far skin is off a circle
+WIDTHS = 0.45, 0.25, 0.18  # of the radius: beyond that an edge counts less
 _TURN = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
-_WAY: Float = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
-_DESIGN = np.concatenate([_WAY, np.ones((DIRECTIONS, 1))], axis=1)
+WAY: Float = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
+_DESIGN = np.concatenate([WAY, np.ones((DIRECTIONS, 1))], axis=1)
 _PRODUCTS = (_DESIGN[:, :, None] * _DESIGN[:, None]).reshape(DIRECTIONS, 9)
-_PRIOR_NORMAL = np.diag(_EDGE_SIGMA**2 / np.array([_MIDDLE_SIGMA, _MIDDLE_SIGMA, _RADIUS_SIGMA]) ** 2)
-_SHARE = np.linspace(_FIRST, _LAST, _STEPS).astype(np.float32)
-_MIDDLES = 0.5 * (_SHARE[_WIDTH:] + _SHARE[:-_WIDTH])
-_WEIGHT = np.exp(-0.5 * ((_MIDDLES - 1.0) / _EXPECTED) ** 2).astype(np.float32)
-_STEP = float(_SHARE[1] - _SHARE[0])
+_PRIOR_NORMAL = np.diag(EDGE_SIGMA**2 / np.array([MIDDLE_SIGMA, MIDDLE_SIGMA, RADIUS_SIGMA]) ** 2)
+SHARE = np.linspace(_FIRST, _LAST, _STEPS).astype(np.float32)
+MIDDLES = 0.5 * (SHARE[WIDTH:] + SHARE[:-WIDTH])
+WEIGHT = np.exp(-0.5 * ((MIDDLES - 1.0) / _EXPECTED) ** 2).astype(np.float32)
+STEP = float(SHARE[1] - SHARE[0])
 
 
 class Circles(NamedTuple):
@@ -66,10 +63,10 @@ def fitted(led: Image, middle: Float | Float32, radius: Float | Float32, open_: 
     middle, radius = middle.astype(np.float64), radius.astype(np.float64)
     off, strength, inside = _edges(led, middle, radius)
     wanted: Float = np.asarray(open_, np.float64) * inside
-    firm = wanted * np.minimum(np.maximum((strength - _LEAST_DROP) * (1.0 / _FIRM_DROP), 0.0), 1.0)
+    firm = wanted * np.minimum(np.maximum((strength - LEAST_DROP) * (1.0 / FIRM_DROP), 0.0), 1.0)
     weight: Float = firm
     solution, rest, normal = np.zeros((len(radius), 3)), off, np.broadcast_to(np.eye(3), (len(radius), 3, 3))
-    for width in _WIDTHS:
+    for width in WIDTHS:
         normal = (weight @ _PRODUCTS).reshape(-1, 3, 3) + _PRIOR_NORMAL
         solution = np.asarray(
             np.linalg.solve(normal, ((weight * off) @ _DESIGN)[..., None])[..., 0], np.float64
@@ -77,7 +74,7 @@ def fitted(led: Image, middle: Float | Float32, radius: Float | Float32, open_: 
         rest = (off - solution @ _DESIGN.T) * (1.0 / width)
         weight = firm / (1.0 + rest * rest) ** 2
     shown = (firm * (np.abs(rest) < 1.0)).sum(axis=1) / np.maximum(wanted.sum(axis=1), _TINY)
-    variance = np.linalg.inv(normal)[:, (0, 1), (0, 1)].sum(axis=1) * (0.5 * _EDGE_SIGMA**2)
+    variance = np.linalg.inv(normal)[:, (0, 1), (0, 1)].sum(axis=1) * (0.5 * EDGE_SIGMA**2)
     solution *= radius[:, None]
     return Circles(middle + solution[:, :2], radius + solution[:, 2], radius * np.sqrt(variance), shown)
 
@@ -85,24 +82,22 @@ def fitted(led: Image, middle: Float | Float32, radius: Float | Float32, open_: 
 def _edges(led: Image, middle: Float, radius: Float) -> tuple[Float, Float, Bool]:
     """Of N circles and each direction: how far beyond the circle the edge is (N, DIRECTIONS), in radii; by how much the
     logarithm of light falls there; and whether the image shows that far."""
-    reach = radius[:, None, None].astype(np.float32) * _SHARE
+    reach = radius[:, None, None].astype(np.float32) * SHARE
     x, y = (
-        middle[:, k, None, None].astype(np.float32) + reach * _WAY[:, k, None].astype(np.float32)
+        middle[:, k, None, None].astype(np.float32) + reach * WAY[:, k, None].astype(np.float32)
         for k in (0, 1)
     )
     height, width = led.shape
     inside: Bool = (x[..., -1] > 0) & (y[..., -1] > 0) & (x[..., -1] < width - 1) & (y[..., -1] < height - 1)
     along = x.reshape(-1, _STEPS), y.reshape(-1, _STEPS)
     light = cv2.remap(led, *along, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    log: Float32 = np.log(np.asarray(light, np.float32) + _DARK)
-    drop = log[:, :-_WIDTH] - log[:, _WIDTH:]
-    best: Int = (drop * _WEIGHT).argmax(axis=1)
+    log: Float32 = LOG[np.asarray(light, np.uint8)]
+    drop = log[:, :-WIDTH] - log[:, WIDTH:]
+    best: Int = (drop * WEIGHT).argmax(axis=1)
     steps, flat = drop.shape[1], drop.ravel()
     at = best + np.arange(len(best), dtype=np.int64) * steps
     # The parabola through the steepest step and its neighbours.
     before, here, behind = flat[at - (best > 0)], flat[at], flat[at + (best < steps - 1)]
     part = 0.5 * (behind - before) / np.maximum(2.0 * here - before - behind, _TINY)
-    off: Float = (
-        _RIM - 1.0 + _MIDDLES[best] + _STEP * np.minimum(np.maximum(part, -0.5), 0.5).astype(np.float64)
-    )
+    off: Float = RIM - 1.0 + MIDDLES[best] + STEP * np.minimum(np.maximum(part, -0.5), 0.5).astype(np.float64)
     return off.reshape(inside.shape), here.reshape(inside.shape).astype(np.float64), inside

@@ -18,6 +18,8 @@ import numpy as np
 
 from common.arrays import Float
 from common.errors import CalibrationError
+from common.fingertips import Fingertips
+from common.geometry import rotation_vector_to_matrix
 from common.hand_model import CHAINS, FINGER_JOINTS
 from common.round_cones import Cones, first_hits, terms
 from slave.wrist.led_depth import Float32
@@ -30,7 +32,9 @@ DIP_PER_PIP = (0.6, 0.84)
 ABDUCTION_RAD = float(np.radians(15.0))  # the outer two of the three abductions
 THUMB_POSTURES = (7, 8, 5, 6)  # values of its angles
 OVERHANG = 1.3  # of the radius of the tip: how far skin reaches beyond the tip joint, 1.0 to 1.7 by hand
-DORSAL = 0.05  # of the radius: how far the end of the bone lies from the middle of a tip seen end on, whose pulp shows
+BALL = (
+    0.7  # of how far the fingertip's outermost point lies towards the nail: the middle of what is seen of it
+)
 DIRECTIONS = 8  # of the outline of a fingertip, from the right clockwise
 _AROUND = 1.4  # of its radius: where other parts of the finger are looked for
 SOFT = 0.3  # of the light comes from inside the skin and from the skin around, whatever the incidence
@@ -43,6 +47,7 @@ END, BONES, HIGHEST, ABOVE, APEX = 0, slice(0, 6), 6, slice(7, 13), 13
 SAMPLES = APEX + 1
 _ALONG = ((2, 0.35), (1, 0.75), (1, 0.3), (0, 0.75), (0, 0.5))  # bone, share of it
 _ABOVE = tuple((far, turn) for far in (1.4, 1.9) for turn in (-0.5, 0.0, 0.5))  # of the joint's radius, rad
+_TWIST_RAD = 0.05  # for derivatives
 _CHUNK = 4096
 _ORIGIN = np.zeros(3)
 
@@ -61,6 +66,8 @@ class Postures:
         open: (H + 4 L, DIRECTIONS) 1: the outline of the fingertip shows there, 0: the finger goes on.
         end: (H + 4 L, 3) of the end: radius of its outline [px], cosine between the last bone and the way to the camera
             (1: it points at the camera), whether the finger itself leaves it to be seen.
+        twist: (H + 4 L, 5) what a twist of the finger about its first bone, before it is bent, moves: END and APEX
+            [px/rad], and where the laser meets it across the fingers [m/rad].
     """
 
     thumb: int
@@ -71,18 +78,21 @@ class Postures:
     laser: Float32
     open: Float32
     end: Float32
+    twist: Float32
 
 
 class _OfFinger(NamedTuple):
-    """The rows of one finger: `uv`, `near`, `laser` (H, 3, 2), `open` and `end` of `Postures`."""
+    """The rows of one finger: `uv`, `near`, `laser` (H, 3, 2), `open`, `end` and `twist` of `Postures`."""
 
     uv: Float
     near: Float
     laser: Float
     open: Float
     end: Float
+    twist: Float
 
 
+@lru_cache(maxsize=8)
 def plane_axes(view: WristView) -> Float:
     """Two unit vectors (2, 3) in the laser's plane: across the fingers, to the right in the image, and away."""
     across = np.array([1.0, 0.0, 0.0]) - view.normal[0] * view.normal
@@ -113,9 +123,9 @@ def postures_of(view: WristView) -> Postures:
     long = long.reshape(-1, 3, 5, 4)
     thumb = thumb_postures(view, *THUMB_POSTURES)[:, None]
     fingers = [_postures(view, finger, long if finger else thumb) for finger in range(5)]
-    uv, near, open_, end = (
+    uv, near, open_, end, twist = (
         np.concatenate([getattr(one, of) for one in fingers]).astype(np.float32)
-        for of in ("uv", "near", "open", "end")
+        for of in ("uv", "near", "open", "end", "twist")
     )
     laser = np.moveaxis(np.array([one.laser for one in fingers[1:]]), (2, 3), (0, 1))
     return Postures(
@@ -127,6 +137,7 @@ def postures_of(view: WristView) -> Postures:
         np.ascontiguousarray(laser, np.float32),
         open_,
         end,
+        twist,
     )
 
 
@@ -138,8 +149,9 @@ def _postures(view: WristView, finger: int, angles: Float) -> _OfFinger:
     radius = view.model.radius_m[list(FINGER_JOINTS[finger])][-4:]
     tip = joints.rotation[:, CHAINS[finger, 3]]
     along = -tip[:, :, 2]
-    end = chain[:, 3] + (OVERHANG - 1.0) * radius[3] * along
-    apex = end + radius[3] * (along + DORSAL * tip[:, :, 1])
+    dorsal_m = Fingertips.of(view.model).dorsal_m
+    end = chain[:, 3] + (OVERHANG - 1.0) * radius[3] * along + BALL * dorsal_m * tip[:, :, 1]
+    apex = end + radius[3] * along + (1.0 - BALL) * dorsal_m * tip[:, :, 1]
     bones = np.concatenate([chain[:, :3], end[:, None]], axis=1)
     skin = _skin(bones, radius)
     laser = _on_plane(view, skin)
@@ -152,6 +164,7 @@ def _postures(view: WristView, finger: int, angles: Float) -> _OfFinger:
     bones, apex, along = (
         each.reshape(count, nodes, *each.shape[1:])[:, middle] for each in (bones, apex, along)
     )
+    twist = _twist(view, finger, angles[:, middle], bones, apex, radius)
     size = view.optics.matrix[0, 0] * radius[3] / np.maximum(bones[:, 3, 2], NEAREST_M)
     turn = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
     ring = uv[:, middle, END, None] + _AROUND * size[:, None, None] * np.stack(
@@ -170,7 +183,27 @@ def _postures(view: WristView, finger: int, angles: Float) -> _OfFinger:
         _parabola((laser @ plane_axes(view).T).reshape(count, nodes, 1, 2))[:, :, 0],
         np.asarray(near[:, SAMPLES:] == 0.0, np.float64),
         np.nan_to_num(np.stack([size, facing, seen], axis=-1)),
+        np.nan_to_num(twist),
     )
+
+
+def _twist(view: WristView, finger: int, angles: Float, bones: Float, apex: Float, radius: Float) -> Float:
+    """`twist` of `Postures` (H, 5), of a finger at angles (H, 5, 4) of its joints (H, 4, 3) and end (H, 3) [m]."""
+    straight = angles[:1].copy()
+    straight[..., 1:] = 0.0
+    chain = view.model.forward(view.T_camera_palm, straight).position_m[0, CHAINS[finger]]
+    axis = chain[1] - chain[0]
+    turn = rotation_vector_to_matrix(_TWIST_RAD * axis / np.linalg.norm(axis))
+    moved: list[Float] = []
+    for by in (np.eye(3), turn):
+        turned, tip = ((each - chain[0]) @ by.T + chain[0] for each in (bones, apex))
+        laser = _on_plane(view, _skin(turned, radius)) @ plane_axes(view)[0]
+        moved.append(
+            np.concatenate(
+                [view.optics.project(turned[:, 3]), view.optics.project(tip), laser[:, None]], axis=1
+            )
+        )
+    return (moved[1] - moved[0]) / _TWIST_RAD
 
 
 def _parabola(values: Float) -> Float:

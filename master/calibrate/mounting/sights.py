@@ -6,6 +6,8 @@ numbers of each finger are unknown, which a mounting must not take for its own: 
 pulp its tip is seen.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from common.arrays import Float
@@ -89,7 +91,7 @@ class Sights:
         return (
             skin.spheres(chains)[:, FINGERS],
             skin.radius_m[FINGERS],
-            Fingertips(beyond).points(chains)[:, FINGERS],
+            replace(self._tips, beyond_m=beyond).points(chains)[:, FINGERS],
         )
 
     @staticmethod

@@ -11,6 +11,7 @@ from slave.wrist.background import lit
 from slave.wrist.detector import WristDetector
 from slave.wrist.engine import NUMPY, Engine, engine_named
 from slave.wrist.fingers import separate
+from slave.wrist.fingertips import fingertips
 from slave.wrist.laser import laser_lines
 from slave.wrist.paths import FENCE
 from tests.slave.wrist.wrist_frames import VIEW, strobed
@@ -117,11 +118,40 @@ def test_a_hand_is_seen_alike(fast: Engine) -> None:
         np.testing.assert_allclose(there.sigma_px, here.sigma_px, rtol=0.1)
 
 
+@pytest.mark.parametrize("name", ["spread", "standard", "random"])
+def test_fingertips_are_the_same(fast: Engine, name: str) -> None:
+    frames = strobed(name, 8)
+    count = 0
+    for k in range(0, 24, 3):
+        ambient, laser, led = (frame.image for frame in frames[k : k + 3])
+        lit_led = lit(led, ambient)
+        laser_uv = laser_lines(lit(laser, ambient), separate(lit_led, VIEW), VIEW).uv
+        here, there = (fingertips(lit_led, led, laser_uv, VIEW, one.candidates) for one in (NUMPY, fast))
+        for name in ("uv", "sigma_px", "depth"):
+            np.testing.assert_allclose(getattr(there, name), getattr(here, name), atol=1e-2, err_msg=name)
+        count += int(np.isfinite(here.depth).sum())
+    assert count >= 12
+
+
+def test_a_finger_without_a_laser_point_has_no_tip(fast: Engine) -> None:
+    ambient, laser, led = (frame.image for frame in strobed("poses", 1))
+    lit_led = lit(led, ambient)
+    laser_uv = laser_lines(lit(laser, ambient), separate(lit_led, VIEW), VIEW).uv
+    laser_uv[2] = np.nan
+    for engine in (NUMPY, fast):
+        found = fingertips(lit_led, led, laser_uv, VIEW, engine.candidates)
+        assert np.isnan(found.uv[2]).all()
+        assert np.isfinite(found.uv[1]).all()
+        nothing = fingertips(lit_led, led, np.full((5, 2), np.nan), VIEW, engine.candidates)
+        assert np.isnan(nothing.uv).all()
+
+
 def test_a_first_hand_finds_everything_compiled(fast: Engine) -> None:
     from slave.wrist import fast as seams
-    from slave.wrist import fast_lines
+    from slave.wrist import fast_lines, fast_tips
 
     functions = (seams._least_paths, seams._energy, fast_lines._scan, fast_lines._link, fast_lines._measure)
+    functions += (fast_tips._search,)
     before = [len(one.signatures) for one in functions]  # pyright: ignore[reportFunctionMemberAccess]
     assert all(before)
     detector = WristDetector(VIEW, 90.0, engine=fast)
