@@ -240,6 +240,7 @@ def _search(
             for _ in range(2):
                 _fit(led, circle, table.open[row], edges)
             misfit = found.cost[k] + limits.shown_worth * (1.0 - circle[4])
+            misfit += _apart(found, k, table, limits, circle)
             if misfit < least:
                 least = misfit
                 best[:] = circle
@@ -502,6 +503,14 @@ def _light(led: Image, u: float, v: float) -> int:
 
 
 @compiled
+def _apart(found: _Found, k: int, table: _Table, limits: _Limits, circle: Float) -> float:
+    """As `fingertips._apart`, of one hypothesis."""
+    x, y, radius = circle[0] - found.at[k, 0], circle[1] - found.at[k, 1], circle[2]
+    larger = math.log(table.end[int(found.row[k]), 0] / radius) / limits.size_sigma
+    return (x * x + y * y) / (limits.at_sigma * radius) ** 2 + larger * larger
+
+
+@compiled
 def _ends(found: _Found, count: int, table: _Table, limits: _Limits, circle: Float, out: Float) -> None:
     """As `fingertips.Ends`, of one finger whose outline is that circle."""
     square = np.full(count, np.inf)
@@ -510,9 +519,7 @@ def _ends(found: _Found, count: int, table: _Table, limits: _Limits, circle: Flo
     least = np.inf
     for k in range(count):
         if found.cost[k] < within:
-            u, v = (x - found.at[k, 0]) / radius, (y - found.at[k, 1]) / radius
-            larger = math.log(table.end[int(found.row[k]), 0] / radius) / limits.size_sigma
-            square[k] = found.cost[k] + (u * u + v * v) / limits.at_sigma**2 + larger * larger
+            square[k] = found.cost[k] + _apart(found, k, table, limits, circle)
             least = min(least, square[k])
     sure = (limits.at_sure + circle[3] / radius) ** -2
     total = ways = 0.0

@@ -55,12 +55,12 @@ AT_SURE, LASER_SURE_M = 0.1, 8e-4  # how well an outline is seen, of the radius,
 TWIST_SIGMA = 0.05  # rad: of the hinges of real fingers
 ENDS_WITHIN = 40.0  # of the best posture's cost: those whose ends are averaged
 CORRELATED = 2.5  # samples that differ for one reason
-# Of an end that is reported, of the thumb, whose four angles are searched less finely, and of the fingers; the misfit
-# of one that is sure to be seen, and of others in proportion.
-LEAST_SHOWN, MOST_MISFIT = np.array([[0.75, 0.6], [15.0, 22.0]])
+# Of an end that is reported; of the thumb, whose four angles are searched less finely, and of the fingers.
+LEAST_SHOWN = np.array([0.75, 0.6])
+MOST_MISFIT, LIKELY = 32.0, 0.4  # of one that is less likely to be seen in proportion
 # Standard deviations: edges; of the radius, how far flesh is off its cones, and where on its disk an end is that faces
 # the camera; and the misfit at which they are twice as large.
-PIXEL, FLESH, PULP, DOUBTFUL = 0.7, 0.05, 0.08, 40.0
+PIXEL, FLESH, PULP, DOUBTFUL = 0.7, 0.05, 0.08, 20.0
 OF_SPREAD = 0.6  # postures that are possible differ by more than the mean of them is off
 
 
@@ -290,10 +290,17 @@ def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) ->
     circle = fitted(led, some.uv[best, END], some.table.end[rows, 0], outline)
     circle = fitted(led, circle.middle, circle.radius, outline)
     misfit = cost[best] + SHOWN_WORTH * (1.0 - circle.shown)
+    misfit += _apart(some.uv[best, END], some.table.end[rows, 0], circle.middle, circle.radius)
     order = np.lexsort((misfit, finger))
     chosen = order[np.append(True, finger[order[1:]] != finger[order[:-1]])]
     circle, misfit, finger = Circles(*(each[chosen] for each in circle)), misfit[chosen], finger[chosen]
     return reported(finger, circle, misfit, _ends(some, cost, finger, circle))
+
+
+def _apart(at: Float32, size: Float32, middle: Float, radius: Float) -> Float:
+    """What circles (N, 2), (N,) [px] cost that are not where postures have them, nor as large."""
+    off = (middle - at) / (AT_SIGMA * radius)[:, None]
+    return np.vecdot(off, off) + (np.log(size / radius) * (1.0 / SIZE_SIGMA)) ** 2
 
 
 class Ends(NamedTuple):
@@ -327,15 +334,14 @@ def _ends(some: Hypotheses, cost: Float32, finger: Int, circle: Circles) -> Ends
     row[finger] = np.arange(len(finger))
     of = row[some.finger[near]]
     end, uv, radius = some.table.end[some.rows[near]], some.uv[near], circle.radius[of]
-    off = (circle.middle[of] - uv[:, END]) / radius[:, None]
-    larger = np.log(end[:, 0] / radius) * (1.0 / SIZE_SIGMA)
-    square = cost[near] + (off[:, 0] ** 2 + off[:, 1] ** 2) * (1.0 / AT_SIGMA**2) + larger * larger
+    square = cost[near] + _apart(uv[:, END], end[:, 0], circle.middle[of], radius)
     sigma = AT_SURE + circle.sigma_px / circle.radius
     first = np.searchsorted(of, np.arange(len(finger)))
     weight = np.exp((np.minimum.reduceat(square, first)[of] - square) * (0.5 / CORRELATED))
     what = np.empty((len(of), 6))
     what[:, 0] = 1.0
-    what[:, 1:3] = way = (uv[:, APEX] - uv[:, END]) / end[:, :1] + _turned(some, near, off, sigma[of])
+    turned = _turned(some, near, (circle.middle[of] - uv[:, END]) / radius[:, None], sigma[of])
+    what[:, 1:3] = way = (uv[:, APEX] - uv[:, END]) / end[:, :1] + turned
     what[:, 3] = way[:, 0] ** 2 + way[:, 1] ** 2
     what[:, 4:] = end[:, 1:]
     sums = np.add.reduceat(what * weight[:, None], first)
@@ -404,7 +410,8 @@ def fingertips(
     if found is None:
         return out
     kind = np.minimum(found.finger, 1)
-    good = (found.shown > LEAST_SHOWN[kind]) & (found.misfit < MOST_MISFIT[kind] * found.seen)
+    most = MOST_MISFIT * np.minimum(found.seen / LIKELY, 1.0)
+    good = (found.shown > LEAST_SHOWN[kind]) & (found.misfit < most)
     for k in np.flatnonzero(good).tolist():
         finger, at = int(found.finger[k]), found.uv[k]
         depth = depth_about(near, optics, float(at[0]), float(at[1]), float(found.radius_px[k]))
