@@ -31,7 +31,7 @@ _THUMB = pytest.mark.xfail(
 )
 _HIDDEN = pytest.mark.xfail(
     strict=True,
-    reason="28 % of the reported tips of the curl and 47 % of mcp have just turned behind their last bone, 1 of 11 is off",
+    reason="28 % of the tips of the curl and 47 % of mcp have just turned behind their last bone; 1 of 11 is off",
 )
 HANDS = {"curl": "right", "mcp": "right", "spread": "right", "left_small": "left-small"}
 
