@@ -530,4 +530,4 @@ def test_a_rendered_curl_from_exact_points(datasets: Path) -> None:
     seen = (pip < 85.1) & (truth["laser_len_vis"][:, 2:6] > 0.015)
     every = [float(np.sqrt(np.mean((found - pip)[seen[:, f], f] ** 2))) for f in range(4)]
     assert max(every) < 3.5, dict(zip(FINGERS[1:], every, strict=True))
-    assert np.abs(found - pip)[tracked & (pip > 101.0)].max() < 12.0
+    assert not tracked[pip > 101.0].any()
