@@ -47,11 +47,11 @@ def _densities(hand: HandTables, settings: Settings, prior: Prior, f: int, unsee
             shows = (1.0 - share) * scan.showing[f, node] + share * scan.showing[f, node + 1]
             base -= (settings.unseen_again if prior.recent[f] > 0.0 else settings.unseen) * shows
         off = flexion - prior.natural[f, 1] - prior.slope[f, 1] * pip
-        sigma = prior.flexion[f]
+        variance = prior.flexion[f] ** 2 + flexion2
         if f > 0 and prior.only_natural[0] == 0.0:
             off -= prior.coupled_share[0] * pip
-            sigma += prior.coupled_spread[0] * max(pip, 0.0)
-        natural = _normal_log(off, sigma * sigma + flexion2)
+            variance += (prior.coupled_spread[0] * max(pip, 0.0)) ** 2
+        natural = _normal_log(off, variance)
         scan.log_p[_NATURAL, k] = base + natural - log(high - low)
         free = _normal_log(pip - settings.free_pip_mean_rad, settings.free_pip_rad**2) - span
         scan.log_p[_FREE, k] = base + free

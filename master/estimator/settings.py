@@ -155,11 +155,11 @@ class Settings(NamedTuple):
         float, Range("rad", 0.005, 1.0, "of a natural MCP about its share of the PIP, of straight fingers")
     ] = radians(5.0)
     coupled_spread: Annotated[
-        float, Range("1", 0.0, 1.0, "and by so much of the PIP more, of a hand of which nothing is known")
-    ] = 0.2
+        float, Range("1", 0.0, 1.0, "share of the PIP besides, of a hand of which nothing is known")
+    ] = 0.3
     coupled_fingers: Annotated[
         float, Range("1", 1.0, 1e5, "half bent fingers seen that this counts as, once each triple")
-    ] = 20.0
+    ] = 60.0
     coupled_s: Annotated[float, Range("s", 1.0, 3600.0, "as long as a hand keeps to its own share")] = 60.0
     thumb_coupled_rad: Annotated[
         float, Range("rad", 0.01, 1.0, "of a thumb's IP about what goes with its MCP")

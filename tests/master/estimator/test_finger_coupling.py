@@ -12,7 +12,7 @@ from master.estimator.settings import DEFAULT
 from master.estimator.wrist_pipeline import WristPipeline
 from tests.master.estimator.worn import PIP, TRIPLE_NS, Worn, bent, pipeline, pushed
 
-CURL_DEG = np.linspace(25.0, 80.0, 60)
+CURL_DEG = np.linspace(25.0, 80.0, 120)
 SHOWN_PIP_DEG = 8.0
 
 
@@ -48,7 +48,7 @@ def laser_alone(worn: Worn, line: WristPipeline) -> tuple[HandPose, Float]:
 @pytest.mark.parametrize("share", [0.45, 0.54, 0.7])
 def test_a_hand_teaches_its_own_share(worn: Worn, share: float) -> None:
     found, spread = coupled(learnt(worn, share))
-    assert found == pytest.approx(share, abs=0.06)
+    assert found == pytest.approx(share, abs=0.07)
     assert spread < 0.7 * DEFAULT.coupled_spread
 
 

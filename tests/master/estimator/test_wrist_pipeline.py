@@ -441,7 +441,7 @@ def test_what_an_imu_says_that_nobody_mounted_is_counted_and_turns_no_palm(worn:
             "auto",
             marks=pytest.mark.xfail(
                 strict=True,
-                reason="knuckles are taken to follow PIPs within 5 deg and a fifth of the PIP: 4 of 5 joints are in",
+                reason="knuckles are taken to follow PIPs within 5 deg and a share of the PIP: 4 of 5 joints are in",
             ),
         ),
         pytest.param(
