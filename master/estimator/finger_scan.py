@@ -383,6 +383,10 @@ def scan_finger(
             scan.rows[f, node, i] = scan.r[i]
         scan.misfit[f] = min(scan.misfit[f], 2.0 * cost)
         scan.showing[f, node] = 1.0 if _shows(device, prior, length, scan) else 0.0
+    # Where a node happens to lie on a turn of the ridge, its volume is of that pose alone.
+    for node in range(scan.first[f] + 1, scan.last[f]):
+        most = max(scan.volume[f, node - 1], scan.volume[f, node + 1])
+        scan.volume[f, node] = min(scan.volume[f, node], most)
     scan.known[f] = 1.0
 
 
