@@ -5,7 +5,7 @@ tell which of them it is. A density may have several parts; the one that weighs 
 and the covariance holds all of them.
 """
 
-from math import exp, inf, isfinite, log, nan, pi
+from math import exp, inf, isfinite, log, pi
 
 from common.arrays import Float
 from common.kernels import inlined, inner
@@ -35,7 +35,6 @@ def _densities(hand: HandTables, settings: Settings, prior: Prior, f: int, unsee
         if node < scan.first[f] or node + 1 > scan.last[f]:
             for h in range(HANDS):
                 scan.log_p[h, k] = -_FAR
-            scan.on_curve[k] = -_FAR
             continue
         chi2 = 0.0
         for i in range(ROWS):
@@ -48,12 +47,12 @@ def _densities(hand: HandTables, settings: Settings, prior: Prior, f: int, unsee
             shows = (1.0 - share) * scan.showing[f, node] + share * scan.showing[f, node + 1]
             base -= (settings.unseen_again if prior.recent[f] > 0.0 else settings.unseen) * shows
         off = flexion - prior.natural[f, 1] - prior.slope[f, 1] * pip
-        sigma = prior.flexion[f]
+        variance = prior.flexion[f] ** 2 + flexion2
         if f > 0 and prior.only_natural[0] == 0.0:
-            sigma += settings.coupled_share * max(pip, 0.0)
-        natural = _normal_log(off, sigma * sigma + flexion2)
+            off -= prior.coupled_share[0] * pip
+            variance += (prior.coupled_spread[0] * max(pip, 0.0)) ** 2
+        natural = _normal_log(off, variance)
         scan.log_p[_NATURAL, k] = base + natural - log(high - low)
-        scan.on_curve[k] = base + _normal_log(off, prior.flexion[f] ** 2 + flexion2)
         free = _normal_log(pip - settings.free_pip_mean_rad, settings.free_pip_rad**2) - span
         scan.log_p[_FREE, k] = base + free
         straight = log(2.0) + _normal_log(pip, settings.straight_pip_rad**2) - span
@@ -126,19 +125,12 @@ def choose(hand: HandTables, settings: Settings, sights: Sights, prior: Prior, f
             if scan.share[h] > 0.0:
                 p[k] += scan.share[h] * exp(scan.log_p[h, k] - scan.hand[f, h])
         total += p[k]
-    # A laser point alone leaves the PIP to habit: where the hand may be natural, it is taken where habit has it.
-    by_habit = sights.shown[f] == 0.0 and scan.share[_NATURAL] > settings.habit_counts
-    top = -inf
     for k in range(count):
         p[k] /= total
-        top = max(top, scan.on_curve[k])
-    for k in range(count):
         off = (low + k * step - prior.last[f]) / prior.walked[f]
-        scan.near[k] = exp(scan.on_curve[k] - top) if by_habit else p[k]
-        if prior.recent[f] > 0.0:
-            scan.near[k] *= exp(-0.5 * off * off)
+        scan.near[k] = p[k] * exp(-0.5 * off * off) if prior.recent[f] > 0.0 else p[k]
     # Parts: the density is walked from top to top.
-    begin, best_begin, best_end, best, second, second_at, parts = 0, 0, count, -1.0, -1.0, -1.0, 0
+    begin, best_begin, best_end, best, parts = 0, 0, count, -1.0, 0
     while begin < count:
         # From `begin` up to the lowest place before another top, if the density clearly falls below both.
         near = scan.near
@@ -158,11 +150,7 @@ def choose(hand: HandTables, settings: Settings, sights: Sights, prior: Prior, f
         if weight > settings.other_part:
             parts += 1
         if likely > best:
-            if best >= 0.0:
-                second, second_at = best, 0.5 * (best_begin + best_end)
             best, best_begin, best_end = likely, begin, end
-        elif likely > second:
-            second, second_at = likely, 0.5 * (begin + end)
         begin = end
     half, place, crest, crest_at = 0.0, float(best_begin), -1.0, best_begin
     found = False
@@ -185,7 +173,6 @@ def choose(hand: HandTables, settings: Settings, sights: Sights, prior: Prior, f
         off = low + k * step - scan.out[f, 2]
         scan.pip2[f] += p[k] * off * off
     scan.parts[f] = parts
-    scan.rival[f] = low + second_at * step if parts > 1 else nan
     if isfinite(prior.law[f]):
         for k in range(1, 4):
             scan.out[f, k] = scan.mode[f, k] = prior.natural[f, k] + prior.slope[f, k] * prior.law[f]

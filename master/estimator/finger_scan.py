@@ -49,6 +49,8 @@ class Prior:
         light, light2: (1,) mean and variance of the logarithm of the light's unit.
         natural, slope: (5, 4) natural angles by the PIP: natural + slope PIP.
         abduction, flexion: (5,) standard deviations of abduction and flexion about them [rad].
+        coupled_share, coupled_spread: (1,) by how much of the PIP more this hand bends in its MCP, and within how much
+            of it (`master.estimator.finger_coupling`).
         last: (5,) PIPs where the fingers are expected, `walked` (5,) how far from there they may be, and `recent` (5,)
             whether they are expected anywhere.
         near_rad: (5,) how far from there a finger that is well known is searched; 0: everywhere.
@@ -67,6 +69,8 @@ class Prior:
     slope: Float
     abduction: Float
     flexion: Float
+    coupled_share: Float
+    coupled_spread: Float
     last: Float
     walked: Float
     recent: Float
@@ -90,6 +94,8 @@ class Prior:
             slope=(5, 4),
             abduction=5,
             flexion=5,
+            coupled_share=1,
+            coupled_spread=1,
             last=5,
             walked=5,
             recent=5,
@@ -112,12 +118,12 @@ class Scan:
         hand: (5, 3) logarithm of the evidence of each hand.
         share: (3,) probabilities of the hands.
         p: (61,) density of one finger, fine, and `log_p` (3, 61) by hand.
-        near: (61,) density by which its place is chosen, and `on_curve` (61,) the logarithm of that of habit alone.
+        near: (61,) density by which its place is chosen.
         out: (5, 5) angles and twist chosen, and `mode` (5, 5) of the most likely pose of that part.
         way: (5, 5) derivative of these by the PIP there.
         pip2: (5,) variance of the PIP.
         misfit: (5,) chi square of the best node; of none: infinite.
-        parts: (5,) how many parts a density has that count, and `rival` (5,) the PIP of the next best; NaN: none.
+        parts: (5,) how many parts a density has that count.
         known: (5,) whether the finger was scanned.
         first, last: (5,) nodes between which the valley was searched.
         showing: (5, NODES) 1 where the fingertip would be in sight.
@@ -133,7 +139,6 @@ class Scan:
     share: Float
     p: Float
     near: Float
-    on_curve: Float
     log_p: Float
     out: Float
     mode: Float
@@ -141,7 +146,6 @@ class Scan:
     pip2: Float
     misfit: Float
     parts: Float
-    rival: Float
     known: Float
     first: Int
     last: Int
@@ -172,7 +176,6 @@ class Scan:
             share=HANDS,
             p=fine,
             near=fine,
-            on_curve=fine,
             log_p=(HANDS, fine),
             out=(5, 5),
             mode=(5, 5),
@@ -180,7 +183,6 @@ class Scan:
             pip2=5,
             misfit=5,
             parts=5,
-            rival=5,
             known=5,
             first=("i8", 5),
             last=("i8", 5),
@@ -381,6 +383,10 @@ def scan_finger(
             scan.rows[f, node, i] = scan.r[i]
         scan.misfit[f] = min(scan.misfit[f], 2.0 * cost)
         scan.showing[f, node] = 1.0 if _shows(device, prior, length, scan) else 0.0
+    # Where a node happens to lie on a turn of the ridge, its volume is of that pose alone.
+    for node in range(scan.first[f] + 1, scan.last[f]):
+        most = max(scan.volume[f, node - 1], scan.volume[f, node + 1])
+        scan.volume[f, node] = min(scan.volume[f, node], most)
     scan.known[f] = 1.0
 
 

@@ -151,20 +151,20 @@ class Settings(NamedTuple):
     dip_share: Annotated[
         float, Range("1", 0.01, 1.0, "and by so much of the PIP more; the papers' ratios")
     ] = 0.13
-    habit_counts: Annotated[
-        float,
-        Range(
-            "1", 0.0, 1.0, "probability of a natural hand above which habit tells what a laser leaves open"
-        ),
-    ] = 0.05
     coupled_rad: Annotated[
         float, Range("rad", 0.005, 1.0, "of a natural MCP about its share of the PIP, of straight fingers")
     ] = radians(5.0)
-    coupled_share: Annotated[float, Range("1", 0.0, 1.0, "and by so much of the PIP more")] = 0.2
+    coupled_spread: Annotated[
+        float, Range("1", 0.0, 1.0, "share of the PIP besides, of a hand of which nothing is known")
+    ] = 0.3
+    coupled_fingers: Annotated[
+        float, Range("1", 1.0, 1e5, "half bent fingers seen that this counts as, once each triple")
+    ] = 60.0
+    coupled_s: Annotated[float, Range("s", 1.0, 3600.0, "as long as a hand keeps to its own share")] = 60.0
     thumb_coupled_rad: Annotated[
         float, Range("rad", 0.01, 1.0, "of a thumb's IP about what goes with its MCP")
     ] = radians(12.0)
-    mostly_natural: Annotated[float, Range("1", 0.01, 0.99, "hands before anything of them is seen")] = 0.6
+    mostly_natural: Annotated[float, Range("1", 0.01, 0.99, "hands before anything of them is seen")] = 0.8
     straight_pip_rad: Annotated[
         float, Range("rad", 0.02, 1.0, "by which fingers are bent that are stretched")
     ] = radians(10.0)
@@ -176,6 +176,9 @@ class Settings(NamedTuple):
     ] = 0.7
     parted: Annotated[float, Range("1", 0.05, 0.95, "of the lower top, between two parts of a density")] = 0.4
     other_part: Annotated[float, Range("1", 0.001, 0.5, "less probability than this is no other part")] = 0.05
+    branch_rad: Annotated[
+        float, Range("rad", 0.5, 2.5, "PIP beyond which a laser point on the last phalanx tells two poses")
+    ] = radians(95.0)
     goes_on_rad: Annotated[
         float, Range("rad", 0.02, 2.0, "by which a PIP may have moved at least since the finger was seen")
     ] = radians(8.0)
@@ -194,7 +197,7 @@ class Settings(NamedTuple):
         Range(
             "rad", 0.02, 1.0, "standard deviation of the PIP of a finger that is TRACKED by a wrist device"
         ),
-    ] = radians(8.5)
+    ] = radians(15.0)
     contrary: Annotated[
         float,
         Range(

@@ -50,6 +50,7 @@ class HandState:
         level: (5,) `Level` codes of what a wrist device told each finger from last; 0: markers told it since.
         searched: (5,) triples since the whole valley of a finger was searched.
         vague: (5,) whether that was not well enough to be tracked.
+        coupling: (3,) sums of what was learnt of MCP and PIP (`master.estimator.finger_coupling`).
         natural: (1,) probability that it obeys habits.
         speed: (1,) [m/s] of the palm, and `lost_s` (1,) how long nothing tells where it is.
         hidden_ns: (5,) when each hidden finger was seen last; NEVER_NS: it is seen.
@@ -75,6 +76,7 @@ class HandState:
     level: Code
     searched: Int
     vague: Bool
+    coupling: Float
     natural: Float
     speed: Float
     lost_s: Float
@@ -107,6 +109,7 @@ class HandState:
             level=("u1", 5),
             searched=("i8", 5),
             vague=("u1", 5),
+            coupling=3,
             natural=1,
             speed=1,
             lost_s=1,

@@ -5,6 +5,7 @@ from typing import Any
 from common.kernels import inner, kernel
 from common.messages import Level
 from master.estimator.extras import predict_extras
+from master.estimator.finger_coupling import expect_coupling, learn_coupling
 from master.estimator.finger_density import choose, weigh_hands
 from master.estimator.finger_scan import Prior, Scan, scan_finger
 from master.estimator.finger_surface import MOVES, look
@@ -95,6 +96,7 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
         return
     bent_palm(device.palm, state.z[BEND], state.z[BEND + 1], prior.palm, prior.bend_axes)
     _expected(hand, device, settings, state, task, sights, scan, prior)
+    expect_coupling(settings, state, max(dt_s, 0.0), prior)
     for f in range(5):
         if sights.lit[f] == 0.0:
             if prior.recent[f] == 0.0:
@@ -120,11 +122,14 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
             for k in range(4):
                 task.scanned[4 * f + k] = scan.mode[f, k]
             task.level[f] = _IK if sights.shown[f] > 0.0 else _FK
-            task.ambiguous[f] = scan.parts[f] > 1.5
+            curled = f > 0 and scan.out[f, 2] > settings.branch_rad
+            task.ambiguous[f] = scan.parts[f] > 1.5 or (curled and sights.shown[f] == 0.0)
             # The unit of light is learnt a little at a time, and nothing of a finger that is in doubt.
             doubted = task.ambiguous[f] or scan.misfit[f] > settings.doubted
             sights.teaches[f] = 1.0 if sights.shown[f] > 0.0 and not doubted else 0.0
             sights.depth_w2[f] *= 0.0 if doubted else settings.light_share
+            if f > 0 and not curled and sights.teaches[f] > 0.0:
+                learn_coupling(prior, f, scan, state)
 
 
 @inner

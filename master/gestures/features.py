@@ -39,7 +39,7 @@ class HandFeatures(NamedTuple):
         hand: Name of the hand profile.
         t_ns: The instant [ns], that of the pose.
         known: (5,) the finger's tip is known to `KNOWN_SIGMA_M` or better.
-        seen: (5,) a sensor observes the finger's tip now.
+        seen: (5,) a sensor observes the finger now: its tip, or a wrist device its laser line, and not ambiguously.
         sigma_m: (5,) standard deviation [m] of the tip along the axis where it is worst; inf: nothing is known.
         shape_sigma_m: (5,) the same without what the wrist's place has of it, which moves the whole hand.
         bend_rad: (5, 3) bends of MCP, PIP and DIP, zero where the bones lie in the palm's plane in one line; of the
@@ -133,7 +133,7 @@ class FeatureExtractor:
             hand=pose.hand,
             t_ns=pose.t_ns,
             known=np.empty(5, np.bool_),
-            seen=pose.tracked[TIPS],
+            seen=pose.tracked[TIPS] | ((pose.level > 0) & ~pose.ambiguous),
             sigma_m=np.empty(5),
             shape_sigma_m=np.empty(5),
             bend_rad=np.empty((5, 3)),

@@ -77,9 +77,9 @@ def test_a_sharper_tip_makes_a_narrower_density(worn: Worn) -> None:
 
 
 def test_all_fingers_tell_which_hand_it_is(worn: Worn) -> None:
-    assert scanned(worn, natural(60.0)).share[NATURAL] > 0.7
+    assert scanned(worn, natural(60.0)).share[NATURAL] > 0.85
     assert scanned(worn, bent(60.0, 3.0)).share[STRAIGHT] > 0.5
-    assert scanned(worn, bent(10.0, 75.0)).share[NATURAL] < 0.8
+    assert scanned(worn, bent(70.0, 45.0)).share[FREE] > 0.5
     for angles in (natural(60.0), bent(60.0, 3.0)):
         assert scanned(worn, angles).share.sum() == pytest.approx(1.0)
         np.testing.assert_array_equal(scanned(worn, angles, "fk").share, [1.0, 0.0, 0.0])
@@ -88,7 +88,7 @@ def test_all_fingers_tell_which_hand_it_is(worn: Worn) -> None:
 def test_a_finger_of_which_the_laser_alone_tells_has_no_say(worn: Worn) -> None:
     line = pipeline(worn, "auto")
     pushed(line, worn.message(natural(60.0), tips=False))
-    np.testing.assert_allclose(scan_of(line).share, [0.6, 0.2, 0.2], atol=1e-9)
+    np.testing.assert_allclose(scan_of(line).share, [0.8, 0.1, 0.1], atol=1e-9)
 
 
 def test_what_is_chosen_lies_on_the_valley_and_its_spread_is_that_of_the_density(worn: Worn) -> None:
@@ -101,7 +101,6 @@ def test_what_is_chosen_lies_on_the_valley_and_its_spread_is_that_of_the_density
             assert 0.0 < scan.pip2[f] < 1.5
             assert scan.way[f, PIP] == pytest.approx(1.0)
             assert scan.parts[f] >= 1.0
-            assert np.isfinite(scan.rival[f]) == (scan.parts[f] > 1.0)
 
 
 def test_where_a_finger_was_decides_between_two_poses_that_look_alike(worn: Worn) -> None:

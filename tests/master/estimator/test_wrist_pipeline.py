@@ -441,7 +441,7 @@ def test_what_an_imu_says_that_nobody_mounted_is_counted_and_turns_no_palm(worn:
             "auto",
             marks=pytest.mark.xfail(
                 strict=True,
-                reason="knuckles are taken to follow PIPs within 5 deg and a fifth of the PIP: 4 of 5 joints are in",
+                reason="knuckles are taken to follow PIPs within 5 deg and a share of the PIP: 4 of 5 joints are in",
             ),
         ),
         pytest.param(
@@ -530,4 +530,4 @@ def test_a_rendered_curl_from_exact_points(datasets: Path) -> None:
     seen = (pip < 85.1) & (truth["laser_len_vis"][:, 2:6] > 0.015)
     every = [float(np.sqrt(np.mean((found - pip)[seen[:, f], f] ** 2))) for f in range(4)]
     assert max(every) < 3.5, dict(zip(FINGERS[1:], every, strict=True))
-    assert np.abs(found - pip)[tracked & (pip > 101.0)].max() < 12.0
+    assert not tracked[pip > 101.0].any()

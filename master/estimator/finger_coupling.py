@@ -1,0 +1,43 @@
+"""Kernels of how the MCP of a hand goes with its PIP, learnt from the fingers whose tips are seen.
+
+A natural MCP is a share of the PIP (`master.estimator.natural_curve`). But each hand has a share of its own, and keeps
+to it more closely or less. Both are those of a regression through the origin,
+
+    e = MCP - natural MCP,   share = sum(PIP e) / sum(PIP^2),   spread^2 = sum(e^2) / sum(PIP^2) - share^2,
+
+of expected squares, so that a finger that is hardly known tells no false closeness. The sums begin as if some fingers
+of usual hands had been seen, and fade back to that.
+"""
+
+from math import exp, radians, sqrt
+
+from common.kernels import inner
+from master.estimator.finger_scan import Prior, Scan
+from master.estimator.settings import Settings
+from master.estimator.state import HandState
+
+_BENT_RAD2 = radians(45.0) ** 2  # of a finger that counts as one
+
+
+@inner
+def expect_coupling(settings: Settings, state: HandState, dt_s: float, prior: Prior) -> None:
+    """Write share and spread as they are believed, a time after the last triple."""
+    kept, sums = exp(-dt_s / settings.coupled_s), state.coupling
+    for i in range(3):
+        sums[i] *= kept
+    usual = settings.coupled_fingers * _BENT_RAD2
+    squared = usual + sums[0]
+    share = sums[1] / squared
+    spread2 = (usual * settings.coupled_spread**2 + sums[2]) / squared - share * share
+    prior.coupled_share[0], prior.coupled_spread[0] = share, sqrt(max(spread2, 0.0))
+
+
+@inner
+def learn_coupling(prior: Prior, f: int, scan: Scan, state: HandState) -> None:
+    """Add a finger of which laser and tip tell without doubt."""
+    pip, pip2, sums = scan.out[f, 2], scan.pip2[f], state.coupling
+    off = scan.out[f, 1] - prior.natural[f, 1] - prior.slope[f, 1] * pip
+    way = scan.way[f, 1] - prior.slope[f, 1]
+    sums[0] += pip * pip + pip2
+    sums[1] += pip * off + way * pip2
+    sums[2] += off * off + way * way * pip2
