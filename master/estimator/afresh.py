@@ -1,4 +1,4 @@
-"""A hand of one epoch alone: where a search begins that has no state to go on from, and what it takes for one.
+"""A hand of one epoch alone: where a search begins that has no state to go on from.
 
 From another hand of the epoch, if there is one that explains the markers; else from several, open to closed, each laid
 on the markers as a rigid body, of which the best goes on.
@@ -21,9 +21,6 @@ from master.estimator.wrist_device import BEND
 _BENDS_RAD = (0.1, 0.7, 1.3)  # of the PIP, from which a search afresh begins: open to closed
 _MCP_PER_PIP = 0.6
 _ABOVE_M, _ABOVE_WEIGHT, _PALM_WEIGHT = 0.05, 0.3, 3.0
-_SPREAD_M = 5e-3  # markers nearer than this to one line do not turn a hand about it
-_LENGTH_M = 20e-3  # a line shorter than this has no direction
-_ACROSS = 0.9  # cosine to the sight, at most
 _EVEN = 0.5  # probability
 _AT_ORIGIN = np.eye(4)
 NONE = frozenset[int]()
@@ -61,31 +58,6 @@ class Afresh:
         any_finger = habits.unlike(NONE)
         likeliest = np.asarray(np.linalg.solve(any_finger.normal[0], any_finger.pull[0]), np.float64)
         self._natural = np.minimum(np.maximum(likeliest, parameters.low), parameters.high)
-
-    def enough(self, epoch: Epoch) -> bool:
-        """Tell whether the markers fix a hand: not in one line, or across `facing`.
-
-        What faces the cameras turns the hand about a line of markers, but not about one that points at them. With an
-        orientation that is known any one marker is enough.
-        """
-        if epoch.place is not None:
-            return True
-        points = epoch.points_m[self._steps.on_hand][self._steps.placed(epoch)]
-        if epoch.turn is not None and epoch.turn.sure:
-            return len(points) > 0
-        if len(points) < 2:
-            return False
-        off = points - points.mean(axis=0)
-        if len(points) > 2:  # plainly not in one line, without what a decomposition takes
-            length2 = np.vecdot(off, off)
-            along, longest2 = off @ off[length2.argmax()], float(length2.max())
-            if longest2 > 0.0 and float((length2 - along * along / longest2).max()) > (4.0 * _SPREAD_M) ** 2:
-                return True
-        _, extent, axes = np.linalg.svd(off)
-        if len(points) > 2 and extent[1] > _SPREAD_M:
-            return True
-        back = self._steps.at.ground.back[0]
-        return bool(back and extent[0] > _LENGTH_M and abs(axes[0] @ epoch.facing) < _ACROSS)
 
     def begin(self, at: Epoch) -> float:
         """Fit without the state; return chi square of the markers.

@@ -31,6 +31,9 @@ from master.estimator.wrist_update import prepare_epoch
 _STEP = 16
 _STIFF_RAD = np.radians(1.0)  # of fingers that are taken to bend as their PIP does
 _STANDS_M = 1e-4  # of a palm before the wrist device alone, whose frame is the rig's
+_SPREAD_M = 5e-3  # markers nearer than this to one line do not turn a hand about it
+_LENGTH_M = 20e-3  # a line shorter than this has no direction
+_ACROSS = 0.9  # cosine to the sight, at most
 _EYE, _AT_ORIGIN = np.eye(3), np.eye(4)
 
 
@@ -193,6 +196,31 @@ class EpochSteps:
         if at.cov_m2 is not None:
             return self.observed.placed
         return np.isfinite(at.points_m[self.on_hand].sum(axis=1))
+
+    def enough(self, at: Epoch) -> bool:
+        """Tell whether the markers fix a hand: not in one line, or across `facing`.
+
+        What faces the cameras turns the hand about a line of markers, but not about one that points at them. With an
+        orientation that is known any one marker is enough.
+        """
+        if at.place is not None:
+            return True
+        points = at.points_m[self.on_hand][self.placed(at)]
+        if at.turn is not None and at.turn.sure:
+            return len(points) > 0
+        if len(points) < 2:
+            return False
+        off = points - points.mean(axis=0)
+        if len(points) > 2:  # plainly not in one line, without what a decomposition takes
+            length2 = np.vecdot(off, off)
+            along, longest2 = off @ off[length2.argmax()], float(length2.max())
+            if longest2 > 0.0 and float((length2 - along * along / longest2).max()) > (4.0 * _SPREAD_M) ** 2:
+                return True
+        _, extent, axes = np.linalg.svd(off)
+        if len(points) > 2 and extent[1] > _SPREAD_M:
+            return True
+        back = self.at.ground.back[0]
+        return bool(back and extent[0] > _LENGTH_M and abs(axes[0] @ at.facing) < _ACROSS)
 
     def unexplained(self) -> bool:
         """Tell whether a marker is too far from what was found."""

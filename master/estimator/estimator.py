@@ -77,7 +77,8 @@ class Estimator:
 
     def recent(self, t_ns: int) -> bool:
         """Whether the state still says anything at `t_ns`."""
-        return self._continuous and self.known and 0.0 < (t_ns - self.t_ns) * 1e-9 <= self.settings.forget_s
+        age_s = (t_ns - int(self._now.t_ns[0])) * 1e-9
+        return self._continuous and bool(self._now.known[0]) and 0.0 < age_s <= self.settings.forget_s
 
     @property
     def extras(self) -> Float:
@@ -149,7 +150,7 @@ class Estimator:
             goes_on = explained or wrong <= self.settings.misled + self._afresh.begin(at)
             if goes_on and not explained:
                 self._go_on(at, may_leave=False)
-        elif self._afresh.enough(at):
+        elif self._steps.enough(at):
             goes_on = False
             self._afresh.begin(at)
         else:
@@ -165,7 +166,7 @@ class Estimator:
             that may take its place is better.
         """
         start, task = at.start, self._at.task
-        task.may_leave[0] = may_leave and start is not None and self._afresh.enough(at)
+        task.may_leave[0] = may_leave and start is not None and self._steps.enough(at)
         if start is not None:
             task.palm[:], task.angles[:] = start.T_rig_palm, start.angles_rad.reshape(20)
         limit = self._steps.predict()
@@ -174,7 +175,7 @@ class Estimator:
         # Whether a hand obeys habits, fingers before a wrist device say by themselves.
         wrong = self._steps.fit(self._habits if self._at.ground.seen[0] > 0 else self._natural_habits)
         if self._only_natural and may_leave:
-            return wrong, not (self._steps.unexplained() and self._afresh.enough(at))
+            return wrong, not (self._steps.unexplained() and self._steps.enough(at))
         return wrong, not wrong > limit  # NaN: there is nothing to compare
 
     def _knows_place(self) -> bool:
