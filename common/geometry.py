@@ -4,6 +4,8 @@ import numpy as np
 
 from common.arrays import Float
 
+Wxyz = tuple[float, float, float, float]  # one quaternion, as plain numbers
+
 _EYE = np.eye(3)
 _SKEW: Float = np.cross(_EYE[:, None], _EYE[None]).swapaxes(1, 2).reshape(3, 9)
 _UNSKEW: Float = 0.5 * _SKEW.T
@@ -35,6 +37,32 @@ def quaternion_to_matrix(q_wxyz: Float) -> Float:
     out = 2 * np.array((yy + zz, xy - wz, xz + wy, xy + wz, xx + zz, yz - wx, xz - wy, yz + wx, xx + yy))
     out[::4] = 1 - out[::4]  # the diagonal
     return np.moveaxis(out.reshape(3, 3, *w.shape), (0, 1), (-2, -1))
+
+
+def quaternion_product(p: Wxyz, q: Wxyz) -> Wxyz:
+    """The rotation p after q; of one pair plain numbers are ten times faster than arrays."""
+    a, b, c, d = p
+    w, x, y, z = q
+    return (
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    )
+
+
+def matrix_of(q: Wxyz) -> Float:
+    """Rotation matrix (3, 3) of one unit quaternion, as `quaternion_to_matrix`."""
+    w, x, y, z = q
+    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+    wx, wy, wz = w * x, w * y, w * z
+    return np.array(
+        [
+            [1.0 - 2.0 * (yy + zz), 2.0 * (xy - wz), 2.0 * (xz + wy)],
+            [2.0 * (xy + wz), 1.0 - 2.0 * (xx + zz), 2.0 * (yz - wx)],
+            [2.0 * (xz - wy), 2.0 * (yz + wx), 1.0 - 2.0 * (xx + yy)],
+        ]
+    )
 
 
 def matrix_to_quaternion(rotation: Float) -> Float:

@@ -154,8 +154,8 @@ class Layout:
             if array is not given:
                 force_setattr(message, name, array)
             if dtype is _FLOAT:
-                numbers.append(array.ravel())
-        every = np.concatenate(numbers)
+                numbers.append(array)
+        every = np.concatenate(numbers, axis=None)
         # NaN, which is "not observed", is neither less nor greater.
         if np.count_nonzero(every < self._low) or np.count_nonzero(every > self._high):
             self._refuse(every.tolist())

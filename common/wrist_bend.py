@@ -10,9 +10,12 @@ The palm frame has its origin in the wrist joint, so a bend moves nothing but th
 `T_camera_palm` was calibrated with a straight wrist sees the palm at T_camera_palm [R_forearm_palm, 0].
 """
 
+from math import cos, sin
+
 import numpy as np
 
 from common.arrays import Float
+from common.geometry import Wxyz
 
 STRAIGHT = np.zeros(2)
 STRAIGHT.flags.writeable = False
@@ -27,6 +30,17 @@ def forearm_palm(bend_rad: Float) -> Float:
     R[..., 1, 1], R[..., 1, 2] = c, -s
     R[..., 2, 0], R[..., 2, 1], R[..., 2, 2] = -sd, cd * s, cd * c
     return R
+
+
+def bend_quaternion(flexion_rad: float, deviation_rad: float) -> Wxyz:
+    """The quaternion of `forearm_palm` of one bend."""
+    c, s, cd, sd = (
+        cos(0.5 * flexion_rad),
+        sin(0.5 * flexion_rad),
+        cos(0.5 * deviation_rad),
+        sin(0.5 * deviation_rad),
+    )
+    return cd * c, cd * s, sd * c, -sd * s
 
 
 def bend_of(R_forearm_palm: Float) -> Float:

@@ -20,21 +20,30 @@ _FAR = 1e9  # logarithm of what is not searched
 
 @inlined
 def _normal_log(off: float, variance: float) -> float:
-    return -0.5 * off * off / variance - 0.5 * log(2.0 * pi * variance)
+    return _by_width(off, variance, 0.5 * log(2.0 * pi * variance))
+
+
+@inlined
+def _by_width(off: float, variance: float, width: float) -> float:
+    """`_normal_log`, where half the logarithm of 2 pi variance is known."""
+    return -0.5 * off * off / variance - width
 
 
 @inner
 def _densities(hand: HandTables, settings: Settings, prior: Prior, f: int, unseen: bool, scan: Scan) -> None:
     """Write the logarithm of the density of finger f (3, 61), by hand."""
+    log_p = scan.log_p[f]
     low, high = hand.limits[f, 2, 0], hand.limits[f, 2, 1]
-    span = log(hand.limits[f, 1, 1] - hand.limits[f, 1, 0])
+    span, length = log(hand.limits[f, 1, 1] - hand.limits[f, 1, 0]), log(high - low)
+    free2, straight2 = settings.free_pip_rad**2, settings.straight_pip_rad**2
+    free_width, straight_width = 0.5 * log(2.0 * pi * free2), 0.5 * log(2.0 * pi * straight2)
     for k in range(FINE * (NODES - 1) + 1):
         node = min(k // FINE, NODES - 2)
         share = k / FINE - node
         pip = low + (high - low) * k / (FINE * (NODES - 1))
         if node < scan.first[f] or node + 1 > scan.last[f]:
             for h in range(HANDS):
-                scan.log_p[h, k] = -_FAR
+                log_p[h, k] = -_FAR
             continue
         chi2 = 0.0
         for i in range(ROWS):
@@ -52,11 +61,11 @@ def _densities(hand: HandTables, settings: Settings, prior: Prior, f: int, unsee
             off -= prior.coupled_share[0] * pip
             variance += (prior.coupled_spread[0] * max(pip, 0.0)) ** 2
         natural = _normal_log(off, variance)
-        scan.log_p[_NATURAL, k] = base + natural - log(high - low)
-        free = _normal_log(pip - settings.free_pip_mean_rad, settings.free_pip_rad**2) - span
-        scan.log_p[_FREE, k] = base + free
-        straight = log(2.0) + _normal_log(pip, settings.straight_pip_rad**2) - span
-        scan.log_p[_STRAIGHT, k] = base + (straight if f > 0 else free)
+        log_p[_NATURAL, k] = base + natural - length
+        free = _by_width(pip - settings.free_pip_mean_rad, free2, free_width) - span
+        log_p[_FREE, k] = base + free
+        straight = log(2.0) + _by_width(pip, straight2, straight_width) - span
+        log_p[_STRAIGHT, k] = base + (straight if f > 0 else free)
 
 
 @inner
@@ -77,10 +86,10 @@ def weigh_hands(hand: HandTables, settings: Settings, sights: Sights, prior: Pri
         for h in range(HANDS):
             top = -inf
             for k in range(FINE * (NODES - 1) + 1):
-                top = max(top, scan.log_p[h, k])
+                top = max(top, scan.log_p[f, h, k])
             total = 0.0
             for k in range(FINE * (NODES - 1) + 1):
-                total += exp(scan.log_p[h, k] - top)
+                total += exp(scan.log_p[f, h, k] - top)
             scan.hand[f, h] = log(total) + top
             if f > 0 and sights.shown[f] > 0.0:
                 scan.share[h] += scan.hand[f, h]
@@ -108,14 +117,12 @@ def _at(scan: Scan, f: int, place: float, out: Float) -> None:
 def choose(hand: HandTables, settings: Settings, sights: Sights, prior: Prior, f: int, scan: Scan) -> None:
     """Write what is believed of finger f: the median of the part that weighs most, its likeliest pose, and the spread.
 
+    By the densities that `weigh_hands` left.
+
     Two tops are of one part where the density does not fall clearly between them. Where frames follow each other, a
     part near to where the finger was is believed rather.
     """
     count, p = FINE * (NODES - 1) + 1, scan.p
-    others = 0
-    for g in range(1, 5):
-        others += 1 if sights.shown[g] > 0.0 else 0
-    _densities(hand, settings, prior, f, others > 0 and sights.shown[f] == 0.0, scan)
     low, high = hand.limits[f, 2, 0], hand.limits[f, 2, 1]
     step = (high - low) / (count - 1)
     total = 0.0
@@ -123,7 +130,7 @@ def choose(hand: HandTables, settings: Settings, sights: Sights, prior: Prior, f
         p[k] = 0.0
         for h in range(HANDS):
             if scan.share[h] > 0.0:
-                p[k] += scan.share[h] * exp(scan.log_p[h, k] - scan.hand[f, h])
+                p[k] += scan.share[h] * exp(scan.log_p[f, h, k] - scan.hand[f, h])
         total += p[k]
     for k in range(count):
         p[k] /= total

@@ -20,7 +20,7 @@ from typing import Any
 from common.arrays import Float, Int
 from common.kernels import inlined, inner
 from common.records import record
-from master.estimator.finger_surface import OWN_MOVES, Surface, cut, first_hit, look
+from master.estimator.finger_surface import NO_MOVES, OWN_MOVES, Surface, cut, first_hit, look
 from master.estimator.hand_tables import HandTables
 from master.estimator.kinematics import twist_hand
 from master.estimator.matrices import cholesky, substitute
@@ -117,8 +117,8 @@ class Scan:
         lack: (5, NODES, 2) of the ridge to the cut.
         hand: (5, 3) logarithm of the evidence of each hand.
         share: (3,) probabilities of the hands.
-        p: (61,) density of one finger, fine, and `log_p` (3, 61) by hand.
-        near: (61,) density by which its place is chosen.
+        log_p: (5, 3, 61) logarithm of the density of each finger, fine, by hand.
+        p: (61,) density of one finger, and `near` (61,) that by which its place is chosen.
         out: (5, 5) angles and twist chosen, and `mode` (5, 5) of the most likely pose of that part.
         way: (5, 5) derivative of these by the PIP there.
         pip2: (5,) variance of the PIP.
@@ -176,7 +176,7 @@ class Scan:
             share=HANDS,
             p=fine,
             near=fine,
-            log_p=(HANDS, fine),
+            log_p=(5, HANDS, fine),
             out=(5, 5),
             mode=(5, 5),
             way=(5, 5),
@@ -214,20 +214,8 @@ def _dip_sigma(settings: Settings, f: int, pip: float) -> float:
 
 
 @inner
-def _rows(
-    hand: HandTables,
-    device: Any,
-    settings: Settings,
-    sights: Sights,
-    prior: Prior,
-    f: int,
-    tip: bool,
-    moved: bool,
-    scan: Scan,
-) -> float:
-    """Write residuals (8,) and derivatives (8, 4) at `scan.angles`, `scan.twist`; return half chi square."""
-    if moved:  # else what was seen of it is in `scan.surface` still
-        look(hand, device, prior.palm, prior.bend_axes, scan.angles, f, OWN_MOVES, scan.surface)
+def _rows(settings: Settings, sights: Sights, prior: Prior, f: int, tip: bool, scan: Scan) -> float:
+    """Write residuals (8,) and derivatives (8, 4) of what `look` left in `scan.surface`; return half chi square."""
     seen, G, r, J, a = scan.surface.seen, scan.surface.J, scan.r, scan.J, scan.angles
     for i in range(ROWS):
         r[i] = 0.0
@@ -306,7 +294,7 @@ def scan_finger(
     scan: Scan,
 ) -> None:
     """Write the valley of finger f, from `Scan.x` to `misfit`."""
-    a, x = scan.angles, scan.x
+    a, x, surface = scan.angles, scan.x, scan.surface
     low, high = hand.limits[f, 2, 0], hand.limits[f, 2, 1]
     scan.misfit[f] = inf
     scan.first[f], scan.last[f] = 0, NODES - 1
@@ -328,27 +316,29 @@ def scan_finger(
         if (node - scan.first[f]) % _AFRESH == 0:
             for start in range(_COARSE):
                 _put(hand, f, aside, _COARSE_RAD[start], dip, prior.twist[f], scan)
-                cost = _rows(hand, device, settings, sights, prior, f, tip, True, scan)
+                look(hand, device, prior.palm, prior.bend_axes, a, f, NO_MOVES, surface)
+                cost = _rows(settings, sights, prior, f, tip, scan)
                 if cost < best:
                     best, at = cost, start
         if node > scan.first[f]:
             before = x[f, node - 1]
             _put(hand, f, before[0], before[1], before[3], before[4], scan)
-            if at < _COARSE and _rows(hand, device, settings, sights, prior, f, tip, True, scan) < best:
-                at = _COARSE
+            if at < _COARSE:
+                look(hand, device, prior.palm, prior.bend_axes, a, f, NO_MOVES, surface)
+                if _rows(settings, sights, prior, f, tip, scan) < best:
+                    at = _COARSE
         if at < _COARSE:
             _put(hand, f, aside, _COARSE_RAD[at], dip, prior.twist[f], scan)
         steps = _STEPS if at == _COARSE else _STEPS_AFRESH
         length = cost = 0.0
         for k in range(steps + 1):
-            cost = _rows(hand, device, settings, sights, prior, f, tip, True, scan)
+            look(hand, device, prior.palm, prior.bend_axes, a, f, OWN_MOVES, surface)
             if k == steps - 1:
-                length = cut(device, f, scan.surface)
+                length = cut(device, f, surface)
                 if length > 0.0:
-                    c = scan.surface.cut
-                    sights.lack[f, 0] = c[0] / c[2] - scan.surface.seen[0]
-                    sights.lack[f, 1] = c[1] / c[2] - scan.surface.seen[1]
-                    cost = _rows(hand, device, settings, sights, prior, f, tip, False, scan)
+                    sights.lack[f, 0] = surface.cut[0] / surface.cut[2] - surface.seen[0]
+                    sights.lack[f, 1] = surface.cut[1] / surface.cut[2] - surface.seen[1]
+            cost = _rows(settings, sights, prior, f, tip, scan)
             if not _normal(scan) or k == steps:
                 break
             for u in range(4):

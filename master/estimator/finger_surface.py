@@ -17,12 +17,13 @@ from typing import Any
 import numpy as np
 
 from common.arrays import Float
-from common.kernels import inlined, inner
+from common.kernels import constant, inlined, inner
 from common.records import record
 from master.estimator.hand_tables import HandTables
 from master.estimator.kinematics import abduction_axis, finger_chain
 
-MOVES, OWN_MOVES = 7, 5  # abduction, flexion, PIP, DIP, twist, and the wrist's flexion and deviation
+# Abduction, flexion, PIP, DIP, twist, and the wrist's flexion and deviation; all, those of the finger itself, none.
+MOVES, OWN_MOVES, NO_MOVES = constant(7), constant(5), constant(0)
 _BONE = np.array([0, 0, 0, 0, 1, 1, 2, 2])
 _PULLED_IN = 0.77
 _CAP_ALONG, _CAP_OUT = 0.7, 0.5  # radii from the last sphere to where the skin turns away
@@ -31,6 +32,7 @@ _FARTHEST = 6.0  # lengths of its last stretch that a chain which ends before th
 _ROOT = 4  # spheres of the first bone, which of a thumb is in its ball
 RAYS = 16
 _SEEN_M = 3e-4  # a lit point this near behind the first the camera sees is seen
+_ROUNDED_M = 1e-9
 _STRETCH = 0.5  # share of the finger's breadth that one chord may span: more is a jump from part to part
 
 
@@ -40,6 +42,7 @@ class Surface:
     S: Float  # (8, 3) spheres
     Q: Float  # (9, 3) ridge
     along: Float  # (8, 3)
+    bone: Float  # (7, 3) unit vectors from sphere to sphere
     q: Float  # (3,) laser point
     way: Float  # (3,) of the chain there
     laser: Float  # (7, 12) terms of the cones from the laser
@@ -47,6 +50,7 @@ class Surface:
     ray: Float  # (3,)
     lit: Float  # (RAYS, 5) x, y, z, clearness, body
     reached: Float  # (7,) whether the plane comes near a cone
+    begins: Float  # (7,) no part of a cone is nearer to the camera [m]
     cut: Float  # (3,) point of the exact cut
     R: Float  # (4, 3, 3) joints, camera frame
     P: Float  # (4, 3)
@@ -63,6 +67,7 @@ class Surface:
             S=(8, 3),
             Q=(9, 3),
             along=(8, 3),
+            bone=(7, 3),
             q=3,
             way=3,
             laser=(7, 12),
@@ -70,6 +75,7 @@ class Surface:
             ray=3,
             lit=(RAYS, 5),
             reached=7,
+            begins=7,
             cut=3,
             R=(4, 3, 3),
             P=(4, 3),
@@ -83,7 +89,7 @@ class Surface:
 @inner
 def spheres(device: Any, f: int, work: Surface) -> None:
     """Write the spheres of finger f of joints `work.R`, `work.P`, and the way of the chain."""
-    S, along, R, P = work.S, work.along, work.R, work.P
+    S, along, bone, R, P = work.S, work.along, work.bone, work.R, work.P
     for k in range(8):
         b = _BONE[k]
         if k == 4 or k == 6:
@@ -102,16 +108,14 @@ def spheres(device: Any, f: int, work: Surface) -> None:
             for j in range(3):
                 total += R[b, i, j] * device.local[f, k, j]
             S[k, i] = total
+    for k in range(7):
+        x, y, z = S[k + 1, 0] - S[k, 0], S[k + 1, 1] - S[k, 1], S[k + 1, 2] - S[k, 2]
+        scale = 1.0 / sqrt(x * x + y * y + z * z)
+        bone[k, 0], bone[k, 1], bone[k, 2] = scale * x, scale * y, scale * z
     for k in range(8):
         x = y = z = 0.0
         for first in range(max(k - 1, 0), min(k, 6) + 1):
-            dx, dy, dz = (
-                S[first + 1, 0] - S[first, 0],
-                S[first + 1, 1] - S[first, 1],
-                S[first + 1, 2] - S[first, 2],
-            )
-            scale = 1.0 / sqrt(dx * dx + dy * dy + dz * dz)
-            x, y, z = x + scale * dx, y + scale * dy, z + scale * dz
+            x, y, z = x + bone[first, 0], y + bone[first, 1], z + bone[first, 2]
         scale = 1.0 / sqrt(x * x + y * y + z * z)
         along[k, 0], along[k, 1], along[k, 2] = scale * x, scale * y, scale * z
 
@@ -189,6 +193,16 @@ def _terms(S: Float, k: int, r1: float, r2: float, ox: float, oy: float, oz: flo
 
 
 @inlined
+def _away(S: Float, k: int) -> float:
+    """How far the way from sphere k to k + 1 is from the camera at least [m]."""
+    ax, ay, az = S[k + 1, 0] - S[k, 0], S[k + 1, 1] - S[k, 1], S[k + 1, 2] - S[k, 2]
+    foot = -(S[k, 0] * ax + S[k, 1] * ay + S[k, 2] * az) / (ax * ax + ay * ay + az * az)
+    share = min(max(foot, 0.0), 1.0)
+    x, y, z = S[k, 0] + share * ax, S[k, 1] + share * ay, S[k, 2] + share * az
+    return sqrt(x * x + y * y + z * z)
+
+
+@inlined
 def first_hit(t: Float, dx: float, dy: float, dz: float) -> float:
     """How far along a unit ray the cone of terms (12,) begins; inf: it is missed (`common.round_cones`)."""
     m2, m3 = dx * t[0] + dy * t[1] + dz * t[2], dx * t[3] + dy * t[4] + dz * t[5]
@@ -224,8 +238,8 @@ def cut(device: Any, f: int, work: Surface) -> float:
     low, high, broad = inf, -inf, 0.0
     for k in range(7):
         r1, r2 = device.radius[f, k], device.radius[f, k + 1]
-        _terms(S, k, r1, r2, laser[0], laser[1], laser[2], work.laser[k])
         _terms(S, k, r1, r2, 0.0, 0.0, 0.0, work.camera[k])
+        work.begins[k] = _away(S, k) - max(r1, r2) - _ROUNDED_M
     near = 0.0
     for k in range(7):
         work.reached[k] = 0.0
@@ -255,6 +269,10 @@ def cut(device: Any, f: int, work: Surface) -> float:
         near = height
     if not low < high:
         return 0.0
+    for k in range(7):
+        if work.reached[k] > 0.0:
+            r1, r2 = device.radius[f, k], device.radius[f, k + 1]
+            _terms(S, k, r1, r2, laser[0], laser[1], laser[2], work.laser[k])
     step = (high - low) / (RAYS - 1)
     first = _ROOT - 1 if f == 0 else 0
     for ray in range(RAYS):
@@ -277,7 +295,8 @@ def cut(device: Any, f: int, work: Surface) -> float:
             continue
         ex, ey, ez, seen = x / distance, y / distance, z / distance, inf
         for k in range(7):
-            seen = min(seen, first_hit(work.camera[k], ex, ey, ez))
+            if work.begins[k] < distance:  # what is farther hides nothing
+                seen = min(seen, first_hit(work.camera[k], ex, ey, ez))
         lit[ray, 3] = min(seen - distance, 0.0) + _SEEN_M
     total = u = v = 0.0
     for ray in range(RAYS - 1):
@@ -346,6 +365,11 @@ def look(
         t[i] = P[2, i]
         for j in range(3):
             t[i] += R[2, i, j] * device.tip[f, j]
+    x, y = q[0] / q[2], q[1] / q[2]
+    tx, ty = t[0] / t[2], t[1] / t[2]
+    seen[0], seen[1], seen[2], seen[3], seen[4] = x, y, tx, ty, log(max(t[2], 1e-3))
+    if moves == 0:
+        return at
     abduction_axis(hand, T, f, A[0])
     for i in range(3):
         A[1, i], A[2, i], A[3, i] = -R[0, i, 0], -R[1, i, 0], -R[2, i, 0]
@@ -360,9 +384,6 @@ def look(
             along += (swing[0, f, 1, j, k] + c * swing[1, f, 1, j, k] + s * swing[2, f, 1, j, k]) * u[j]
         for i in range(3):
             A[4, i] += R[0, i, k] * along
-    x, y = q[0] / q[2], q[1] / q[2]
-    tx, ty = t[0] / t[2], t[1] / t[2]
-    seen[0], seen[1], seen[2], seen[3], seen[4] = x, y, tx, ty, log(max(t[2], 1e-3))
     for k in range(moves):
         ax, ay, az = A[k, 0], A[k, 1], A[k, 2]
         ox, oy, oz, carried = P[0, 0], P[0, 1], P[0, 2], True

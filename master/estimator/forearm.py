@@ -12,19 +12,14 @@ to count its drift again. If not, palms that contradict for long say it.
 """
 
 from collections import Counter
-from math import atan2, hypot, nan, pi, sqrt
+from math import atan2, cos, hypot, isnan, nan, pi, sin, sqrt
 
 import numpy as np
 
 from common.arrays import Float
 from common.calibration import ImuCalibration
-from common.geometry import (
-    axis_rotation,
-    matrix_to_quaternion,
-    quaternion_to_matrix,
-    rotation_vector_to_matrix,
-)
-from common.wrist_bend import forearm_palm
+from common.geometry import Wxyz, matrix_of, matrix_to_quaternion, quaternion_product
+from common.wrist_bend import bend_quaternion
 from master.estimator.epoch import Turn
 from master.estimator.imu_samples import Between, OrientationSamples
 from master.estimator.palm_imu import SURE_RAD, turn_of
@@ -36,6 +31,8 @@ LOST_RAD = 1.0  # a heading less sure than this may point anywhere
 _WALK2, _MOST2 = np.radians([0.2, 5.0]) ** 2  # [rad^2/s] a heading walks at least and, unless evenly, at most
 _CONTRARY_NS, _CONTRARY = 500_000_000, 5  # what contradicts for so long, and so often, is right
 _RESTARTED_S = 0.25  # an IMU that begins anew is silent for longer, until it knows where up is
+_SMALL_RAD = 1e-9  # a tilt by less is taken as small
+_EYE = np.eye(3)
 NO_WORLD = np.full(4, np.nan), np.full(2, np.nan)
 
 
@@ -56,8 +53,8 @@ class Forearm:
             CalibrationError: The file does not say how it is mounted.
         """
         self.counts: Counter[str] = Counter() if counts is None else counts
-        self._imu, self._imu_forearm = imu, turn_of("q_palm_imu", imu.q_palm_imu).T
-        self._rig_world = None if imu.q_rig_world is None else turn_of("q_rig_world", imu.q_rig_world)
+        self._imu, self._imu_forearm = imu, _wxyz(turn_of("q_palm_imu", imu.q_palm_imu).T)
+        self._rig_world = None if imu.q_rig_world is None else _wxyz(turn_of("q_rig_world", imu.q_rig_world))
         self._samples = OrientationSamples(self.counts, imu.heading_drift_rad_s, imu.stamp_offset_us)
         self._sample_ns, self._sample_drift_rad = 0, nan
         self._asked_ns: int | None = None
@@ -73,7 +70,7 @@ class Forearm:
     def push(self, t_ns: int, wxyz: Float, heading_sigma_rad: float = nan) -> None:
         """Take one sample: quaternion (4,), IMU axes -> its world, and how far its heading has drifted if told."""
         self._samples.push(t_ns, wxyz, heading_sigma_rad)
-        if np.isnan(wxyz).any():
+        if isnan(sum(wxyz.tolist())):
             return
         silent_s = 1e-9 * abs(t_ns - self._sample_ns)
         if silent_s > _RESTARTED_S and heading_sigma_rad < self._sample_drift_rad:
@@ -92,20 +89,23 @@ class Forearm:
         if found is None or self._rig_world is None:
             return None
         walked = self._walked_rad2(t_ns, found)
-        tilted = self._rig_world @ rotation_vector_to_matrix(np.array([*z[TILT : TILT + 2], 0.0]))
-        rotation = tilted @ axis_rotation(2, z[HEADING]) @ self._forearm(found)
+        tilted, turned = self._tilted(self._rig_world, z), 0.5 * float(z[HEADING])
+        heading = cos(turned), 0.0, 0.0, sin(turned)
+        rotation = matrix_of(quaternion_product(quaternion_product(tilted, heading), self._forearm(found)))
         sigma = hypot(DEFAULT.strap_rad, DEFAULT.palm_walk_rad_s * found.away_s)
-        axes = np.stack([self._rig_world[:, 0], self._rig_world[:, 1], tilted[:, 2]])
+        axes = matrix_of(self._rig_world).T.copy()  # about x and y of the world the forearm tilts,
+        axes[2] = matrix_of(tilted)[:, 2]  # about the vertical that is believed it turns
         wide = z_cov[HEADING, HEADING] + walked + np.trace(z_cov[BEND : BEND + 2, BEND : BEND + 2])
-        return Turn(rotation, np.eye(3) / sigma**2, bool(wide < SURE_RAD**2), axes, walked)
+        return Turn(rotation, _EYE / sigma**2, bool(wide < SURE_RAD**2), axes, walked)
 
     def heading_of(self, t_ns: int, R_rig_palm: Float, z: Float) -> float | None:
         """The heading that comes nearest to a palm (3, 3) [rad]; None: no sample is near."""
         found = self._samples.between(t_ns)
         if found is None or self._rig_world is None:
             return None
-        tilted = self._rig_world @ rotation_vector_to_matrix(np.array([*z[TILT : TILT + 2], 0.0]))
-        turn = tilted.T @ R_rig_palm @ (self._forearm(found) @ forearm_palm(z[BEND : BEND + 2])).T
+        flexion, deviation = z[BEND : BEND + 2].tolist()
+        palm = matrix_of(quaternion_product(self._forearm(found), bend_quaternion(flexion, deviation)))
+        turn = matrix_of(self._tilted(self._rig_world, z)).T @ R_rig_palm @ palm.T
         return atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
 
     def contradicted(self, t_ns: int, *, by_palm: bool) -> bool:
@@ -133,23 +133,33 @@ class Forearm:
         if found is None:
             return NO_WORLD
         turned = DEFAULT.palm_walk_rad_s * found.away_s
-        forearm = self._forearm(found)
-        deviation = axis_rotation(1, bend_rad[1])
-        axes = forearm @ np.stack([deviation[:, 0], np.array([0.0, 1.0, 0.0])], axis=1)
-        x, y, z = np.vecdot(axes @ bend_cov, axes).tolist()
+        forearm, (flexion, deviation) = self._forearm(found), bend_rad.tolist()
+        (ff, fd), (_, dd) = bend_cov.tolist()
+        c, s = cos(deviation), sin(deviation)
+        # Along each axis of the world: what a flexion, about the forearm's x as it deviates, and a deviation leave.
+        about = [(c * x - s * z, y) for x, y, z in matrix_of(forearm).tolist()]
+        x, y, z = (u * u * ff + 2.0 * u * v * fd + v * v * dd for u, v in about)
         tilt = hypot(self._imu.orientation_sigma_rad, turned, sqrt(0.5 * (x + y)))
         heading = hypot(self._imu.heading_sigma_rad or 0.0, found.drift_rad, turned, sqrt(z))
-        palm = matrix_to_quaternion(forearm @ forearm_palm(bend_rad))
-        return palm, np.array([tilt, min(heading, ANYWHERE_RAD)])
+        palm = np.array(quaternion_product(forearm, bend_quaternion(flexion, deviation)))
+        return -palm if palm[0] < 0.0 else palm, np.array([tilt, min(heading, ANYWHERE_RAD)])
 
     def _between(self, t_ns: int) -> Between | None:
         found = self._samples.between(t_ns)
         self.counts["orientation.absent" if found is None else "orientation.used"] += 1
         return found
 
-    def _forearm(self, found: Between) -> Float:
-        """The forearm (3, 3) in the IMU's world."""
-        return quaternion_to_matrix(found.q_wxyz) @ self._imu_forearm
+    def _forearm(self, found: Between) -> Wxyz:
+        """The forearm in the IMU's world."""
+        return quaternion_product(found.q_wxyz, self._imu_forearm)
+
+    @staticmethod
+    def _tilted(rig_world: Wxyz, z: Float) -> Wxyz:
+        """The IMU's world in the rig, tilted as is believed."""
+        x, y = z[TILT : TILT + 2].tolist()
+        angle = hypot(x, y)
+        share = sin(0.5 * angle) / angle if angle > _SMALL_RAD else 0.5
+        return quaternion_product(rig_world, (cos(0.5 * angle), share * x, share * y, 0.0))
 
     def _walked_rad2(self, t_ns: int, found: Between) -> float:
         """Variance [rad^2] of what the heading has drifted since the epoch before.
@@ -164,3 +174,9 @@ class Forearm:
             even_rad, walked = max(even_rad, self._imu.heading_drift_rad_s * since_s), _MOST2 * since_s
         self._asked_ns, self._drift_rad = t_ns, found.drift_rad
         return float(max(even_rad**2, min(max(walked, _WALK2 * since_s), _MOST2 * since_s)))
+
+
+def _wxyz(rotation: Float) -> Wxyz:
+    """The unit quaternion of a rotation (3, 3)."""
+    w, x, y, z = matrix_to_quaternion(rotation).tolist()
+    return w, x, y, z

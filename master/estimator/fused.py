@@ -142,10 +142,9 @@ class WristSide:
         return msgspec.structs.replace(pose, **changes)
 
     def _count(self, event: str, fingers: Bool) -> None:
-        if not fingers.any():
-            return
-        for f in np.flatnonzero(fingers):
-            self.counts[f"{event}.{FINGERS[f]}"] += 1
+        for f, happens in enumerate(fingers.tolist()):
+            if happens:
+                self.counts[f"{event}.{FINGERS[f]}"] += 1
 
 
 class FusedPipeline:

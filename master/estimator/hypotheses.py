@@ -1,13 +1,13 @@
 """Records of a fit: a hand under each hypothesis, and both together."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from common.arrays import Float
 from common.kernels import inlined
-from common.records import record
+from common.records import boxed, record
 from master.estimator.priors import Habits
 from master.estimator.problem import Belief, Search
 from master.estimator.residuals import Observations
@@ -24,6 +24,7 @@ class Posterior:
         steps: (1,) of the search.
         natural: (1,) probability that the hand obeys habits.
         scale: (1,) by how much the misfit has scaled the covariance.
+        contrary: (1,) chi square of the palm against how other sensors have it turned, and of what the extras gave in.
     """
 
     palm: Float
@@ -34,6 +35,7 @@ class Posterior:
     steps: Float
     natural: Float
     scale: Float
+    contrary: Float
 
     @classmethod
     def empty(cls, n: int, extras: int, markers: int) -> "Posterior":
@@ -49,21 +51,25 @@ class Posterior:
             steps=1,
             natural=1,
             scale=1,
+            contrary=1,
         )
 
 
 class Blank(NamedTuple):
-    """Of which nothing is believed: what `_onto` needs for a fit to points alone."""
+    """Of which nothing is believed: what `_onto` needs for a fit to points alone.
+
+    `belief`: the array that a `Belief` lies in (`common.records.boxed`).
+    """
 
     habits: Habits
-    belief: Belief
+    belief: Any
     between: Observations
 
     @classmethod
     def of(cls, n: int, extras: int, cameras: int, markers: int) -> "Blank":
         """For a hand with n free angles."""
         nothing = Habits(np.zeros((1, n, n)), np.zeros((1, n)), np.zeros(1), np.zeros(1))
-        return cls(nothing, Belief.none(n, extras), Observations.empty(cameras, markers))
+        return cls(nothing, boxed(Belief.none(n, extras)), Observations.empty(cameras, markers))
 
 
 class Hypothesis:

@@ -2,12 +2,11 @@
 
 from collections import Counter, deque
 from dataclasses import dataclass
-from math import isnan, nan
-
-import numpy as np
+from math import acos, isnan, nan, sin, sqrt
 
 from common.arrays import Float
 from common.calibration import UNIT_WITHIN
+from common.geometry import Wxyz
 
 REACH_NS = 50_000_000  # farther from an instant a sample tells nothing of it
 _KEPT = 512  # half a second of the fastest sensors; instants lie at most two camera periods behind
@@ -17,7 +16,7 @@ _STRAIGHT = 1e-9  # sine of an angle below which an arc is a straight line
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sample:
     t_ns: int
-    q_wxyz: Float
+    q_wxyz: Wxyz
     drift_rad: float
 
 
@@ -26,12 +25,12 @@ class Between:
     """An IMU's orientation at an instant.
 
     Attributes:
-        q_wxyz: Quaternion (4,).
+        q_wxyz: Unit quaternion.
         away_s: How far from samples that is [s].
         drift_rad: How far its heading has drifted since the first sample, standard deviation [rad].
     """
 
-    q_wxyz: Float
+    q_wxyz: Wxyz
     away_s: float
     drift_rad: float
 
@@ -66,8 +65,9 @@ class OrientationSamples:
         newest came from a time that is not yet: the others are forgotten.
         """
         t_ns += self._late_ns
-        length = float(np.linalg.norm(orientation_wxyz))
-        if np.isnan(length):
+        w, x, y, z = orientation_wxyz.tolist()
+        length = sqrt(w * w + x * x + y * y + z * z)
+        if isnan(length):
             self.counts["orientation.missing"] += 1
         elif abs(length - 1.0) > UNIT_WITHIN:
             self.counts["orientation.not_unit"] += 1
@@ -81,7 +81,8 @@ class OrientationSamples:
             drift_rad = heading_sigma_rad
             if isnan(drift_rad):
                 drift_rad = 1e-9 * (t_ns - self._first_ns) * self._drift_rad_s
-            self._samples.append(_Sample(t_ns, orientation_wxyz / length, drift_rad))
+            unit = w / length, x / length, y / length, z / length
+            self._samples.append(_Sample(t_ns, unit, drift_rad))
 
     def between(self, t_ns: int) -> Between | None:
         """The orientation at an instant; None: too far from any sample.
@@ -107,12 +108,14 @@ class OrientationSamples:
         return None if one is None else Between(one.q_wxyz, 1e-9 * abs(t_ns - one.t_ns), one.drift_rad)
 
 
-def slerp(first: Float, second: Float, share: float) -> Float:
-    """Unit quaternion (4,) on the shorter arc between two, at `share` 0...1 of the way (Shoemake, 1985)."""
-    cosine = float(first @ second)
-    other = second if cosine >= 0.0 else -second
-    angle = np.arccos(min(abs(cosine), 1.0))
-    sine = np.sin(angle)
+def slerp(first: Wxyz, second: Wxyz, share: float) -> Wxyz:
+    """Unit quaternion on the shorter arc between two, at `share` 0...1 of the way (Shoemake, 1985)."""
+    (a, b, c, d), (w, x, y, z) = first, second
+    cosine = a * w + b * x + c * y + d * z
+    angle = acos(min(abs(cosine), 1.0))
+    sine = sin(angle)
     if sine < _STRAIGHT:
         return first
-    return (np.sin((1.0 - share) * angle) * first + np.sin(share * angle) * other) / sine
+    p, q = sin((1.0 - share) * angle) / sine, sin(share * angle) / sine
+    q = q if cosine >= 0.0 else -q
+    return p * a + q * w, p * b + q * x, p * c + q * y, p * d + q * z

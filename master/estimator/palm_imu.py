@@ -18,6 +18,7 @@ from common.arrays import Float
 from common.calibration import ImuCalibration, Quaternion
 from common.errors import CalibrationError
 from common.geometry import (
+    matrix_of,
     matrix_to_quaternion,
     quaternion_to_matrix,
     rotation_vector_to_matrix,
@@ -71,7 +72,7 @@ class OrientationTrack:
             self.counts["orientation.absent"] += 1
             return None
         self.counts["orientation.used"] += 1
-        rotation = self._rig_world @ quaternion_to_matrix(found.q_wxyz) @ self._palm_imu.T
+        rotation = self._rig_world @ matrix_of(found.q_wxyz) @ self._palm_imu.T
         if heading_rad is None and near is not None:
             rotation = _turn_about(self._up, near.T_rig_palm[:3, :3] @ rotation.T) @ rotation
         tilt_2 = self._imu.orientation_sigma_rad**2 + (DEFAULT.palm_walk_rad_s * found.away_s) ** 2

@@ -174,7 +174,7 @@ class MarkerPipeline:
     def _solve(self, frames: FrameSet) -> SolvedPose:
         t_ns, last, age_s = frames.t_ns, self._recent(frames.t_ns), 0.0
         if last is not None:
-            age_s = (t_ns - int(self._estimator.state.t_ns[0])) * 1e-9 if self._estimator else 0.0
+            age_s = (t_ns - self._estimator.t_ns) * 1e-9 if self._estimator else 0.0
         with self._stage("triangulate"):
             if self._lens_shift.any:
                 frames = replace(frames, uv=self._lens_shift.centres(frames.uv, frames.area))

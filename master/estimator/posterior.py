@@ -270,7 +270,7 @@ def _onto(
     linearise(
         rig,
         blank.habits,
-        blank.belief,
+        blank.belief[0],
         between,
         _ONLY,
         out.palm,

@@ -56,6 +56,7 @@ class HandState:
         hidden_ns: (5,) when each hidden finger was seen last; NEVER_NS: it is seen.
         then, then_rates: (5, 20) the angles and rates of the whole hand at that time.
         then_alike: (5,) how neighbours correlated then.
+        turn: (3, 3) how other sensors had the palm turned, and `turn_known` (1,) whether they said so.
     """
 
     t_ns: Int
@@ -84,6 +85,8 @@ class HandState:
     then: Float
     then_rates: Float
     then_alike: Float
+    turn: Float
+    turn_known: Bool
 
     @classmethod
     def unknown(cls, n: int, extras: int) -> "HandState":
@@ -117,6 +120,8 @@ class HandState:
             then=(5, 20),
             then_rates=(5, 20),
             then_alike=5,
+            turn=(3, 3),
+            turn_known=("u1", 1),
         )
         for never in (state.t_ns, state.z_ns, state.seen_ns, state.placed_ns, state.told_ns, state.hidden_ns):
             never[:] = NEVER_NS

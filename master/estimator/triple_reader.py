@@ -10,7 +10,7 @@ from math import nan
 
 import numpy as np
 
-from common.arrays import Bool, Float
+from common.arrays import Float
 from common.hand_model import FINGERS
 from common.messages import WristDetections
 from master.estimator.cubic import CubicLaw
@@ -18,7 +18,6 @@ from master.estimator.epoch import WristRows
 from master.wrist_setup import WristSetup
 
 _NO_LAW = np.full(5, nan)
-_ONES = np.ones((5, 1))
 
 
 class TripleReader:
@@ -26,27 +25,22 @@ class TripleReader:
 
     def __init__(self, setup: WristSetup, cubic: CubicLaw | None, counts: Counter[str]) -> None:
         self._setup, self._cubic, self._counts = setup, cubic, counts
-        self._size = np.array([setup.optics.width_px, setup.optics.height_px])
 
     def read(self, message: WristDetections, t_ns: int) -> tuple[WristRows, Float]:
         """The rows of a triple for an epoch, and its laser points (5, 3) [m], camera frame; NaN: not seen."""
         setup, level = self._setup, self._setup.level
         uv = np.concatenate([message.laser_uv, message.tip_uv])
-        sigma = np.concatenate([message.laser_sigma_px, message.tip_sigma_px])
-        seen = np.isfinite(uv[:, 0])
-        inside = ((uv >= -0.5) & (uv <= self._size - 0.5)).all(axis=1) & (sigma <= self._size.max())
-        rays = setup.optics.undistort(np.where(inside[:, None], uv, nan))
-        laser, tip = rays[:5].copy(), rays[5:].copy()
-        ray = np.concatenate([laser, _ONES], axis=1)
-        away = setup.offset_m / (ray @ setup.normal)
-        points_m = ray * np.where(away > 0.0, away, nan)[:, None]
-        for event, fingers in (
-            ("outside", seen[:5] & ~inside[:5]),
-            ("no_plane", inside[:5] & np.isnan(points_m[:, 0])),
-            ("tip_outside", seen[5:] & ~inside[5:]),
-        ):
-            if fingers.any():
-                self._count(event, fingers)
+        self._leave_out("outside", uv[:5], message.laser_sigma_px)
+        self._leave_out("tip_outside", uv[5:], message.tip_sigma_px)
+        xy1 = np.ones((10, 3))
+        xy1[:, :2] = setup.optics.undistort(uv)
+        away = setup.offset_m / (xy1[:5] @ setup.normal)
+        for f, (u, far) in enumerate(zip(uv[:5, 0].tolist(), away.tolist(), strict=True)):
+            if u == u and not far > 0.0:  # NaN was not seen
+                away[f] = nan
+                self._counts[f"no_plane.{FINGERS[f]}"] += 1
+        points_m = xy1[:5] * away[:, None]
+        laser, tip = xy1[:5, :2].copy(), xy1[5:, :2].copy()
         if level == "fk":
             tip[:] = nan
         elif level == "ik":
@@ -67,6 +61,13 @@ class TripleReader:
         )
         return rows, points_m
 
-    def _count(self, event: str, fingers: Bool) -> None:
-        for f in np.flatnonzero(fingers):
-            self._counts[f"{event}.{FINGERS[f]}"] += 1
+    def _leave_out(self, event: str, uv: Float, sigma_px: Float) -> None:
+        """Write NaN to points (5, 2) outside the picture, and to those that may be anywhere in it; count them."""
+        optics = self._setup.optics
+        right, low = optics.width_px - 0.5, optics.height_px - 0.5
+        most_px = max(optics.width_px, optics.height_px)
+        for f, ((u, v), sigma) in enumerate(zip(uv.tolist(), sigma_px.tolist(), strict=True)):
+            inside = -0.5 <= u <= right and -0.5 <= v <= low and sigma <= most_px
+            if u == u and not inside:
+                uv[f] = nan
+                self._counts[f"{event}.{FINGERS[f]}"] += 1

@@ -24,7 +24,8 @@ from master.estimator.solve import descend
 from master.estimator.state import NEVER_NS, PALM_PART, HandState, grow, predict
 from master.estimator.workspace import Model
 from master.estimator.wrist_device import EXTRAS
-from master.estimator.wrist_update import extras_alone, take_scanned
+from master.estimator.wrist_rows import contrary, sensed_palm
+from master.estimator.wrist_update import extras_alone, start_scanned, take_scanned
 
 _LONG_S = 10.0
 _SOLVED, _MEASURED, _HELD, _WRIST = (
@@ -184,16 +185,34 @@ def predict_epoch(model: Model, boxed_state: Any, observed: Observations, boxed_
         if chi_square(rig, observed, state.palm, state.x, walked_m, room.search) > limit:
             return -1.0
     predict(rig.hand, settings, state, t_ns, space.ground.shown, space.hidden, belief)
-    for i in range(3):
-        for j in range(3):
-            belief.palm[i, j] = 0.0
-            for k in range(3):
-                belief.palm[i, j] += task.turned[i, k] * state.palm[k, j]
+    _turn_on(state, belief, room.search)
     task.natural[0], task.counts[0] = state.natural[0], exp(-dt_s / settings.habit_memory_s)
     copy(belief.palm, room.start_T)
     for c in range(state.x.shape[0]):
         room.start_x[c] = state.x[c]
+    start_scanned(rig.hand, space.scan, task.scanned, room.search.x, room.start_x)
     return limit
+
+
+@inner
+def _turn_on(state: HandState, belief: Belief, search: Search) -> None:
+    """Write the palm of the state, turned on as other sensors say, to `belief.palm`."""
+    by = search.J
+    for i in range(3):
+        for j in range(3):
+            by[i, j] = 1.0 if i == j else 0.0
+    if belief.turned[0] > 0.0 and state.turn_known[0] > 0:
+        sensed_palm(belief, state.z, search)
+        for i in range(3):
+            for j in range(3):
+                by[i, j] = 0.0
+                for k in range(3):
+                    by[i, j] += search.palm[i, k] * state.turn[j, k]
+    for i in range(3):
+        for j in range(3):
+            belief.palm[i, j] = 0.0
+            for k in range(3):
+                belief.palm[i, j] += by[i, k] * state.palm[k, j]
 
 
 @kernel
@@ -254,6 +273,7 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
         extras_alone(belief, found, search)
     if belief.sights.rows[0] > 0.0:
         take_scanned(rig, space.ground, space.scan, found, search.rows)
+    found.contrary[0] = contrary(belief, found.palm, found.z, search) if belief.turned[0] > 0.0 else 0.0
     return chi_square(rig, observed, found.palm, found.x, 0.0, search)
 
 
@@ -330,6 +350,13 @@ def take_over_epoch(
     copy(found.palm, state.palm)
     since_s = dt_s if goes_on else _LONG_S  # what begins owes nothing to an epoch before
     keep_extras(settings, state, since_s, space.belief, found.z, found.cov, found.scale[0], space.extras)
+    # With tilt and heading as this epoch leaves them, so that what is learnt of these is no motion.
+    state.turn_known[0] = space.belief.turned[0] > 0.0
+    if state.turn_known[0] > 0:
+        sensed_palm(space.belief, state.z, space.room.search)
+        for i in range(3):
+            for j in range(3):
+                state.turn[i, j] = space.room.search.palm[i, j]
     for f in range(5):
         if space.ground.rests[f] > 0:
             state.level[f], state.vague[f] = 0, False

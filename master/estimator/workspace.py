@@ -21,7 +21,6 @@ class Task:
     Attributes:
         t_ns: (1,) the epoch.
         palm_shown: (1,) whether something tells where the palm is.
-        turned: (3, 3) by how much sensors say that the palm has turned since.
         palm, angles: (4, 4), (20,) another hand of the epoch [rad].
         x: (n,) its free angles, inside the limits; or, with the palm, where a search begins.
         may_leave: (1,) whether there is another, and it may take the place of the state.
@@ -38,7 +37,6 @@ class Task:
 
     t_ns: Int
     palm_shown: Bool
-    turned: Float
     palm: Float
     angles: Float
     x: Float
@@ -62,7 +60,6 @@ class Task:
             cls,
             t_ns=("i8", 1),
             palm_shown=("u1", 1),
-            turned=(3, 3),
             palm=(4, 4),
             angles=20,
             x=n,

@@ -13,6 +13,7 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.hand_model import CHAINS, FINGERS
+from common.kernels import bound
 from common.messages import HandPose, Source, WristDetections
 from master.estimator.epoch import Epoch, Fitted, Turn
 from master.estimator.estimator import Estimator
@@ -58,6 +59,7 @@ class WristPipeline:
         self._estimator = Estimator(
             (setup.optics,), self._hand, (), (), continuous=continuous, settings=settings, wrist=self._model
         )
+        self._quaternions = bound(quaternions, np.empty((26, 3, 3)), np.empty((26, 4)))
         self._reader = TripleReader(setup, self._model.cubic, self.counts)
         T = setup.T_camera_palm
         self._turn = Turn(np.ascontiguousarray(T[:3, :3]), _TURN_INFO, sure=True, axes=_NO_AXES)
@@ -102,30 +104,32 @@ class WristPipeline:
         )
         told: Bool = hand.level > 0
         self._seen_ns[told] = t_ns
-        held = ~told & (t_ns - self._seen_ns <= (self._forget_ns if self._continuous else 0))
+        known: Bool = t_ns - self._seen_ns <= (self._forget_ns if self._continuous else 0)
         for event, fingers in (
             ("tip_refused", hand.refused),
             ("off", hand.off),
             ("ambiguous", hand.ambiguous),
-            ("held", held),
-            ("unseen", ~told & ~held),
+            ("held", known & ~told),
+            ("unseen", ~known),
         ):
-            self._count(event, fingers)
-        valid, tracked, source = np.zeros(26, np.bool_), hand.tracked.copy(), hand.source.copy()
+            for f, happens in enumerate(fingers.tolist()):
+                if happens:
+                    self.counts[f"{event}.{FINGERS[f]}"] += 1
+        tracked, source, orientation = hand.tracked, hand.source, np.empty((26, 4))
         if hand.solution is None:
-            position, orientation = np.full((26, 3), nan), np.full((26, 4), nan)
-            cov, angles = np.full((26, 3, 3), nan), np.full((5, 4), nan)
+            valid, position, angles = np.zeros(26, np.bool_), np.full((26, 3), nan), np.full((5, 4), nan)
+            orientation[:], cov = nan, np.full((26, 3, 3), nan)
         else:
-            solution = hand.solution
+            solution, valid = hand.solution, np.ones(26, np.bool_)
             position, cov = solution.joints.position_m, solution.cov_m2
-            orientation, angles = np.empty((26, 4)), solution.angles_rad.copy()
-            quaternions(solution.joints.rotation, orientation)
-            lost = CHAINS[~(told | held)].ravel()
-            valid[:] = True
-            valid[lost], tracked[lost], source[lost] = False, False, Source.NONE
-            position[lost], orientation[lost], cov[lost] = nan, nan, nan
-            angles[~(told | held)] = nan
-            tracked[_PALM], source[_PALM] = tracked[CHAINS[told].ravel()].any(), Source.WRIST
+            angles = solution.angles_rad
+            self._quaternions(solution.joints.rotation, orientation)
+            if not known.all():
+                lost = CHAINS[~known].ravel()
+                valid[lost], tracked[lost], source[lost] = False, False, Source.NONE
+                position[lost], orientation[lost], cov[lost] = nan, nan, nan
+                angles[~known] = nan
+            tracked[_PALM], source[_PALM] = tracked[CHAINS[told]].any(), Source.WRIST
         return HandPose.known_good(
             hand=model.profile.name,
             t_ns=t_ns,
@@ -147,10 +151,3 @@ class WristPipeline:
             level=hand.level,
             ambiguous=hand.ambiguous,
         )
-
-    def _count(self, event: str, fingers: Bool) -> None:
-        """Count an event of each of the fingers (5,) by name."""
-        if not fingers.any():
-            return
-        for f in np.flatnonzero(fingers):
-            self.counts[f"{event}.{FINGERS[f]}"] += 1

@@ -42,32 +42,53 @@ def turn_slope(turn: Float, J: Float) -> None:
 
 
 @inner
-def turn_row(
-    belief: Belief, T: Float, z: Float, n: int, gradient: Float, normal: Float, search: Search
-) -> float:
-    """Add the TURN row; return its cost.
+def sensed_palm(belief: Belief, z: Float, search: Search) -> None:
+    """Write how other sensors have the palm turned, to `search.palm` (3, 3), and how extras turn that: `slope` (5, 3).
 
-    The palm by the sensors is  exp(axes . (tilt, heading less the believed)) forearm R_y(deviation) R_x(flexion); of
-    an IMU on the palm itself it is `forearm`.
+    By an IMU on the forearm it is  exp(axes . (tilt, heading less the believed)) forearm R_y(deviation) R_x(flexion),
+    and extras are tilt 2, heading, flexion, deviation; by one on the palm itself it is `forearm`, which none turns.
     """
-    R, J, q, slope, F = search.turned, search.J, search.q, search.slope, belief.forearm
-    K = 0
-    if belief.on_forearm[0] > 0.0:
-        K = 5
-        bent_palm(F, z[BEND], z[BEND + 1], R, search.bend_axes)
-        for i in range(3):  # how the rig turns the sensed palm by each unknown, in rig axes
-            for a in range(3):
-                slope[a, i] = belief.axes[a, i]
-            slope[3, i], slope[4, i] = search.bend_axes[0, i], search.bend_axes[1, i]
-        for i in range(3):
-            search.off[i] = 0.0
-            for a in range(3):
-                search.off[i] += belief.axes[a, i] * (z[TILT + a] - belief.z[TILT + a])
-        turn_by(search.off, R, search.palm)
-    else:
+    R, slope, F = search.turned, search.slope, belief.forearm
+    if belief.on_forearm[0] == 0.0:
         for i in range(3):
             for j in range(3):
                 search.palm[i, j] = F[i, j]
+        return
+    bent_palm(F, z[BEND], z[BEND + 1], R, search.bend_axes)
+    for i in range(3):  # rig axes
+        for a in range(3):
+            slope[a, i] = belief.axes[a, i]
+        slope[3, i], slope[4, i] = search.bend_axes[0, i], search.bend_axes[1, i]
+    for i in range(3):
+        search.off[i] = 0.0
+        for a in range(3):
+            search.off[i] += belief.axes[a, i] * (z[TILT + a] - belief.z[TILT + a])
+    turn_by(search.off, R, search.palm)
+
+
+@inner
+def contrary(belief: Belief, T: Float, z: Float, search: Search) -> float:
+    """Chi square of a palm against how other sensors have it turned, and of what the extras gave in to it."""
+    sensed_palm(belief, z, search)
+    turn_between(T, search.palm, search.J, search.q)
+    total, q = 0.0, search.q
+    for i in range(3):
+        for j in range(3):
+            total += q[i] * belief.turn_info[i, j] * q[j]
+    for i in range(z.shape[0]):
+        for j in range(z.shape[0]):
+            total += (z[i] - belief.z[i]) * belief.z_info[i, j] * (z[j] - belief.z[j])
+    return total
+
+
+@inner
+def turn_row(
+    belief: Belief, T: Float, z: Float, n: int, gradient: Float, normal: Float, search: Search
+) -> float:
+    """Add the TURN row; return its cost."""
+    J, q, slope = search.J, search.q, search.slope
+    K = 5 if belief.on_forearm[0] > 0.0 else 0
+    sensed_palm(belief, z, search)
     turn_between(T, search.palm, J, q)
     turn_slope(q, J)
     L, w = belief.turn_info, search.off

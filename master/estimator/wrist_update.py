@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from common.arrays import Float
 from common.kernels import inner, kernel
 from common.messages import Level
 from master.estimator.extras import predict_extras
@@ -73,7 +74,8 @@ def _expected(
 def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
     """Step the extras to an epoch, and search the valleys of the fingers that a wrist device sees.
 
-    What no pose explains is no row: a fingertip that is another thing, a laser point on one.
+    What no pose explains is no row: a fingertip that is another thing, a laser point on one. The rows that are left are
+    counted.
 
     Args:
         model: What is the same at every epoch.
@@ -130,6 +132,30 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
             sights.depth_w2[f] *= 0.0 if doubted else settings.light_share
             if f > 0 and not curled and sights.teaches[f] > 0.0:
                 learn_coupling(prior, f, scan, state)
+    _count(sights, space.ground)
+
+
+@inner
+def _count(sights: Sights, ground: Ground) -> None:
+    """Count the rows of a wrist device; fingertips alone, without laser points, count for nothing."""
+    lit, shown = 0, 0
+    for f in range(5):
+        shown += 1 if sights.shown[f] > 0.0 else 0
+        if sights.lit[f] > 0.0:
+            lit += 1
+            ground.shown[f] = True
+    if lit > 0:
+        ground.numbers[0] += 2.0 * (lit + shown)
+
+
+@inner
+def start_scanned(hand: HandTables, scan: Scan, scanned: Float, x: Float, out: Float) -> None:
+    """Write the free angles (n,) of fingers whose valley was searched, of angles (20,); `x`: (n,) room."""
+    free_of(hand, scanned, x)
+    for f in range(5):
+        if scan.known[f] > 0.0:
+            for c in range(hand.first[f], hand.first[f + 1]):
+                out[c] = x[c]
 
 
 @inner

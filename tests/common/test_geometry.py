@@ -14,7 +14,9 @@ from common.geometry import (
     fit_rigid,
     intersect_plane,
     invert,
+    matrix_of,
     matrix_to_quaternion,
+    quaternion_product,
     quaternion_to_matrix,
     rigid,
     rotation_vector_to_matrix,
@@ -35,6 +37,14 @@ def scipy_matrix(q_wxyz: Float) -> Float:
 @given(quaternions)
 def test_quaternion_to_matrix_is_scipys(q: Float) -> None:
     np.testing.assert_allclose(quaternion_to_matrix(q), scipy_matrix(q), atol=1e-12)
+
+
+@given(quaternions, quaternions)
+def test_one_quaternion_in_plain_numbers_turns_as_one_in_an_array(p: Float, q: Float) -> None:
+    one, other = (tuple((each / np.linalg.norm(each)).tolist()) for each in (p, q))
+    np.testing.assert_allclose(matrix_of(one), scipy_matrix(p), atol=1e-12)
+    product = matrix_of(quaternion_product(one, other))
+    np.testing.assert_allclose(product, scipy_matrix(p) @ scipy_matrix(q), atol=1e-12)
 
 
 @given(quaternions)

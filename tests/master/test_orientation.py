@@ -78,7 +78,7 @@ def test_slerp_is_that_of_scipy_whatever_the_signs(seed: int, share: float) -> N
     expected = Slerp([0.0, 1.0], Rotation.concatenate([a, b]))(share).as_matrix()
     wxyz = [r.as_quat()[[3, 0, 1, 2]] for r in (a, b)]
     for sign in (1.0, -1.0):
-        found = slerp(wxyz[0], sign * wxyz[1], share)
+        found = np.array(slerp(tuple(wxyz[0]), tuple(sign * wxyz[1]), share))
         assert np.linalg.norm(found) == pytest.approx(1.0, abs=1e-9)
         np.testing.assert_allclose(quaternion_to_matrix(found), expected, atol=1e-6)
 

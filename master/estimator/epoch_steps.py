@@ -1,0 +1,246 @@
+"""The compiled steps of an epoch, with the tables, the state and the room of one hand that they work on."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.camera_model import CameraModel
+from common.hand_model import HandJoints, HandModel
+from common.kernels import bound
+from common.records import boxed, fields
+from master.estimator.cameras import CameraArrays
+from master.estimator.epoch import Epoch
+from master.estimator.extras import usual_of
+from master.estimator.ground import count_rows
+from master.estimator.hand_tables import HandTables, Mounts
+from master.estimator.hypotheses import Blank
+from master.estimator.kinematics import Scratch, pose
+from master.estimator.parameters import HandParameters
+from master.estimator.priors import Habits
+from master.estimator.problem import Rig
+from master.estimator.residuals import Observations, observe_points, observe_rays
+from master.estimator.settings import Settings
+from master.estimator.state import HandState
+from master.estimator.update import Estimate, fit_epoch, predict_epoch, take_over_epoch
+from master.estimator.workspace import Model, Workspace
+from master.estimator.wrist_device import EXTRAS, HEADING, NO_EXTRAS, Device, observe_wrist
+from master.estimator.wrist_model import WristModel
+from master.estimator.wrist_update import prepare_epoch
+
+_STEP = 16
+_STIFF_RAD = np.radians(1.0)  # of fingers that are taken to bend as their PIP does
+_STANDS_M = 1e-4  # of a palm before the wrist device alone, whose frame is the rig's
+_SPREAD_M = 5e-3  # markers nearer than this to one line do not turn a hand about it
+_LENGTH_M = 20e-3  # a line shorter than this has no direction
+_ACROSS = 0.9  # cosine to the sight, at most
+_EYE, _AT_ORIGIN = np.eye(3), np.eye(4)
+
+
+class EpochSteps:
+    """Holds the state of one hand, and what is worked on at an epoch.
+
+    Attributes:
+        state: All that is remembered of the hand; `now`: its fields.
+        at: Task, belief, what is found, and room: fields of `Workspace`.
+        observed: Rows of the markers.
+        on_hand: (M,) the hand's markers among those of the rig.
+        finger: (M,) the finger that carries each; -1: the palm.
+    """
+
+    def __init__(
+        self,
+        cameras: Sequence[CameraModel],
+        model: HandModel,
+        parameters: HandParameters,
+        markers: tuple[str, ...],
+        hand_markers: tuple[str, ...],
+        habits: Habits,
+        settings: Settings,
+        wrist: WristModel | None,
+    ) -> None:
+        """Lay out the tables, and compile. Arguments as of `Estimator`; `habits`: any of those to be fitted with."""
+        self._settings, mounts, count = settings, Mounts.of(model, hand_markers), len(hand_markers)
+        self.on_hand = np.array([markers.index(name) for name in hand_markers], np.int64)
+        self.finger = mounts.finger
+        extras, device = (NO_EXTRAS, Device.none()) if wrist is None else (EXTRAS, wrist.device)
+        self._rig = Rig(HandTables.of(model, parameters), mounts, CameraArrays.of(cameras), device)
+        n = len(parameters.free)
+        self.observed = observed = Observations.empty(len(cameras), count)
+        self._blank = Blank.of(n, extras, len(cameras), count)
+        # Records are used by their fields here, and handed to kernels in the arrays that they lie in.
+        self.state = state = HandState.unknown(n, extras)
+        space = Workspace.empty(n, extras, _capacity(count))
+        self.now, self.at = fields(state), fields(space)
+        self._state, self._space, self._work = boxed(state), boxed(space), boxed(Scratch.empty())
+        self._ground, self._sights = self._space["ground"], self._space["belief"]["sights"]
+        hand, device = boxed(self._rig.hand), boxed(device)
+        self._model = Model(hand, boxed(settings.record()), mounts, self._rig.cameras, device)
+        self.at.room.search.bend_share[0] = settings.bend_share
+        self.at.belief.z_info[0, 0] = 1.0  # of a rig without wrist device: one extra that means nothing
+        if wrist is not None:
+            self._lay_out(wrist)
+        nothing, own = np.full((len(cameras), len(markers), 2), np.nan), np.zeros((len(markers), 3, 3))
+        room, none = (np.empty((26, 3)), np.empty((26, 3, 3)), np.empty((count, 3))), np.full((5, 2), np.nan)
+        each = none[:, 0].copy()
+        self._rays = bound(observe_rays, nothing, nothing[..., 0].copy(), own, self.on_hand, observed)
+        self._points = bound(observe_points, room[2], own[self.on_hand], 0.0, observed)
+        self._count = bound(count_rows, mounts, observed, self._ground)
+        self._triple = bound(
+            observe_wrist, device, none, each, each, none, each, each, 0.0, 0.0, 0.0, self._sights
+        )
+        self._pose = bound(pose, hand, mounts, _AT_ORIGIN, np.zeros(20), self._work, *room)
+        rig, state, space = self._model, self._state, self._space
+        self._prepare = bound(prepare_epoch, rig, state, space)
+        self._predict = bound(predict_epoch, rig, state, observed, space)
+        self._fit = bound(fit_epoch, rig, habits, observed, self._blank, space)
+        self._take_over = bound(take_over_epoch, rig, state, True, observed, space, Estimate.empty())
+
+    def pose(self, T: Float, angles_rad: Float) -> tuple[HandJoints, Float]:
+        """Place joints and markers (M, 3) [m], rig frame, as `Estimator.pose`."""
+        position, rotation = np.empty((26, 3)), np.empty((26, 3, 3))
+        places, angles = np.empty((len(self.on_hand), 3)), angles_rad.reshape(20)
+        T_whole = np.ascontiguousarray(T)
+        self._pose(
+            self._model.hand, self._model.mounts, T_whole, angles, self._work, position, rotation, places
+        )
+        return HandJoints(position, rotation, T), places
+
+    def observe(self, at: Epoch, *, continuous: bool) -> None:
+        """Write the rows of an epoch, and count them."""
+        task, sights = self.at.task, self.at.belief.sights
+        task.t_ns[0], task.second_order[0], task.continuous[0] = at.t_ns, at.second_order, continuous
+        task.walked_rad2[0] = 0.0 if at.turn is None else at.turn.walked_rad2
+        if at.wrist is None:
+            sights.rows[0] = 0.0
+            sights.lit[:] = sights.shown[:] = 0.0
+        else:
+            self.at.prior.law[:] = at.wrist.law
+            self._triple(
+                self._model.device,
+                at.wrist.laser,
+                at.wrist.laser_sigma_px,
+                at.wrist.laser_px,
+                at.wrist.tip,
+                at.wrist.tip_sigma_px,
+                at.wrist.tip_depth,
+                self._settings.light_rad,
+                at.wrist.laser_s,
+                at.wrist.tip_s,
+                self._sights,
+            )
+        if at.uv is None and at.cov_m2 is None:
+            self.observed.seen[:] = False
+        elif at.cov_m2 is not None:
+            bones_m2 = self._settings.bones_m**2
+            points, cov = at.points_m[self.on_hand], at.cov_m2[self.on_hand]
+            self._points(points, cov, bones_m2, self.observed)
+        else:
+            assert at.uv is not None
+            assert at.variance_px2 is not None
+            assert at.own_m2 is not None
+            own = at.own_m2 + self._settings.bones_m**2 * _EYE
+            uv, variance = np.ascontiguousarray(at.uv), np.ascontiguousarray(at.variance_px2)
+            self._rays(uv, variance, own, self.on_hand, self.observed)
+        self._count(self._model.mounts, self.observed, self._ground)
+
+    def prepare(self) -> None:
+        """Step the extras, and search the valleys of the fingers that a wrist device sees."""
+        self._prepare(self._model, self._state, self._space)
+
+    def believe(self, at: Epoch, *, known: bool) -> None:
+        """Write what is believed beside the past and habits; `known`: whether the past still says anything."""
+        belief, ground, turn = self.at.belief, self.at.ground, at.turn
+        belief.facing[:] = at.facing
+        belief.facing_w2[0] = self._settings.facing_rad**-2.0 if ground.back[0] else 0.0
+        belief.depth_w2[0] = 0.0
+        if known and ground.most[0] == 1:
+            alone = self._rig.cameras.centre[(self.observed.weight > 0.0).sum(axis=1).argmax()]
+            sight = self.now.palm[:3, 3] - alone
+            belief.sight[:] = sight / np.sqrt(sight @ sight)
+            belief.depth_w2[0] = self._settings.held_depth_m**-2.0
+        belief.turned[0] = turn is not None
+        if turn is not None:
+            belief.forearm[:3, :3], belief.turn_info[:] = turn.rotation, turn.information
+            belief.on_forearm[0] = turn.axes is not None
+            belief.axes[:] = 0.0 if turn.axes is None else turn.axes
+        belief.place_w2[0] = 0.0
+        if at.place is not None:
+            belief.place[:], belief.place_w2[0] = at.place, _STANDS_M**-2.0
+
+    def predict(self) -> float:
+        """Write where the state has the hand; as `predict_epoch`."""
+        return self._predict(self._model, self._state, self.observed, self._space)
+
+    def fit(self, habits: Habits, *, rough: bool = False) -> float:
+        """Fit what is measured; return chi square, or the cost of a rough search."""
+        self.at.task.rough[0] = rough
+        return self._fit(self._model, habits, self.observed, self._blank, self._space)
+
+    def take_over(self, *, goes_on: bool) -> Estimate:
+        """Take what was found into the state; `goes_on`: the hand is that of the epoch before."""
+        out = Estimate.empty()
+        self._take_over(self._model, self._state, goes_on, self.observed, self._space, out)
+        return out
+
+    def kept(self) -> Float:
+        """A copy of the state, for `put_back`."""
+        return self._state.copy()
+
+    def put_back(self, state: Float) -> None:
+        """Let the state be what it was."""
+        self._state[:] = state
+
+    def placed(self, at: Epoch) -> Bool:
+        """Tell of which of the hand's markers (M,) the places are known."""
+        if at.cov_m2 is not None:
+            return self.observed.placed
+        return np.isfinite(at.points_m[self.on_hand].sum(axis=1))
+
+    def enough(self, at: Epoch) -> bool:
+        """Tell whether the markers fix a hand: not in one line, or across `facing`.
+
+        What faces the cameras turns the hand about a line of markers, but not about one that points at them. With an
+        orientation that is known any one marker is enough.
+        """
+        if at.place is not None:
+            return True
+        points = at.points_m[self.on_hand][self.placed(at)]
+        if at.turn is not None and at.turn.sure:
+            return len(points) > 0
+        if len(points) < 2:
+            return False
+        off = points - points.mean(axis=0)
+        if len(points) > 2:  # plainly not in one line, without what a decomposition takes
+            length2 = np.vecdot(off, off)
+            along, longest2 = off @ off[length2.argmax()], float(length2.max())
+            if longest2 > 0.0 and float((length2 - along * along / longest2).max()) > (4.0 * _SPREAD_M) ** 2:
+                return True
+        _, extent, axes = np.linalg.svd(off)
+        if len(points) > 2 and extent[1] > _SPREAD_M:
+            return True
+        back = self.at.ground.back[0]
+        return bool(back and extent[0] > _LENGTH_M and abs(axes[0] @ at.facing) < _ACROSS)
+
+    def unexplained(self) -> bool:
+        """Tell whether a marker is too far from what was found."""
+        surprise = self.at.found.surprise[: len(self.on_hand)]
+        return bool((surprise > self._settings.explained).any())
+
+    def _lay_out(self, wrist: WristModel) -> None:
+        """Write what is believed of fingers before a wrist device, and of what it leaves open."""
+        prior, state, s = self.at.prior, self.now, self._settings
+        prior.natural[:], prior.slope[:], prior.frame[:] = wrist.natural, wrist.slope, wrist.frame
+        prior.abduction[:], prior.flexion[:] = s.abduction_rad, s.coupled_rad
+        prior.abduction[0] = prior.flexion[0] = 0.5 * s.thumb_rad
+        if wrist.only_natural:
+            prior.only_natural[0], prior.flexion[:] = 1.0, _STIFF_RAD
+        state.usual[:] = usual_of(s, loose=wrist.loose, tilt_rad=wrist.tilt_rad)
+        state.z_cov[:] = np.diag(state.usual)
+        if wrist.heading_rad is not None:
+            state.z_cov[HEADING, HEADING] = wrist.heading_rad**2
+
+
+def _capacity(markers: int) -> int:
+    """Round a count of markers up, so that kernels are compiled once for most rigs."""
+    return max(-(-markers // _STEP), 1) * _STEP
