@@ -109,7 +109,7 @@ class Afresh:
             T = np.eye(4)
             T[:3, :3], T[:3, 3] = turned, epoch.place
             return [(T, self._as_told(self._natural.copy()))]
-        placed = steps.placed(epoch)
+        placed = steps.placed
         weight = np.where(steps.finger[placed] >= 0, 1.0, _PALM_WEIGHT)
         observed = epoch.points_m[steps.on_hand][placed]
         starts: list[tuple[Float, Float]] = []

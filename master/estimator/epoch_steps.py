@@ -44,6 +44,7 @@ class EpochSteps:
         state: All that is remembered of the hand; `now`: its fields.
         at: Task, belief, what is found, and room: fields of `Workspace`.
         observed: Rows of the markers.
+        placed: (M,) of which of the hand's markers the places are known at the epoch.
         on_hand: (M,) the hand's markers among those of the rig.
         finger: (M,) the finger that carries each; -1: the palm.
     """
@@ -67,6 +68,7 @@ class EpochSteps:
         self._rig = Rig(HandTables.of(model, parameters), mounts, CameraArrays.of(cameras), device)
         n = len(parameters.free)
         self.observed = observed = Observations.empty(len(cameras), count)
+        self.placed: Bool = np.zeros(count, np.bool_)
         self._blank = Blank.of(n, extras, len(cameras), count)
         # Records are used by their fields here, and handed to kernels in the arrays that they lie in.
         self.state = state = HandState.unknown(n, extras)
@@ -142,6 +144,8 @@ class EpochSteps:
             own = at.own_m2 + self._settings.bones_m**2 * _EYE
             uv, variance = np.ascontiguousarray(at.uv), np.ascontiguousarray(at.variance_px2)
             self._rays(uv, variance, own, self.on_hand, self.observed)
+        measured = at.cov_m2 is not None
+        self.placed = self.observed.placed if measured else np.isfinite(at.points_m[self.on_hand].sum(axis=1))
         self._count(self._model.mounts, self.observed, self._ground)
 
     def prepare(self) -> None:
@@ -191,12 +195,6 @@ class EpochSteps:
         """Let the state be what it was."""
         self._state[:] = state
 
-    def placed(self, at: Epoch) -> Bool:
-        """Tell of which of the hand's markers (M,) the places are known."""
-        if at.cov_m2 is not None:
-            return self.observed.placed
-        return np.isfinite(at.points_m[self.on_hand].sum(axis=1))
-
     def enough(self, at: Epoch) -> bool:
         """Tell whether the markers fix a hand: not in one line, or across `facing`.
 
@@ -205,7 +203,7 @@ class EpochSteps:
         """
         if at.place is not None:
             return True
-        points = at.points_m[self.on_hand][self.placed(at)]
+        points = at.points_m[self.on_hand][self.placed]
         if at.turn is not None and at.turn.sure:
             return len(points) > 0
         if len(points) < 2:
