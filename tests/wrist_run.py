@@ -1,19 +1,24 @@
 """A simulated wrist device without errors: what its camera would report, and the poses of an exact master."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from common.arrays import Float
 from common.geometry import matrix_to_quaternion
+from common.hand_model import HandModel
+from common.hand_profiles import mirrored_profile
 from common.messages import HandPose, Source, WristDetections
 from common.sim.wrist.scene import WristScene, WristTruth
 from master.outputs.poses import Poses
 from master.rig import load_setup
 from master.rig_setup import RigSetup
+from master.wrist_setup import WristSetup
 
 TRIPLE_NS = 33_333_333
 START_NS = 1_000_000_000
+_MIRROR = np.array([-1.0, 1.0, 1.0])
 
 
 def wrist_setup(root: Path, rig: str = "wrist") -> RigSetup:
@@ -76,3 +81,17 @@ def true_poses(setup: RigSetup, truths: list[WristTruth]) -> Poses:
 
 def _where_seen(uv: Float, value: float) -> Float:
     return np.where(np.isnan(uv).any(axis=1), np.nan, value)
+
+
+def mirrored_setup(setup: WristSetup) -> WristSetup:
+    """The same device seen in a mirror at x = 0, on the other hand; its camera is taken as symmetric."""
+    palm = setup.T_camera_palm.copy()
+    palm[:3, :3] = np.diag(_MIRROR) @ palm[:3, :3] @ np.diag(_MIRROR)
+    palm[:3, 3] *= _MIRROR
+    return replace(
+        setup,
+        model=HandModel.of(mirrored_profile(setup.model.profile)),
+        T_camera_palm=palm,
+        normal=setup.normal * _MIRROR,
+        laser_m=setup.laser_m * _MIRROR,
+    )

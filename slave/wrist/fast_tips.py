@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.arrays import Bool, Float, Image, Int
+from common.arrays import Float, Image, Int
 from slave.markers.fast_compile import compiled
 from slave.wrist import fingertips, outline, postures
 from slave.wrist.fingertips import Candidates, Ends, LedImage, light_scale, on_plane, reported
@@ -82,27 +82,6 @@ class _Outline(NamedTuple):
     edge_sigma: float
     middle_sigma: float
     radius_sigma: float
-
-
-class _Seen(NamedTuple):
-    """The shrunken LED image: `LedImage`."""
-
-    near: Float32
-    clipped: Bool
-
-
-class _Table(NamedTuple):
-    """`Postures`."""
-
-    thumb: int
-    uv: Float32
-    middle: Float32
-    near: Float32
-    thumb_laser: Float32
-    laser: Float32
-    open: Float32
-    end: Float32
-    twist: Float32
 
 
 class _Found(NamedTuple):
@@ -181,10 +160,8 @@ def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) ->
     if gain is None:
         return None
     out = np.full((5, _COLUMNS), np.nan)
-    table = _table(postures_of(view))
-    _search(
-        led, _Seen(image.near, image.clipped), on_plane(laser_m, view), gain, table, _LIMITS, _OUTLINE, out
-    )
+    table = postures_of(view)
+    _search(led, image, on_plane(laser_m, view), gain, table, _LIMITS, _OUTLINE, out)
     finger = np.flatnonzero(np.isfinite(out[:, 0]))
     if not len(finger):
         return None
@@ -193,18 +170,14 @@ def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) ->
     return reported(finger, circle, misfit, Ends(np.stack(ends[:2], axis=-1), *ends[2:]))
 
 
-def _table(of: Postures) -> _Table:
-    return _Table(of.thumb, of.uv, of.middle, of.near, of.thumb_laser, of.laser, of.open, of.end, of.twist)
-
-
 def prepare() -> None:
     """Compile the search, on an image that shows nothing."""
     some = np.zeros((1, 3, postures.SAMPLES, 2), np.float32)
     near, laser = np.zeros((1, postures.APEX), np.float32), np.zeros((3, 2, 4, 0), np.float32)
     whole = some[:, :, 0].copy(), near, np.zeros((2, 1), np.float32), laser
     ends = (np.zeros((1, of), np.float32) for of in (postures.DIRECTIONS, 3, 5))
-    table = _Table(1, some, *whole, *ends)
-    image = _Seen(np.zeros((1, 1), np.float32), np.zeros((1, 1), np.bool_))
+    table = Postures(1, some, *whole, *ends)
+    image = LedImage(np.zeros((1, 1), np.float32), np.zeros((1, 1), np.bool_))
     out, plane = np.empty((5, _COLUMNS)), np.full((5, 2), np.nan, np.float32)
     _search(np.zeros((1, 1), np.uint8), image, plane, 1.0, table, _LIMITS, _OUTLINE, out)
 
@@ -212,10 +185,10 @@ def prepare() -> None:
 @compiled
 def _search(
     led: Image,
-    image: _Seen,
+    image: LedImage,
     plane: Float32,
     gain: float,
-    table: _Table,
+    table: Postures,
     limits: _Limits,
     edges: _Outline,
     out: Float,
@@ -251,7 +224,7 @@ def _search(
 
 @compiled
 def _postures(
-    image: _Seen, plane: Float32, gain: float, table: _Table, limits: _Limits, finger: int, found: _Found
+    image: LedImage, plane: Float32, gain: float, table: Postures, limits: _Limits, finger: int, found: _Found
 ) -> int:
     """Postures of index ... little that meet the laser where it is seen and are as bright as they should be."""
     length = table.laser.shape[3]
@@ -302,7 +275,9 @@ def _postures(
 
 
 @compiled
-def _thumbs(image: _Seen, plane: Float32, gain: float, table: _Table, limits: _Limits, found: _Found) -> int:
+def _thumbs(
+    image: LedImage, plane: Float32, gain: float, table: Postures, limits: _Limits, found: _Found
+) -> int:
     """Postures of the thumb."""
     count = 0
     for row in range(table.thumb):
@@ -315,7 +290,7 @@ def _thumbs(image: _Seen, plane: Float32, gain: float, table: _Table, limits: _L
 
 
 @compiled
-def _at(image: _Seen, u: float, v: float, shrink: int) -> tuple[float, bool, bool]:
+def _at(image: LedImage, u: float, v: float, shrink: int) -> tuple[float, bool, bool]:
     """As `LedImage.at`."""
     height, width = image.near.shape
     column, row = int((u + 0.5) / shrink), int((v + 0.5) / shrink)
@@ -325,9 +300,9 @@ def _at(image: _Seen, u: float, v: float, shrink: int) -> tuple[float, bool, boo
 
 @compiled
 def _take(
-    image: _Seen,
+    image: LedImage,
     gain: float,
-    table: _Table,
+    table: Postures,
     limits: _Limits,
     row: int,
     abduction: float,
@@ -359,7 +334,9 @@ def _take(
 
 
 @compiled
-def _cost(image: _Seen, gain: float, uv: Float32, near: Float32, abduction: float, limits: _Limits) -> float:
+def _cost(
+    image: LedImage, gain: float, uv: Float32, near: Float32, abduction: float, limits: _Limits
+) -> float:
     """As `fingertips.costs`, without what the laser says."""
     bones = limits.bones
     off = np.empty(bones)
@@ -397,7 +374,7 @@ def _cost(image: _Seen, gain: float, uv: Float32, near: Float32, abduction: floa
 
 
 @compiled
-def _modes(found: _Found, count: int, table: _Table, limits: _Limits, out: Int) -> int:
+def _modes(found: _Found, count: int, table: Postures, limits: _Limits, out: Int) -> int:
     """As `fingertips.modes`, of one finger: how many."""
     if count == 0:
         return 0
@@ -503,7 +480,7 @@ def _light(led: Image, u: float, v: float) -> int:
 
 
 @compiled
-def _apart(found: _Found, k: int, table: _Table, limits: _Limits, circle: Float) -> float:
+def _apart(found: _Found, k: int, table: Postures, limits: _Limits, circle: Float) -> float:
     """As `fingertips._apart`, of one hypothesis."""
     x, y, radius = circle[0] - found.at[k, 0], circle[1] - found.at[k, 1], circle[2]
     larger = math.log(table.end[int(found.row[k]), 0] / radius) / limits.size_sigma
@@ -511,7 +488,7 @@ def _apart(found: _Found, k: int, table: _Table, limits: _Limits, circle: Float)
 
 
 @compiled
-def _ends(found: _Found, count: int, table: _Table, limits: _Limits, circle: Float, out: Float) -> None:
+def _ends(found: _Found, count: int, table: Postures, limits: _Limits, circle: Float, out: Float) -> None:
     """As `fingertips.Ends`, of one finger whose outline is that circle."""
     square = np.full(count, np.inf)
     within = found.cost[:count].min() + limits.ends_within
@@ -546,7 +523,7 @@ def _ends(found: _Found, count: int, table: _Table, limits: _Limits, circle: Flo
 
 @compiled
 def _turned(
-    found: _Found, k: int, table: _Table, limits: _Limits, u: float, v: float, sure: float
+    found: _Found, k: int, table: Postures, limits: _Limits, u: float, v: float, sure: float
 ) -> tuple[float, float]:
     """As `fingertips._turned`, of one hypothesis."""
     row, by = int(found.row[k]), found.abduction[k]

@@ -82,8 +82,7 @@ class Fingertips:
 NO_TIPS = Fingertips(np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LedImage:
+class LedImage(NamedTuple):
     """What samples are compared with: nearness (h, w) of the shrunken image, and where it is a lower bound (h, w)."""
 
     near: Float32

@@ -10,7 +10,6 @@ and the root of the light there (nearness): along the bones, and above the highe
 where there is nothing of it.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -52,8 +51,7 @@ _CHUNK = 4096
 _ORIGIN = np.zeros(3)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Postures:
+class Postures(NamedTuple):
     """Postures of all five fingers, one after another: H of the thumb, then 4 L of index ... little.
 
     Attributes:

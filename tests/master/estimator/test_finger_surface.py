@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.hand_model import CHAINS, HandModel
-from common.hand_profiles import mirrored_profile
+from common.hand_model import CHAINS
 from common.wrist_bend import STRAIGHT
 from master.calibrate.laser_cut import LaserCut
 from master.estimator.laser_plane import PlaneAxes
 from master.wrist_setup import WristSetup
 from tests.master.estimator.worn import NO_TWIST, PIP, Worn, bent, natural
+from tests.wrist_run import mirrored_setup
 
-MIRROR = np.array([-1.0, 1.0, 1.0])
 BENDS = [(0.0, 0.0), (12.0, 0.0), (-10.0, 5.0), (-20.0, -12.0), (-25.0, 15.0)]
 
 
@@ -136,24 +135,10 @@ def test_hinges_that_are_rolled_turn_the_finger_about_its_first_bone(worn: Worn)
     np.testing.assert_array_equal(worn.looks(angles, STRAIGHT, NO_TWIST).tip, straight.tip)
 
 
-def mirrored(setup: WristSetup) -> WristSetup:
-    """The same device seen in a mirror at x = 0, on the other hand; its camera is taken as symmetric."""
-    palm = setup.T_camera_palm.copy()
-    palm[:3, :3] = np.diag(MIRROR) @ palm[:3, :3] @ np.diag(MIRROR)
-    palm[:3, 3] *= MIRROR
-    return replace(
-        setup,
-        model=HandModel.of(mirrored_profile(setup.model.profile)),
-        T_camera_palm=palm,
-        normal=setup.normal * MIRROR,
-        laser_m=setup.laser_m * MIRROR,
-    )
-
-
 def test_the_left_hand_is_the_right_one_mirrored(worn: Worn) -> None:
     optics = replace(worn.setup.optics, distortion=np.zeros(5))
     right = Worn(replace(worn.setup, optics=optics))
-    left = Worn(mirrored(right.setup))
+    left = Worn(mirrored_setup(right.setup))
     for pip in (10.0, 40.0, 70.0):
         angles = bent(0.5 * pip, pip, 4.0)
         here, there = right.looks(angles), left.looks(angles)

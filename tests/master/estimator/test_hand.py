@@ -1,20 +1,14 @@
 """Tests of the fit of one epoch: exact recovery, limits under any input, a palm that turns, the covariance."""
 
-from functools import lru_cache
-
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.arrays import Float
-from common.calibration import Couplings
 from common.errors import CalibrationError
 from common.geometry import rigid, rotation_vector_to_matrix
 from common.hand_model import CHAINS, TIPS, HandModel
-from common.hand_presets import preset_couplings, preset_limits
-from common.hand_profiles import generated_profile
 from master.estimator.estimator import Estimator
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT, Settings
@@ -42,23 +36,9 @@ from tests.master.estimator.fitted import (
     residual_m,
     turned,
 )
+from tests.master.estimator.whole import MODELS
 
 seeds = st.integers(0, 2**32 - 1)
-
-
-@lru_cache
-def made(side: str, preset: str, coupled: bool) -> HandModel:
-    profile = generated_profile("made", side)
-    limits = preset_limits("K" if preset == "K" else "D")
-    couplings = preset_couplings("D") if coupled else Couplings(dip_per_pip=None)
-    return HandModel.of(msgspec.structs.replace(profile, limits_rad=limits, couplings=couplings))
-
-
-MODELS = {
-    "right K": made("right", "K", True),
-    "left D": made("left", "D", True),
-    "free": made("right", "K", False),
-}
 
 
 # -- finding the hand -------------------------------------------------------------------------------------------

@@ -9,14 +9,11 @@ import pytest
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.hand_model import HandModel
-from common.hand_profiles import mirrored_profile
 from master.calibrate.laser_cut import LaserCut
 from master.estimator.laser_plane import PlaneAxes
 from master.estimator.natural_curve import NaturalCurve
 from master.wrist_setup import WristSetup
-from tests.wrist_run import wrist_setup
-
-MIRROR = np.array([-1.0, 1.0, 1.0])
+from tests.wrist_run import mirrored_setup, wrist_setup
 
 
 @pytest.fixture(scope="module")
@@ -26,20 +23,6 @@ def setup(root: Path) -> WristSetup:
     return wrist
 
 
-def mirrored(setup: WristSetup) -> WristSetup:
-    """The same device seen in a mirror at x = 0, on the other hand; its camera is taken as symmetric."""
-    palm = setup.T_camera_palm.copy()
-    palm[:3, :3] = np.diag(MIRROR) @ palm[:3, :3] @ np.diag(MIRROR)
-    palm[:3, 3] *= MIRROR
-    return replace(
-        setup,
-        model=HandModel.of(mirrored_profile(setup.model.profile)),
-        T_camera_palm=palm,
-        normal=setup.normal * MIRROR,
-        laser_m=setup.laser_m * MIRROR,
-    )
-
-
 def test_the_left_hand_is_the_right_one_mirrored(setup: WristSetup) -> None:
     straight = replace(setup.optics, distortion=np.zeros(5))
     right = replace(setup, optics=straight)
@@ -47,7 +30,7 @@ def test_the_left_hand_is_the_right_one_mirrored(setup: WristSetup) -> None:
         np.radians(np.array([[10.0, 20.0, 40.0, 60.0, 80.0]])), np.radians([[5.0, 4.0, -3.0, 2.0, -6.0]])
     )[:, None]
     there, length, _ = LaserCut(right)(angles)
-    mirror, same, _ = LaserCut(mirrored(right))(angles)
+    mirror, same, _ = LaserCut(mirrored_setup(right))(angles)
     np.testing.assert_allclose(
         mirror, there * [-1.0, 1.0], atol=2e-4
     )  # the fan's rays go the other way round
