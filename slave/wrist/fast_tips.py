@@ -46,7 +46,12 @@ class _Limits(NamedTuple):
     as_bright: float
     above_most: float
     above_unknown: float
+    folded_darker: float
+    folded_as_bright: float
     unknown_cost: float
+    hidden: float
+    hides: float
+    side: float
     modes: int
     mode_within: float
     apart: float
@@ -61,7 +66,9 @@ class _Limits(NamedTuple):
     end: int
     bones: int
     highest: int
+    far: int
     apex: int
+    upwards: int
     shrink: int
 
 
@@ -117,7 +124,12 @@ _LIMITS = _Limits(
     fingertips.AS_BRIGHT,
     fingertips.ABOVE_MOST,
     fingertips.ABOVE_UNKNOWN,
+    fingertips.FOLDED_DARKER,
+    fingertips.FOLDED_AS_BRIGHT,
     fingertips.UNKNOWN_COST,
+    fingertips.HIDDEN,
+    fingertips.HIDES,
+    fingertips.SIDE,
     fingertips.MODES,
     fingertips.MODE_WITHIN,
     fingertips.APART,
@@ -132,7 +144,9 @@ _LIMITS = _Limits(
     postures.END,
     postures.BONES.stop,
     postures.HIGHEST,
+    postures.ABOVE.start + fingertips.FAR,
     postures.APEX,
+    fingertips.UPWARDS,
     SHRINK,
 )
 _OUTLINE = _Outline(
@@ -177,7 +191,7 @@ def prepare() -> None:
     whole = some[:, :, 0].copy(), near, np.zeros((2, 1), np.float32), laser
     ends = (np.zeros((1, of), np.float32) for of in (postures.DIRECTIONS, 3, 5))
     table = Postures(1, some, *whole, *ends)
-    image = LedImage(np.zeros((1, 1), np.float32), np.zeros((1, 1), np.bool_))
+    image = LedImage.of(np.zeros((1, 1), np.float32), np.zeros((1, 1), np.bool_))
     out, plane = np.empty((5, _COLUMNS)), np.full((5, 2), np.nan, np.float32)
     _search(np.zeros((1, 1), np.uint8), image, plane, 1.0, table, _LIMITS, _OUTLINE, out)
 
@@ -199,6 +213,7 @@ def _search(
     found = _Found(np.empty(most), np.empty(most), np.empty(most), np.empty(most), np.empty((most, 4)))
     circle, best = np.empty(5), np.empty(5)
     which = np.empty(limits.modes, np.int64)
+    open_ = np.empty(table.open.shape[1], np.float32)
     for finger in range(5):
         if finger == 0:
             count = _thumbs(image, plane, gain, table, limits, found)
@@ -210,8 +225,9 @@ def _search(
             row = int(found.row[k])
             circle[0], circle[1] = found.at[k, 0], found.at[k, 1]
             circle[2] = table.end[row, 0]
+            _open(image, gain, table, row, found.abduction[k], limits, open_)
             for _ in range(2):
-                _fit(led, circle, table.open[row], edges)
+                _fit(led, circle, open_, edges)
             misfit = found.cost[k] + limits.shown_worth * (1.0 - circle[4])
             misfit += _apart(found, k, table, limits, circle)
             if misfit < least:
@@ -290,12 +306,12 @@ def _thumbs(
 
 
 @compiled
-def _at(image: LedImage, u: float, v: float, shrink: int) -> tuple[float, bool, bool]:
-    """As `LedImage.at`."""
+def _cell(image: LedImage, u: float, v: float, shrink: int) -> tuple[int, int, bool]:
+    """Row and column of a pixel, and whether it is outside of the image."""
     height, width = image.near.shape
     column, row = int((u + 0.5) / shrink), int((v + 0.5) / shrink)
     x, y = min(max(column, 0), width - 1), min(max(row, 0), height - 1)
-    return image.near[y, x], image.clipped[y, x], x != column or y != row
+    return y, x, x != column or y != row
 
 
 @compiled
@@ -317,15 +333,16 @@ def _take(
     middle, near = table.middle[row], table.near[row]
     u = middle[0, 0] + abduction * (middle[1, 0] + abduction * middle[2, 0])
     v = middle[0, 1] + abduction * (middle[1, 1] + abduction * middle[2, 1])
-    seen, bound, outside = _at(image, u, v, limits.shrink)
-    ratio = max(seen, limits.least_near) / max(near[limits.end] * gain, 0.1)
-    if bound:
+    y, x, outside = _cell(image, u, v, limits.shrink)
+    ratio = max(image.near[y, x], limits.least_near) / max(near[limits.end] * gain, 0.1)
+    if image.clipped[y, x]:
         ratio = max(ratio, 1.0)
     if outside or not limits.least_ratio < ratio < limits.most_ratio:
         return count
     uv = table.uv[row]
+    folded = table.open[row, limits.upwards] == 0.0
     found.row[count], found.abduction[count], found.aside[count] = row, abduction, aside
-    found.cost[count] = cost + _cost(image, gain, uv, near, abduction, limits)
+    found.cost[count] = cost + _cost(image, gain, uv, near, abduction, folded, row >= table.thumb, limits)
     apex = limits.apex
     found.at[count, 0], found.at[count, 1] = u, v
     found.at[count, 2] = uv[0, apex, 0] + abduction * (uv[1, apex, 0] + abduction * uv[2, apex, 0])
@@ -335,34 +352,51 @@ def _take(
 
 @compiled
 def _cost(
-    image: LedImage, gain: float, uv: Float32, near: Float32, abduction: float, limits: _Limits
+    image: LedImage,
+    gain: float,
+    uv: Float32,
+    near: Float32,
+    abduction: float,
+    folded: bool,
+    of_finger: bool,
+    limits: _Limits,
 ) -> float:
     """As `fingertips.costs`, without what the laser says."""
     bones = limits.bones
     off = np.empty(bones)
     known = np.empty(bones, np.int64)
     most = 3.0 * limits.own_sigma + limits.scale_sigma
-    scale = above = 0.0
+    scale = above = hides = 0.0
     highest = max(near[limits.highest] * gain, 0.1)
+    hidden = limits.hidden if of_finger else -np.inf
+    darker = limits.folded_darker if folded else limits.darker
+    as_bright = limits.folded_as_bright if folded else limits.as_bright
     for k in range(limits.apex):
         if k == limits.highest:
             continue
         u = uv[0, k, 0] + abduction * (uv[1, k, 0] + abduction * uv[2, k, 0])
         v = uv[0, k, 1] + abduction * (uv[1, k, 1] + abduction * uv[2, k, 1])
-        seen, bound, outside = _at(image, u, v, limits.shrink)
+        y, x, outside = _cell(image, u, v, limits.shrink)
         if k < bones:
-            off[k] = math.log(max(seen, limits.least_near) / max(near[k] * gain, 0.1))
-            if bound:
+            off[k] = math.log(max(image.near[y, x], limits.least_near) / max(near[k] * gain, 0.1))
+            known[k] = 2
+            if outside:
+                known[k] = 0
+            elif image.clipped[y, x]:
+                known[k] = 1
+            elif off[k] < hidden:
+                known[k], off[k], hides = 0, 0.0, limits.hides
+            if image.clipped[y, x]:
                 off[k] = max(off[k], 0.0)
-            known[k] = 0 if outside else 1 if bound else 2
             scale += min(max(off[k], -most), most)
         elif not outside and not near[k] > 0.0:
-            bright = min(max((seen / highest - limits.darker) / (limits.as_bright - limits.darker), 0.0), 1.0)
-            if bound:
-                bright = limits.above_unknown
+            bright = limits.above_unknown
+            if not image.clipped[y, x]:
+                seen = image.over[y, x] if folded and k >= limits.far else image.near[y, x]
+                bright = min(max((seen / highest - darker) / (as_bright - darker), 0.0), 1.0)
             above += bright * bright
     scale /= bones + (limits.own_sigma / limits.scale_sigma) ** 2
-    cost = limits.above_most * above + (scale / limits.scale_sigma) ** 2
+    cost = limits.above_most * above + (scale / limits.scale_sigma) ** 2 + hides
     for k in range(bones):
         square = min(((off[k] - scale) / limits.own_sigma) ** 2, limits.own_most)
         if known[k] == 0:
@@ -371,6 +405,30 @@ def _cost(
             square = max(square, limits.unknown_cost)
         cost += square
     return cost
+
+
+@compiled
+def _open(
+    image: LedImage, gain: float, table: Postures, row: int, abduction: float, limits: _Limits, out: Float32
+) -> None:
+    """As `fingertips._open`, of one hypothesis."""
+    uv, near, end = table.uv[row], table.near[row], limits.end
+    out[:] = table.open[row]
+    end_u = uv[0, end, 0] + abduction * (uv[1, end, 0] + abduction * uv[2, end, 0])
+    end_v = uv[0, end, 1] + abduction * (uv[1, end, 1] + abduction * uv[2, end, 1])
+    for k in range(limits.bones):
+        u = uv[0, k, 0] + abduction * (uv[1, k, 0] + abduction * uv[2, k, 0])
+        v = uv[0, k, 1] + abduction * (uv[1, k, 1] + abduction * uv[2, k, 1])
+        y, x, outside = _cell(image, u, v, limits.shrink)
+        if outside or image.clipped[y, x]:
+            continue
+        if math.log(max(image.near[y, x], limits.least_near) / max(near[k] * gain, 0.1)) < limits.hidden:
+            u, v = u - end_u, v - end_v
+            least = limits.side * math.hypot(u, v)
+            for way in range(len(out)):
+                turn = way * (2.0 * math.pi / len(out))
+                if math.cos(turn) * u + math.sin(turn) * v > least:
+                    out[way] = 0.0
 
 
 @compiled

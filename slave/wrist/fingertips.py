@@ -8,8 +8,9 @@ outline, measured at full resolution (`outline`), says which it is and where exa
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, Self, TypeAlias
 
+import cv2
 import numpy as np
 
 from common.arrays import Bool, Float, Image, Int
@@ -37,6 +38,8 @@ MOST_ABDUCTION = 1.7  # of the outer two of the table
 WITHIN_M, SIGMA_M = 4e-3, 2.5e-3
 MOST_OFF_M, SPREAD_M = 15e-3, 3e-3  # where no posture is as near as that
 ASIDE_M, MOST_ASIDE = 2.5e-3, 3.0  # standard deviation across the fingers, and deviations allowed
+FAR = 3  # of the samples above a finger: from there on they are far
+UPWARDS = 6  # of directions
 UNSURE, VARIANT = 0.18, 1.2  # of the outer abductions: less is one; deviations of the other two
 MOST_OFF = 0.35  # of the logarithm of a fingertip's nearness
 THUMB_WITHIN_M, THUMB_SIGMA_M = 12e-3, 5e-3
@@ -45,7 +48,18 @@ OWN_SIGMA, OWN_MOST = 0.1, 9.0  # of the logarithm of nearness on the finger; sq
 SCALE_SIGMA = 0.12  # of that which all samples of a finger share
 DARKER, AS_BRIGHT = 0.65, 0.95  # of a finger's nearness: what is beyond its end costs nothing, costs all
 ABOVE_MOST, ABOVE_UNKNOWN = 9.0, 0.33  # and of the root of that where the image is saturated
-UNKNOWN_COST = 1.0  # of a sample outside of the image, or where that is saturated
+# Above a folded finger, the same: what is lit there may be an object that hides the rest of an extended one.
+FOLDED_DARKER, FOLDED_AS_BRIGHT = 0.15, 0.35
+OVER_PX = 100  # above a folded finger: how far a fingertip may be seen again beyond such an object
+UNKNOWN_COST = (
+    1.0  # of a sample outside of the image, or where that is saturated, or where something hides it
+)
+HIDDEN, HIDES = (
+    -0.6,
+    8.0,
+)  # logarithm of nearness of what hides skin; what it costs that there is such a thing
+# before a finger: the thumb is before all that a hand grips.
+SIDE = 0.35  # cosine between outline and hidden skin, seen from the end: no outline shows there
 MODES = 4  # places of a finger whose outlines are looked at
 MODE_WITHIN = 24.0  # what they may cost more than the best
 APART = 0.8  # of the radius of a fingertip: places that differ
@@ -83,10 +97,29 @@ NO_TIPS = Fingertips(np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.
 
 
 class LedImage(NamedTuple):
-    """What samples are compared with: nearness (h, w) of the shrunken image, and where it is a lower bound (h, w)."""
+    """What samples are compared with, of the shrunken image.
+
+    Attributes:
+        near: (h, w) nearness.
+        clipped: (h, w) where it is a lower bound.
+        over: (h, w) the most within OVER_PX above.
+    """
 
     near: Float32
     clipped: Bool
+    over: Float32
+
+    @classmethod
+    def of(cls, near: Float32, clipped: Bool) -> Self:
+        """Of nearness and bound."""
+        rows = OVER_PX // SHRINK
+        column = np.ones((rows, 1), np.uint8)
+        over = cv2.dilate(near, column, anchor=(0, rows - 1), borderType=cv2.BORDER_REPLICATE)
+        return cls(near, clipped, np.asarray(over, np.float32))
+
+    def above(self, uv: Float32) -> Float32:
+        """The most nearness above pixels (..., 2)."""
+        return self._replace(near=self.over).at(uv)[0]
 
     def at(self, uv: Float32) -> tuple[Float32, Bool, Bool]:
         """Nearness, bound and whether it is outside of the image, at pixels (..., 2)."""
@@ -210,6 +243,9 @@ def costs(some: Hypotheses, image: LedImage, gain: float) -> Float32:
     seen, bound, outside = image.at(some.uv[:, :APEX])
     predicted = some.table.near[some.rows] * np.float32(gain)
     off = _logarithm(seen[:, BONES], predicted[:, BONES], bound[:, BONES])
+    unknown = bound[:, BONES] | outside[:, BONES]
+    hidden = (off < HIDDEN) & ~unknown & (some.finger > 0)[:, None]
+    off[hidden] = 0.0
     most = np.float32(3.0 * OWN_SIGMA + SCALE_SIGMA)
     count = off.shape[1]
     weight = np.float32(1.0 / (count + (OWN_SIGMA / SCALE_SIGMA) ** 2))
@@ -217,15 +253,22 @@ def costs(some: Hypotheses, image: LedImage, gain: float) -> Float32:
     square = ((off - scale[:, None]) * np.float32(1.0 / OWN_SIGMA)) ** 2
     np.minimum(square, OWN_MOST, out=square)
     np.maximum(square, UNKNOWN_COST, out=square, where=bound[:, BONES])
-    square[outside[:, BONES]] = UNKNOWN_COST
-    bright = (
-        seen[:, ABOVE] / np.maximum(predicted[:, HIGHEST, None], np.float32(0.1)) - DARKER
-    ) * np.float32(1.0 / (AS_BRIGHT - DARKER))
-    bright = np.minimum(np.maximum(bright, 0.0), 1.0)
-    bright[bound[:, ABOVE]] = ABOVE_UNKNOWN
-    bright[outside[:, ABOVE] | (predicted[:, ABOVE] > 0.0)] = 0.0
-    above = np.float32(ABOVE_MOST) * (bright * bright).sum(axis=1)
-    return some.cost + square.sum(axis=1) + above + (scale * np.float32(1.0 / SCALE_SIGMA)) ** 2
+    square[outside[:, BONES] | hidden] = UNKNOWN_COST
+    cost = some.cost + square.sum(axis=1) + (scale * np.float32(1.0 / SCALE_SIGMA)) ** 2
+    cost += np.float32(HIDES) * hidden.any(axis=1)
+    # Above the finger.
+    folded = some.table.open[some.rows, UPWARDS] == 0.0
+    seen, bound, outside = seen[:, ABOVE], bound[:, ABOVE], outside[:, ABOVE]
+    seen[folded, FAR:] = image.above(some.uv[folded, ABOVE][:, FAR:])
+    darker, as_bright = (
+        np.where(folded, np.float32(a), np.float32(b))[:, None]
+        for a, b in ((FOLDED_DARKER, DARKER), (FOLDED_AS_BRIGHT, AS_BRIGHT))
+    )
+    bright = seen / np.maximum(predicted[:, HIGHEST, None], np.float32(0.1))
+    bright = np.minimum(np.maximum((bright - darker) / (as_bright - darker), 0.0), 1.0)
+    bright[bound] = ABOVE_UNKNOWN
+    bright[outside | (predicted[:, ABOVE] > 0.0)] = 0.0
+    return cost + np.float32(ABOVE_MOST) * (bright * bright).sum(axis=1)
 
 
 def modes(some: Hypotheses, cost: Float32) -> Int:
@@ -285,7 +328,7 @@ def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) ->
     cost = costs(some, image, gain)
     best = modes(some, cost)
     finger, rows = some.finger[best], some.rows[best]
-    outline = np.repeat(some.table.open[rows], OUTLINE // DIRECTIONS, axis=1)
+    outline = np.repeat(_open(some, best, image, gain), OUTLINE // DIRECTIONS, axis=1)
     circle = fitted(led, some.uv[best, END], some.table.end[rows, 0], outline)
     circle = fitted(led, circle.middle, circle.radius, outline)
     misfit = cost[best] + SHOWN_WORTH * (1.0 - circle.shown)
@@ -294,6 +337,19 @@ def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) ->
     chosen = order[np.append(True, finger[order[1:]] != finger[order[:-1]])]
     circle, misfit, finger = Circles(*(each[chosen] for each in circle)), misfit[chosen], finger[chosen]
     return reported(finger, circle, misfit, _ends(some, cost, finger, circle))
+
+
+def _open(some: Hypotheses, which: Int, image: LedImage, gain: float) -> Float32:
+    """`open` (M, DIRECTIONS) of hypotheses (M,), without where something hides the finger next to its end."""
+    open_, uv = some.table.open[some.rows[which]], some.uv[which]
+    seen, bound, outside = image.at(uv[:, BONES])
+    off = _logarithm(seen, some.table.near[some.rows[which], BONES] * np.float32(gain), bound)
+    hidden = (off < HIDDEN) & ~bound & ~outside
+    turn = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
+    way = uv[:, BONES] - uv[:, END, None]
+    along = way @ np.stack([np.cos(turn), np.sin(turn)])
+    towards = hidden[..., None] & (along > SIDE * np.linalg.norm(way, axis=-1)[..., None])
+    return np.where(towards.any(axis=1), np.float32(0.0), open_)
 
 
 def _apart(at: Float32, size: Float32, middle: Float, radius: Float) -> Float:
@@ -404,7 +460,7 @@ def fingertips(
     out = Fingertips(np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan))
     optics = led_optics(view)
     near = nearness(shrink(led), optics)
-    image = LedImage(near, frame[1::SHRINK, 1::SHRINK] > CLIPPED)
+    image = LedImage.of(near, frame[1::SHRINK, 1::SHRINK] > CLIPPED)
     found = search(led, image, laser_uv, view)
     if found is None:
         return out

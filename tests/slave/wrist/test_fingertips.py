@@ -85,6 +85,17 @@ def test_visible_tips_are_found(name: str, seed: int, hand: str) -> None:
     assert elsewhere <= 0.05 * reported
 
 
+def test_fingers_behind_what_they_grip_do_not_pass_for_folded_ones() -> None:
+    elsewhere = near = reported = 0
+    for one in shown("grasp", 39, count=16):
+        off = np.linalg.norm(found(one).uv - one.tip_uv, axis=1)[1:]
+        reported += int(np.isfinite(off).sum())
+        elsewhere += int((off > ELSEWHERE_PX).sum())
+        near += int((off[one.visible[1:]] <= ELSEWHERE_PX).sum())
+    assert near >= 15  # beyond the object
+    assert elsewhere <= 0.08 * reported
+
+
 def test_what_is_reported_says_how_sure_it_is() -> None:
     pulls: dict[bool, list[float]] = {True: [], False: []}
     for name, seed, hand in (("curl@dark", 31, "default"), ("spread@indoor", 33, "default")):
