@@ -225,7 +225,7 @@ def _search(
             row = int(found.row[k])
             circle[0], circle[1] = found.at[k, 0], found.at[k, 1]
             circle[2] = table.end[row, 0]
-            _open(image, gain, table, row, found.abduction[k], limits, open_)
+            _open(image, gain, table, row, float(found.abduction[k]), limits, open_)
             for _ in range(2):
                 _fit(led, circle, open_, edges)
             misfit = found.cost[k] + limits.shown_worth * (1.0 - circle[4])

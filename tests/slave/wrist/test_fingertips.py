@@ -93,7 +93,7 @@ def test_fingers_behind_what_they_grip_do_not_pass_for_folded_ones() -> None:
         elsewhere += int((off > ELSEWHERE_PX).sum())
         near += int((off[one.visible[1:]] <= ELSEWHERE_PX).sum())
     assert near >= 15  # beyond the object
-    assert elsewhere <= 0.08 * reported
+    assert elsewhere <= 0.05 * reported
 
 
 def test_what_is_reported_says_how_sure_it_is() -> None:
