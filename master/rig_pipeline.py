@@ -35,7 +35,7 @@ from master.rig_setup import RigSetup
 
 _ANY_CURL_RAD = 100.0  # a finger that is not seen may be bent anyhow
 _MOUNTED_RAD = np.radians(0.5)  # standard deviation of the pitch of cameras mounted by eye
-_LEAD_M_S = 0.12  # of a palm, and of a finger on it, when another sensor takes over: 4 mm a frame at 60 Hz
+_LEAD_M_S = 0.3  # of a palm, and of a finger on it, where it is solved elsewhere: 5 mm a frame at 60 Hz
 
 
 class Pipeline(Protocol):
