@@ -21,6 +21,7 @@ _SUDDEN_M = 3e-3  # from one instant to the next, beside motion
 _SPEED_S = 0.03  # of the shown hand, which is smooth
 _GOES_ON = 0.5  # of it: a motion that is not seen any more rather ends than goes on
 _STALE_S = 0.1  # after such a gap nothing of a speed is left
+_STEP_M = 5e-3  # is the most that is led between two poses
 _EASE_S = 0.04  # in which the last of what is led fades
 _LITTLE_M, _NOTHING_M = 1e-3, 1e-5  # a part that is led by more is not yet where its markers are
 
@@ -56,9 +57,8 @@ class Lead:
             leaps = ((rests != self._rests) | ~placed | led) & (off > _SUDDEN_M)
             self._offset = np.where(leaps[PARTS], goes_on - solved, self._offset)
             size_m = np.maximum(np.bincount(PARTS, np.abs(self._offset)), _NOTHING_M)
-            self._offset = (
-                self._offset * np.maximum(1.0 - self._lead_m_s * gap_s / size_m, exp(-gap_s / _EASE_S))[PARTS]
-            )
+            left = 1.0 - min(self._lead_m_s * gap_s, _STEP_M) / size_m
+            self._offset = self._offset * np.maximum(left, exp(-gap_s / _EASE_S))[PARTS]
         self._rests, self._points_m = rests, points_m
         return self._offset
 

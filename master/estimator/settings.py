@@ -192,6 +192,9 @@ class Settings(NamedTuple):
     refused: Annotated[
         float, Range("chi square", 4.0, 100.0, "of laser point and fingertip of a finger, beside any pose")
     ] = 14.0
+    refused_unlit: Annotated[
+        float, Range("chi square", 3.0, 100.0, "the same where the light of the fingertip fits no pose")
+    ] = 8.0
     tracked_pip_rad: Annotated[
         float,
         Range(

@@ -5,7 +5,7 @@ person, what calibration leaves of plane and palm, and the part of the line that
 shorter than expected is off across by up to half of what is missing, and by a third of that along, as skin curves away.
 """
 
-from math import cos, log, sin
+from math import cos, hypot, log, sin
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,8 @@ TWIST, BEND, RATE, TILT, HEADING, LIGHT, EXTRAS = 0, 5, 7, 9, 11, 12, 13
 NO_EXTRAS = 1  # of a rig without wrist device: one that means nothing
 _PALM_M = 7e-4  # what calibration leaves of plane and palm: a palm pitched by 0.2 degrees, and 0.3 mm
 _BLUR_PX = 0.5
+_CURVED = 1.0 / 3.0  # of how far a centroid is off across: as far it is off along
+_WHOLE = 0.85  # of the line that is expected: a shorter one is hidden in part
 _AWAY_M = 0.1  # a fingertip of which no laser point tells the distance
 
 
@@ -193,6 +195,35 @@ def loosen(W: Float, J: Float, row: int, cov: Float) -> None:
             b += J[row, 5 + i] * p * J[row + 1, 5 + j]
             c += J[row + 1, 5 + i] * p * J[row + 1, 5 + j]
     inverse_2(a, b, c, W)
+
+
+@inner
+def loosen_short(device: Any, sights: Sights, f: int, length_px: float, point: Float, A: Float) -> bool:
+    """Take from the information of a laser point what it does not say of a line that is hidden in part.
+
+    Args:
+        device, sights: `Sights.laser_W` is changed.
+        f: Finger.
+        length_px: The line's, were all of it seen.
+        point, A: (3,), (2, 2) room.
+
+    Returns:
+        Whether the line is that short.
+    """
+    seen_px = sights.laser_px[f]
+    x, y = sights.laser[f, 0], sights.laser[f, 1]
+    if seen_px == 0.0 or seen_px > _WHOLE * length_px or not on_plane(device, x, y, point, A):
+        return False
+    W = sights.laser_W[f]
+    det = W[0, 0] * W[1, 1] - W[0, 1] * W[1, 0]
+    a, b, c = W[1, 1] / det, -W[0, 1] / det, W[0, 0] / det
+    off = 0.5 * (length_px - seen_px) / device.focal[0]
+    for axis in range(2):
+        scale = off * (1.0 if axis == 0 else _CURVED) / hypot(A[0, axis], A[1, axis])
+        u, v = scale * A[0, axis], scale * A[1, axis]
+        a, b, c = a + u * u, b + u * v, c + v * v
+    inverse_2(a, b, c, W)
+    return True
 
 
 @inner

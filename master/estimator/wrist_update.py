@@ -1,5 +1,6 @@
 """Kernels of one epoch for what a wrist device sees: before the fit, and after it."""
 
+from math import inf
 from typing import Any
 
 from common.arrays import Float
@@ -8,7 +9,7 @@ from common.messages import Level
 from master.estimator.extras import predict_extras
 from master.estimator.finger_coupling import expect_coupling, learn_coupling
 from master.estimator.finger_density import choose, weigh_hands
-from master.estimator.finger_scan import Prior, Scan, scan_finger
+from master.estimator.finger_scan import ROWS, Prior, Scan, scan_finger
 from master.estimator.finger_surface import MOVES, look
 from master.estimator.ground import Ground
 from master.estimator.hand_tables import HandTables
@@ -19,7 +20,7 @@ from master.estimator.settings import Settings
 from master.estimator.solve import palm_off
 from master.estimator.state import NEVER_NS, HandState
 from master.estimator.workspace import Model, Task
-from master.estimator.wrist_device import BEND, EXTRAS, LIGHT, Sights, bent_palm, loosen
+from master.estimator.wrist_device import BEND, EXTRAS, LIGHT, Sights, bent_palm, loosen, loosen_short
 
 _FK, _IK = int(Level.FK), int(Level.IK)
 
@@ -105,13 +106,15 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
                 sights.shown[f] = 0.0
             continue
         scan_finger(hand, device, settings, sights, prior, f, sights.shown[f] > 0.0, scan)
+        if loosen_short(device, sights, f, _length_px(scan, f), scan.g[:3], scan.H[:2, :2]):
+            scan_finger(hand, device, settings, sights, prior, f, sights.shown[f] > 0.0, scan)
         if prior.near_rad[f] > 0.0 and scan.misfit[f] > settings.refused:
             prior.near_rad[f] = 0.0
             scan_finger(hand, device, settings, sights, prior, f, sights.shown[f] > 0.0, scan)
         if scan.misfit[f] > settings.refused and sights.depth_w2[f] > 0.0:
             sights.depth_w2[f] = 0.0  # a tip may shine, or lie in shade: what it is off then is its light
             scan_finger(hand, device, settings, sights, prior, f, True, scan)
-        explained = settings.refused if sights.depth_w2[f] > 0.0 else settings.doubted
+        explained = settings.refused if sights.depth_w2[f] > 0.0 else settings.refused_unlit
         if scan.misfit[f] > explained and sights.shown[f] > 0.0:
             task.refused[f], sights.shown[f] = True, 0.0
             scan_finger(hand, device, settings, sights, prior, f, False, scan)
@@ -133,6 +136,19 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
             if f > 0 and not curled and sights.teaches[f] > 0.0:
                 learn_coupling(prior, f, scan, state)
     _count(sights, space.ground)
+
+
+@inner
+def _length_px(scan: Scan, f: int) -> float:
+    """Length of the laser's line at the best node of a finger."""
+    least, best = inf, scan.first[f]
+    for node in range(scan.first[f], scan.last[f] + 1):
+        total = 0.0
+        for i in range(ROWS):
+            total += scan.rows[f, node, i] ** 2
+        if total < least:
+            least, best = total, node
+    return float(scan.length_px[f, best])
 
 
 @inner
