@@ -60,9 +60,9 @@ HIDDEN, HIDES = (
 )  # logarithm of nearness of what hides skin; what it costs that there is such a thing
 # before a finger: the thumb is before all that a hand grips.
 SIDE = 0.35  # cosine between outline and hidden skin, seen from the end: no outline shows there
-MODES = 4  # places of a finger whose outlines are looked at
+MODES = 8  # places of a finger whose outlines are looked at
 MODE_WITHIN = 24.0  # what they may cost more than the best
-APART = 0.8  # of the radius of a fingertip: places that differ
+APART = 0.4  # of the radius of a fingertip: places that differ
 SHOWN_WORTH = 30.0  # what an outline that is not seen at all costs
 AT_SIGMA, SIZE_SIGMA = 0.35, 0.12  # of the radius: how far a posture's outline may be from the seen one
 AT_SURE, LASER_SURE_M = 0.1, 8e-4  # how well an outline is seen, of the radius, and a laser point
