@@ -257,7 +257,9 @@ def test_recorded_tips_are_found(datasets: Path, name: str) -> None:
     distance = np.linalg.norm(errors, axis=2)
     reported = np.isfinite(distance)
     assert (distance[visible] <= 10.0).mean() >= 0.75
-    assert (distance[reported] > ELSEWHERE_PX).sum() <= max(1.0, 0.06 * reported.sum())
+    assert (distance[reported & visible] > ELSEWHERE_PX).sum() <= max(1.0, 0.02 * reported.sum())
+    # Of deeply curled fingers, whose ends are hidden, knuckles are reported sometimes.
+    assert (distance[reported] > ELSEWHERE_PX).sum() <= max(1.0, 0.1 * reported.sum())
 
 
 def test_relative_depth_orders_the_tips_by_their_distance() -> None:
