@@ -137,7 +137,9 @@ def _makers(data: Path) -> tuple[dict[str, Maker], dict[str, Maker]]:
 
     simulated: dict[str, Maker] = {name: partial(oracle_scenes.scenes, name) for name in oracle_scenes.SCENES}
     simulated |= {"held": oracle_scenes.held, "room": oracle_scenes.in_room}
-    simulated |= {name: partial(oracle_wrist.fused, name) for name in oracle_wrist.FUSED}
+    simulated |= {
+        name: partial(oracle_wrist.fused, name) for name in oracle_wrist.FUSED | oracle_wrist.RENDERED
+    }
     recorded: dict[str, Maker] = {
         name: partial(oracle_recorded.rendered, data, names)
         for name, names in oracle_recorded.RENDERED.items()

@@ -2,8 +2,8 @@
 
 Of a device alone the palm stands where calibration found it, in the frame of its camera. Recorded hands are those of
 the data folder, meshes are rendered by `bench.wrist_mesh`. Before both kinds of rig messages are made of the truth
-(`bench.fusion_shown`). Hidden is a finger whose tip is not in sight of the wrist camera; before both, one whose marker
-fewer than two cameras have in sight.
+(`bench.fusion_shown`), or found by both slaves in rendered frames (`bench.fusion_watched`). Hidden is a finger whose
+tip is not in sight of the wrist camera; before both, one whose marker fewer than two cameras have in sight.
 """
 
 import tempfile
@@ -16,6 +16,7 @@ import numpy as np
 
 from bench.fusion_scene import CALIBRATION, Both, Shown
 from bench.fusion_shown import shown_of
+from bench.fusion_watched import watched
 from bench.oracle_freeze import Piece, calibration_files
 from bench.oracle_recorded import angles_of, hand_of, slave
 from bench.oracle_scenes import truth_of
@@ -36,6 +37,10 @@ FUSED = {
     "fused-travel": ("both-travel", "desk", "wrist"),
     "fused-grasp": ("grasp", "desk", "wrist"),
     "fused-grip": ("grasp", "desk-back3", "wrist-back3"),
+}
+RENDERED = {
+    "rendered-grasp": ("grasp", "desk", "wrist"),
+    "rendered-grip": ("grasp", "desk-back3", "wrist-back3"),
 }
 _MESH_SEED, _SEEDS, _SECONDS = 271, (31, 32), 8.0
 _ABOUT_S = 0.02
@@ -78,11 +83,15 @@ def _detected(folder: Path, hands: Path) -> Piece:
 
 
 def fused(name: str, seconds: float = _SECONDS, seeds: Sequence[int] = _SEEDS) -> Iterator[Piece]:
-    """A hand before marker cameras, with a wrist device and its IMU, once for each seed; a key of `FUSED`."""
-    scene, *rigs = FUSED[name]
+    """A hand before marker cameras, with a wrist device and its IMU, once for each seed.
+
+    `name`: a key of `FUSED` or `RENDERED`.
+    """
+    scene, *rigs = (FUSED | RENDERED)[name]
+    sensed = watched if name in RENDERED else shown_of
     files = calibration_files(CALIBRATION, rigs[0]) | calibration_files(CALIBRATION, rigs[1])
     for seed in seeds:
-        shown = shown_of(Both.of(scene, seed, rigs=(rigs[0], rigs[1])), seconds)
+        shown = sensed(Both.of(scene, seed, rigs=(rigs[0], rigs[1])), seconds)
         yield Piece(f"seed{seed}", tuple(rigs), files, shown.messages, _truth_of(shown))
 
 
