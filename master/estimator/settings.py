@@ -156,7 +156,7 @@ class Settings(NamedTuple):
     ] = radians(5.0)
     coupled_spread: Annotated[
         float, Range("1", 0.0, 1.0, "share of the PIP besides, of a hand of which nothing is known")
-    ] = 0.3
+    ] = 0.2
     coupled_fingers: Annotated[
         float, Range("1", 1.0, 1e5, "half bent fingers seen that this counts as, once each triple")
     ] = 60.0
@@ -230,9 +230,9 @@ class Settings(NamedTuple):
         float, Range("1", 0.0, 1.0, "of what fingers tell of the wrist's bend: they err together")
     ] = 0.6
     strap_rad: Annotated[
-        float, Range("rad", 0.001, 0.5, "of a palm by markers, and of a device on skin, against the forearm")
-    ] = radians(2.5)
-    pace_1_s: Annotated[float, Range("1/s", 0.1, 30.0, "of wrists; Hansson et al. 2009")] = 3.0
+        float, Range("rad", 0.001, 0.5, "of a palm by markers, and of how IMU and camera are mounted")
+    ] = radians(1.5)
+    pace_1_s: Annotated[float, Range("1/s", 0.1, 30.0, "of wrists; Hansson et al. 2009")] = 1.5
     habit_s: Annotated[float, Range("s", 1.0, 600.0, "as long as a posture of the wrist is kept")] = 20.0
     tilt_s: Annotated[float, Range("s", 0.1, 600.0, "as long as an IMU has the vertical off")] = 5.0
     errs_s: Annotated[float, Range("s", 0.01, 60.0, "as long as errors of shape and skin stay")] = 0.5
@@ -241,7 +241,7 @@ class Settings(NamedTuple):
         Range(
             "s", 0.001, 60.0, "as long as errors of a palm by markers stay, of what a wrist moves meanwhile"
         ),
-    ] = 0.1
+    ] = 0.05
     # The search.
     tolerance: Annotated[float, Range("half chi square", 1e-12, 1.0, "what a step may leave")] = 1e-7
     tolerance_share: Annotated[float, Range("1", 0.0, 0.1, "of the cost, likewise")] = 1e-4

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench import oracle_scenes
+from bench import oracle_scenes, oracle_wrist
 from bench.__main__ import main
 from bench.oracle_compare import ALL, compare, judged, table
 from bench.oracle_freeze import Piece, calibration_files, freeze
@@ -209,6 +209,7 @@ def test_without_the_data_the_simulated_sets_are_frozen(
 
     for name in ("scenes", "held", "in_room"):
         monkeypatch.setattr(oracle_scenes, name, short)
+    monkeypatch.setattr(oracle_wrist, "fused", short)
     monkeypatch.setenv("PHALANX_DATASETS", str(tmp_path / "nowhere"))
     assert main(["oracle", "freeze", "--out", str(tmp_path)]) == 0
     assert "only the simulated sets" in capsys.readouterr().out
@@ -217,6 +218,8 @@ def test_without_the_data_the_simulated_sets_are_frozen(
         *(f"fused-{name}" for name in ("curl", "grasp", "grip", "poses", "travel")),
         "grasp",
         "held",
+        "rendered-grasp",
+        "rendered-grip",
         "room",
         "standard",
     ]

