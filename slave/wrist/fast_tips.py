@@ -306,6 +306,15 @@ def _thumbs(
 
 
 @compiled
+def _along(parabola: Float32, by: float) -> tuple[float, float]:
+    """A pixel by its parabola (3, 2) in the abduction."""
+    return (
+        parabola[0, 0] + by * (parabola[1, 0] + by * parabola[2, 0]),
+        parabola[0, 1] + by * (parabola[1, 1] + by * parabola[2, 1]),
+    )
+
+
+@compiled
 def _cell(image: LedImage, u: float, v: float, shrink: int) -> tuple[int, int, bool]:
     """Row and column of a pixel, and whether it is outside of the image."""
     height, width = image.near.shape
@@ -331,8 +340,7 @@ def _take(
     if count == len(found.row):
         return count
     middle, near = table.middle[row], table.near[row]
-    u = middle[0, 0] + abduction * (middle[1, 0] + abduction * middle[2, 0])
-    v = middle[0, 1] + abduction * (middle[1, 1] + abduction * middle[2, 1])
+    u, v = _along(middle, abduction)
     y, x, outside = _cell(image, u, v, limits.shrink)
     ratio = max(image.near[y, x], limits.least_near) / max(near[limits.end] * gain, 0.1)
     if image.clipped[y, x]:
@@ -343,10 +351,8 @@ def _take(
     folded = table.open[row, limits.upwards] == 0.0
     found.row[count], found.abduction[count], found.aside[count] = row, abduction, aside
     found.cost[count] = cost + _cost(image, gain, uv, near, abduction, folded, row >= table.thumb, limits)
-    apex = limits.apex
     found.at[count, 0], found.at[count, 1] = u, v
-    found.at[count, 2] = uv[0, apex, 0] + abduction * (uv[1, apex, 0] + abduction * uv[2, apex, 0])
-    found.at[count, 3] = uv[0, apex, 1] + abduction * (uv[1, apex, 1] + abduction * uv[2, apex, 1])
+    found.at[count, 2], found.at[count, 3] = _along(uv[:, limits.apex], abduction)
     return count + 1
 
 
@@ -374,8 +380,7 @@ def _cost(
     for k in range(limits.apex):
         if k == limits.highest:
             continue
-        u = uv[0, k, 0] + abduction * (uv[1, k, 0] + abduction * uv[2, k, 0])
-        v = uv[0, k, 1] + abduction * (uv[1, k, 1] + abduction * uv[2, k, 1])
+        u, v = _along(uv[:, k], abduction)
         y, x, outside = _cell(image, u, v, limits.shrink)
         if k < bones:
             off[k] = math.log(max(image.near[y, x], limits.least_near) / max(near[k] * gain, 0.1))
@@ -414,11 +419,9 @@ def _open(
     """As `fingertips._open`, of one hypothesis."""
     uv, near, end = table.uv[row], table.near[row], limits.end
     out[:] = table.open[row]
-    end_u = uv[0, end, 0] + abduction * (uv[1, end, 0] + abduction * uv[2, end, 0])
-    end_v = uv[0, end, 1] + abduction * (uv[1, end, 1] + abduction * uv[2, end, 1])
+    end_u, end_v = _along(uv[:, end], abduction)
     for k in range(limits.bones):
-        u = uv[0, k, 0] + abduction * (uv[1, k, 0] + abduction * uv[2, k, 0])
-        v = uv[0, k, 1] + abduction * (uv[1, k, 1] + abduction * uv[2, k, 1])
+        u, v = _along(uv[:, k], abduction)
         y, x, outside = _cell(image, u, v, limits.shrink)
         if outside or image.clipped[y, x]:
             continue
