@@ -147,10 +147,6 @@ def test_straight_fingers_are_told_by_their_tips(
         assert both.summary[error] <= 0.5 * laser.summary[error], finger
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="fk takes joints to bend together to a degree, and is sure where the laser stands still: 5 of 8",
-)
 def test_beyond_the_point_where_the_laser_stands_still_the_output_says_so(
     replays: dict[str, Replay], root: Path, tmp_path: Path
 ) -> None:

@@ -124,9 +124,9 @@ def test_a_bend_goes_back_to_the_posture_that_is_kept() -> None:
     mean = np.zeros(EXTRAS)
     mean[BEND : BEND + 2] = 0.2, 0.2
     extras.set(mean, 1e-6 * np.eye(EXTRAS))
-    extras.after(0.2)
+    extras.after(0.3 / DEFAULT.pace_1_s)
     assert -0.4 < extras.mean[BEND] < 0.2
-    extras.after(5.0)
+    extras.after(15.0 / DEFAULT.pace_1_s)
     np.testing.assert_allclose(extras.mean[BEND : BEND + 2], [-0.4, 0.1], atol=1e-3)
 
 
