@@ -2,7 +2,7 @@
 
     python -m bench.aarch64 count                 every case
     python -m bench.aarch64 count six lost        some of: step six twelve lost windows search numba numba-windows
-                                                  seed
+                                                  wrist wrist-numba seed
     python -m bench.aarch64 count six --parts     and the parts of the detector, six markers
     python -m bench.aarch64 count --record        every case, and what was counted is the new baseline
 
@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
 
-from bench.aarch64 import baseline, frames, scene
+from bench.aarch64 import baseline, scene
 from bench.aarch64.count import CPU, Counted, counted, native
 from bench.aarch64.guest import MACHINE_CODE
 from bench.aarch64.sysroot import CACHE, PYTHON, NotPossibleError, fast_wheels, prepare
@@ -31,6 +31,8 @@ CASES = {
     "search": "the same, one of them lost: a strip in every frame",
     "numba": "detection, six markers, by machine code",
     "numba-windows": "the same in windows alone",
+    "wrist": "triple of a wrist device: strobe, seams, laser, tips, message",
+    "wrist-numba": "the same, by machine code",
     "seed": "published pipeline rebuilt, six markers",
 }
 LONGEST = 30  # parts shown
@@ -38,6 +40,7 @@ RATIOS = (
     ("seed", "six", "published / ours"),
     ("six", "windows", "whole frame / windows"),
     ("search", "six", "windows and one marker lost / whole frame"),
+    ("wrist", "wrist-numba", "wrist, numpy / machine code"),
     ("numba", "numba-windows", "whole frame / windows, machine code"),
     ("twelve", "six", "12 markers / 6 markers"),
     ("lost", "six", "every marker sought anew / tracked"),
@@ -71,8 +74,7 @@ def _count(cases: list[str], *, parts: bool, record: bool, cpu: str) -> int:
     sysroot = prepare(_say)
     fast = fast_wheels(_say) if set(cases) & set(MACHINE_CODE) else None
     with tempfile.TemporaryDirectory(dir=CACHE, prefix="frames-") as folder:
-        for name, marked in scene.rendered().items():
-            frames.write(Path(folder) / name, marked)
+        scene.write_all(Path(folder))
         equal = [case for case in cases if case not in MACHINE_CODE]  # whose sums may be in any order
         here = native(Path(folder), equal)
         found = counted(sysroot, Path(folder), [*cases, "parts"] if parts else cases, cpu, fast)

@@ -19,9 +19,19 @@ import cv2
 import numpy as np
 
 from bench import seed_markers
-from bench.aarch64.frames import FRAME_NS, SIX, TWELVE, MarkedFrames, read, without
+from bench.aarch64.frames import (
+    FRAME_NS,
+    SIX,
+    STROBED_NS,
+    TWELVE,
+    WRIST,
+    MarkedFrames,
+    read,
+    read_strobed,
+    without,
+)
 from bench.aarch64.parts import counted_parts
-from common.messages import Message
+from common.messages import Message, WristDetections, encode
 from master.link import MasterLink
 from slave.app import run
 from slave.cameras.source import Frame
@@ -29,9 +39,14 @@ from slave.link import SlaveLink
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.engine import engine_named
 from slave.tally import Tally
+from slave.wrist import engine as wrist_engine
+from slave.wrist.detector import WristDetector
+from slave.wrist.view import WristView
 
 FIRST, LAST = 20, 60  # the slope is taken between these counts of frames
-MACHINE_CODE = ("numba", "numba-windows")  # cases
+MACHINE_CODE = ("numba", "numba-windows", "wrist-numba")  # cases
+STROBED = ("wrist", "wrist-numba")
+STROBED_DECIMALS = 3  # compared: least squares of outlines differ in the last bit from processor to processor
 WINDOWS = ("windows", "search", "numba-windows")
 PUSHED = ("six", "twelve", "parts", "numba", *WINDOWS)
 KEY = bytes(range(32))
@@ -129,6 +144,8 @@ class _Source:
 
 def run_case(case: str, folder: Path, marks: Marks) -> str:
     """Run `case` over all frames with marks at FIRST and LAST; return the hash of what it found."""
+    if case in STROBED:
+        return _run_strobed(case, folder, marks)
     frames = read(folder / (TWELVE if case == "twelve" else SIX))
     if case == "search":
         frames = without(frames, frames.names[0])
@@ -164,6 +181,30 @@ def run_case(case: str, folder: Path, marks: Marks) -> str:
         raise ValueError(f"no case {case!r}")
     for one in found:
         digest.add(*(np.asarray(getattr(one, field.name), float) for field in fields(one)))
+    return digest.hex()
+
+
+def _run_strobed(case: str, folder: Path, marks: Marks) -> str:
+    """Run a wrist device's triples: strobe, seams, laser, tips, message, encode; a step is a triple."""
+    frames, digest = read_strobed(folder / WRIST), Digest()
+    view = WristView.of(frames.rig, frames.camera, frames.hand)
+    engine = wrist_engine.engine_named("numba" if case in MACHINE_CODE else "numpy")
+    detector = WristDetector(view, frames.camera.frame_rate_hz, engine)
+    told: list[WristDetections] = []
+    for k in range(LAST):
+        if k == FIRST:
+            marks(f"{case} {k}")
+        for i, image in enumerate(frames.triple(k)):
+            seq = 3 * k + i
+            if (found := detector.push(Frame(seq, seq * STROBED_NS, seq * STROBED_NS, image))) is not None:
+                told.append(found.message(frames.camera.name, 7))
+                encode(told[-1])
+    marks(f"{case} {LAST}")
+    if len(told) < LAST - FIRST:
+        raise RuntimeError(f"{len(told)} of {LAST} triples were told")
+    for one in told:
+        values = one.laser_uv, one.laser_sigma_px, one.laser_px, one.tip_uv, one.tip_sigma_px, one.tip_depth
+        digest.add(*(np.round(value, STROBED_DECIMALS) for value in values))
     return digest.hex()
 
 

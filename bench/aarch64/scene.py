@@ -1,4 +1,4 @@
-"""Renders what is counted on: six markers of an open hand, and twelve of two; on the host, uncounted."""
+"""Renders, on the host and uncounted, what is counted on: marked hands, and a curl before a wrist device."""
 
 from pathlib import Path
 
@@ -6,16 +6,30 @@ import cv2
 import msgspec
 import numpy as np
 
-from bench.aarch64.frames import SIX, TWELVE, MarkedFrames
+from bench.aarch64.frames import (
+    SIX,
+    STROBED_NS,
+    TWELVE,
+    WRIST,
+    MarkedFrames,
+    StrobedFrames,
+    write,
+    write_strobed,
+)
 from common.arrays import Image
 from common.calibration import CameraCalibration, HandProfile, HsvRange, RigCalibration, load
 from common.sim.render import Renderer
 from common.sim.scene import Scene
+from common.sim.wrist.render import WristRenderer
+from common.sim.wrist.scene import WristScene
+from slave.cameras.synthetic import STROBE
 
 CALIBRATION = Path(__file__).resolve().parents[2] / "calib_json"
 OPEN_S = 20.0  # an open hand: all six markers in view
 FRAME_S = 1.0 / 60.0
+SEED = 7
 COUNT = 11  # forth and back a period of twenty frames
+CURL, CURL_S = "curl", 0.5  # begins where fingers bend
 SECOND_VALUE = 236  # HSV value from which a colour is the second hand's
 
 
@@ -29,6 +43,25 @@ def rendered() -> dict[str, MarkedFrames]:
     images = [renderer.render(OPEN_S + FRAME_S * k) for k in range(COUNT)]
     six = MarkedFrames(cameras[name], rig.markers, images)
     return {SIX: six, TWELVE: with_second_hand(six)}
+
+
+def strobed() -> StrobedFrames:
+    """Triples of a curl before the wrist device of the rig `wrist`."""
+    rig = load(CALIBRATION / "rigs/wrist.json", RigCalibration)
+    name = rig.cameras[0]
+    camera = load(CALIBRATION / f"cameras/{name}.json", CameraCalibration)
+    hand = load(CALIBRATION / f"hands/{rig.hand}.json", HandProfile)
+    renderer = WristRenderer(WristScene.by_name(CURL, rig, {name: camera}, hand, SEED), name)
+    seconds = [CURL_S + 1e-9 * STROBED_NS * k for k in range(3 * COUNT)]
+    images = [renderer.render(at_s, STROBE[k % 3]) for k, at_s in enumerate(seconds)]
+    return StrobedFrames(rig, camera, hand, [tuple(images[k : k + 3]) for k in range(0, len(images), 3)])
+
+
+def write_all(folder: Path) -> None:
+    """Write every set to a folder of its name in `folder`."""
+    for name, marked in rendered().items():
+        write(folder / name, marked)
+    write_strobed(folder / WRIST, strobed())
 
 
 def with_second_hand(six: MarkedFrames) -> MarkedFrames:

@@ -17,7 +17,7 @@ from bench.aarch64 import baseline, scene, sysroot
 from bench.aarch64.__main__ import CASES, main
 from bench.aarch64.baseline import Baseline, BaselineError
 from bench.aarch64.count import FIRST, LAST, Counted, counted, native, slope, spans
-from bench.aarch64.frames import FRAME_NS, SIX, TWELVE, forth_and_back, read, without, write
+from bench.aarch64.frames import FRAME_NS, SIX, TWELVE, WRIST, forth_and_back, read, read_strobed, without
 from bench.aarch64.guest import Digest, Marks, run_case
 from bench.aarch64.parts import counted_parts
 from bench.aarch64.sysroot import NotPossibleError, Sysroot
@@ -30,8 +30,7 @@ RECORD = Baseline("cortex-a53", {"six": 4_000_000}, {"numpy": "2.4.6", "qemu": "
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("frames")
-    for name, marked in scene.rendered().items():
-        write(place / name, marked)
+    scene.write_all(place)
     return place
 
 
@@ -143,9 +142,16 @@ def test_frames_come_back_as_written(folder: Path) -> None:
     assert len(sets[TWELVE].names) == 2 * len(sets[SIX].names) == 12
 
 
-def test_no_frames_are_an_error(tmp_path: Path) -> None:
+def test_strobed_frames_come_back_as_written(folder: Path) -> None:
+    one, back = scene.strobed(), read_strobed(folder / WRIST)
+    assert (back.rig, back.camera, back.hand) == (one.rig, one.camera, one.hand)
+    np.testing.assert_array_equal(back.triples, one.triples)
+
+
+@pytest.mark.parametrize("reader", [read, read_strobed])
+def test_no_frames_are_an_error(reader: Callable[[Path], object], tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no frames"):
-        read(tmp_path)
+        reader(tmp_path)
 
 
 @pytest.mark.parametrize("name", [SIX, TWELVE])
@@ -159,10 +165,11 @@ def test_every_marker_is_there_to_be_detected(folder: Path, name: str) -> None:
 # The program that is counted, natively
 
 
-def test_a_case_marks_twice_and_repeats_bit_by_bit(folder: Path) -> None:
+@pytest.mark.parametrize("case", ["step", "wrist"])
+def test_a_case_marks_twice_and_repeats_bit_by_bit(case: str, folder: Path) -> None:
     marks = Marks()
-    assert run_case("step", folder, marks) == run_case("step", folder, Marks())
-    assert marks.labels == [f"step {FIRST}", f"step {LAST}"]
+    assert run_case(case, folder, marks) == run_case(case, folder, Marks())
+    assert marks.labels == [f"{case} {FIRST}", f"{case} {LAST}"]
 
 
 def test_windows_find_what_whole_frames_do_and_a_lost_marker_is_one(folder: Path) -> None:
