@@ -1,5 +1,6 @@
 """The frames that are counted on, as files: written once by `bench.aarch64.scene`, read on both architectures."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +13,6 @@ from common.calibration import CameraCalibration, HandProfile, HsvRange, RigCali
 
 FRAME_NS = 16_666_667
 SIX, TWELVE, WRIST = "six", "twelve", "wrist"
-STROBED_NS = 11_111_111  # from frame to frame of a wrist camera
 
 
 class MarkedFrames(NamedTuple):
@@ -41,16 +41,21 @@ def without(frames: MarkedFrames, name: str) -> MarkedFrames:
 
 
 class StrobedFrames(NamedTuple):
-    """Triples of frames (H, W) of a wrist camera, ambient, laser, LED; rig, camera and hand."""
+    """Frames (H, W) of a wrist camera, ambient, laser, LED in turn, in whole triples; rig, camera and hand."""
 
     rig: RigCalibration
     camera: CameraCalibration
     hand: HandProfile
-    triples: list[tuple[Image, ...]]
+    images: list[Image]
 
-    def triple(self, k: int) -> tuple[Image, ...]:
+    def triple(self, k: int) -> list[Image]:
         """Triple `k` of the endless sequence forth and back."""
-        return self.triples[forth_and_back(k, len(self.triples))]
+        first = 3 * forth_and_back(k, len(self.images) // 3)
+        return self.images[first : first + 3]
+
+    def t_ns(self, seq: int) -> int:
+        """Time of frame `seq` of that sequence."""
+        return round(1e9 * seq / self.camera.frame_rate_hz)
 
 
 def write(place: Path, frames: MarkedFrames) -> None:
@@ -62,9 +67,7 @@ def write(place: Path, frames: MarkedFrames) -> None:
     place.mkdir(parents=True, exist_ok=True)
     (place / "camera.json").write_bytes(msgspec.json.encode(frames.camera))
     (place / "names.json").write_bytes(msgspec.json.encode(frames.names))
-    for k, image in enumerate(frames.images):
-        if not cv2.imwrite(str(place / f"{k:02d}.png"), image):
-            raise OSError(f"{place}: cannot write frame {k}")
+    _write_images(place, frames.images)
 
 
 def read(place: Path) -> MarkedFrames:
@@ -73,16 +76,13 @@ def read(place: Path) -> MarkedFrames:
     Raises:
         FileNotFoundError: There are no frames.
     """
-    files = sorted(place.glob("*.png"))
-    if not files:
-        raise FileNotFoundError(f"{place}: no frames")
-    images = [np.asarray(cv2.imread(str(file), cv2.IMREAD_COLOR), np.uint8) for file in files]
+    images = _read_images(place, cv2.IMREAD_COLOR)
     names = msgspec.json.decode((place / "names.json").read_bytes(), type=tuple[str, ...])
     return MarkedFrames(load(place / "camera.json", CameraCalibration), names, images)
 
 
 def write_strobed(place: Path, frames: StrobedFrames) -> None:
-    """Write to the folder `place`: rig.json, camera.json, hand.json, and the triples as PNG.
+    """Write to the folder `place`: rig.json, camera.json, hand.json, and the frames as PNG.
 
     Raises:
         OSError: A file cannot be written.
@@ -90,10 +90,7 @@ def write_strobed(place: Path, frames: StrobedFrames) -> None:
     place.mkdir(parents=True, exist_ok=True)
     for name in ("rig", "camera", "hand"):
         (place / f"{name}.json").write_bytes(msgspec.json.encode(getattr(frames, name)))
-    for k, triple in enumerate(frames.triples):
-        for i, image in enumerate(triple):
-            if not cv2.imwrite(str(place / f"{k:02d}-{i}.png"), image):
-                raise OSError(f"{place}: cannot write frame {k}-{i}")
+    _write_images(place, frames.images)
 
 
 def read_strobed(place: Path) -> StrobedFrames:
@@ -102,13 +99,19 @@ def read_strobed(place: Path) -> StrobedFrames:
     Raises:
         FileNotFoundError: There are no frames.
     """
+    images = _read_images(place, cv2.IMREAD_GRAYSCALE)
+    rig, hand = load(place / "rig.json", RigCalibration), load(place / "hand.json", HandProfile)
+    return StrobedFrames(rig, load(place / "camera.json", CameraCalibration), hand, images)
+
+
+def _write_images(place: Path, images: Sequence[Image]) -> None:
+    for k, image in enumerate(images):
+        if not cv2.imwrite(str(place / f"{k:02d}.png"), image):
+            raise OSError(f"{place}: cannot write frame {k}")
+
+
+def _read_images(place: Path, kind: int) -> list[Image]:
     files = sorted(place.glob("*.png"))
     if not files:
         raise FileNotFoundError(f"{place}: no frames")
-    images = [np.asarray(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), np.uint8) for file in files]
-    return StrobedFrames(
-        load(place / "rig.json", RigCalibration),
-        load(place / "camera.json", CameraCalibration),
-        load(place / "hand.json", HandProfile),
-        [tuple(images[k : k + 3]) for k in range(0, len(images), 3)],
-    )
+    return [np.asarray(cv2.imread(str(file), kind), np.uint8) for file in files]

@@ -13,23 +13,14 @@ import sys
 import threading
 from collections.abc import Callable
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from bench import seed_markers
-from bench.aarch64.frames import (
-    FRAME_NS,
-    SIX,
-    STROBED_NS,
-    TWELVE,
-    WRIST,
-    MarkedFrames,
-    read,
-    read_strobed,
-    without,
-)
+from bench.aarch64.frames import FRAME_NS, SIX, TWELVE, WRIST, MarkedFrames, read, read_strobed, without
 from bench.aarch64.parts import counted_parts
 from common.messages import Message, WristDetections, encode
 from master.link import MasterLink
@@ -81,6 +72,12 @@ class Digest:
     def hex(self) -> str:
         """The hash of all that was taken."""
         return self._sha.hexdigest()
+
+
+def arrays_of(message: Message) -> list[np.ndarray]:
+    """The arrays of a message as floats, field by field."""
+    values = (getattr(message, name) for name in message.__struct_fields__)
+    return [value.astype(float) for value in values if isinstance(value, np.ndarray)]
 
 
 class _StillClock:
@@ -150,17 +147,7 @@ def run_case(case: str, folder: Path, marks: Marks) -> str:
     if case == "search":
         frames = without(frames, frames.names[0])
     digest = Digest()
-
-    def mark(k: int) -> None:
-        if k in (FIRST, LAST):
-            marks(f"{case} {k}")
-
-    def each(step: Callable[[int], None]) -> None:
-        for k in range(LAST):
-            mark(k)
-            step(k)
-        mark(LAST)
-
+    mark, each = partial(_mark, marks, case), partial(_each, marks, case)
     engine = engine_named("numba" if case in MACHINE_CODE else "numpy")
     detector = MarkerDetector(frames.camera, frames.names, engine=engine)
     detector.windows_only = case in WINDOWS
@@ -184,6 +171,20 @@ def run_case(case: str, folder: Path, marks: Marks) -> str:
     return digest.hex()
 
 
+def _mark(marks: Marks, case: str, k: int) -> None:
+    """Mark the place before step `k`, where it is one that is counted from or to."""
+    if k in (FIRST, LAST):
+        marks(f"{case} {k}")
+
+
+def _each(marks: Marks, case: str, step: Callable[[int], None]) -> None:
+    """Take all steps of a case, with its marks."""
+    for k in range(LAST):
+        _mark(marks, case, k)
+        step(k)
+    _mark(marks, case, LAST)
+
+
 def _run_strobed(case: str, folder: Path, marks: Marks) -> str:
     """Run a wrist device's triples: strobe, seams, laser, tips, message, encode; a step is a triple."""
     frames, digest = read_strobed(folder / WRIST), Digest()
@@ -191,20 +192,19 @@ def _run_strobed(case: str, folder: Path, marks: Marks) -> str:
     engine = wrist_engine.engine_named("numba" if case in MACHINE_CODE else "numpy")
     detector = WristDetector(view, frames.camera.frame_rate_hz, engine)
     told: list[WristDetections] = []
-    for k in range(LAST):
-        if k == FIRST:
-            marks(f"{case} {k}")
-        for i, image in enumerate(frames.triple(k)):
-            seq = 3 * k + i
-            if (found := detector.push(Frame(seq, seq * STROBED_NS, seq * STROBED_NS, image))) is not None:
+
+    def step(k: int) -> None:
+        for seq, image in enumerate(frames.triple(k), 3 * k):
+            t_ns = frames.t_ns(seq)
+            if (found := detector.push(Frame(seq, t_ns, t_ns, image))) is not None:
                 told.append(found.message(frames.camera.name, 7))
                 encode(told[-1])
-    marks(f"{case} {LAST}")
+
+    _each(marks, case, step)
     if len(told) < LAST - FIRST:
         raise RuntimeError(f"{len(told)} of {LAST} triples were told")
     for one in told:
-        values = one.laser_uv, one.laser_sigma_px, one.laser_px, one.tip_uv, one.tip_sigma_px, one.tip_depth
-        digest.add(*(np.round(value, STROBED_DECIMALS) for value in values))
+        digest.add(*(np.round(array, STROBED_DECIMALS) for array in arrays_of(one)))
     return digest.hex()
 
 

@@ -6,16 +6,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from bench.aarch64.frames import (
-    SIX,
-    STROBED_NS,
-    TWELVE,
-    WRIST,
-    MarkedFrames,
-    StrobedFrames,
-    write,
-    write_strobed,
-)
+from bench.aarch64.frames import SIX, TWELVE, WRIST, MarkedFrames, StrobedFrames, write, write_strobed
 from common.arrays import Image
 from common.calibration import CameraCalibration, HandProfile, HsvRange, RigCalibration, load
 from common.sim.render import Renderer
@@ -52,9 +43,8 @@ def strobed() -> StrobedFrames:
     camera = load(CALIBRATION / f"cameras/{name}.json", CameraCalibration)
     hand = load(CALIBRATION / f"hands/{rig.hand}.json", HandProfile)
     renderer = WristRenderer(WristScene.by_name(CURL, rig, {name: camera}, hand, SEED), name)
-    seconds = [CURL_S + 1e-9 * STROBED_NS * k for k in range(3 * COUNT)]
-    images = [renderer.render(at_s, STROBE[k % 3]) for k, at_s in enumerate(seconds)]
-    return StrobedFrames(rig, camera, hand, [tuple(images[k : k + 3]) for k in range(0, len(images), 3)])
+    images = [renderer.render(CURL_S + k / camera.frame_rate_hz, STROBE[k % 3]) for k in range(3 * COUNT)]
+    return StrobedFrames(rig, camera, hand, images)
 
 
 def write_all(folder: Path) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 import common
 import slave
 from bench.aarch64.frames import FRAME_NS, SIX, read
-from bench.aarch64.guest import Digest
+from bench.aarch64.guest import Digest, arrays_of
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.datagram import Kind, Opener, Sealer, parse
 from common.errors import PhalanxError
@@ -120,8 +120,7 @@ def opened(datagrams: list[bytes]) -> list[bytes]:
 def _hash(messages: list[MarkerDetections] | list[WristDetections]) -> str:
     digest = Digest()
     for message in messages:
-        values = (getattr(message, name) for name in message.__struct_fields__)
-        digest.add(*(value.astype(float) for value in values if isinstance(value, np.ndarray)))
+        digest.add(*arrays_of(message))
     return digest.hex()
 
 

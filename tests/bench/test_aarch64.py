@@ -145,7 +145,7 @@ def test_frames_come_back_as_written(folder: Path) -> None:
 def test_strobed_frames_come_back_as_written(folder: Path) -> None:
     one, back = scene.strobed(), read_strobed(folder / WRIST)
     assert (back.rig, back.camera, back.hand) == (one.rig, one.camera, one.hand)
-    np.testing.assert_array_equal(back.triples, one.triples)
+    np.testing.assert_array_equal(back.images, one.images)
 
 
 @pytest.mark.parametrize("reader", [read, read_strobed])
