@@ -69,8 +69,11 @@ emulator: ## what checks the service and runs aarch64 programs in the tests; wit
 hosts-tools: emulator ## what the tests with whole machines need; without root it says what to install
 	$(call apt,the tests with whole machines,qemu-system-arm qemu-system-x86 qemu-utils systemd-container rsync openssh-client iproute2 tcpdump kmod,qemu-system-aarch64 qemu-system-x86_64 systemd-nspawn rsync ssh ip tcpdump depmod)
 
-test: check browser emulator ## check, then all tests; one that fails is tried once more, and listed
-	@$(BIN)/python -m pytest -n 3 --reruns 1 --dist loadfile --no-loadscope-reorder $(TEST_ARGS)
+# A test that hangs says where each thread stands and takes its worker with it; another worker goes on.
+HANG := -o faulthandler_timeout=600 -o faulthandler_exit_on_timeout=true
+
+test: check browser emulator ## check, then all tests; one that fails or hangs is tried once more, and listed
+	@$(BIN)/python -m pytest -n 3 --reruns 1 --dist loadfile --no-loadscope-reorder $(HANG) $(TEST_ARGS)
 
 test-bare: ## the gate on a Debian that has git, make and python3-venv alone, and is thrown away; as root, 30 min
 	$(call apt,the gate on a bare Debian,mmdebstrap debian-archive-keyring,mmdebstrap)
