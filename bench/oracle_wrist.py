@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from bench.fusion_scene import CALIBRATION, Both, Shown
+from bench.fusion_scene import CALIBRATION, Both, Observed, Shown
 from bench.fusion_shown import shown_of
 from bench.fusion_watched import watched
 from bench.oracle_freeze import Piece, calibration_files
@@ -25,6 +25,7 @@ from bench.wrist_mesh.sets import set_named, write_set
 from common.errors import RecordingError
 from common.frame_recording import open_recording
 from common.hand_model import FINGERS
+from common.messages import WristDetections
 from common.npz import read_npz
 from master.recorded import recorded_triples
 from master.wrist_score import load_wrist_truth
@@ -37,11 +38,13 @@ FUSED = {
     "fused-travel": ("both-travel", "desk", "wrist"),
     "fused-grasp": ("grasp", "desk", "wrist"),
     "fused-grip": ("grasp", "desk-back3", "wrist-back3"),
+    "fused-grip-slow": ("grasp", "desk-back3", "wrist-back3"),
 }
 RENDERED = {
     "rendered-grasp": ("grasp", "desk", "wrist"),
     "rendered-grip": ("grasp", "desk-back3", "wrist-back3"),
 }
+_SLOW, _EVERY = "fused-grip-slow", 3  # of the triples: as many as a busy machine makes
 _MESH_SEED, _SEEDS, _SECONDS = 271, (31, 32), 8.0
 _ABOUT_S = 0.02
 
@@ -92,7 +95,15 @@ def fused(name: str, seconds: float = _SECONDS, seeds: Sequence[int] = _SEEDS) -
     files = calibration_files(CALIBRATION, rigs[0]) | calibration_files(CALIBRATION, rigs[1])
     for seed in seeds:
         shown = sensed(Both.of(scene, seed, rigs=(rigs[0], rigs[1])), seconds)
-        yield Piece(f"seed{seed}", tuple(rigs), files, shown.messages, _truth_of(shown))
+        messages = _thinned(shown.messages) if name == _SLOW else shown.messages
+        yield Piece(f"seed{seed}", tuple(rigs), files, messages, _truth_of(shown))
+
+
+def _thinned(messages: list[Observed]) -> list[Observed]:
+    """The same with every third triple alone."""
+    triples = [one for one in messages if isinstance(one, WristDetections)]
+    kept = {id(one) for one in triples[::_EVERY]}
+    return [one for one in messages if not isinstance(one, WristDetections) or id(one) in kept]
 
 
 def _truth_of(shown: Shown) -> Truth:

@@ -136,12 +136,14 @@ class Hidden:
         angles: (20,) [rad]; those of fingers that are seen mean nothing.
         sigma: (5,) [rad] standard deviation of that.
         gone_s: (5,) time since they were seen last; 0: seen now.
+        back_s: (5,) the same of those that are seen again now; 0: they were seen at the epoch before, or are hidden.
         own: (5,) share of the variance of a step that the fingers that are seen do not tell.
     """
 
     angles: Float
     sigma: Float
     gone_s: Float
+    back_s: Float
     own: Float
     x: Float  # (n,) room
     K: Float  # (4, 4) room
@@ -152,7 +154,7 @@ class Hidden:
     @classmethod
     def none(cls, n: int) -> "Hidden":
         """Room for one hand."""
-        return record(cls, angles=20, sigma=5, gone_s=5, own=5, x=n, K=(4, 4), L=(4, 4), weight=4, ahead=20)
+        return record(cls, angles=20, sigma=5, gone_s=5, back_s=5, own=5, x=n, K=(4, 4), L=(4, 4), weight=4, ahead=20)
 
 
 @inlined
@@ -196,8 +198,10 @@ def hide(
     for a in range(20):
         hidden.angles[a] = state.angles[a]
     for f in range(5):
-        hidden.sigma[f], hidden.gone_s[f], hidden.own[f] = settings.held_rad, 0.0, 1.0
+        hidden.sigma[f], hidden.gone_s[f], hidden.back_s[f], hidden.own[f] = settings.held_rad, 0.0, 0.0, 1.0
         if shown[f]:
+            if state.hidden_ns[f] != NEVER_NS:
+                hidden.back_s[f] = (t_ns - state.hidden_ns[f]) * 1e-9
             state.hidden_ns[f] = NEVER_NS
             continue
         if state.hidden_ns[f] == NEVER_NS:

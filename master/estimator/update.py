@@ -21,7 +21,7 @@ from master.estimator.problem import Belief, Rig, Search
 from master.estimator.residuals import Observations, marker_rows
 from master.estimator.settings import Settings
 from master.estimator.solve import descend
-from master.estimator.state import NEVER_NS, PALM_PART, HandState, grow, predict
+from master.estimator.state import NEVER_NS, PALM_PART, HandState, Hidden, grow, predict
 from master.estimator.workspace import Model
 from master.estimator.wrist_device import EXTRAS
 from master.estimator.wrist_rows import contrary, sensed_palm
@@ -277,6 +277,19 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
     return chi_square(rig, observed, found.palm, found.x, 0.0, search)
 
 
+@inner
+def _take_rates(settings: Settings, state: HandState, dt_s: float, angles: Float, hidden: Hidden) -> None:
+    """Follow how fast the angles (20,) change; of a finger that is seen again, since it was seen last."""
+    for a in range(20):
+        f = a // 4
+        if hidden.back_s[f] > 0.0:
+            away_s, rate, before = hidden.back_s[f], state.then_rates[f, a], state.then[f, a]
+        else:
+            away_s, rate, before = dt_s, state.rates[a], state.angles[a]
+        share = 1.0 - exp(-away_s / settings.rate_memory_s)
+        state.rates[a] = rate + share * ((angles[a] - before) / away_s - rate)
+
+
 @kernel
 def take_over_epoch(
     model: Model, boxed_state: Any, goes_on: bool, observed: Observations, boxed_space: Any, out: Estimate
@@ -302,10 +315,7 @@ def take_over_epoch(
     lost = not palm_shown
     if goes_on:
         grow(hand, settings, state, dt_s, found.palm, palm_shown, hidden)
-        share = 1.0 - exp(-dt_s / settings.rate_memory_s)
-        for a in range(20):
-            rate = (work.angles[a] - state.angles[a]) / dt_s
-            state.rates[a] += share * (rate - state.rates[a])
+        _take_rates(settings, state, dt_s, work.angles, hidden)
         for f in range(5):
             lost = lost or hidden.gone_s[f] > 0.0
     else:

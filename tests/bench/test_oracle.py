@@ -215,7 +215,7 @@ def test_without_the_data_the_simulated_sets_are_frozen(
     assert "only the simulated sets" in capsys.readouterr().out
     assert sets_of(tmp_path) == [
         "both-travel",
-        *(f"fused-{name}" for name in ("curl", "grasp", "grip", "poses", "travel")),
+        *(f"fused-{name}" for name in ("curl", "grasp", "grip", "grip-slow", "poses", "travel")),
         "grasp",
         "held",
         "rendered-grasp",

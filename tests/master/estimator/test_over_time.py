@@ -132,6 +132,21 @@ def test_a_returning_marker_is_believed_at_once(gap: int) -> None:
     assert jump <= np.linalg.norm(held.solution.joints.position_m[TIPS[INDEX]] - truth) + 2e-3
 
 
+@pytest.mark.parametrize("gap", [5, 10, 25])
+def test_a_finger_that_shows_once_goes_on_as_fast_as_it_moved_since_it_was_seen_last(gap: int) -> None:
+    """How far it is from where it was believed to be is no motion of one frame."""
+    machine = estimator()
+    stop = 10 + gap
+    run(machine, range(10), speed_deg_s=60.0)
+    run(machine, range(10, stop), gone=(MARKER_INDEX,), speed_deg_s=60.0)
+    run(machine, range(stop, stop + 1), speed_deg_s=60.0)
+    lost = run(machine, range(stop + 1, stop + 11), gone=(0, MARKER_INDEX, 2, 3, 4), speed_deg_s=60.0)
+    truth = [min(20.0 + k, 110.0) for k in range(stop + 1, stop + 11)]
+    off = np.array([pip_deg(hand) for hand in lost]) - truth
+    assert off.max() < 1.0  # it is not thrown ahead,
+    assert off.min() > -8.0  # and no farther behind than a motion that fades leaves it
+
+
 def test_a_hand_that_nobody_sees_is_held_half_a_second_and_then_not_valid() -> None:
     machine = estimator()
     run(machine, range(10), speed_deg_s=0.0)
