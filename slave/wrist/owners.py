@@ -1,9 +1,10 @@
 """Whose each part of the laser line is, by where it lies on the laser's plane, where the seams cannot be right.
 
 A pixel of the plane is a known place before the palm. Fingers lean little to the side, so that it lies nearest to the
-axis of its own (`Reach.place`), even where seams were drawn through another valley. The thumb crosses the plane near
-its MCP or beside the palm: what lies as near to its root is its own, and what lies before the knuckles and farther
-away than that never is.
+axis of its own (`Reach.place`), even where seams were drawn through another valley. A wrist that deviates by 5 degrees
+moves all of them by half a finger, and a palm that holds something does not show it; but where four lines lie side by
+side their middle is between the second and the third. The thumb crosses the plane near its MCP or beside the palm:
+what lies as near to its root is its own, and what lies before the knuckles and farther away than that never is.
 """
 
 import numpy as np
@@ -19,6 +20,12 @@ _BESIDE_INDEX = 0.5  # place: there is the thumb of a bent wrist where the index
 # fingers point to the root of the thumb, the little one a quarter of a spacing towards it.
 _FROM: Float = np.array([-np.inf, -np.inf, 1.35, 2.3, 3.1])
 _TO: Float = np.array([np.inf, 1.65, 2.65, 3.65, np.inf])
+_ALL = (3.2, 4.4)  # place: from the outside of the index to that of the little finger
+_GAP, _FULL = (
+    0.08,
+    0.72,
+)  # place: a larger step is no line; share that the lines of four fingers side by side fill
+_MOST_ASIDE = 0.7  # place: farther the palm has not turned unseen
 _CREASE_PX = 20  # columns on either side of a seam in which the crease may be
 
 
@@ -28,6 +35,7 @@ def owners(finger: Int, runs: Runs, points: Float, reach: Reach) -> Int:
     on = finger != NONE
     near = on & reach.only_thumb(beyond, place)
     out = np.where(near, _THUMB, finger)
+    place = place - _aside(place[out > _THUMB])
     out = _at_creases(out, runs)
     ends = out[1:] != out[:-1]
     ends[runs.first[1:] - 1] = True
@@ -45,6 +53,17 @@ def owners(finger: Int, runs: Runs, points: Float, reach: Reach) -> Int:
         if ((of == _INDEX) & ~beyond_index).any():
             of = np.where(beyond_index, _THUMB, of)
     return np.repeat(of, count)
+
+
+def _aside(place: Float) -> float:
+    """How far all fingers lie beside their axes, by the places (N,) of their runs; 0: not all four are there."""
+    if not len(place):
+        return 0.0
+    across = np.sort(place)
+    steps, wide = np.diff(across), float(across[-1] - across[0])
+    off = 0.5 * float(across[0] + across[-1]) - 2.5
+    full = float(steps[steps < _GAP].sum()) > _FULL * wide
+    return off if full and _ALL[0] < wide < _ALL[1] and abs(off) < _MOST_ASIDE else 0.0
 
 
 def _room(of: Int, nearest: Int, moving: Bool) -> Bool:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from bench.fusion_scene import Both
 from common.geometry import rotation_vector_to_matrix
 from common.sim.wrist.render import WristRenderer
 from slave.cameras.synthetic import STROBE
@@ -61,3 +62,18 @@ def test_seams_that_lie_one_finger_aside_do_not_move_the_line() -> None:
     assert (aside != whose)[whose > 0].mean() > 0.9
     kept = (whose > 0) & (finger != 4)
     assert (owners(aside, runs, points, reach) == whose)[kept].mean() > 0.9
+
+
+@pytest.mark.parametrize("t", [4.9, 5.1, 17.0])
+def test_lines_of_a_palm_that_deviates_and_holds_something_are_counted_from_the_outside(t: float) -> None:
+    """What is held hides the webs, so that nobody sees how the palm lies."""
+    both = Both.of("grasp", 7, rigs=("desk-back3", "wrist-back3"))
+    name = both.wrist.rig.cameras[0]
+    view = WristView.of(both.wrist.rig, both.wrist.cameras[name], both.wrist.hand.profile)
+    renderer, truth = WristRenderer(both.worn, name, 2), both.worn.truth(t)
+    ambient, laser, led = (renderer.render(t, kind) for kind in STROBE)
+    fingers = separate(lit(led, ambient), view)
+    assert abs(np.degrees(truth.bend_rad[1])) > 5.0
+    assert fingers.turn.straight
+    found = laser_lines(lit(laser, ambient), fingers, view).uv[1:]
+    assert (np.linalg.norm(found - truth.laser_uv[2:6], axis=1) < NEAR_PX).all()
