@@ -81,7 +81,7 @@ class Settings(NamedTuple):
         float, Range("s", 0.0, 5.0, "how fast a hand may change from habits to none")
     ] = 0.3
     # Fingers that nobody sees.
-    coast_s: Annotated[float, Range("s", 0.01, 1.0, _COORDINATION)] = 0.12
+    coast_s: Annotated[float, Range("s", 0.01, 1.0, _COORDINATION)] = 0.16
     rate_memory_s: Annotated[
         float, Range("s", 1e-3, 1.0, "half of a new rate counts at 60 frames a second")
     ] = 0.024
