@@ -25,7 +25,7 @@ _GAP, _FULL = (
     0.08,
     0.72,
 )  # place: a larger step is no line; share that the lines of four fingers side by side fill
-_MOST_ASIDE = 0.7  # place: farther the palm has not turned unseen
+_ASIDE = (0.3, 0.7)  # place: by less it is folded fingers; farther the palm has not turned unseen
 _CREASE_PX = 20  # columns on either side of a seam in which the crease may be
 
 
@@ -35,7 +35,7 @@ def owners(finger: Int, runs: Runs, points: Float, reach: Reach) -> Int:
     on = finger != NONE
     near = on & reach.only_thumb(beyond, place)
     out = np.where(near, _THUMB, finger)
-    place = place - _aside(place[out > _THUMB])
+    place = place - _shift(place[out > _THUMB])
     out = _at_creases(out, runs)
     ends = out[1:] != out[:-1]
     ends[runs.first[1:] - 1] = True
@@ -55,15 +55,15 @@ def owners(finger: Int, runs: Runs, points: Float, reach: Reach) -> Int:
     return np.repeat(of, count)
 
 
-def _aside(place: Float) -> float:
-    """How far all fingers lie beside their axes, by the places (N,) of their runs; 0: not all four are there."""
+def _shift(place: Float) -> float:
+    """How far all fingers lie beside their axes, by the places (N,) of their runs; 0: about there, or not all four."""
     if not len(place):
         return 0.0
     across = np.sort(place)
     steps, wide = np.diff(across), float(across[-1] - across[0])
     off = 0.5 * float(across[0] + across[-1]) - 2.5
     full = float(steps[steps < _GAP].sum()) > _FULL * wide
-    return off if full and _ALL[0] < wide < _ALL[1] and abs(off) < _MOST_ASIDE else 0.0
+    return off if full and _ALL[0] < wide < _ALL[1] and _ASIDE[0] < abs(off) < _ASIDE[1] else 0.0
 
 
 def _room(of: Int, nearest: Int, moving: Bool) -> Bool:
