@@ -53,7 +53,7 @@ class HandState:
         coupling: (3,) sums of what was learnt of MCP and PIP (`master.estimator.finger_coupling`).
         natural: (1,) probability that it obeys habits.
         speed: (1,) [m/s] of the palm, and `lost_s` (1,) how long nothing tells where it is.
-        hidden_ns: (5,) when each hidden finger was seen last; NEVER_NS: it is seen.
+        hidden_ns: (5,) when each finger that was hidden at the last epoch was seen last; NEVER_NS: it was seen there.
         then, then_rates: (5, 20) the angles and rates of the whole hand at that time.
         then_alike: (5,) how neighbours correlated then.
         turn: (3, 3) how other sensors had the palm turned, and `turn_known` (1,) whether they said so.
@@ -136,14 +136,12 @@ class Hidden:
         angles: (20,) [rad]; those of fingers that are seen mean nothing.
         sigma: (5,) [rad] standard deviation of that.
         gone_s: (5,) time since they were seen last; 0: seen now.
-        back_s: (5,) the same of those that are seen again now; 0: they were seen at the epoch before, or are hidden.
         own: (5,) share of the variance of a step that the fingers that are seen do not tell.
     """
 
     angles: Float
     sigma: Float
     gone_s: Float
-    back_s: Float
     own: Float
     x: Float  # (n,) room
     K: Float  # (4, 4) room
@@ -154,9 +152,7 @@ class Hidden:
     @classmethod
     def none(cls, n: int) -> "Hidden":
         """Room for one hand."""
-        return record(
-            cls, angles=20, sigma=5, gone_s=5, back_s=5, own=5, x=n, K=(4, 4), L=(4, 4), weight=4, ahead=20
-        )
+        return record(cls, angles=20, sigma=5, gone_s=5, own=5, x=n, K=(4, 4), L=(4, 4), weight=4, ahead=20)
 
 
 @inlined
@@ -200,11 +196,8 @@ def hide(
     for a in range(20):
         hidden.angles[a] = state.angles[a]
     for f in range(5):
-        hidden.sigma[f], hidden.gone_s[f], hidden.back_s[f], hidden.own[f] = settings.held_rad, 0.0, 0.0, 1.0
+        hidden.sigma[f], hidden.gone_s[f], hidden.own[f] = settings.held_rad, 0.0, 1.0
         if shown[f]:
-            if state.hidden_ns[f] != NEVER_NS:
-                hidden.back_s[f] = (t_ns - state.hidden_ns[f]) * 1e-9
-            state.hidden_ns[f] = NEVER_NS
             continue
         if state.hidden_ns[f] == NEVER_NS:
             state.hidden_ns[f] = state.t_ns[0]

@@ -21,7 +21,7 @@ from master.estimator.problem import Belief, Rig, Search
 from master.estimator.residuals import Observations, marker_rows
 from master.estimator.settings import Settings
 from master.estimator.solve import descend
-from master.estimator.state import NEVER_NS, PALM_PART, HandState, Hidden, grow, predict
+from master.estimator.state import NEVER_NS, PALM_PART, HandState, grow, predict
 from master.estimator.workspace import Model
 from master.estimator.wrist_device import EXTRAS
 from master.estimator.wrist_rows import contrary, sensed_palm
@@ -278,14 +278,13 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
 
 
 @inner
-def _take_rates(settings: Settings, state: HandState, dt_s: float, angles: Float, hidden: Hidden) -> None:
-    """Follow how fast the angles (20,) change; of a finger that is seen again, since it was seen last."""
+def _take_rates(settings: Settings, state: HandState, t_ns: int, shown: Bool, angles: Float) -> None:
+    """Follow how fast angles (20,) change; of a finger (5,) that shows again, since it was seen last."""
     for a in range(20):
-        f = a // 4
-        if hidden.back_s[f] > 0.0:
-            away_s, rate, before = hidden.back_s[f], state.then_rates[f, a], state.then[f, a]
-        else:
-            away_s, rate, before = dt_s, state.rates[a], state.angles[a]
+        f, before_ns, rate, before = a // 4, state.t_ns[0], state.rates[a], state.angles[a]
+        if shown[f] and state.hidden_ns[f] != NEVER_NS:
+            before_ns, rate, before = state.hidden_ns[f], state.then_rates[f, a], state.then[f, a]
+        away_s = (t_ns - before_ns) * 1e-9
         share = 1.0 - exp(-away_s / settings.rate_memory_s)
         state.rates[a] = rate + share * ((angles[a] - before) / away_s - rate)
 
@@ -315,7 +314,7 @@ def take_over_epoch(
     lost = not palm_shown
     if goes_on:
         grow(hand, settings, state, dt_s, found.palm, palm_shown, hidden)
-        _take_rates(settings, state, dt_s, work.angles, hidden)
+        _take_rates(settings, state, t_ns, shown, work.angles)
         for f in range(5):
             lost = lost or hidden.gone_s[f] > 0.0
     else:
@@ -354,7 +353,7 @@ def take_over_epoch(
     state.t_ns[0], state.known[0], state.natural[0] = t_ns, True, found.natural[0]
     for f in range(5):
         if shown[f]:
-            state.told_ns[f] = t_ns
+            state.told_ns[f], state.hidden_ns[f] = t_ns, NEVER_NS
     if palm_shown:
         state.told_ns[PALM_PART] = t_ns
     copy(found.palm, state.palm)

@@ -21,10 +21,8 @@ _BESIDE_INDEX = 0.5  # place: there is the thumb of a bent wrist where the index
 _FROM: Float = np.array([-np.inf, -np.inf, 1.35, 2.3, 3.1])
 _TO: Float = np.array([np.inf, 1.65, 2.65, 3.65, np.inf])
 _ALL = (3.2, 4.4)  # place: from the outside of the index to that of the little finger
-_GAP, _FULL = (
-    0.08,
-    0.72,
-)  # place: a larger step is no line; share that the lines of four fingers side by side fill
+_GAP = 0.08  # place: a larger step is no line
+_FULL = 0.72  # share of that way that the lines of four fingers side by side fill, at least
 _ASIDE = (0.3, 0.7)  # place: by less it is folded fingers; farther the palm has not turned unseen
 _CREASE_PX = 20  # columns on either side of a seam in which the crease may be
 

@@ -10,7 +10,7 @@ from common.arrays import Float
 from common.records import boxed
 from master.estimator.hand_tables import HandTables
 from master.estimator.settings import DEFAULT
-from master.estimator.state import HandState, Hidden
+from master.estimator.state import NEVER_NS, HandState, Hidden
 from master.estimator.wrist_device import NO_EXTRAS
 from tests.hand_helpers import RIGHT, within
 from tests.master.estimator.fitted import FREE, PARAMETERS, STEP_NS
@@ -50,6 +50,7 @@ class Memory:
         seen = np.isin(np.arange(5), list(shown))
         boxes = boxed(TABLES), boxed(SETTINGS), boxed(self.state)
         hide_at(*boxes, t_ns, seen, boxed(hidden))
+        self.state.hidden_ns[seen] = NEVER_NS  # as the end of an epoch leaves it
         return HiddenFingers(hidden.angles.reshape(5, 4), hidden.sigma.copy(), hidden.gone_s.copy())
 
 
@@ -135,6 +136,21 @@ def test_a_marker_that_returns_begins_a_new_time() -> None:
     assert memory.belief(21 * STEP_NS, 20 * STEP_NS, bent(40.0), ALL).gone_s[RING] == 0.0
     hidden = memory.belief(22 * STEP_NS, 21 * STEP_NS, bent(40.0), seen)
     assert hidden.gone_s[RING] == pytest.approx(STEP_NS * 1e-9)
+
+
+def test_an_epoch_that_is_fitted_twice_still_knows_when_a_finger_was_seen_last() -> None:
+    memory = Memory()
+    memory.belief(STEP_NS, 0, bent(40.0), ALL - {RING})
+    assert memory.state.hidden_ns[RING] == 0
+    hide_at(
+        boxed(TABLES),
+        boxed(SETTINGS),
+        boxed(memory.state),
+        2 * STEP_NS,
+        np.ones(5, np.bool_),
+        boxed(Hidden.none(FREE)),
+    )
+    assert memory.state.hidden_ns[RING] == 0
 
 
 def test_nothing_that_is_believed_leaves_the_limits() -> None:
