@@ -279,7 +279,10 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
 
 @inner
 def _take_rates(settings: Settings, state: HandState, t_ns: int, shown: Bool, angles: Float) -> None:
-    """Follow how fast angles (20,) change; of a finger (5,) that shows again, since it was seen last."""
+    """Follow the rates of angles (20,) [rad/s].
+
+    That of a finger (5,) that shows again is taken since it was seen last.
+    """
     for a in range(20):
         f, before_ns, rate, before = a // 4, state.t_ns[0], state.rates[a], state.angles[a]
         if shown[f] and state.hidden_ns[f] != NEVER_NS:

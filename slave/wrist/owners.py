@@ -54,7 +54,14 @@ def owners(finger: Int, runs: Runs, points: Float, reach: Reach) -> Int:
 
 
 def _shift(place: Float) -> float:
-    """How far all fingers lie beside their axes, by the places (N,) of their runs; 0: about there, or not all four."""
+    """Measure by how much all fingers lie beside their axes.
+
+    Args:
+        place: (N,) of their runs.
+
+    Returns:
+        As a place; 0 where they lie about there, or not all four are there.
+    """
     if not len(place):
         return 0.0
     across = np.sort(place)
