@@ -18,7 +18,7 @@ The figures are those of parts and arms, not of recordings:
 - its walk, 0.1 deg/s in 100 s, and how well rest shows it, to 0.03 deg/s within about 9 s: the defaults of VQF (Laidig,
   Seel 2023);
 - noise, 0.015 deg/s/sqrt(Hz): the same part; LSM6DSO (DS12140, table 2) has a quarter of it;
-- scale, 1 %: LSM6DSO +-1 %; what is wrong otherwise (across axes, not linear), 0.4 % of the rate, half a second long;
+- scale, 1 %: LSM6DSO +-1 %; what is wrong otherwise (across axes, not linear), 0.3 % of the rate, half a second long;
 - velocity, 0.35 m/s along each axis for 0.6 s: fingertips of recorded hands have 0.5 m/s (p99) where they are gentle,
   1 to 2 where they are brisk, and come back;
 - accelerometer, 5 mg after calibration; the zero of one that is not calibrated belongs to `orientation_sigma_rad`.
@@ -38,7 +38,7 @@ _BIAS_WALK = radians(0.01)  # [rad/s per root second]
 _REST = radians(0.09)  # [rad/s times root second]: with the walk, 0.03 deg/s are reached
 _NOISE = radians(0.015)  # [rad per root second]
 _SCALE = 0.01
-_OTHER, _OTHER_S = 0.004, 0.5
+_OTHER, _OTHER_S = 0.003, 0.5
 _VELOCITY_M_S, _VELOCITY_S = 0.35, 0.6
 _ACCELEROMETER_RAD = 0.005
 _FIRST_RAD = radians(60.0)
