@@ -8,9 +8,10 @@ of it. A value that is empty or NaN was not measured.
 """
 
 import csv
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
+from itertools import pairwise
 from math import nan
 from pathlib import Path
 
@@ -25,6 +26,8 @@ _PREAMBLE = 30  # lines in which the header must stand
 _RATES_HZ = (4.0, 4000.0)  # a factor of a thousand: one unit of time fits, no other
 _GRAVITY_M_S2 = (6.0, 15.0)  # median size of the force
 _RATE_RAD_S = 70.0  # 4000 deg/s, beyond any gyroscope: then it is in degrees
+_MOST_NS = 10**18  # what imu.csv can hold
+_UNIT_WITHIN = 0.05
 _EMPTY = frozenset({"", "nan", "na", "null", "none"})
 
 
@@ -68,37 +71,37 @@ def read_csv(path: Path, units: Mapping[str, str] | None = None, rate_hz: float 
         text = read_table(path.parent, path.name)
     except FileNotFoundError as error:
         raise RecordingError(f"{path}: there is no such file") from error
-    lines = text.removeprefix("\ufeff").splitlines()
     try:
-        first, delimiter, columns = _header(lines, timed=rate_hz is None)
-        t_ns, values, late = _rows(lines, first, delimiter, columns)
+        return _read(text.removeprefix("\ufeff").splitlines(), units or {}, rate_hz)
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from error
+    except csv.Error as error:
+        raise RecordingError(f"{path}: not a table of text: {error}") from error
+
+
+def _read(lines: Sequence[str], given: Mapping[str, str], rate_hz: float | None) -> Table:
+    first, delimiter, columns = _header(lines, timed=rate_hz is None)
+    times, values, late = _rows(lines, first, delimiter, columns)
     if len(values) < 2:
-        raise RecordingError(
-            f"{path}: {len(values)} rows below the header of line {first}: at least 2 are needed"
-        )
-    given = units or {}
-    try:
-        scaled, said = _scaled(values, columns, given)
-        if rate_hz is None:
-            scale, said[TIME] = _time_unit(np.diff(t_ns), columns[TIME, ""].unit, given.get(TIME))
-            ns = np.array([int((one * scale).to_integral_value()) for one in t_ns], np.int64)
-        else:
-            ns, said[TIME] = (
-                np.round(np.arange(len(values)) * (1e9 / rate_hz)).astype(np.int64),
-                f"{rate_hz:g} Hz, as given",
-            )
-    except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from error
+        raise RecordingError(f"{len(values)} rows below the header of line {first}: at least 2 are needed")
+    scaled, said = _scaled(values, columns, given)
+    if rate_hz is None:
+        unit, said[TIME] = _time_unit(times, columns[TIME, ""].unit, given.get(TIME))
+        ns = [int((one * unit).to_integral_value()) for one in times]
+    else:
+        ns, said[TIME] = [round(k * 1e9 / rate_hz) for k in range(len(values))], f"{rate_hz:g} Hz, as given"
+    if max(abs(ns[0]), abs(ns[-1])) >= _MOST_NS:
+        raise RecordingError(f"time: {times[-1]} {said[TIME]} is beyond any clock: say --time-unit")
     measured = np.isfinite(np.column_stack((scaled[GYRO], scaled[ACCEL]))).all(axis=1)
     names = {
-        what: ", ".join(columns[what, axis].name for axis in AXES[what])
-        for what in AXES
-        if (what, AXES[what][0]) in columns
+        what: ", ".join(columns[what, axis].name for axis in axes)
+        for what, axes in AXES.items()
+        if all((what, axis) in columns for axis in axes)
     }
+    scaled[TURN][~(np.abs(np.linalg.norm(scaled[TURN], axis=1) - 1.0) < _UNIT_WITHIN)] = nan  # no rotation
+    t_ns, incomplete = np.array(ns, np.int64), int((~measured).sum())
     return Table(
-        ns, scaled[GYRO], scaled[ACCEL], scaled[MAG], scaled[TURN], names, said, late, int((~measured).sum())
+        t_ns, scaled[GYRO], scaled[ACCEL], scaled[MAG], scaled[TURN], names, said, late, incomplete
     )  # fmt: skip
 
 
@@ -249,9 +252,9 @@ def _size(vectors: Float) -> float:
     return float(np.median(size[np.isfinite(size)])) if np.isfinite(size).any() else nan
 
 
-def _time_unit(steps: Iterable[Decimal], named: str, given: str | None) -> tuple[Decimal, str]:
+def _time_unit(times: Sequence[Decimal], named: str, given: str | None) -> tuple[Decimal, str]:
     """Nanoseconds in one of the unit of time, and what that is."""
-    step = float(np.median(np.array([float(one) for one in steps])))
+    step = float(np.median(np.array([float(b - a) for a, b in pairwise(times)])))
     low, high = _RATES_HZ
     fits = [unit for unit, scale in UNITS[TIME].items() if low < 1e9 / (step * scale) <= high]
     if not (unit := named or given or next(iter(fits), "")):

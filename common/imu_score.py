@@ -30,7 +30,7 @@ class TiltErrors:
             np.isfinite(found_wxyz).all(axis=1) & np.isfinite(truth_wxyz).all(axis=1) & np.isfinite(sigma_rad)
         )
         found, truth = (quaternion_to_matrix(q[known]) for q in (found_wxyz, truth_wxyz))
-        up = (found @ truth[:, 2, :, None])[..., 0]  # the true vertical in the world that was found
+        up: Float = (found @ truth[:, 2, :, None])[..., 0]  # the true vertical in the world that was found
         sine = np.hypot(up[:, 0], up[:, 1])
         angle = np.arctan2(sine, up[:, 2]) / np.maximum(sine, 1e-12)
         return cls(np.column_stack((-up[:, 1], up[:, 0])) * angle[:, None], sigma_rad[known])
@@ -38,7 +38,7 @@ class TiltErrors:
     @property
     def rms_deg(self) -> float:
         """Root mean square of the inclination's error, both axes together."""
-        return float(np.degrees(np.sqrt(np.mean(np.sum(np.square(self.error_rad), axis=1)))))
+        return float(np.degrees(np.sqrt(np.vecdot(self.error_rad, self.error_rad).mean())))
 
     @property
     def stated_deg(self) -> float:
@@ -48,7 +48,7 @@ class TiltErrors:
     @property
     def within(self) -> float:
         """Share of samples in their 95 % regions."""
-        return float(np.mean(np.sum(np.square(self.error_rad), axis=1) < _REGION * np.square(self.sigma_rad)))
+        return float((np.vecdot(self.error_rad, self.error_rad) < _REGION * np.square(self.sigma_rad)).mean())
 
     def where(self, rows: Bool) -> "TiltErrors":
         """Those of some samples (N,)."""

@@ -39,9 +39,12 @@ def import_table(table: Table, source: str, folder: Path | None, say: Callable[[
     sigma_rad: list[float] = []
     rest_s = 0.0
     for k, t_ns in enumerate(table.t_ns.tolist()):
-        sample = ImuSample(
-            source, 0, k, t_ns, table.gyro_rad_s[k], table.accel_m_s2[k], table.mag_ut[k], _NO_TURN
-        )
+        try:
+            sample = ImuSample(
+                source, 0, k, t_ns, table.gyro_rad_s[k], table.accel_m_s2[k], table.mag_ut[k], _NO_TURN
+            )
+        except ValueError as error:
+            raise RecordingError(f"sample {k + 1}, at {1e-9 * t_ns:.3f} s: {error}") from error
         samples.append(fusion.push(sample))
         sigma_rad.append(fusion.tilt_sigma_rad)
         rest_s += period_s if fusion.at_rest else 0.0
