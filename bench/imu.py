@@ -181,12 +181,6 @@ def _reliability(what: str, pooled: list[TiltErrors]) -> Iterator[Row]:
             )
 
 
-def ours(rate_hz: float) -> Push:
-    """The filter of every slave and recording."""
-    fusion = OrientationFilter(rate_hz)
-    return lambda sample: fusion.push(sample).orientation_wxyz
-
-
 def forces_alone(rate_hz: float) -> Push:
     """Where the force of every sample points is up; no heading at all."""
     return lambda sample: _level(sample.accel_m_s2)
