@@ -138,7 +138,7 @@ def test_behind_a_uart_the_wire_takes_its_time(link: Path) -> None:
     assert {"usb_data_messages_enabled": True} not in device.asked
     device.inertial()
     [one] = samples(imu, 1)
-    assert CLOCK.now_ns() - one.t_ns > 2_500_000 + 2_900_000, "34 bytes at 115200 baud take 3 ms"
+    assert CLOCK.now_ns() - one.t_ns > 2_900_000, "34 bytes at 115200 baud take 3 ms"
     imu.close()
     device.unplug()
 
