@@ -37,7 +37,7 @@ SECTIONS = {
     "fusion_cost": "Processor time of the fused line, message by message; baseline: each sensor alone",
     "orientation": "Palm and joints with one and three markers on the back, without and with an IMU; exact truth",
     "forearm": "Palm by an IMU on the forearm, with markers and without: heading, bend; simulated, exact truth",
-    "imu": "Orientation by rates and forces; truth: BROAD (PHALANX_DATASETS), simulated arms; baseline: imufusion",
+    "imu": "Orientation by rates and forces; truth: BROAD (PHALANX_DATASETS), simulated arms; baseline: VQF",
     "master": "The master above the bus; and 16 cameras over sealed UDP",
     "sync": "Depth of a hand at 1 m/s from unsynchronised cameras, by rate, offset, motion; baseline: uncorrected",
     "depth": "Depth at rest, by fitted laws, and on recorded sweeps; baseline: the error budget",

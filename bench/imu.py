@@ -1,8 +1,9 @@
-"""Orientation by rates and forces alone, beside peers fed the same samples in the same run; and its heading's drift.
+"""Orientation by rates and forces alone, beside VQF fed the same samples in the same run; its stated sigmas; its drift.
 
-Recorded: two recordings of BROAD (D. Laidig et al. 2021, CC BY 4.0) with optical truth, of which only what moves is
-scored. Inclination is the angle between true and found vertical. The heading of such a filter begins anywhere: its
-error is that against its first moment of the motion, its drift the slope of a line through it.
+Recorded: recordings of BROAD (D. Laidig et al. 2021, CC BY 4.0) with optical truth, of which only what moves is scored.
+All that lie in the folder `broad` of PHALANX_DATASETS are taken. Inclination is the angle between true and found
+vertical, and is held against VQF's; 95 % of it should lie within the stated sigmas. The heading of such a filter begins
+anywhere: its error is that against its first moment of the motion, its drift the slope of a line through it.
 
 Simulated: a forearm that gestures, with parts of two data sheets, at rest for three seconds before it moves or never at
 rest; the drift there is held against what `heading_sigma_rad` says of it.
@@ -12,11 +13,11 @@ import importlib
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from time import perf_counter_ns
 from typing import Any
 
-import imufusion
 import numpy as np
 
 from bench.row import Row
@@ -24,15 +25,16 @@ from common.arrays import Bool, Float
 from common.calibration import ImuCalibration
 from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_matrix, rigid
 from common.imu_fusion import OrientationFilter
+from common.imu_score import TiltErrors
 from common.messages import ImuSample
 from common.sim.imu import ICM20948, LSM6DSO, InertialPart, SimulatedImu
 from common.sim.motion import HandState
 
 _DATASETS = Path(os.environ.get("PHALANX_DATASETS", Path(__file__).parents[2] / "shared/datasets")).resolve()
-_G_M_S2 = 9.81
 _NOTHING, _NO_TURN = np.full(3, np.nan), np.full(4, np.nan)
 _PARTS: dict[str, InertialPart] = {"LSM6DSO": LSM6DSO, "ICM-20948": ICM20948}
 _SEEDS = range(8)
+_STATED_DEG = (0.0, 0.4, 0.6, 0.8, 1.0, 1.5, 2.0, 3.0, 6.0)
 _LEVEL = ImuCalibration(
     q_palm_imu=(1.0, 0.0, 0.0, 0.0), q_rig_world=(1.0, 0.0, 0.0, 0.0), orientation_sigma_rad=1e-9
 )
@@ -102,6 +104,23 @@ def recordings(folder: Path, every: int = 1) -> dict[str, Recording]:
     return {path.stem: Recording.of(path, every) for path in sorted(folder.glob("*.npz"))}
 
 
+def stated(recording: Recording) -> tuple[Float, Float]:
+    """What this filter says of every sample: orientation (T, 4), and its tilt's standard deviation (T,) [rad]."""
+    fusion = OrientationFilter(recording.rate_hz)
+    found: list[Float] = []
+    sigma_rad: list[float] = []
+    for sample in recording.samples:
+        found.append(fusion.push(sample).orientation_wxyz)
+        sigma_rad.append(fusion.tilt_sigma_rad)
+    return np.array(found), np.array(sigma_rad)
+
+
+def tilt_errors(found_wxyz: Float, sigma_rad: Float, recording: Recording) -> TiltErrors:
+    """Of what moved."""
+    rows = recording.moving
+    return TiltErrors.of(found_wxyz[rows], recording.truth_wxyz[rows], sigma_rad[rows])
+
+
 def played(push: Push, recording: Recording) -> Float:
     """What a filter says of every sample (T, 4)."""
     return np.array([push(sample) for sample in recording.samples])
@@ -114,65 +133,52 @@ def rows() -> Iterator[Row]:
         yield Row(
             "recorded: skipped", 0.0, "", f"no recordings at {_DATASETS / 'broad'}: set PHALANX_DATASETS"
         )
+    pooled: list[TiltErrors] = []
     for name, recording in found.items():
-        what = name.strip("0123456789_B").removeprefix("undisturbed_").replace("_", " ")
-        for peer, make in _PEERS.items():
-            push = make(recording.rate_hz)
-            if push is None:
-                yield Row(f"{what}, {peer}", float("nan"), "", "not installed")
-                continue
-            errors = Errors.of(played(push, recording), recording)
-            note = "goal 1" if peer == "this filter" else ""
-            yield Row(f"{what}, {peer}: inclination", errors.inclination_rms_deg, "deg rms", note)
-            if make is forces_alone:  # it has no heading
-                continue
-            note = f"{_rms(errors.heading_deg):.2f} deg rms against its begin"
-            yield Row(f"{what}, {peer}: heading", errors.drift_deg_per_min, "deg/min", note)
+        yield from _recorded(name.replace("undisturbed_", "").replace("_", " "), recording, pooled)
+    yield from _reliability("recorded", pooled)
+    pooled = []
     for part in _PARTS:
         for rest_s in (3.0, 0.0):
-            yield from _simulated(part, rest_s)
+            yield from _simulated(part, rest_s, pooled)
+    yield from _reliability("simulated", pooled)
     yield from _cost()
 
 
-def ours(rate_hz: float) -> Push:
-    """The filter of every slave and recording."""
-    fusion = OrientationFilter(rate_hz)
-    return lambda sample: fusion.push(sample).orientation_wxyz
+def _recorded(what: str, recording: Recording, pooled: list[TiltErrors]) -> Iterator[Row]:
+    """One recording by both filters."""
+    found, sigma_rad = stated(recording)
+    tilt = tilt_errors(found, sigma_rad, recording)
+    pooled.append(tilt)
+    other = vqf(recording.rate_hz)
+    theirs = None if other is None else Errors.of(played(other, recording), recording)
+    against = "VQF is not installed" if theirs is None else (
+        f"{tilt.rms_deg / theirs.inclination_rms_deg:.2f} of VQF's {theirs.inclination_rms_deg:.2f}"
+    )  # fmt: skip
+    says = f"stated {tilt.stated_deg:.2f}, {100 * tilt.within:.0f} % within 95 %"
+    yield Row(f"{what}: inclination", tilt.rms_deg, "deg rms", f"{against}; {says}")
+    errors = Errors.of(found, recording)
+    note = f"{_rms(errors.heading_deg):.2f} deg rms against its begin"
+    if theirs is not None:
+        note += f"; VQF {theirs.drift_deg_per_min:.2f} deg/min, {_rms(theirs.heading_deg):.2f} deg"
+    yield Row(f"{what}: heading", errors.drift_deg_per_min, "deg/min", note)
 
 
-def library(rate_hz: float) -> Push:
-    """imufusion as it comes: its own bias, its usual gain."""
-    settings = imufusion.AhrsSettings(sample_rate=rate_hz, convention=imufusion.CONVENTION_ENU)
-    ahrs, bias = imufusion.Ahrs(), imufusion.Bias()
-    ahrs.set_settings(settings)
-    bias.set_settings(imufusion.BiasSettings(sample_rate=rate_hz))
-
-    def push(sample: ImuSample) -> Float:
-        rate = bias.update(np.degrees(sample.gyro_rad_s))
-        ahrs.update_no_magnetometer(rate, sample.accel_m_s2 / _G_M_S2)
-        return np.asarray(ahrs.get_quaternion(), np.float64)
-
-    return push
-
-
-def summed_up(rate_hz: float) -> Push:
-    """Rates alone, from the first upright: no gravity, no bias."""
-    ahrs = imufusion.Ahrs()
-    ahrs.set_settings(
-        imufusion.AhrsSettings(sample_rate=rate_hz, convention=imufusion.CONVENTION_ENU, gain=0.0)
+def _reliability(what: str, pooled: list[TiltErrors]) -> Iterator[Row]:
+    """Found error by stated sigma, of all samples together."""
+    if not pooled:
+        return
+    errors = TiltErrors(
+        *(np.concatenate([getattr(one, name) for one in pooled]) for name in ("error_rad", "sigma_rad"))
     )
-    ahrs.skip_startup()
-    begun = False
-
-    def push(sample: ImuSample) -> Float:
-        nonlocal begun
-        if not begun:
-            ahrs.set_quaternion(_level(sample.accel_m_s2))
-            begun = True
-        ahrs.update_no_magnetometer(np.degrees(sample.gyro_rad_s), np.zeros(3))
-        return np.asarray(ahrs.get_quaternion(), np.float64)
-
-    return push
+    sigma_deg = np.degrees(errors.sigma_rad)
+    for low, high in pairwise(_STATED_DEG):
+        some = errors.where((sigma_deg >= low) & (sigma_deg < high))
+        if len(some.sigma_rad):
+            note = f"stated {some.stated_deg:.2f}, {100 * some.within:.1f} % within 95 %, {len(some.sigma_rad)} samples"
+            yield Row(
+                f"{what}, stated {low:g} to {high:g} deg per axis: inclination", some.rms_deg, "deg rms", note
+            )
 
 
 def forces_alone(rate_hz: float) -> Push:
@@ -192,15 +198,6 @@ def vqf(rate_hz: float) -> Push | None:
         return other.getQuat6D()
 
     return push
-
-
-_PEERS: dict[str, Callable[[float], Push | None]] = {
-    "this filter": ours,
-    "imufusion as it comes": library,
-    "rates summed up": summed_up,
-    "forces alone": forces_alone,
-    "VQF": vqf,
-}
 
 
 class Gestures:
@@ -228,28 +225,39 @@ class Gestures:
         return u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
 
 
-def _simulated(part: str, rest_s: float) -> Iterator[Row]:
+def _simulated(part: str, rest_s: float, pooled: list[TiltErrors]) -> Iterator[Row]:
     """A minute of gestures of every seed."""
-    tilt: list[float] = []
+    tilt: list[TiltErrors] = []
+    theirs: list[float] = []
     drift: list[float] = []
     surprise: list[float] = []
     for seed in _SEEDS:
         motion, fusion = Gestures(seed, rest_s), OrientationFilter(_LEVEL.rate_hz)
         sensor = SimulatedImu(motion, _LEVEL, seed, _PARTS[part])
-        said: list[tuple[Float, float]] = []
+        said: list[tuple[Float, float, float]] = []
         samples: list[ImuSample] = []
         for sample in sensor.around(0.0, rest_s + 62.0):
             samples.append(sample)
-            said.append((fusion.push(sample).orientation_wxyz, fusion.heading_sigma_rad))
+            said.append(
+                (fusion.push(sample).orientation_wxyz, fusion.heading_sigma_rad, fusion.tilt_sigma_rad)
+            )
         truth = np.array([_lies(motion, sample.seq / _LEVEL.rate_hz) for sample in samples])
         moving = np.array([sample.t_ns for sample in samples]) > (rest_s + 2.0) * 1e9
-        errors = Errors.of(np.array([q for q, _ in said]), Recording(samples, _LEVEL.rate_hz, truth, moving))
+        recording = Recording(samples, _LEVEL.rate_hz, truth, moving)
+        found = np.array([q for q, _, _ in said])
+        tilt.append(tilt_errors(found, np.array([sigma for _, _, sigma in said]), recording))
+        if (other := vqf(_LEVEL.rate_hz)) is not None:
+            theirs.append(Errors.of(played(other, recording), recording).inclination_rms_deg)
+        errors = Errors.of(found, recording)
         begun = said[int(np.argmax(moving))][1]
-        tilt.append(errors.inclination_rms_deg)
         drift.append(errors.drift_deg_per_min)
         surprise.append(errors.heading_deg[-1] / np.degrees(np.sqrt(max(said[-1][1] ** 2 - begun**2, 1e-12))))
+    pooled += tilt
     name = f"simulated {part}, {'rested' if rest_s else 'never at rest'}"
-    yield Row(f"{name}: inclination", _rms(np.array(tilt)), "deg rms", f"{len(_SEEDS)} arms, a minute each")
+    rms, within = _rms(np.array([one.rms_deg for one in tilt])), np.mean([one.within for one in tilt])
+    against = f"VQF {_rms(np.array(theirs)):.2f}" if theirs else "VQF is not installed"
+    says = f"stated {_rms(np.array([one.stated_deg for one in tilt])):.2f}, {100 * within:.0f} % within 95 %"
+    yield Row(f"{name}: inclination", rms, "deg rms", f"{len(_SEEDS)} arms, a minute each; {against}; {says}")
     note = f"{_rms(np.array(surprise)):.1f} of what heading_sigma_rad says (rms)"
     yield Row(f"{name}: heading", _rms(np.array(drift)), "deg/min", note)
 
@@ -260,20 +268,15 @@ def _lies(motion: Gestures, t_s: float) -> Float:
 
 
 def _cost() -> Iterator[Row]:
-    """Microseconds per sample, this filter and the library's in turns."""
-    sensor = SimulatedImu(Gestures(1, 0.0), _LEVEL, 1)
-    samples = list(sensor.around(2.0, 10.0))
-    pushes = {name: make(_LEVEL.rate_hz) for name, make in (("this filter", ours), ("library", library))}
-    spent: dict[str, list[float]] = {name: [] for name in pushes}
-    for sample in samples:
-        for name, push in pushes.items():
-            start = perf_counter_ns()
-            push(sample)
-            spent[name].append((perf_counter_ns() - start) * 1e-3)
-    other = float(np.median(spent["library"]))
-    mine = float(np.median(spent["this filter"]))
-    note = f"imufusion as it comes: {other:.1f}; {100 * mine * 120e-6:.1f} % of a core at 120 Hz"
-    yield Row("cost of a sample", mine, "us", note)
+    """Microseconds per sample."""
+    fusion = OrientationFilter(_LEVEL.rate_hz)
+    spent: list[float] = []
+    for sample in list(SimulatedImu(Gestures(1, 0.0), _LEVEL, 1).around(2.0, 10.0)):
+        start = perf_counter_ns()
+        fusion.push(sample)
+        spent.append((perf_counter_ns() - start) * 1e-3)
+    mine = float(np.median(spent))
+    yield Row("cost of a sample", mine, "us", f"{100 * mine * 120e-6:.1f} % of a core at 120 Hz")
 
 
 def _level(force: Float) -> Float:

@@ -33,7 +33,6 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "serial": ("slave/imu/*.py",),
     "smbus2": ("slave/imu/*.py", "slave/lights/*.py"),
     "gpiod": ("slave/lights/gpio*.py",),
-    "imufusion": ("common/imu_fusion.py",),
     "picamera2": ("slave/cameras/picamera2*.py",),
     "libcamera": ("slave/cameras/picamera2*.py",),
     "numba": ("common/kernels.py", "slave/markers/fast*.py"),

@@ -27,7 +27,6 @@ PACKAGES = ("python3", "libgomp1", "libstdc++6")
 WHEELS = (
     "cryptography",
     "eclipse-zenoh",
-    "imufusion",
     "msgspec",
     "numpy",
     "opencv-python-headless",

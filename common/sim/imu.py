@@ -1,6 +1,7 @@
 """An IMU on a simulated hand or forearm: what a common part says of the motion, raw; its orientation it does not know.
 
-The motion's exact rates and forces, and on top of them the errors of a part, an LSM6DSO if none is named. The
+The motion's exact rates, as means since the last sample, and forces, and on top of them the errors of a part, an
+LSM6DSO if none is named. The
 accelerometer's zero is off by as much as the rig's file says that the tilt may be: gravity then points elsewhere, and
 no filter can know better. Zeros and scale are the same for a whole recording; the gyroscope's zero wanders a little, as
 in a part that warms up. That of a wrist device sits on the forearm, at the wrist joint (`OnForearm`).
@@ -15,7 +16,7 @@ import numpy as np
 from common.arrays import Float
 from common.calibration import ImuCalibration
 from common.errors import CalibrationError
-from common.geometry import quaternion_to_matrix, unskew
+from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix
 from common.messages import ImuSample
 from common.sim.motion import HandMotion
 from common.sim.scene import Scene
@@ -24,7 +25,7 @@ from common.sim.wrist.scene import WristScene
 
 GRAVITY_M_S2 = 9.81
 _WANDER_RAD_S, _WANDER_S = radians(0.03), 200.0
-_HALF_STEP_S = 1e-3  # for rates and accelerations
+_HALF_STEP_S = 1e-3  # for accelerations
 _BEFORE_S, _AFTER_S = 2.0, 0.1  # a filter has to settle before the first frame
 _NOTHING, _NO_TURN = np.full(3, np.nan), np.full(4, np.nan)
 _UNPLACED = "imu: q_palm_imu and q_rig_world: missing; an IMU is simulated as it is mounted"
@@ -111,10 +112,13 @@ class SimulatedImu:
         """Sample `seq`, at scene time `t_s` [s], stamped `t_ns`."""
         before, now, after = (self._motion.at(t_s + h).T_rig_palm for h in (-_HALF_STEP_S, 0.0, _HALF_STEP_S))
         rig_imu = now[:3, :3] @ self._palm_imu
-        turned = unskew(before[:3, :3].T @ after[:3, :3])  # palm axes; the sine of so small an angle is it
+        last = self._motion.at(t_s - 1.0 / self._imu.rate_hz).T_rig_palm[:3, :3]
+        turned = matrix_to_rotation_vector(last.T @ now[:3, :3])  # palm axes
         moved = (after[:3, 3] - 2.0 * now[:3, 3] + before[:3, 3]) / _HALF_STEP_S**2
         new = sqrt(0.5 * self._imu.rate_hz) * np.random.default_rng([self._seed, 1, seq]).normal(size=(2, 3))
-        rate = self._palm_imu.T @ turned / (2.0 * _HALF_STEP_S)
+        rate = (
+            self._palm_imu.T @ turned * self._imu.rate_hz
+        )  # the mean since the last sample, as a low-pass leaves it
         return ImuSample(
             source=self._imu.name,
             session=0,

@@ -1,18 +1,21 @@
-"""`phalanx-slave imu`: sends what an IMU measures."""
+"""`phalanx-slave imu`: sends what an IMU measures, or takes in a recording of one."""
 
 import argparse
 import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from common.clock import SystemClock
 from common.errors import CalibrationError
+from common.imu_csv_columns import ACCEL, GYRO, MAG, TIME, UNITS
 from slave.commands.options import (
     add_link,
     add_place,
     add_simulated,
     clock_of,
     epoch_of,
+    positive,
     rig_of,
     secrets_of,
     world_of,
@@ -35,23 +38,48 @@ EXAMPLES = """\
         an x-IMU3 on USB; on the pins of a Pi: ximu3:/dev/serial0@115200; docs/imu.md says what is set and checked
   phalanx-slave imu --name imu --rig wrist --imu lsm6dsox:1:0x6a --key-file rig.key
         an LSM6DSOX on I2C bus 1 of a Pi
+  phalanx-slave imu --csv walk.csv --gyro-unit deg/s --out recordings/walk
+        reads a CSV with a header (docs/imu.md), says its rate, gaps, bias and orientation, and writes imu.csv;
+        against a quaternion in it, how right the tilt is. No device, no master
 """
 
 
 def add_options(command: argparse.ArgumentParser) -> None:
     """The options of `imu`."""
-    add_place(command, "IMU of this slave, that of the rig")
+    add_place(command, "IMU of this slave, that of the rig (default: imu)", default="imu")
     opening.add_options(command)
+    _add_csv(command.add_argument_group("a recording (--csv)").add_argument)
     add_link(command)
     add_simulated(command.add_argument_group("synthetic IMU").add_argument)
 
 
+def _add_csv(add: Callable[..., argparse.Action]) -> None:
+    add(
+        "--out",
+        "-o",
+        type=Path,
+        metavar="FOLDER",
+        help="where its imu.csv goes (default: it is only looked at)",
+    )
+    for what in (TIME, GYRO, ACCEL, MAG):
+        text = f"unit of {what} where the header does not say it"
+        add(f"--{what}-unit", choices=tuple(UNITS[what]), help=text)
+    add(
+        "--rate-hz",
+        type=positive,
+        metavar="HZ",
+        help="samples per second of a table without a column of time",
+    )
+
+
 def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
-    """Send samples until it is told to end.
+    """Send samples until it is told to end, or take in a recording.
 
     Raises:
         PhalanxError: A file, the IMU, a key or the network is not as it must be.
     """
+    if options.csv is not None:
+        return _take_in(options, say)
     from slave.imu.live import run_live
     from slave.imu.synthetic import SyntheticImu
     from slave.simulated import imu_of
@@ -79,4 +107,13 @@ def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
             source = opening.open_real(options.name, options.imu, rig.imu.rate_hz, clock, stop, service.away)
         uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
         run_live(options.name, source, orientation, uplink, clock, stop, tell, service, access)
+    return 0
+
+
+def _take_in(options: argparse.Namespace, say: Callable[[str], None]) -> int:
+    from common.imu_csv import read_csv
+    from slave.imu.importing import import_table
+
+    units = {what: unit for what in (TIME, GYRO, ACCEL, MAG) if (unit := getattr(options, f"{what}_unit"))}
+    import_table(read_csv(options.csv, units, options.rate_hz), options.name, options.out, say)
     return 0

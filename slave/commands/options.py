@@ -20,9 +20,9 @@ BEACON_PORT = 47800
 BOTH = "grasp | both-poses | both-curl | both-travel | both-moves | gestures"  # the same motion for both kinds of rig
 
 
-def add_place(command: argparse.ArgumentParser, who: str) -> None:
-    """Who this slave is, and whose."""
-    command.add_argument("--name", required=True, help=who)
+def add_place(command: argparse.ArgumentParser, who: str, default: str | None = None) -> None:
+    """Who this slave is, and whose; without a default it has to be said."""
+    command.add_argument("--name", required=default is None, default=default, help=who)
     add_rig(command)
 
 

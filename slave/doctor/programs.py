@@ -8,7 +8,7 @@ from slave.doctor.system import System, pairs
 
 CURRENT = "/opt/phalanx/current"
 TIMEOUT_S = 60.0  # numpy and cv2 from a cold SD card
-NEEDED = ("numpy", "cv2", "zenoh", "cryptography", "msgspec", "imufusion")
+NEEDED = ("numpy", "cv2", "zenoh", "cryptography", "msgspec")
 # One name after another, each said before the next is tried: of one that crashes, nothing is said.
 PROBE = """
 import ctypes, importlib, sys

@@ -4,6 +4,7 @@ import argparse
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from common.calibration import ImuCalibration
@@ -36,8 +37,12 @@ class ListPlaces(argparse.Action):
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of an IMU that is sent live."""
-    parser.add_argument("--imu", required=True, metavar="DRIVER", help=IMUS)
+    """Add the options that name an IMU, live or recorded."""
+    which = parser.add_mutually_exclusive_group(required=True)
+    which.add_argument("--imu", metavar="DRIVER", help=IMUS)
+    which.add_argument(
+        "--csv", type=Path, metavar="FILE", help="a recording: a CSV with a header, time, rates, forces"
+    )
     parser.add_argument("--list", action=ListPlaces, help="say where an IMU may be connected, and end")
 
 

@@ -9,8 +9,9 @@ switched off (User Manual v1.11, section "Save command").
     gyroscope deg/s -> rad/s    accelerometer g -> m/s^2    magnetometer a.u. -> uT, 1 a.u. about 50 uT
 
 The magnetometer gives 20 values a second: a sample that none has come with since the last one has NaN. An inertial
-message is the mean of as many samples as the rate is divided by, stamped with the last (section "Sample averaging"),
-so it was measured half their span earlier. Its stamps become times by `DeviceClock`.
+message is the mean of as many samples as the rate is divided by, stamped with the last (section "Sample averaging"):
+the end of the period that its rates are the mean of, which is what the filter takes a sample for. Its stamps become
+times by `DeviceClock`.
 """
 
 import logging
@@ -126,9 +127,6 @@ class Ximu3Imu:
         """
         self._name, self._place, self._clock, self._stop = name, place, clock, stop
         self._divisor = divisor(rate_hz)
-        self._half_ns = round(
-            0.5e9 * (self._divisor - 1) / SAMPLE_RATE_HZ
-        )  # of what a message is the mean of
         self._decoder = Decoder()
         self._came: deque[Data] = deque()
         self._answers: deque[Answer] = deque()
@@ -275,7 +273,7 @@ class Ximu3Imu:
         period_us = 1e6 * self._divisor / SAMPLE_RATE_HZ
         passed = 1 if self._stamp_us is None else max(1, round((message.t_us - self._stamp_us) / period_us))
         self._seq, self._stamp_us = self._seq + passed, message.t_us
-        t_ns = self._device_clock.at(message.t_us * 1000) - self._half_ns
+        t_ns = self._device_clock.at(message.t_us * 1000)
         mag, self._mag = self._mag, _NONE[0]
         return ImuSample(self._name, 0, self._seq, t_ns, gyro, accel, mag, _NONE[1])
 

@@ -84,7 +84,7 @@ def test_units_values_that_come_rarely_and_when_it_was_measured(device: FakeXimu
     assert np.isnan(first.orientation_wxyz).all()
     assert (first.source, first.session, first.seq, second.seq) == ("imu", 0, 0, 1)
     assert second.t_ns - first.t_ns == 7_500_000
-    assert second.t_ns <= CLOCK.now_ns() - 2_500_000, "half of the three samples before the stamp"
+    assert second.t_ns <= CLOCK.now_ns()
     assert abs(second.t_ns - before_ns) < 60e9
     assert imu.gauges() == {"temperature_c": 31.25, "battery_percent": 87.0}
     assert imu.counts()["imu.inertial"] == 2
@@ -138,7 +138,7 @@ def test_behind_a_uart_the_wire_takes_its_time(link: Path) -> None:
     assert {"usb_data_messages_enabled": True} not in device.asked
     device.inertial()
     [one] = samples(imu, 1)
-    assert CLOCK.now_ns() - one.t_ns > 2_500_000 + 2_900_000, "34 bytes at 115200 baud take 3 ms"
+    assert CLOCK.now_ns() - one.t_ns > 2_900_000, "34 bytes at 115200 baud take 3 ms"
     imu.close()
     device.unplug()
 

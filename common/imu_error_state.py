@@ -1,0 +1,126 @@
+"""How unsure a summed-up orientation is, and how it is corrected: the covariance of an error-state Kalman filter.
+
+Eleven errors, after Sola 2017 ("Quaternion kinematics for the error-state Kalman filter", ch. 5) with the global error
+of its ch. 7: attitude t (3,) [rad] in the world's axes, the gyroscope's bias b (3,) [rad/s] and scale s (3,) [1] in
+the sensor's, level velocity v (2,) [m/s]. With R sensor -> world and w the rate,
+
+    t' = -R (b + s w) + noise,      v' = g (t_y, -t_x).
+
+Gravity is seen through the velocity: an arm gains none for long, so that the velocity which a tilted gravity sums up is
+measured as zero. Velocity in the world's axes is where accelerations cancel (the almost inertial frame of Laidig, Seel
+2023, section 4); here it is a state, so that the memory of the mean is the filter's own, and holds at any rate of
+samples. Rest measures the bias. Neither moves the heading, of which they know nothing: its gain is zero, its covariance
+that of a considered parameter (Schmidt 1966).
+
+The figures are those of parts and arms, not of recordings:
+
+- bias when switched on, 2.5 deg/s: +-5 deg/s of an ICM-20948 (DS-000189, table 1), taken as two sigma; LSM6DSO: +-1;
+- its walk, 0.1 deg/s in 100 s, and how well rest shows it, to 0.03 deg/s within about 9 s: the defaults of VQF (Laidig,
+  Seel 2023);
+- noise, 0.015 deg/s/sqrt(Hz): the same part; LSM6DSO (DS12140, table 2) has a quarter of it;
+- scale, 1 %: LSM6DSO +-1 %; what is wrong otherwise (across axes, not linear), 0.3 % of the rate, half a second long;
+- velocity, 0.35 m/s along each axis for 0.6 s: fingertips of recorded hands have 0.5 m/s (p99) where they are gentle,
+  1 to 2 where they are brisk, and come back;
+- accelerometer, 5 mg after calibration; the zero of one that is not calibrated belongs to `orientation_sigma_rad`.
+"""
+
+from math import hypot, pi, radians, sqrt
+
+import numpy as np
+
+from common.arrays import Float
+
+ATTITUDE, BIAS, SCALE, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11)
+BIAS_RAD_S = radians(2.5)
+G_M_S2 = 9.80665
+_SIZE, _HEADING = 11, 2
+_BIAS_WALK = radians(0.01)  # [rad/s per root second]
+_REST = radians(0.09)  # [rad/s times root second]: with the walk, 0.03 deg/s are reached
+_NOISE = radians(0.015)  # [rad per root second]
+_SCALE = 0.01
+_OTHER, _OTHER_S = 0.003, 0.5
+_VELOCITY_M_S, _VELOCITY_S = 0.35, 0.6
+_ACCELEROMETER_RAD = 0.005
+_FIRST_RAD = radians(60.0)
+_UNSEEN_RAD_S = 3.0  # as fast as a forearm turns unseen
+_ANYWHERE_RAD = pi / sqrt(3.0)  # standard deviation of a uniform circle
+
+
+class ErrorState:
+    """Push machine. Holds the covariance (11, 11) of the errors."""
+
+    def __init__(self) -> None:
+        """Know nothing yet, but where up is roughly."""
+        first = [_FIRST_RAD, _FIRST_RAD, 0.0, *[BIAS_RAD_S] * 3, *[_SCALE] * 3, *[_VELOCITY_M_S] * 2]
+        self._cov = np.diag(np.square(first))
+        self._variance = self._cov.reshape(-1)[:: _SIZE + 1]  # a view of its diagonal
+        self._transition = np.eye(_SIZE)
+
+    @property
+    def tilt_rad(self) -> float:
+        """Standard deviation of the tilt, per axis."""
+        return hypot(sqrt(0.5 * float(self._variance[0] + self._variance[1])), _ACCELEROMETER_RAD)
+
+    @property
+    def bias_rad_s(self) -> float:
+        """Standard deviation of the bias, that of its worst axis."""
+        return sqrt(float(self._variance[BIAS].max()))
+
+    @property
+    def heading_rad(self) -> float:
+        """Standard deviation of the heading against that of the beginning."""
+        return min(sqrt(float(self._variance[_HEADING])), _ANYWHERE_RAD)
+
+    def turned(self, step_s: float, world_sensor: Float, rate_rad_s: Float, *, felt: bool) -> None:
+        """A step was summed up: at this rate (3,) of the sensor, which then lay so (3, 3), with a force or without."""
+        change, fallen = -step_s * world_sensor, step_s * G_M_S2 if felt else 0.0
+        self._transition[ATTITUDE, BIAS] = change
+        self._transition[ATTITUDE, SCALE] = change * rate_rad_s
+        self._transition[9, 1], self._transition[10, 0] = fallen, -fallen
+        np.matmul(self._transition @ self._cov, self._transition.T, out=self._cov)
+        noise = _NOISE**2 + _OTHER**2 * _OTHER_S * float(rate_rad_s @ rate_rad_s)
+        self._variance[ATTITUDE] += noise * step_s
+        self._warmed(step_s)
+
+    def silent(self, gap_s: float) -> bool:
+        """Nothing was heard for so long: it may have turned; whether its tilt may be anything now."""
+        attitude = self._variance[ATTITUDE] + (_UNSEEN_RAD_S * gap_s) ** 2
+        for block in (ATTITUDE, VELOCITY):
+            self._cov[block] = self._cov[:, block] = 0.0
+        most = np.square([_FIRST_RAD, _FIRST_RAD, _ANYWHERE_RAD])
+        self._variance[ATTITUDE] = np.minimum(attitude, most)
+        self._variance[VELOCITY] = _VELOCITY_M_S**2
+        self._warmed(gap_s)
+        return bool(attitude[0] >= most[0])
+
+    def level(self, step_s: float, velocity_m_s: Float) -> Float:
+        """Forces were summed up for a step to this level velocity (2,), which is zero; all corrections (11,)."""
+        noise = 2.0 * _VELOCITY_S * _VELOCITY_M_S**2 / step_s
+        return self._measured(VELOCITY, -velocity_m_s, noise)
+
+    def rest(self, step_s: float, off_rad_s: Float) -> Float:
+        """It lay still for a step, with this rate (3,) beyond the bias; all corrections (11,)."""
+        return self._measured(BIAS, off_rad_s, _REST**2 / step_s)
+
+    def contradicted(self, heading_rad: float) -> None:
+        """Rest tells another bias than rest before; one of them was a turn, and the heading may be off by so much."""
+        heading = float(self._variance[_HEADING])
+        self._cov[BIAS] = self._cov[:, BIAS] = 0.0
+        self._variance[BIAS] = BIAS_RAD_S**2
+        self._variance[_HEADING] = min(heading + heading_rad**2, _ANYWHERE_RAD**2)
+
+    def _measured(self, block: slice, innovation: Float, noise: float) -> Float:
+        """Take a measurement of some errors, one after the other; corrections (11,) of all but the heading."""
+        found = np.zeros(_SIZE)
+        heading = float(self._variance[_HEADING])
+        for k, value in enumerate(innovation.tolist(), block.start):
+            row = self._cov[k].copy()
+            gain = row / (row[k] + noise)
+            found += (value - found[k]) * gain
+            self._cov -= gain[:, None] * row
+        self._variance[_HEADING] = heading
+        found[_HEADING] = 0.0
+        return found
+
+    def _warmed(self, step_s: float) -> None:
+        self._variance[BIAS] = np.minimum(self._variance[BIAS] + _BIAS_WALK**2 * step_s, BIAS_RAD_S**2)
