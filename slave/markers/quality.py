@@ -19,7 +19,7 @@ from slave.markers.centroid import Measured
 from slave.markers.classify import HUES
 
 CLEAR_CONTRAST = 6.0  # below it, the colour's mask may be a part of the marker, and its outline is sought (`outline`)
-SMALL = 40.0  # px^2 below which forms and colours are hardly known
+SMALL = 40.0  # px^2 below which a colour is hardly that of the paint alone
 LARGEST_CONTRAST = 20.0  # no marker is the more certain beyond it
 
 
@@ -37,7 +37,6 @@ class Evidence(NamedTuple):
         rival: 1: a second blob of the colour may be the marker.
         ragged: 1: hardly a pixel has four neighbours of the colour.
         cut: 1: it touches the border of the image.
-        small: Logarithm of the area over `SMALL`, at most 0.
     """
 
     contrast: float
@@ -50,11 +49,21 @@ class Evidence(NamedTuple):
     rival: float
     ragged: float
     cut: float
-    small: float
 
 
-BIAS = 0.0
-WEIGHTS = Evidence(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+BIAS = -7.33
+WEIGHTS = Evidence(
+    contrast=0.48,
+    unclear=-1.55,
+    outlined=6.06,
+    fullness=10.64,
+    slender=-2.22,
+    hue=-5.25,
+    vivid=2.28,
+    rival=-2.66,
+    ragged=-0.70,
+    cut=-1.76,
+)
 
 
 def evidence_of(
@@ -86,7 +95,6 @@ def evidence_of(
         rival=float(rival),
         ragged=float(seen.thin),
         cut=float(seen.cut),
-        small=math.log(min(max(seen.area, 1.0) / SMALL, 1.0)),
     )
 
 
