@@ -46,8 +46,10 @@ SLIVER = 14.0  # px^2; a thinner sliver cannot be told from a fringe
 SMEARED = 2.0  # px of way during the exposure from which an edge is no edge
 DIGITS = 6  # of what is reported: what comes after them differs between processors
 NOT_SEEN = (math.nan,) * 11  # what is reported of a marker
+NEAR = 3.0  # sides of the marker: a rival so near may be taken for it in the next frame
 RIVALS = 2  # that are measured in one frame
 RIVAL = 0.3  # of the marker's area: a smaller blob is no rival, nor one as much larger
+JUDGED = 6  # frames: a clear marker that is tracked is judged in one of so many, and stays what it was between
 OUTLINES = 2  # that are sought in one frame: one costs as much as a frame of clear markers
 OUTLINED = 60.0  # px^2 from which an outline can be told from its pixels
 
@@ -89,7 +91,7 @@ class MarkerDetector:
         windows_only: Only windows of tracked markers are scanned, and strips for lost ones; the first frame is scanned
             whole. May change between two frames.
         beside: Things of a marker's colour that are none, as far as scans saw them.
-        evidence: Marker row -> what its quality in the last frame was made of.
+        evidence: Marker row -> what its quality was made of, of those that were judged in the last frame.
     """
 
     def __init__(
@@ -119,6 +121,7 @@ class MarkerDetector:
         self._margin = camera.roi_margin
         self._names = markers
         self._table = table_of(markers, camera.markers, f"camera {camera.name!r}") if table is None else table
+        self._colours = [(camera.markers or {})[name] for name in markers]
         self._free = tuple(markers.index(name) for name in free)
         self._engine = engine
         engine.prepare(self._table)
@@ -126,6 +129,9 @@ class MarkerDetector:
         self._tracks: list[Track | None] = [None] * len(markers)
         self._scanner = Scanner(camera.width_px, camera.height_px, engine)
         self._last_ns: int | None = None  # time of the last frame
+        self._turn = 0  # which of the markers are judged in this frame
+        self._quality = [0.0] * len(markers)
+        self._lonely = [True] * len(markers)  # no other blob might have been it when it was found
         self._gains = (1.0, 1.0, 1.0)  # of the light against calibration, blue first
         self.windows_only = False
         self.beside = Beside(markers)
@@ -187,7 +193,7 @@ class MarkerDetector:
         }
         outlines = _outlines(image, seen_as)
         reports: dict[int, tuple[float, ...]] = {}
-        self.evidence = {}
+        self.evidence, self._turn = {}, (self._turn + 1) % JUDGED
         for m, seen in seen_as.items():
             before = self._tracks[m] if windows[m] is not None else None
             reports[m] = self._report(
@@ -221,9 +227,13 @@ class MarkerDetector:
         self._seeds = {}
         if other._names == self._names:
             self._tracks, self._scanner, self.beside = other._tracks, other._scanner, other.beside
-            self._last_ns = other._last_ns
+            self._last_ns, self._turn = other._last_ns, other._turn
+            self._quality, self._lonely = other._quality, other._lonely
             return
         tracks = dict(zip(other._names, other._tracks, strict=True))
+        quality, lonely = (dict(zip(other._names, v, strict=True)) for v in (other._quality, other._lonely))
+        self._quality = [quality.get(name, 0.0) for name in self._names]
+        self._lonely = [lonely.get(name, True) for name in self._names]
         self._tracks = [tracks.get(name) for name in self._names]
 
     def tune(self, camera: CameraCalibration) -> None:
@@ -252,16 +262,20 @@ class MarkerDetector:
     ) -> tuple[float, ...]:
         """What is reported of one marker, whose track was `before` if it was alive; it goes on."""
         other = (math.nan, math.nan) if rival is None else (rival.u, rival.v)
-        colour = (self._camera.markers or {})[self._names[m]]
         support = 0.0 if outline is None else outline.support
-        self.evidence[m] = evidence = evidence_of(seen, self._gains, colour, support, rival is not None)
+        near = math.hypot(other[0] - seen.u, other[1] - seen.v) < NEAR * math.sqrt(blob.area)  # NaN is not
+        if before is None:
+            self._lonely[m] = rival is None
+        clear = seen.contrast >= CLEAR_CONTRAST and not (seen.cut or seen.thin)
+        if before is None or not clear or near or m % JUDGED == self._turn:
+            self.evidence[m] = evidence_of(seen, self._gains, self._colours[m], support, near or not self._lonely[m])
+            self._quality[m] = probability_of(self.evidence[m])
         if outline is not None:
             seen = outline.measured(seen)
         self._tracks[m] = track = advance(self._tracks[m], seen, blob, t_ns)
         sigma = sigma_of(seen, before, track, self._exposure_s, outline)
         u, v, area = seen.u, seen.v, seen.area
         smear = math.hypot(track.du, track.dv) * self._exposure_s
-        clear = seen.contrast >= CLEAR_CONTRAST and not (seen.cut or seen.thin)
         if before is not None and track.covered and smear < SMEARED and clear:
             shape, x, y = Ellipse(before.xx, before.xy, before.yy), u - seen.left, v - seen.top
             whole = centre_of(seen.window, shape, x, y)
@@ -270,10 +284,10 @@ class MarkerDetector:
                 sigma = math.hypot(COVERED_PX, whole.rms)
         sigma = math.hypot(sigma, doubt)
         clarity = clarity_of(seen, track.whole)
-        if math.hypot(other[0] - u, other[1] - v) < 3.0 * math.sqrt(blob.area):  # NaN is not
+        if near:
             clarity *= 0.5
         blue, green, red = seen.colour
-        return u, v, area, probability_of(evidence), sigma, *other, clarity, blue, green, red
+        return u, v, area, self._quality[m], sigma, *other, clarity, blue, green, red
 
     def _rival(self, m: int, blob: Blob, blobs: list[list[Blob]], window: Window | None) -> Blob | None:
         """The largest other blob of the colour that may be the marker as far as size and motion tell; no rim is."""

@@ -12,6 +12,7 @@ markers are more frequent than markers, less of what is found is right than it s
 """
 
 import math
+from operator import mul
 from typing import NamedTuple
 
 from common.calibration import HsvRange
@@ -100,9 +101,7 @@ def evidence_of(
 
 def probability_of(evidence: Evidence) -> float:
     """Probability 0..1 that it is a marker."""
-    logit = BIAS
-    for weight, value in zip(WEIGHTS, evidence, strict=True):
-        logit += weight * value
+    logit = sum(map(mul, WEIGHTS, evidence), BIAS)
     return 1.0 / (1.0 + math.exp(-min(max(logit, -30.0), 30.0)))
 
 
