@@ -21,9 +21,16 @@ from slave.markers.detector import Detections, MarkerDetector
 ROOT: Final = Path(__file__).resolve().parents[1]
 SIX: Final = ("thumb", "index", "middle", "ring", "little", "back")
 MARKED: Final = ROOT / "tests/golden/real_ball.json"
-RENDERED: Final = {"lights_0_warm": 1, "flex90": 5, "translate_8ms": 5, "poses_left": 1}  # every so many-th frame
+RENDERED: Final = {
+    "lights_0_warm": 1,
+    "flex90": 5,
+    "translate_8ms": 5,
+    "poses_left": 1,
+}  # every so many-th frame
 VISIBLE: Final = 0.5
-GREEN: Final = HsvRange(hsv_low=(38, 60, 20), hsv_high=(88, 255, 255))  # where a person would click on the ball
+GREEN: Final = HsvRange(
+    hsv_low=(38, 60, 20), hsv_high=(88, 255, 255)
+)  # where a person would click on the ball
 PAINTINGS: Final = 4  # of one photograph
 
 
@@ -95,7 +102,11 @@ class Collector:
             image = as_by_another_camera(view.image, rng)
             of_kind = view.kind.camera.markers or {}
             self.look(
-                f"painted {photo.source}", image, {n: of_kind[n] for n in view.kind.names}, view.uv, view.radius
+                f"painted {photo.source}",
+                image,
+                {n: of_kind[n] for n in view.kind.names},
+                view.uv,
+                view.radius,
             )
 
     def look_at_rendered(self, rng: np.random.Generator) -> None:

@@ -82,7 +82,9 @@ def painted(photo: Photo, rng: np.random.Generator) -> Painted:
     table = to_linear(photo.image[..., ::-1] / 255.0).astype(np.float32) / np.float32(scene.brightness)
     shown = rng.permutation(len(scene.caps))[: rng.integers(1, len(scene.caps) + 1)]
     caps = [
-        replace(cap, occluder=replace(occluder, share=rng.uniform(0.1, HIDDEN))) if rng.random() < COVERED else cap
+        replace(cap, occluder=replace(occluder, share=rng.uniform(0.1, HIDDEN)))
+        if rng.random() < COVERED
+        else cap
         for cap, occluder in zip(scene.caps, scene.occluders, strict=True)
     ]
     light = replace(scene, table=table).light(tuple(caps[m] for m in shown))
@@ -116,4 +118,6 @@ def halves(image: Image) -> Iterator[Image]:
     for v in (0, height // 3):
         for u in (0, width // 3):
             part = image[v : v + 2 * height // 3, u : u + 2 * width // 3]
-            yield np.ascontiguousarray(cv2.resize(part, (width, height), interpolation=cv2.INTER_CUBIC), np.uint8)
+            yield np.ascontiguousarray(
+                cv2.resize(part, (width, height), interpolation=cv2.INTER_CUBIC), np.uint8
+            )

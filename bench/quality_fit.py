@@ -57,7 +57,9 @@ def predicted(rows: Rows, beta: Float) -> Float:
     return 1.0 / (1.0 + np.exp(-np.clip(beta[0] + rows.evidence @ beta[1:], -30.0, 30.0)))
 
 
-def reliability(quality: Float, right: Float, weight: Float, bins: int = 5) -> list[tuple[float, float, float]]:
+def reliability(
+    quality: Float, right: Float, weight: Float, bins: int = 5
+) -> list[tuple[float, float, float]]:
     """(mean stated, found, share of all) of each bin of stated quality that is not empty."""
     bin_of = np.minimum((quality * bins).astype(int), bins - 1)
     table: list[tuple[float, float, float]] = []
@@ -82,7 +84,9 @@ def collected(seed: int = 1) -> Rows:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Fit without the sources that are held out, and judge those."""
     parser = argparse.ArgumentParser(prog="python -m bench.quality_fit", description=__doc__.splitlines()[0])
-    parser.add_argument("--held-out", default="", metavar="SOURCE,...", help="photographs that are not fitted to")
+    parser.add_argument(
+        "--held-out", default="", metavar="SOURCE,...", help="photographs that are not fitted to"
+    )
     held = set(parser.parse_args(arguments).held_out.split(",")) - {""}
     rows = collected()
     apart = np.array([source.split()[-1] in held for source in rows.source])

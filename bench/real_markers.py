@@ -1,7 +1,7 @@
 """Markers in real pictures: a lit ball that a hand holds, and photographs without paint.
 
-    .venv/bin/python -m bench real_markers
-    PHALANX_PHOTOS=FOLDER .venv/bin/python -m bench.real_markers --picture out/reliability.png
+.venv/bin/python -m bench real_markers
+PHALANX_PHOTOS=FOLDER .venv/bin/python -m bench.real_markers --picture out/reliability.png
 """
 
 import argparse
@@ -83,7 +83,9 @@ def ball_errors(colour: HsvRange) -> tuple[Float, Float, Float]:
         if file.stem in marked:
             u, v, _ = marked[file.stem]
             away = float(np.hypot(*(found.uv[0] - (u, v))))
-            rows_of.append((away, away / float(found.sigma_px[0]), float(np.hypot(*(_plain(image, colour) - (u, v))))))
+            rows_of.append(
+                (away, away / float(found.sigma_px[0]), float(np.hypot(*(_plain(image, colour) - (u, v)))))
+            )
     error, ratio, plain = np.array(rows_of).T
     return error, ratio, plain
 

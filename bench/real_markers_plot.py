@@ -45,7 +45,9 @@ def draw(
     axes.bar(stated, right, 0.06, color="#c9d8e3", label="is a marker")
     axes.plot(stated, right, "o-", color="#14507a", linewidth=1.4)
     for x, y, part in zip(stated, right, share, strict=True):
-        axes.annotate(f"{100.0 * part:.0f} %", (x, y), (0, 7), textcoords="offset points", fontsize=8, ha="center")
+        axes.annotate(
+            f"{100.0 * part:.0f} %", (x, y), (0, 7), textcoords="offset points", fontsize=8, ha="center"
+        )
     axes.set_xlabel("stated quality (share of what is found above the points)", fontsize=9)
     axes.set_ylabel("share that is a marker", fontsize=9)
     axes.set_xlim(0.0, 1.0)
@@ -58,9 +60,7 @@ def draw(
     figure.savefig(file)
 
 
-def _show(
-    axes: Axes, name: str, circle: tuple[float, float, float], image: Image, colour: HsvRange
-) -> None:
+def _show(axes: Axes, name: str, circle: tuple[float, float, float], image: Image, colour: HsvRange) -> None:
     """One frame of the ball: the circle marked by eye in white, what is found with two sigma in red."""
     u, v, radius = circle
     found = MarkerDetector(camera_for(image, {"ball": colour}), ("ball",)).push(image, 0)

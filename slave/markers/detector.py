@@ -12,7 +12,7 @@ detector (`fresh`).
 """
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,8 +49,14 @@ NOT_SEEN = (math.nan,) * 11  # what is reported of a marker
 NEAR = 3.0  # sides of the marker: a rival so near may be taken for it in the next frame
 RIVALS = 2  # that are measured in one frame
 RIVAL = 0.3  # of the marker's area: a smaller blob is no rival, nor one as much larger
-JUDGED = 6  # frames: a clear marker that is tracked is judged in one of so many, and stays what it was between
+JUDGED = (
+    6  # frames: a clear marker that is tracked is judged in one of so many, and stays what it was between
+)
 OUTLINES = 2  # that are sought in one frame: one costs as much as a frame of clear markers
+LARGE = 300.0  # px^2 from which the outline of one of clear contrast is looked at,
+RARELY = 120  # in one frame of so many while its colour fills it,
+SURE = 0.8  # and taken with an edge in this share of the directions,
+FULLER = 1.08  # and so many times the colour's area
 OUTLINED = 60.0  # px^2 from which an outline can be told from its pixels
 
 
@@ -129,7 +135,8 @@ class MarkerDetector:
         self._tracks: list[Track | None] = [None] * len(markers)
         self._scanner = Scanner(camera.width_px, camera.height_px, engine)
         self._last_ns: int | None = None  # time of the last frame
-        self._turn = 0  # which of the markers are judged in this frame
+        self._frame = 0  # frames so far
+        self._outlined = [False] * len(markers)  # measured by the outline when it was last sought
         self._quality = [0.0] * len(markers)
         self._lonely = [True] * len(markers)  # no other blob might have been it when it was found
         self._gains = (1.0, 1.0, 1.0)  # of the light against calibration, blue first
@@ -191,9 +198,9 @@ class MarkerDetector:
             for m, seen in zip(rows, measured, strict=False)
             if seen is not None and not (seen.thin and (seen.foreign > FRINGE or seen.area < SLIVER))
         }
-        outlines = _outlines(image, seen_as)
+        outlines = self._outlines(image, seen_as, windows)
         reports: dict[int, tuple[float, ...]] = {}
-        self.evidence, self._turn = {}, (self._turn + 1) % JUDGED
+        self.evidence = {}
         for m, seen in seen_as.items():
             before = self._tracks[m] if windows[m] is not None else None
             reports[m] = self._report(
@@ -227,7 +234,7 @@ class MarkerDetector:
         self._seeds = {}
         if other._names == self._names:
             self._tracks, self._scanner, self.beside = other._tracks, other._scanner, other.beside
-            self._last_ns, self._turn = other._last_ns, other._turn
+            self._last_ns, self._frame, self._outlined = other._last_ns, other._frame, other._outlined
             self._quality, self._lonely = other._quality, other._lonely
             return
         tracks = dict(zip(other._names, other._tracks, strict=True))
@@ -249,6 +256,33 @@ class MarkerDetector:
         """
         self._table, self._gains = table, gains
 
+    def _outlines(
+        self, image: Image, seen_as: Mapping[int, Measured], windows: Sequence[Window | None]
+    ) -> dict[int, Outline]:
+        """Marker row -> the outline of those, the largest, whose colour may be a part of them.
+
+        Where the contrast is clear, nothing but an outline tells: a large marker is looked at when it is found, from
+        time to time, and as long as it has one that holds more than its colour.
+        """
+        self._frame += 1
+        sought: list[tuple[float, int]] = []
+        for m, seen in seen_as.items():
+            if seen.area < OUTLINED or seen.cut or seen.thin:
+                continue
+            due = windows[m] is None or self._outlined[m] or self._frame % RARELY == m % RARELY
+            if seen.contrast < CLEAR_CONTRAST or (seen.area >= LARGE and due):
+                sought.append((seen.area, m))
+        found: dict[int, Outline] = {}
+        for _, m in sorted(sought, reverse=True)[:OUTLINES]:
+            outline, seen = outline_of(image, seen_as[m]), seen_as[m]
+            if outline is not None and seen.contrast >= CLEAR_CONTRAST:
+                fuller = math.pi * outline.radius**2 >= FULLER * seen.area
+                outline = outline if fuller and outline.support >= SURE else None
+            self._outlined[m] = outline is not None
+            if outline is not None:
+                found[m] = outline
+        return found
+
     def _report(
         self,
         m: int,
@@ -262,13 +296,15 @@ class MarkerDetector:
     ) -> tuple[float, ...]:
         """What is reported of one marker, whose track was `before` if it was alive; it goes on."""
         other = (math.nan, math.nan) if rival is None else (rival.u, rival.v)
-        support = 0.0 if outline is None else outline.support
+        support = 0.0 if outline is None or seen.contrast >= CLEAR_CONTRAST else outline.support
         near = math.hypot(other[0] - seen.u, other[1] - seen.v) < NEAR * math.sqrt(blob.area)  # NaN is not
         if before is None:
             self._lonely[m] = rival is None
         clear = seen.contrast >= CLEAR_CONTRAST and not (seen.cut or seen.thin)
-        if before is None or not clear or near or m % JUDGED == self._turn:
-            self.evidence[m] = evidence_of(seen, self._gains, self._colours[m], support, near or not self._lonely[m])
+        if before is None or not clear or near or m % JUDGED == self._frame % JUDGED:
+            self.evidence[m] = evidence_of(
+                seen, self._gains, self._colours[m], support, near or not self._lonely[m]
+            )
             self._quality[m] = probability_of(self.evidence[m])
         if outline is not None:
             seen = outline.measured(seen)
@@ -375,21 +411,6 @@ class MarkerDetector:
                 return CLICKED + math.sqrt(blob.area)  # the click names it; of its fragments take the largest
         track = self._tracks[m]
         return TRACKED if blob is tracked and track is not None and not track.sudden(blob) else 0.0
-
-
-def _outlines(image: Image, seen_as: Mapping[int, Measured]) -> dict[int, Outline]:
-    """Marker row -> the outline of those, the largest, whose surroundings may be a part of them."""
-    unclear = [
-        (seen.area, m)
-        for m, seen in seen_as.items()
-        if seen.contrast < CLEAR_CONTRAST and seen.area >= OUTLINED and not (seen.cut or seen.thin)
-    ]
-    found: dict[int, Outline] = {}
-    for _, m in sorted(unclear, reverse=True)[:OUTLINES]:
-        outline = outline_of(image, seen_as[m])
-        if outline is not None:
-            found[m] = outline
-    return found
 
 
 def _alone(blob: Blob, options: list[Blob]) -> bool:

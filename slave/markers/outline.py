@@ -42,7 +42,7 @@ TOLERANCE = 0.05  # of the radius: an edge so near to the circle is one of its o
 CAUCHY = 0.4  # of the tolerance
 HELD = 0.88  # share of the mask that lies inside the circle
 FILLED = 0.4  # share of the circle that the mask fills
-SUPPORTED = 0.55  # share of the directions that have an edge of the circle's own
+SUPPORTED = 0.6  # share of the directions that have an edge of the circle's own
 UNSEEN = 0.1  # of the radius: standard deviation of the centre where no direction had one
 _STEP = (FARTHEST - NEAREST) / (RADII - 1)
 _AT: Float = np.linspace(NEAREST, FARTHEST, RADII)
@@ -97,7 +97,11 @@ def outline_of(image: Image, seen: Measured) -> Outline | None:
     if support < SUPPORTED or inside < HELD * len(u) or inside < FILLED * math.pi * radius * radius:
         return None
     return Outline(
-        seen.left + x, seen.top + y, radius, support, math.hypot(size * sigma, UNSEEN * (1.0 - support) * radius)
+        seen.left + x,
+        seen.top + y,
+        radius,
+        support,
+        math.hypot(size * sigma, UNSEEN * (1.0 - support) * radius),
     )
 
 
@@ -114,7 +118,7 @@ def _edges(image: Image, u: float, v: float, size: float) -> Float32:
     steep = np.zeros((RAYS, RADII), np.float32)
     steep[:, 1:-1] = np.sqrt(np.square(polar[:, 2:] - polar[:, :-2]).sum(axis=2))
     strong = np.partition(steep.ravel(), steep.size * STRONG // 100)[steep.size * STRONG // 100]
-    return cast(Float32, np.minimum(steep / max(float(strong), 1e-3), LIMIT))
+    return steep / np.float32(max(float(strong), 1e-3))
 
 
 def _grid(*axes: Sequence[float] | Float) -> Float:
@@ -142,10 +146,11 @@ _FINER = tuple(_grid(*[np.linspace(-half, half, 5)] * 3) for half in FINER)
 
 def _best(strength: Float32) -> Float:
     """The circle (3,) du, dv, radius in radii of the hull along which the edges are strongest on average."""
-    circle: Float = _COARSE[int(np.argmax(strength.take(_COARSE_SAMPLES).sum(axis=1)))]
+    limited = np.minimum(strength, LIMIT)
+    circle: Float = _COARSE[int(np.argmax(limited.take(_COARSE_SAMPLES).sum(axis=1)))]
     for finer in _FINER:
         circles = circle + finer
-        circle = circles[int(np.argmax(strength.take(_samples(circles)).sum(axis=1)))]
+        circle = circles[int(np.argmax(limited.take(_samples(circles)).sum(axis=1)))]
     return circle
 
 

@@ -19,7 +19,9 @@ from common.calibration import HsvRange
 from slave.markers.centroid import Measured
 from slave.markers.classify import HUES
 
-CLEAR_CONTRAST = 6.0  # below it, the colour's mask may be a part of the marker, and its outline is sought (`outline`)
+CLEAR_CONTRAST = (
+    6.0  # below it, the colour's mask may be a part of the marker, and its outline is sought (`outline`)
+)
 SMALL = 40.0  # px^2 below which a colour is hardly that of the paint alone
 LARGEST_CONTRAST = 20.0  # no marker is the more certain beyond it
 

@@ -28,7 +28,7 @@ LASTING = 0.3  # how much of a slow loss of area is cover, and not the finger tu
 CUT = 0.3  # of the radius
 THIN = 2.0  # times, for a sliver
 COVERED_PX = 0.15  # a centre found from the edge that is left
-PARTIAL = 0.4  # of the radius: a part of the marker's colour that has no outline
+PARTIAL = 0.5  # of the radius: a part of the marker's colour that has no outline
 
 
 def sigma_of(
