@@ -1,4 +1,4 @@
-"""What markers and things that are none look like to the detector: the rows to which `slave.markers.quality` is fitted."""
+"""What markers, and things that are none, look like to the detector: to this `slave.markers.quality` is fitted."""
 
 import json
 from collections.abc import Mapping
@@ -187,7 +187,7 @@ def clicked_ranges(
         u, v, radius = marked[name]
         t, away = rng.uniform(0.0, 2.0 * np.pi), radius * np.sqrt(rng.random())
         click = (u + away * np.cos(t), v + away * np.sin(t))
-        hsv = np.asarray(cv2.cvtColor(images[name], cv2.COLOR_BGR2HSV))
+        hsv = np.asarray(cv2.cvtColor(images[name], cv2.COLOR_BGR2HSV), np.uint8)
         low, high = np.array(GREEN.hsv_low), np.array(GREEN.hsv_high)
         pixel = hsv[round(click[1]), round(click[0])]
         if np.all((pixel >= low) & (pixel <= high)):

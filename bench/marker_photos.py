@@ -1,14 +1,14 @@
 """Photographs without paint, and the same with paint drawn into them: what tells a marker from what looks like one.
 
-Whatever is found in a photograph without paint is false. Any will do: `PHALANX_PHOTOS` names a folder with one folder of
-pictures per source. The hand before the desk of the data sets is one source more.
+Whatever is found in a photograph without paint is false. Any will do: `PHALANX_PHOTOS` names a folder with one folder
+of pictures per source. The hand before the desk of the data sets is one source more.
 """
 
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, cast
+from typing import Final
 
 import cv2
 import numpy as np
@@ -80,7 +80,7 @@ def painted(photo: Photo, rng: np.random.Generator) -> Painted:
     kind = replace(KINDS[PAINTED[rng.integers(len(PAINTED))]], size=(width, height))
     scene = make_scene(kind, rng)
     table = to_linear(photo.image[..., ::-1] / 255.0).astype(np.float32) / np.float32(scene.brightness)
-    shown = rng.permutation(len(scene.caps))[: rng.integers(1, len(scene.caps) + 1)]
+    shown: list[int] = rng.permutation(len(scene.caps))[: rng.integers(1, len(scene.caps) + 1)].tolist()
     caps = [
         replace(cap, occluder=replace(occluder, share=rng.uniform(0.1, HIDDEN)))
         if rng.random() < COVERED
@@ -103,13 +103,13 @@ def painted(photo: Photo, rng: np.random.Generator) -> Painted:
 def as_by_another_camera(image: Image, rng: np.random.Generator) -> Image:
     """The picture under another exposure and white balance, with some haze, now and then as JPEG."""
     gains = np.exp(rng.normal(0.0, (0.08, 0.02, 0.08)) + rng.normal(0.0, 0.15))
-    image = np.asarray(cv2.LUT(image, relit_bytes(gains).T[None]))
+    image = np.asarray(cv2.LUT(image, relit_bytes(gains).T[None]), np.uint8)
     haze = rng.uniform(0.0, 0.15)
-    image = np.asarray(cv2.addWeighted(image, 1.0 - haze, np.full_like(image, 160), haze, 0.0))
+    image = np.asarray(cv2.addWeighted(image, 1.0 - haze, np.full_like(image, 160), haze, 0.0), np.uint8)
     if rng.random() < 0.5:
         data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(70, 96))])[1]
-        image = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))
-    return cast(Image, np.ascontiguousarray(image, np.uint8))
+        image = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+    return np.ascontiguousarray(image)
 
 
 def halves(image: Image) -> Iterator[Image]:

@@ -83,7 +83,9 @@ def collected(seed: int = 1) -> Rows:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Fit without the sources that are held out, and judge those."""
-    parser = argparse.ArgumentParser(prog="python -m bench.quality_fit", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m bench.quality_fit", description=(__doc__ or "").partition("\n")[0]
+    )
     parser.add_argument(
         "--held-out", default="", metavar="SOURCE,...", help="photographs that are not fitted to"
     )

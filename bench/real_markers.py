@@ -116,7 +116,9 @@ def _plain(image: Image, colour: HsvRange) -> Float:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Draw the reliability diagram, and some frames of the ball with what was found."""
-    parser = argparse.ArgumentParser(prog="python -m bench.real_markers", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m bench.real_markers", description=(__doc__ or "").partition("\n")[0]
+    )
     parser.add_argument("--picture", type=Path, required=True, metavar="FILE", help="PNG to write")
     options = parser.parse_args(arguments)
     cv2.setNumThreads(1)

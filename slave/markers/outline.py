@@ -16,7 +16,7 @@ A circle that holds too little of the mask, or that has edges in too few directi
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, TypeAlias, cast
+from typing import NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
@@ -175,7 +175,7 @@ def _fitted(strength: Float32, circle: Float) -> tuple[float, float, float, floa
         weighted = jacobian * weight[:, None]
         inverse = np.linalg.inv(weighted.T @ jacobian + 1e-3 * np.eye(3))
         circle = circle + inverse @ (weighted.T @ residual)
-        covariance = inverse * float(weight @ np.square(residual) / max(float(weight.sum()) - 3.0, 1.0))
+        covariance = inverse * np.float64(weight @ np.square(residual) / max(float(weight.sum()) - 3.0, 1.0))
     x, y, radius = circle.tolist()
     sigma = math.sqrt(0.5 * float(covariance[0, 0] + covariance[1, 1]))
     return x, y, radius, float(own.mean()), sigma

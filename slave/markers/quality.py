@@ -6,9 +6,9 @@ or bead is compact. A logistic regression weighs that:
 
     P(marker) = 1 / (1 + exp(-(w0 + w . evidence)))
 
-Its weights are fitted by `python -m bench.quality_fit` to markers (rendered hands, generated caps, a real ball, paint drawn
-into photographs) and to what is found in photographs without paint, half and half: where things in the colours of the
-markers are more frequent than markers, less of what is found is right than it says.
+`python -m bench.quality_fit` fits its weights to markers (rendered hands, a real ball, paint drawn into photographs)
+and to what is found in photographs without paint, half and half: where things in the colours of the markers are more
+frequent than markers, less of what is found is right than it says.
 """
 
 import math
@@ -54,16 +54,16 @@ class Evidence(NamedTuple):
     cut: float
 
 
-BIAS = -7.33
+BIAS = -7.56
 WEIGHTS = Evidence(
-    contrast=0.48,
-    unclear=-1.55,
-    outlined=6.06,
-    fullness=10.64,
-    slender=-2.22,
-    hue=-5.25,
-    vivid=2.28,
-    rival=-2.66,
+    contrast=0.55,
+    unclear=-1.41,
+    outlined=5.22,
+    fullness=10.66,
+    slender=-2.17,
+    hue=-5.29,
+    vivid=2.25,
+    rival=-2.61,
     ragged=-0.70,
     cut=-1.76,
 )

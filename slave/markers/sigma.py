@@ -8,8 +8,8 @@ Five independent causes, added in squares; the numbers are those of generated ca
     cover   something in front hides a share h: a straight edge moves the centroid of a disc by 0.9 h r
             (segment of a circle, small h), one direction of two
     cut     the border of the image does the same, unseen
-    colour  where the contrast is so low that the surroundings may be the marker as well, its colour may be a part of it;
-            an outline (`outline`) knows how well it fits, and takes the place of all but the motion
+    colour  where the contrast is so low that the surroundings may be the marker as well, its colour may be a part of
+            it; an outline (`outline`) knows how well it fits, and takes the place of all but the motion
 """
 
 import math
