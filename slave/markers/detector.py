@@ -53,7 +53,7 @@ JUDGED = (
     6  # frames: a clear marker that is tracked is judged in one of so many, and stays what it was between
 )
 OUTLINES = 2  # that are sought in one frame: one costs as much as a frame of clear markers
-LARGE = 300.0  # px^2 from which the outline of one of clear contrast is looked at,
+LARGE = 500.0  # px^2 from which the outline of one of clear contrast is looked at,
 RARELY = 120  # in one frame of so many while its colour fills it,
 SURE = 0.8  # and taken with an edge in this share of the directions,
 FULLER = 1.08  # and so many times the colour's area
