@@ -7,12 +7,12 @@ detector (`fresh`).
     blobs    connected blobs per colour                                          blobs
     decide   by prediction where a track answers; else by what belongs together  roi, group
     measure  sub-pixel centroid of the visible paint, full resolution            centroid
-    outline  where the colour fills a part of a round marker only: its circle    outline
+    outline  where the colour fills a part of a round marker only: its circle    outlines, outline
     judge    how probable it is a marker; how far it may be off                  quality, sigma
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,7 +34,8 @@ from slave.markers.group import (
     connected,
     on_fringe,
 )
-from slave.markers.outline import Outline, outline_of
+from slave.markers.outline import Outline
+from slave.markers.outlines import Outlines
 from slave.markers.quality import CLEAR_CONTRAST, Evidence, clarity_of, evidence_of, probability_of
 from slave.markers.roi import Track, Window, advance
 from slave.markers.scan import Scanned, Scanner
@@ -52,12 +53,6 @@ RIVAL = 0.3  # of the marker's area: a smaller blob is no rival, nor one as much
 JUDGED = (
     6  # frames: a clear marker that is tracked is judged in one of so many, and stays what it was between
 )
-OUTLINES = 2  # that are sought in one frame: one costs as much as a frame of clear markers
-LARGE = 500.0  # px^2 from which the outline of one of clear contrast is looked at,
-RARELY = 120  # in one frame of so many while its colour fills it,
-SURE = 0.8  # and taken with an edge in this share of the directions,
-FULLER = 1.08  # and so many times the colour's area
-OUTLINED = 60.0  # px^2 from which an outline can be told from its pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +131,7 @@ class MarkerDetector:
         self._scanner = Scanner(camera.width_px, camera.height_px, engine)
         self._last_ns: int | None = None  # time of the last frame
         self._frame = 0  # frames so far
-        self._outlined = [False] * len(markers)  # measured by the outline when it was last sought
+        self._outlines = Outlines()
         self._quality = [0.0] * len(markers)
         self._lonely = [True] * len(markers)  # no other blob might have been it when it was found
         self._gains = (1.0, 1.0, 1.0)  # of the light against calibration, blue first
@@ -198,9 +193,9 @@ class MarkerDetector:
             for m, seen in zip(rows, measured, strict=False)
             if seen is not None and not (seen.thin and (seen.foreign > FRINGE or seen.area < SLIVER))
         }
-        outlines = self._outlines(image, seen_as, windows)
+        outlines = self._outlines.push(image, seen_as, [m for m in seen_as if windows[m] is None])
         reports: dict[int, tuple[float, ...]] = {}
-        self.evidence = {}
+        self.evidence, self._frame = {}, self._frame + 1
         for m, seen in seen_as.items():
             before = self._tracks[m] if windows[m] is not None else None
             reports[m] = self._report(
@@ -234,7 +229,7 @@ class MarkerDetector:
         self._seeds = {}
         if other._names == self._names:
             self._tracks, self._scanner, self.beside = other._tracks, other._scanner, other.beside
-            self._last_ns, self._frame, self._outlined = other._last_ns, other._frame, other._outlined
+            self._last_ns, self._frame, self._outlines = other._last_ns, other._frame, other._outlines
             self._quality, self._lonely = other._quality, other._lonely
             return
         tracks = dict(zip(other._names, other._tracks, strict=True))
@@ -255,33 +250,6 @@ class MarkerDetector:
             gains: They, in linear light.
         """
         self._table, self._gains = table, gains
-
-    def _outlines(
-        self, image: Image, seen_as: Mapping[int, Measured], windows: Sequence[Window | None]
-    ) -> dict[int, Outline]:
-        """Marker row -> the outline of those, the largest, whose colour may be a part of them.
-
-        Where the contrast is clear, nothing but an outline tells: a large marker is looked at when it is found, from
-        time to time, and as long as it has one that holds more than its colour.
-        """
-        self._frame += 1
-        sought: list[tuple[float, int]] = []
-        for m, seen in seen_as.items():
-            if seen.area < OUTLINED or seen.cut or seen.thin:
-                continue
-            due = windows[m] is None or self._outlined[m] or self._frame % RARELY == m % RARELY
-            if seen.contrast < CLEAR_CONTRAST or (seen.area >= LARGE and due):
-                sought.append((seen.area, m))
-        found: dict[int, Outline] = {}
-        for _, m in sorted(sought, reverse=True)[:OUTLINES]:
-            outline, seen = outline_of(image, seen_as[m]), seen_as[m]
-            if outline is not None and seen.contrast >= CLEAR_CONTRAST:
-                fuller = math.pi * outline.radius**2 >= FULLER * seen.area
-                outline = outline if fuller and outline.support >= SURE else None
-            self._outlined[m] = outline is not None
-            if outline is not None:
-                found[m] = outline
-        return found
 
     def _report(
         self,
