@@ -20,6 +20,7 @@ from bench.row import Row
 SECTIONS = {
     "markers": "Marker detection, 640x480, six markers, one thread; baseline: the published pipeline rebuilt",
     "marker_accuracy": "Centroids on generated frames with exact truth, kind by kind; baseline: the published pipeline",
+    "real_markers": "A real, lit ball in a hand, and photographs without paint (PHALANX_DATASETS, PHALANX_PHOTOS)",
     "tags": "Fiducial tags on generated frames with exact corners; baseline: cv2.aruco and its ways to refine",
     "steadiness": "Ten thousand frames through one detector: worst sort of frame, memory",
     "light": "Light that changes, standard scene, both cameras; baseline: the same detector with fixed colours",

@@ -44,7 +44,7 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
         ready_t_ns: When the frame was handed to the slave [ns], same clock as `t_ns`.
         uv: Marker centroids (M, 2) [px], distorted image, (0, 0) = centre of the top-left pixel.
         area: Blob areas (M,) [px^2].
-        quality: Confidence (M,) in 0..1: 1 is a whole, unambiguous, well exposed marker.
+        quality: Probability (M,) 0..1 that what was found is the marker.
         sigma_px: Standard deviation per axis (M,) [px] of `uv` as the centroid of all that the camera would see of
             the whole marker: noise, doubt of occlusion, size. Positive where `uv` is seen, NaN elsewhere.
         rival_uv: (M, 2) [px], as `uv`: a second place of the same colour, where the slave could not exclude that

@@ -36,7 +36,7 @@ class RecordedDetections:
         seq: (T,) frame counters.
         uv: (T, M, 2) centroids [px], distorted image.
         area_px2: (T, M) visible areas [px^2].
-        quality: (T, M) 0..1.
+        quality: (T, M) 0..1, the probability that it is the marker.
         sigma_px: (T, M) standard deviation of the centroids per axis [px].
         rival_uv: (T, M, 2) second places of the same colour [px]; NaN: none.
     """

@@ -13,7 +13,7 @@ class BlindDetector:
         """Answer for so many markers."""
         one = np.full(markers, np.nan)
         uv = np.full((markers, 2), np.nan)
-        self._nothing = Detections(uv, one, one, one, uv, np.full((markers, 3), np.nan))
+        self._nothing = Detections(uv, one, one, one, uv, one, np.full((markers, 3), np.nan))
 
     def push(self, image: Image, t_ns: int) -> Detections:
         """Nothing, whatever there is."""

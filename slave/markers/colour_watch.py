@@ -18,7 +18,7 @@ from slave.markers.classify import HUES
 
 TIME_S = 0.5
 LEAST_S = 0.3  # of sightings before a verdict
-GOOD = 0.4  # quality of a sighting that counts: half covered paint is mixed with what covers it
+GOOD = 0.4  # clarity of a sighting that counts: half covered paint is mixed with what covers it
 ROOM = 2.0  # spreads: less is a warning; a marker that is warned of is well again with
 WELL = 3.0
 # Smallest spread that is believed, of hue (of 180), saturation and value (of 255): what noise leaves of one pixel.
@@ -78,17 +78,17 @@ class ColourWatch:
         self._warned = np.zeros(count, np.bool_)
         self._t_ns: int | None = None
 
-    def push(self, light: Float, quality: Float, t_ns: int) -> list[ColourWarning]:
+    def push(self, light: Float, clarity: Float, t_ns: int) -> list[ColourWarning]:
         """Take in one frame; what is to be warned of now.
 
         Args:
             light: (M, 3) linear light of each marker's core, undone to the light of calibration; NaN: not seen.
-            quality: (M,) 0..1; NaN: not seen.
+            clarity: (M,) 0..1; NaN: not seen.
             t_ns: Time of the frame [ns], rising.
         """
         dt_s = 0.0 if self._t_ns is None else min(max(t_ns - self._t_ns, 0) * 1e-9, TIME_S)
         self._t_ns = t_ns
-        good = np.isfinite(light).all(axis=1) & (np.nan_to_num(quality) >= GOOD)
+        good = np.isfinite(light).all(axis=1) & (np.nan_to_num(clarity) >= GOOD)
         if good.any():
             self._learn(good, hsv(np.maximum(light[good], 1e-5)), dt_s)
         room = self.room()

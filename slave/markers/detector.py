@@ -7,6 +7,8 @@ detector (`fresh`).
     blobs    connected blobs per colour                                          blobs
     decide   by prediction where a track answers; else by what belongs together  roi, group
     measure  sub-pixel centroid of the visible paint, full resolution            centroid
+    outline  where the colour fills a part of a round marker only: its circle    outlines, outline
+    judge    how probable it is a marker; how far it may be off                  quality, sigma
 """
 
 import math
@@ -32,6 +34,9 @@ from slave.markers.group import (
     connected,
     on_fringe,
 )
+from slave.markers.outline import Outline
+from slave.markers.outlines import Outlines
+from slave.markers.quality import CLEAR_CONTRAST, Evidence, clarity_of, evidence_of, probability_of
 from slave.markers.roi import Track, Window, advance
 from slave.markers.scan import Scanned, Scanner
 from slave.markers.sigma import COVERED_PX, sigma_of
@@ -39,13 +44,15 @@ from slave.markers.sigma import COVERED_PX, sigma_of
 CLICK_REACH = 6  # px between a click and the scanned box of its marker
 FRINGE = 0.2  # share of foreign neighbours from which a thin sliver counts as a colour fringe
 SLIVER = 14.0  # px^2; a thinner sliver cannot be told from a fringe
-CLEAR_CONTRAST = 6.0  # standard deviations between paint and surroundings that deserve full quality
-SMALL = 40.0  # px^2 below which the centroid of a cap is uncertain
 SMEARED = 2.0  # px of way during the exposure from which an edge is no edge
 DIGITS = 6  # of what is reported: what comes after them differs between processors
-NOT_SEEN = (math.nan,) * 10  # what is reported of a marker
+NOT_SEEN = (math.nan,) * 11  # what is reported of a marker
+NEAR = 3.0  # sides of the marker: a rival so near may be taken for it in the next frame
 RIVALS = 2  # that are measured in one frame
 RIVAL = 0.3  # of the marker's area: a smaller blob is no rival, nor one as much larger
+JUDGED = (
+    6  # frames: a clear marker that is tracked is judged in one of so many, and stays what it was between
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,13 +61,14 @@ class Detections:
 
     Attributes:
         uv: (M, 2) centroids of the visible paint [px], distorted image; of the whole cap where something covers a
-            part of it and the edge that is left tells.
+            part of it and the edge that is left tells; of the whole disc where the colour is only a part of it.
         area: (M,) area [px^2] of what `uv` is the centroid of.
-        quality: (M,) 0..1; 1 is a whole, unambiguous, clear marker.
+        quality: (M,) 0..1, the probability that it is a marker.
         sigma_px: (M,) standard deviation per axis of `uv` as an estimate of the centroid of all that the camera
             would see of the whole cap: noise, doubt of occlusion, size, motion.
         rival_uv: (M, 2) centroid of a second blob of the colour that may be the marker instead [px]; in a frame with
             many only as the scan saw it, to a pixel or so; NaN: none.
+        clarity: (M,) 0..1, how far `colour` is that of the paint alone: 1 is a whole, clear marker.
         colour: (M, 3) mean of the core in linear light 0..1: blue, green, red.
     """
 
@@ -69,6 +77,7 @@ class Detections:
     quality: Float
     sigma_px: Float
     rival_uv: Float
+    clarity: Float
     colour: Float
 
     def nothing(self) -> "Detections":
@@ -83,6 +92,7 @@ class MarkerDetector:
         windows_only: Only windows of tracked markers are scanned, and strips for lost ones; the first frame is scanned
             whole. May change between two frames.
         beside: Things of a marker's colour that are none, as far as scans saw them.
+        evidence: Marker row -> what its quality was made of, of those that were judged in the last frame.
     """
 
     def __init__(
@@ -112,6 +122,7 @@ class MarkerDetector:
         self._margin = camera.roi_margin
         self._names = markers
         self._table = table_of(markers, camera.markers, f"camera {camera.name!r}") if table is None else table
+        self._colours = [(camera.markers or {})[name] for name in markers]
         self._free = tuple(markers.index(name) for name in free)
         self._engine = engine
         engine.prepare(self._table)
@@ -119,14 +130,20 @@ class MarkerDetector:
         self._tracks: list[Track | None] = [None] * len(markers)
         self._scanner = Scanner(camera.width_px, camera.height_px, engine)
         self._last_ns: int | None = None  # time of the last frame
+        self._frame = 0  # frames so far
+        self._outlines = Outlines()
+        self._quality = [0.0] * len(markers)
+        self._lonely = [True] * len(markers)  # no other blob might have been it when it was found
+        self._gains = (1.0, 1.0, 1.0)  # of the light against calibration, blue first
         self.windows_only = False
         self.beside = Beside(markers)
+        self.evidence: dict[int, Evidence] = {}
 
     def fresh(self, seeds: Mapping[str, tuple[float, float]] | None = None) -> "MarkerDetector":
         """A detector of the same camera that has seen nothing yet; shares the colour table."""
         free = [self._names[m] for m in self._free]
         other = MarkerDetector(self._camera, self._names, seeds, self._table, self._engine, free)
-        other.windows_only = self.windows_only
+        other.windows_only, other._gains = self.windows_only, self._gains
         return other
 
     def push(self, image: Image, t_ns: int) -> Detections:
@@ -171,16 +188,26 @@ class MarkerDetector:
         for m, seen in zip(closely, measured[len(rows) :], strict=True):
             if seen is not None:
                 rivals[m] = rivals[m]._replace(u=seen.u, v=seen.v)
+        seen_as = {
+            m: seen
+            for m, seen in zip(rows, measured, strict=False)
+            if seen is not None and not (seen.thin and (seen.foreign > FRINGE or seen.area < SLIVER))
+        }
+        outlines = self._outlines.push(image, seen_as, [m for m in seen_as if windows[m] is None])
         reports: dict[int, tuple[float, ...]] = {}
-        for m, seen in zip(rows, measured, strict=False):
-            if seen is not None and not (seen.thin and (seen.foreign > FRINGE or seen.area < SLIVER)):
-                before = self._tracks[m] if windows[m] is not None else None
-                reports[m] = self._report(m, before, seen, chosen[m], rivals.get(m), t_ns, doubt.get(m, 0.0))
+        self.evidence, self._frame = {}, self._frame + 1
+        for m, seen in seen_as.items():
+            before = self._tracks[m] if windows[m] is not None else None
+            reports[m] = self._report(
+                m, before, seen, outlines.get(m), chosen[m], rivals.get(m), t_ns, doubt.get(m, 0.0)
+            )
         values: list[float] = []
         for m in range(len(self._names)):
             values += reports.get(m, NOT_SEEN)
         result = np.array(values).round(DIGITS).reshape(-1, len(NOT_SEEN)).T
-        return Detections(result[:2].T, result[2], result[3], result[4], result[5:7].T, result[7:].T)
+        return Detections(
+            result[:2].T, result[2], result[3], result[4], result[5:7].T, result[7], result[8:].T
+        )
 
     @property
     def table(self) -> ColourTable:
@@ -202,49 +229,69 @@ class MarkerDetector:
         self._seeds = {}
         if other._names == self._names:
             self._tracks, self._scanner, self.beside = other._tracks, other._scanner, other.beside
-            self._last_ns = other._last_ns
+            self._last_ns, self._frame, self._outlines = other._last_ns, other._frame, other._outlines
+            self._quality, self._lonely = other._quality, other._lonely
             return
         tracks = dict(zip(other._names, other._tracks, strict=True))
+        quality, lonely = (dict(zip(other._names, v, strict=True)) for v in (other._quality, other._lonely))
+        self._quality = [quality.get(name, 0.0) for name in self._names]
+        self._lonely = [lonely.get(name, True) for name in self._names]
         self._tracks = [tracks.get(name) for name in self._names]
 
     def tune(self, camera: CameraCalibration) -> None:
         """The file has another exposure, over which motion smears, or another margin. From any thread."""
         self._exposure_s, self._margin = camera.exposure_us * 1e-6, camera.roi_margin
 
-    def recolour(self, table: ColourTable) -> None:
-        """Go on with another colour table of the same markers, prepared for the engine; tracks go on."""
-        self._table = table
+    def recolour(self, table: ColourTable, gains: tuple[float, float, float]) -> None:
+        """Go on with another colour table of the same markers, prepared for the engine; tracks go on.
+
+        Args:
+            table: Of the light that `gains` (blue, green, red) of that of calibration make.
+            gains: They, in linear light.
+        """
+        self._table, self._gains = table, gains
 
     def _report(
         self,
         m: int,
         before: Track | None,
         seen: Measured,
+        outline: Outline | None,
         blob: Blob,
         rival: Blob | None,
         t_ns: int,
         doubt: float,
     ) -> tuple[float, ...]:
         """What is reported of one marker, whose track was `before` if it was alive; it goes on."""
+        other = (math.nan, math.nan) if rival is None else (rival.u, rival.v)
+        support = 0.0 if outline is None or seen.contrast >= CLEAR_CONTRAST else outline.support
+        near = math.hypot(other[0] - seen.u, other[1] - seen.v) < NEAR * math.sqrt(blob.area)  # NaN is not
+        if before is None:
+            self._lonely[m] = rival is None
+        clear = seen.contrast >= CLEAR_CONTRAST and not (seen.cut or seen.thin)
+        if before is None or not clear or near or m % JUDGED == self._frame % JUDGED:
+            self.evidence[m] = evidence_of(
+                seen, self._gains, self._colours[m], support, near or not self._lonely[m]
+            )
+            self._quality[m] = probability_of(self.evidence[m])
+        if outline is not None:
+            seen = outline.measured(seen)
         self._tracks[m] = track = advance(self._tracks[m], seen, blob, t_ns)
-        quality = _quality(seen, track)
-        sigma = sigma_of(seen, before, track, self._exposure_s)
+        sigma = sigma_of(seen, before, track, self._exposure_s, outline)
         u, v, area = seen.u, seen.v, seen.area
         smear = math.hypot(track.du, track.dv) * self._exposure_s
-        if before is not None and track.covered and smear < SMEARED and not (seen.cut or seen.thin):
+        if before is not None and track.covered and smear < SMEARED and clear:
             shape, x, y = Ellipse(before.xx, before.xy, before.yy), u - seen.left, v - seen.top
             whole = centre_of(seen.window, shape, x, y)
             if whole is not None and explained(before.hidden(seen.area), shape, whole.u - x, whole.v - y):
                 u, v, area = seen.left + whole.u, seen.top + whole.v, before.usual
                 sigma = math.hypot(COVERED_PX, whole.rms)
         sigma = math.hypot(sigma, doubt)
-        other = (math.nan, math.nan)
-        if rival is not None:
-            other = rival.u, rival.v
-            if math.hypot(other[0] - u, other[1] - v) < 3.0 * math.sqrt(blob.area):
-                quality *= 0.5
+        clarity = clarity_of(seen, track.whole)
+        if near:
+            clarity *= 0.5
         blue, green, red = seen.colour
-        return u, v, area, max(0.01, quality), sigma, *other, blue, green, red
+        return u, v, area, self._quality[m], sigma, *other, clarity, blue, green, red
 
     def _rival(self, m: int, blob: Blob, blobs: list[list[Blob]], window: Window | None) -> Blob | None:
         """The largest other blob of the colour that may be the marker as far as size and motion tell; no rim is."""
@@ -332,21 +379,6 @@ class MarkerDetector:
                 return CLICKED + math.sqrt(blob.area)  # the click names it; of its fragments take the largest
         track = self._tracks[m]
         return TRACKED if blob is tracked and track is not None and not track.sudden(blob) else 0.0
-
-
-def _quality(seen: Measured, track: Track) -> float:
-    """0..1: how far the centroid can be trusted to be the centroid of the whole cap's visible side."""
-    area, contrast = seen.area, seen.contrast
-    quality = math.sqrt(area / track.whole) if area < track.whole else 1.0
-    if contrast < CLEAR_CONTRAST:
-        quality *= contrast / CLEAR_CONTRAST
-    if area < SMALL:
-        quality *= math.sqrt(area / SMALL)
-    if seen.cut:
-        quality *= 0.5
-    if seen.thin:
-        quality *= 0.4
-    return min(1.0, quality)
 
 
 def _alone(blob: Blob, options: list[Blob]) -> bool:

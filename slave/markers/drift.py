@@ -143,19 +143,19 @@ class ColourDrift:
         """Add a change of the light that was seen elsewhere, on what stands still: (3,) log gains."""
         self._x, self._anchor = bounded(self._x + change), bounded(self._anchor + change)
 
-    def push(self, colour: Float, quality: Float, t_ns: int) -> GainFit | None:
+    def push(self, colour: Float, clarity: Float, t_ns: int) -> GainFit | None:
         """Learn from the markers of one frame; None where the last look is too recent.
 
         Args:
             colour: (M, 3) linear light of each marker's core, blue first; NaN: not seen.
-            quality: (M,) 0..1; NaN: not seen.
+            clarity: (M,) 0..1; NaN: not seen.
             t_ns: Time of the frame [ns], rising.
         """
         if self._t_ns is not None and 0 <= t_ns - self._t_ns < EVERY_NS:
             return None
         dt_s = 0.0 if self._t_ns is None else min(max(t_ns - self._t_ns, 0), GAP_NS) * 1e-9
         self._t_ns = t_ns
-        fit = fit_gains(colour, self._reference, np.nan_to_num(quality), self._anchor)
+        fit = fit_gains(colour, self._reference, np.nan_to_num(clarity), self._anchor)
         blue, green, red = (-math.expm1(-dt_s / TIME_S) * (fit.log_gains - self._x)).tolist()
         most = RATE_PER_S * dt_s
         b, g, r = (min(max(step, -most), most) for step in (blue - green, green, red - green))

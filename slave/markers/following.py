@@ -132,10 +132,10 @@ class FollowingDetector:
         """Learn the light, and in the next frame, so that none takes long, look at the room of the colours."""
         if self._look_next:
             undone = found.colour * np.exp(-self.log_gains)
-            self._near = self._watch.push(undone, found.quality, t_ns)
+            self._near = self._watch.push(undone, found.clarity, t_ns)
             self._look_next = False
         else:
-            self._look_next = self._light.learn(found.colour, found.quality, t_ns) is not None
+            self._look_next = self._light.learn(found.colour, found.clarity, t_ns) is not None
 
     def _follow(self) -> None:
         """Have a table made where the light has moved; use the one that is ready."""
@@ -147,7 +147,8 @@ class FollowingDetector:
             )
         if self._making is not None and self._making[1].done():
             (self._in_use, job), self._making = self._making, None
-            self._detector.recolour(job.result())
+            blue, green, red = np.exp(self._in_use).tolist()
+            self._detector.recolour(job.result(), (blue, green, red))
             self.tables += 1
 
 

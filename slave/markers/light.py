@@ -79,15 +79,15 @@ class CameraLight:
         if self._provable and not self.proven:
             self._prove(image, t_ns)
 
-    def learn(self, colour: Float, quality: Float, t_ns: int) -> GainFit | None:
+    def learn(self, colour: Float, clarity: Float, t_ns: int) -> GainFit | None:
         """Take in what the markers of that picture showed; None where the last look is too recent.
 
         Args:
             colour: (M, 3) linear light of each marker's core, blue first; NaN: not seen.
-            quality: (M,) 0..1; NaN: not seen.
+            clarity: (M,) 0..1; NaN: not seen.
             t_ns: Time of the frame [ns].
         """
-        fit = self._drift.push(colour, quality, t_ns)
+        fit = self._drift.push(colour, clarity, t_ns)
         if fit is not None:
             seen = fit.misfit[np.isfinite(fit.misfit)]
             if not seen.size or float(np.median(seen)) <= FITS:

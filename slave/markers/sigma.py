@@ -1,6 +1,6 @@
 """Say how far a measured centroid may be off, in pixels, from what was measured.
 
-Four independent causes, added in squares; the numbers are those of generated caps (bench/marker_accuracy):
+Five independent causes, added in squares; the numbers are those of generated caps (bench/marker_accuracy):
 
     edge    the rim is known to a fraction of a pixel; a shift of one side moves the centroid the more the smaller
             the marker, and the less clear its contrast; shading and highlights keep a part at any size
@@ -8,11 +8,15 @@ Four independent causes, added in squares; the numbers are those of generated ca
     cover   something in front hides a share h: a straight edge moves the centroid of a disc by 0.9 h r
             (segment of a circle, small h), one direction of two
     cut     the border of the image does the same, unseen
+    colour  where the contrast is so low that the surroundings may be the marker as well, its colour may be a part of
+            it; an outline (`outline`) knows how well it fits, and takes the place of all but the motion
 """
 
 import math
 
 from slave.markers.centroid import Measured
+from slave.markers.outline import Outline
+from slave.markers.quality import CLEAR_CONTRAST
 from slave.markers.roi import Track
 
 EDGE_PX2 = 0.45  # error times radius
@@ -24,9 +28,12 @@ LASTING = 0.3  # how much of a slow loss of area is cover, and not the finger tu
 CUT = 0.3  # of the radius
 THIN = 2.0  # times, for a sliver
 COVERED_PX = 0.15  # a centre found from the edge that is left
+PARTIAL = 0.5  # of the radius: a part of the marker's colour that has no outline
 
 
-def sigma_of(seen: Measured, before: Track | None, track: Track, exposure_s: float) -> float:
+def sigma_of(
+    seen: Measured, before: Track | None, track: Track, exposure_s: float, outline: Outline | None = None
+) -> float:
     """Standard deviation per axis of the centroid [px].
 
     Args:
@@ -34,7 +41,10 @@ def sigma_of(seen: Measured, before: Track | None, track: Track, exposure_s: flo
         before: The track before it; None: the marker was not tracked.
         track: The track after it.
         exposure_s: Exposure time.
+        outline: The marker's outline, where the measurement is that of its disc.
     """
+    if outline is not None:
+        return math.hypot(outline.sigma, BLUR * math.hypot(track.du, track.dv) * exposure_s)
     radius = math.sqrt((seen.area if seen.area > 1.0 else 1.0) / math.pi)
     edge = math.hypot(EDGE_PX2 / radius, LEAST_PX)
     if seen.contrast < CLEAR:
@@ -45,5 +55,6 @@ def sigma_of(seen: Measured, before: Track | None, track: Track, exposure_s: flo
         hidden = max(hidden, before.hidden(seen.area))
     cover = COVER * hidden * radius / (1.0 - min(hidden, 0.8)) if hidden > 0.0 else 0.0
     cut = CUT * radius if seen.cut else 0.0
-    sigma = math.sqrt(edge * edge + blur * blur + cover * cover + cut * cut)
+    partial = PARTIAL * radius if seen.contrast < CLEAR_CONTRAST else 0.0
+    sigma = math.sqrt(edge * edge + blur * blur + cover * cover + cut * cut + partial * partial)
     return THIN * sigma if seen.thin else sigma

@@ -104,7 +104,7 @@ def test_what_passes_in_front_of_a_marker_moves_it_little_and_is_told() -> None:
     found = push_all([image, image, hidden])[2]
     assert np.hypot(*(found.uv[1] - whole.uv[1])) < 0.5
     assert found.sigma_px[1] > 1.3 * whole.sigma_px[1]
-    assert 0.0 < found.quality[1] < 0.9 * whole.quality[1]
+    assert 0.0 < found.clarity[1] < 0.9 * whole.clarity[1]
 
 
 def test_a_marker_first_seen_half_hidden_is_measured_as_it_is() -> None:

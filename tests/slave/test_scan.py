@@ -55,7 +55,7 @@ def seen(found: Detections) -> list[bool]:
 def assert_same(one: Detections, other: Detections) -> int:
     """All that both report is the same to the bit; how many markers that are."""
     both = np.isfinite(one.uv[:, 0]) & np.isfinite(other.uv[:, 0])
-    for name in ("uv", "area", "quality", "sigma_px", "colour"):
+    for name in ("uv", "area", "clarity", "sigma_px", "colour"):
         np.testing.assert_array_equal(getattr(one, name)[both], getattr(other, name)[both], name)
     return int(both.sum())
 
@@ -118,6 +118,7 @@ def test_generated_markers_are_the_same(name: str, engine: str) -> None:
     for sequence in sequences(replace(kind, frames=max(kind.frames, 5)), 3, seed=11):
         pair: tuple[MarkerDetector, MarkerDetector] | None = None
         tracked = [False] * len(kind.names)
+        always = np.ones(len(kind.names), np.bool_)
         for frame in sequence:
             if pair is None:
                 seeds = clicks(kind, frame) if kind.clicked else None
@@ -126,8 +127,10 @@ def test_generated_markers_are_the_same(name: str, engine: str) -> None:
             one, other = (detector.push(frame.image, frame.t_ns) for detector in pair)
             assert seen(one) == seen(other)
             same += assert_same(one, other)
-            # A marker that was not tracked may be anywhere, and so may its rival.
+            # A marker that was not tracked may be anywhere, and so may its rival, which its quality remembers.
             np.testing.assert_array_equal(one.rival_uv[tracked], other.rival_uv[tracked])
+            always &= seen(one)
+            np.testing.assert_array_equal(one.quality[always], other.quality[always])
             tracked = seen(one)
             frames += 1
     assert same >= 0.8 * frames * len(kind.names)

@@ -202,7 +202,13 @@ class Blind:
         self._left -= 1
         nothing = np.full(1, np.nan)
         return Detections(
-            *[np.full((1, 2), np.nan), *[nothing] * 3, np.full((1, 2), np.nan), np.full((1, 3), np.nan)]
+            *[
+                np.full((1, 2), np.nan),
+                *[nothing] * 3,
+                np.full((1, 2), np.nan),
+                nothing,
+                np.full((1, 3), np.nan),
+            ]
         )
 
 

@@ -1,0 +1,181 @@
+"""Find the outline of a round marker whose colour fills only a part of it.
+
+A lit ball or bead is no flat colour: its top turns pale, its dark side loses the hue, a finger lies in front of it.
+The mask of its colour is then a part of it, of any form, and what surrounds the mask is again the marker. Its outline
+is still there as an edge of the picture. A circle is sought on which the picture has edges in as many directions as
+possible, whatever the colours on both sides:
+
+1. About the convex hull of the mask the picture is sampled in polar coordinates. The radial gradient of its three
+   channels is the strength of an edge, limited, so that one strong edge does not outvote a faint outline.
+2. Circles near the hull are rated by the mean strength along them, coarse to fine (a Hough transform, Duda and Hart
+   1972, read along each circle).
+3. The strongest edge near the circle on each ray, with Cauchy weights, gives it by iterated least squares.
+
+A circle that holds too little of the mask, or that has edges in too few directions, is no answer.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, TypeAlias
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from common.arrays import Bool, Float, Image
+from slave.markers.centroid import Measured
+
+Float32: TypeAlias = npt.NDArray[np.float32]
+Whole: TypeAlias = npt.NDArray[np.intp]
+
+RAYS, RADII = 64, 56  # samples of the picture: directions, and on each
+NEAREST, FARTHEST = 0.45, 1.85  # where they begin and end, in radii of the hull
+SMOOTH = 0.03  # of the radius: standard deviation of the blur before the gradient, at least one pixel
+STRONG = 80  # percentile of the gradients that counts as one edge
+LIMIT = 1.5  # edges: what a stronger one counts
+FAINT = 0.5  # edges: what is weaker is none
+SHIFTS = np.linspace(-0.45, 0.45, 10)  # of the centre, in radii of the hull
+SIZES = np.linspace(0.85, 1.5, 14)
+FINER = 0.06, 0.024  # half widths of the finer searches
+ROUNDS = 4
+TOLERANCE = 0.05  # of the radius: an edge so near to the circle is one of its own
+CAUCHY = 0.4  # of the tolerance
+HELD = 0.88  # share of the mask that lies inside the circle
+FILLED = 0.4  # share of the circle that the mask fills
+SUPPORTED = 0.6  # share of the directions that have an edge of the circle's own
+UNSEEN = 0.1  # of the radius: standard deviation of the centre where no direction had one
+_STEP = (FARTHEST - NEAREST) / (RADII - 1)
+_AT: Float = np.linspace(NEAREST, FARTHEST, RADII)
+_RAY = np.arange(RAYS)
+_COS, _SIN = np.cos(_RAY * (2.0 * math.pi / RAYS)), np.sin(_RAY * (2.0 * math.pi / RAYS))
+
+
+class Outline(NamedTuple):
+    """A circle about a marker.
+
+    Attributes:
+        u, v: Centre [px], distorted image.
+        radius: Radius [px].
+        support: Share of the directions in which the picture has an edge there, 0..1.
+        sigma: Standard deviation of the centre per axis [px].
+    """
+
+    u: float
+    v: float
+    radius: float
+    support: float
+    sigma: float
+
+    def measured(self, seen: Measured) -> Measured:
+        """What was measured, with the place and the moments of the whole disc."""
+        square = self.radius * self.radius
+        area, moment = math.pi * square, square / 4.0
+        return seen._replace(u=self.u, v=self.v, area=area, xx=moment, xy=0.0, yy=moment)
+
+
+def outline_of(image: Image, seen: Measured) -> Outline | None:
+    """The circle about what was measured, or None where the picture shows none.
+
+    Args:
+        image: (H, W, 3) BGR, full resolution.
+        seen: The measurement; its shares tell where the colour is.
+    """
+    mask = (seen.window >= 0.5).astype(np.uint8)
+    borders, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if not borders:
+        return None
+    moments = cv2.moments(cv2.convexHull(np.concatenate([border.reshape(-1, 2) for border in borders])))
+    if moments["m00"] < 1.0:
+        return None
+    x, y = moments["m10"] / moments["m00"], moments["m01"] / moments["m00"]
+    size = math.sqrt(moments["m00"] / math.pi) + 0.5  # the hull ends in the middle of pixels
+    strength = _edges(image, seen.left + x, seen.top + y, size)
+    du, dv, radius, support, sigma = _fitted(strength, _best(strength))
+    x, y, radius = x + size * du, y + size * dv, size * radius
+    v, u = np.nonzero(mask)
+    inside = np.count_nonzero(np.hypot(u - x, v - y) <= radius + 1.0)
+    if support < SUPPORTED or inside < HELD * len(u) or inside < FILLED * math.pi * radius * radius:
+        return None
+    return Outline(
+        seen.left + x,
+        seen.top + y,
+        radius,
+        support,
+        math.hypot(size * sigma, UNSEEN * (1.0 - support) * radius),
+    )
+
+
+def _edges(image: Image, u: float, v: float, size: float) -> Float32:
+    """Strength (RAYS, RADII) of the edges about (u, v) [px], on rays `_RAY` at `_AT` radii of `size` [px]."""
+    reach = math.ceil(FARTHEST * size) + 2
+    left, top = max(math.floor(u) - reach, 0), max(math.floor(v) - reach, 0)
+    part = image[top : math.floor(v) + reach + 1, left : math.floor(u) + reach + 1]
+    smooth = cv2.GaussianBlur(part, (0, 0), max(1.0, SMOOTH * size)).astype(np.float32)
+    x, y = u - left + np.outer(_COS, size * _AT), v - top + np.outer(_SIN, size * _AT)
+    polar = cv2.remap(
+        smooth, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    steep = np.zeros((RAYS, RADII), np.float32)
+    steep[:, 1:-1] = np.sqrt(np.square(polar[:, 2:] - polar[:, :-2]).sum(axis=2))
+    strong = np.partition(steep.ravel(), steep.size * STRONG // 100)[steep.size * STRONG // 100]
+    return steep / np.float32(max(float(strong), 1e-3))
+
+
+def _grid(*axes: Sequence[float] | Float) -> Float:
+    """All triples (N, 3) of three axes."""
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _distance(circles: Float) -> Float:
+    """Where the rays meet circles (N, 3): (N, RAYS) from the hull's centre; all in its radii."""
+    du, dv, radius = circles[:, 0:1], circles[:, 1:2], circles[:, 2:3]
+    across = du * _SIN - dv * _COS
+    return du * _COS + dv * _SIN + np.sqrt(np.maximum(radius * radius - across * across, 0.0))
+
+
+def _samples(circles: Float) -> Whole:
+    """The samples (N, RAYS) on circles (N, 3), as indices of the flat strength; the ends have no strength."""
+    place = np.rint((_distance(circles) - NEAREST) / _STEP).astype(np.intp)
+    return np.clip(place, 0, RADII - 1) + RADII * _RAY
+
+
+_COARSE = _grid(SHIFTS, SHIFTS, SIZES)
+_COARSE_SAMPLES = _samples(_COARSE)
+_FINER = tuple(_grid(*[np.linspace(-half, half, 5)] * 3) for half in FINER)
+
+
+def _best(strength: Float32) -> Float:
+    """The circle (3,) du, dv, radius in radii of the hull along which the edges are strongest on average."""
+    limited = np.minimum(strength, LIMIT)
+    circle: Float = _COARSE[int(np.argmax(limited.take(_COARSE_SAMPLES).sum(axis=1)))]
+    for finer in _FINER:
+        circles = circle + finer
+        circle = circles[int(np.argmax(limited.take(_samples(circles)).sum(axis=1)))]
+    return circle
+
+
+def _fitted(strength: Float32, circle: Float) -> tuple[float, float, float, float, float]:
+    """Centre, radius, support and standard deviation of the centre, in radii of the hull, by least squares."""
+    covariance: Float = np.eye(3)
+    own: Bool = np.zeros(RAYS, np.bool_)
+    for turn in range(ROUNDS):
+        x, y, radius = circle.tolist()
+        tolerance = TOLERANCE * radius * (2.0 if turn == 0 else 1.0)
+        near = np.abs(_AT - _distance(circle[None]).T) <= tolerance + _STEP
+        at = np.clip(np.where(near, strength, -1.0).argmax(axis=1), 1, RADII - 2)
+        before, here, after = strength[_RAY, at - 1], strength[_RAY, at], strength[_RAY, at + 1]
+        bend = np.minimum(before - 2.0 * here + after, -1e-6)  # a parabola through three samples
+        found = _AT[at] + _STEP * np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
+        away_x, away_y = found * _COS - x, found * _SIN - y
+        away = np.hypot(away_x, away_y)
+        residual = away - radius
+        own = (here >= FAINT) & (np.abs(residual) <= tolerance)
+        weight = np.where(here >= FAINT, 1.0 / (1.0 + np.square(residual / (CAUCHY * tolerance))), 0.0)
+        jacobian = np.stack([away_x / away, away_y / away, np.ones(RAYS)], axis=1)
+        weighted = jacobian * weight[:, None]
+        inverse = np.linalg.inv(weighted.T @ jacobian + 1e-3 * np.eye(3))
+        circle = circle + inverse @ (weighted.T @ residual)
+        covariance = inverse * np.float64(weight @ np.square(residual) / max(float(weight.sum()) - 3.0, 1.0))
+    x, y, radius = circle.tolist()
+    sigma = math.sqrt(0.5 * float(covariance[0, 0] + covariance[1, 1]))
+    return x, y, radius, float(own.mean()), sigma

@@ -1,0 +1,144 @@
+"""Say how probable it is that what was found is a marker, from how it looks.
+
+A field, a window frame or a face holds pixels of every colour, and what a colour table finds there has an area and a
+centroid like a marker. But paint is of one colour against its surroundings, near the middle of its range, and a cap
+or bead is compact. A logistic regression weighs that:
+
+    P(marker) = 1 / (1 + exp(-(w0 + w . evidence)))
+
+`python -m bench.quality_fit` fits its weights to markers (rendered hands, a real ball, paint drawn into photographs)
+and to what is found in photographs without paint, half and half: where things in the colours of the markers are more
+frequent than markers, less of what is found is right than it says.
+"""
+
+import math
+from operator import mul
+from typing import NamedTuple
+
+from common.calibration import HsvRange
+from slave.markers.centroid import Measured
+from slave.markers.classify import HUES
+
+CLEAR_CONTRAST = (
+    6.0  # below it, the colour's mask may be a part of the marker, and its outline is sought (`outline`)
+)
+SMALL = 40.0  # px^2 below which a colour is hardly that of the paint alone
+LARGEST_CONTRAST = 20.0  # no marker is the more certain beyond it
+
+
+class Evidence(NamedTuple):
+    """What speaks for a marker; every entry is free of the camera's resolution.
+
+    Attributes:
+        contrast: Logarithm of the contrast between paint and surroundings, at most that of `LARGEST_CONTRAST`.
+        unclear: 1: the contrast is below `CLEAR_CONTRAST`.
+        outlined: Then the share of directions in which a round outline was found, else 0.
+        fullness: Area over that of the ellipse with the same second moments: 1 is an ellipse, less has gaps or arms.
+        slender: Logarithm of the ratio of the axes of that ellipse.
+        hue: Distance of the hue from the middle of the range in half ranges, squared.
+        vivid: Logarithm of the saturation over the least of the range, at most 1.
+        rival: 1: a second blob of the colour may be the marker.
+        ragged: 1: hardly a pixel has four neighbours of the colour.
+        cut: 1: it touches the border of the image.
+    """
+
+    contrast: float
+    unclear: float
+    outlined: float
+    fullness: float
+    slender: float
+    hue: float
+    vivid: float
+    rival: float
+    ragged: float
+    cut: float
+
+
+BIAS = -7.56
+WEIGHTS = Evidence(
+    contrast=0.55,
+    unclear=-1.41,
+    outlined=5.22,
+    fullness=10.66,
+    slender=-2.17,
+    hue=-5.29,
+    vivid=2.25,
+    rival=-2.61,
+    ragged=-0.70,
+    cut=-1.76,
+)
+
+
+def evidence_of(
+    seen: Measured, gains: tuple[float, float, float], colour: HsvRange, support: float, rival: bool
+) -> Evidence:
+    """What speaks for one measurement.
+
+    Args:
+        seen: The measurement by the colour's mask.
+        gains: Of the light against that of calibration, blue, green, red.
+        colour: The marker's range.
+        support: Of its outline, 0: none was found, or none was sought.
+        rival: Whether a second blob of the colour may be the marker.
+    """
+    hue, saturation = _hue_saturation(*(c / gain for c, gain in zip(seen.colour, gains, strict=True)))
+    middle, apart = 0.5 * (seen.xx + seen.yy), math.hypot(0.5 * (seen.xx - seen.yy), seen.xy)
+    longest, shortest = middle + apart, max(middle - apart, 0.02)
+    low, high = colour.hsv_low, colour.hsv_high
+    half = 0.5 * ((high[0] - low[0]) % HUES) + 0.5
+    away = abs((hue - low[0] - half + 0.5 + HUES / 2) % HUES - HUES / 2) / half
+    return Evidence(
+        contrast=math.log(min(max(seen.contrast, 1.0), LARGEST_CONTRAST)),
+        unclear=float(seen.contrast < CLEAR_CONTRAST),
+        outlined=support,
+        fullness=min(seen.area / (4.0 * math.pi * math.sqrt(longest * shortest)), 1.0),
+        slender=0.5 * math.log(longest / shortest),
+        hue=min(away * away, 1.0),
+        vivid=math.log(min(max(saturation / max(low[1], 1), 1.0), math.e)),
+        rival=float(rival),
+        ragged=float(seen.thin),
+        cut=float(seen.cut),
+    )
+
+
+def probability_of(evidence: Evidence) -> float:
+    """Probability 0..1 that it is a marker."""
+    logit = sum(map(mul, WEIGHTS, evidence), BIAS)
+    return 1.0 / (1.0 + math.exp(-min(max(logit, -30.0), 30.0)))
+
+
+def clarity_of(seen: Measured, whole: float) -> float:
+    """How far (0.01..1) the core's colour is that of the paint alone, given the marker's whole area [px^2]."""
+    area, contrast = seen.area, seen.contrast
+    clarity = math.sqrt(area / whole) if area < whole else 1.0
+    if contrast < CLEAR_CONTRAST:
+        clarity *= contrast / CLEAR_CONTRAST
+    if area < SMALL:
+        clarity *= math.sqrt(area / SMALL)
+    if seen.cut:
+        clarity *= 0.5
+    if seen.thin:
+        clarity *= 0.4
+    return min(max(clarity, 0.01), 1.0)
+
+
+def _hue_saturation(blue: float, green: float, red: float) -> tuple[float, float]:
+    """OpenCV's H (0..180) and S (0..255) of a colour in linear light."""
+    blue, green, red = _srgb(blue), _srgb(green), _srgb(red)
+    value = max(blue, green, red)
+    span = value - min(blue, green, red)
+    if span <= 0.0:
+        return 0.0, 0.0
+    if value == red:
+        sector = (green - blue) / span
+    elif value == green:
+        sector = 2.0 + (blue - red) / span
+    else:
+        sector = 4.0 + (red - green) / span
+    return 30.0 * sector % HUES, 255.0 * span / value
+
+
+def _srgb(linear: float) -> float:
+    """As `common.srgb.to_srgb`, of one number."""
+    linear = min(max(linear, 0.0), 1.0)
+    return 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
