@@ -72,9 +72,13 @@ def compare_source(
         say(remark)
     names = _marker_names(poses, wanted)
     ours, theirs = _common(poses, motion, names)
-    alignment = align(ours, theirs) if not aligned else _own_clock(take.begin_t_ns, poses, motion)
-    for line in alignment_lines(None if aligned else alignment):
-        say(line)
+    if aligned:
+        alignment, how = _own_clock(take.begin_t_ns, poses, motion)
+        say(how)
+    else:
+        alignment = align(ours, theirs)
+        for line in alignment_lines(alignment):
+            say(line)
     compared = compare(poses, motion, alignment, names)
     found = figures(compared)
     if found["joint_mm"] is None and not np.isfinite(compared.marker_mm).any():
@@ -148,17 +152,23 @@ def _common(poses: Poses, motion: JointMotion, marker_names: tuple[str, ...]) ->
     return Track(poses.t_ns, np.stack(ours, axis=1)), Track(motion.t_ns, np.stack(theirs, axis=1))
 
 
-def _own_clock(begin_t_ns: int, poses: Poses, motion: JointMotion) -> Alignment:
-    """Frame and clock as they are; times that end before the poses begin are counted from the source's beginning.
+def _own_clock(begin_t_ns: int, poses: Poses, motion: JointMotion) -> tuple[Alignment, str]:
+    """Frame as it is; the clock of the poses, or seconds from the source's beginning, whichever shares more time.
 
     Raises:
         RecordingError: They have no time in common either way.
     """
-    for offset_ns in (0, begin_t_ns):
-        if motion.t_ns[0] + offset_ns <= poses.t_ns[-1] and motion.t_ns[-1] + offset_ns >= poses.t_ns[0]:
-            return Alignment(np.eye(4), offset_ns)
-    raise RecordingError(
-        f"{motion.source}: its times, {1e-9 * motion.t_ns[0]:.3f} to {1e-9 * motion.t_ns[-1]:.3f} s, are not on the"
-        f" clock of the poses, {1e-9 * poses.t_ns[0]:.3f} to {1e-9 * poses.t_ns[-1]:.3f} s, nor seconds from their"
-        " beginning: leave --aligned out"
-    )
+    first, last = (int(motion.t_ns[k]) for k in (0, -1))
+    shared = {
+        offset_ns: min(last + offset_ns, int(poses.t_ns[-1])) - max(first + offset_ns, int(poses.t_ns[0]))
+        for offset_ns in (0, begin_t_ns)
+    }
+    offset_ns = max(shared, key=lambda one: shared[one])
+    if shared[offset_ns] < 0:
+        raise RecordingError(
+            f"{motion.source}: its times, {1e-9 * first:.3f} to {1e-9 * last:.3f} s, are not on the clock of the poses,"
+            f" {1e-9 * poses.t_ns[0]:.3f} to {1e-9 * poses.t_ns[-1]:.3f} s, nor seconds from their beginning:"
+            " leave --aligned out"
+        )
+    counted = "seconds from the beginning of the poses' source" if offset_ns else "the clock of the poses"
+    return Alignment(np.eye(4), offset_ns), f"frame taken as the rig's, times as {counted} (--aligned)"

@@ -1,6 +1,7 @@
 """Reads the labelled points of a C3D file (c3d.org), by py-c3d; the only file that knows that library."""
 
 import struct
+import warnings
 from pathlib import Path
 from typing import Any, cast
 
@@ -33,7 +34,8 @@ def read_c3d(path: Path) -> PointTable:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise RecordingError(f"{path}: larger than 1 GiB: cut it")
-        with path.open("rb") as file:
+        with path.open("rb") as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # it warns of files without analog channels
             reader = cast(Any, c3d).Reader(file)
             labels = [str(label).strip() for label in reader.point_labels]
             rate_hz = float(reader.point_rate)

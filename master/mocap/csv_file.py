@@ -55,9 +55,7 @@ def _plain(rows: list[list[str]], path: Path, rate_hz: float | None) -> PointTab
     body = [row for row in rows[start + 1 :] if any(row)]
     wanted = [at for three in columns.points.values() for at in three]
     times = [] if columns.time is None else [columns.time]
-    values = numbers(
-        [[_cell(row, at) for at in times + wanted] for row in body], start + 2, len(times + wanted), path
-    )
+    values = numbers(body, start + 2, times + wanted, path)
     if times:
         t_s = values[:, 0] * columns.seconds
     elif rate_hz is not None:
@@ -67,12 +65,8 @@ def _plain(rows: list[list[str]], path: Path, rate_hz: float | None) -> PointTab
             f"{path}: has no column of time (t_ns, t_ms, time, seconds): add one, or give its frames a second:"
             " --rate"
         )
-    position = values[:, len(times) :].reshape(len(values), -1, 3)
+    position = values[:, len(times) :].reshape(len(values), len(columns.points), 3)
     return PointTable(tuple(columns.points), t_s, position, columns.unit)
-
-
-def _cell(row: list[str], at: int) -> str:
-    return row[at] if at < len(row) else ""
 
 
 def _columns(header: list[str], path: Path) -> _Columns:

@@ -54,12 +54,12 @@ def match_names(
     found: dict[Side | None, dict[str, list[str]]] = {}
     fingers: dict[tuple[Side | None, int], _Finger] = {}
     for name in names:
-        words = [word.lower() for word in _WORD.findall(name.rsplit(":", 1)[-1])]
+        words = [part for word in _WORD.findall(name.rsplit(":", 1)[-1]) for part in _split(word.lower())]
         side: Side | None = next((_SIDES[word] for word in words if word in _SIDES), None)
         rest = [word for word in words if word not in _SIDES]
         finger = _finger_of(rest)
         if finger is None:
-            if point := _point_of(rest):
+            if name not in ends and (point := _point_of(rest)):
                 found.setdefault(side, {}).setdefault(point, []).append(name)
             continue
         one = fingers.setdefault((side, finger), _Finger())
@@ -83,6 +83,15 @@ def match_names(
         # The fingers name no side, so `hand_left` and `back_right` are markers to the left and right of something.
         return {side: points for side, points in found.items() if any(map(_is_finger, points))}
     return found
+
+
+def _split(word: str) -> list[str]:
+    """The words of one without capitals: `righthandindex`, `rthumb`."""
+    for ahead in ("left", "right", "hand", "l", "r"):
+        rest = word.removeprefix(ahead)
+        if rest != word and (rest in _FINGERS or rest in ("hand", "wrist", "palm") or len(_split(rest)) > 1):
+            return [ahead, *_split(rest)]
+    return [word]
 
 
 def _is_finger(point: str) -> bool:
@@ -130,6 +139,8 @@ def _parts(one: _Finger, thumb: bool, ends: frozenset[str]) -> dict[int, list[st
     """Joint of a finger -> the names that mean it."""
     out = {part: list(names) for part, names in one.worded.items()}
     numbers = sorted(one.numbered) if len(one.numbered) >= _COUNTED else []
+    if joints := [name for name in out.get(_TIP, []) if name not in ends]:
+        out[_TIP] = joints  # a tip of its own goes before what lies beyond it
     tips = out.get(_TIP, [])
     counted_tip = (len(numbers) == 4 and numbers[0] == 1) or len(numbers) == 5
     if tips and counted_tip and set(tips) <= ends:

@@ -130,8 +130,7 @@ def _table(
     """Points by their columns; `t_s` is the column of time as it stands, or the row's number."""
     if not columns:
         raise RecordingError(f"{path}: has no positions of anything")
-    width = 1 + max(max(own) for own in columns.values())
-    values = numbers(body, first_line, width, path)
-    t_s = np.arange(len(body), dtype=np.float64) if time_column is None else values[:, time_column]
-    position = values[:, [at for own in columns.values() for at in own]]
-    return PointTable(tuple(columns), t_s, position.reshape(len(body), -1, 3), unit)
+    times = [] if time_column is None else [time_column]
+    values = numbers(body, first_line, times + [at for own in columns.values() for at in own], path)
+    t_s = values[:, 0] if times else np.arange(len(body), dtype=np.float64)
+    return PointTable(tuple(columns), t_s, values[:, len(times) :].reshape(len(body), len(columns), 3), unit)

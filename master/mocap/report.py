@@ -21,10 +21,8 @@ _COLUMNS = (
 )
 
 
-def alignment_lines(alignment: Alignment | None) -> list[str]:
-    """How frame and clock were brought together; None: they were said to be ours."""
-    if alignment is None:
-        return ["frame and clock taken as ours (--aligned)"]
+def alignment_lines(alignment: Alignment) -> list[str]:
+    """How frame and clock were brought together."""
     turn, shift = _turn_deg(alignment), alignment.T_rig_file[:3, 3]
     fitted = (
         f"clock {1e-9 * alignment.offset_ns:+.4f} s ± {1e3 * alignment.offset_sigma_s:.1f} ms (speeds correlate by"
@@ -70,7 +68,7 @@ def table_lines(figures: Mapping[str, object]) -> list[str]:
 
 
 def alignment_json(alignment: Alignment | None) -> dict[str, object]:
-    """The same for programs."""
+    """The same for programs; None: frame and clock were said to be ours."""
     if alignment is None:
         return {"aligned": True}
     rival = alignment.rival_s

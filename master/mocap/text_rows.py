@@ -30,20 +30,21 @@ def read_rows(path: Path) -> list[list[str]]:
         raise RecordingError(f"{path}: not a text table: {error}") from error
 
 
-def numbers(rows: list[list[str]], first_line: int, width: int, path: Path) -> Float:
-    """The cells of rows as numbers (T, `width`); empty ones and those that are missing at the end are NaN.
+def numbers(rows: list[list[str]], first_line: int, columns: list[int], path: Path) -> Float:
+    """The cells of some columns as numbers (T, C); empty ones and those that a row does not have are NaN.
 
     Raises:
         RecordingError: A cell is no number; with its line and column.
     """
-    out = np.full((len(rows), width), np.nan)
+    out = np.full((len(rows), len(columns)), np.nan)
     for k, row in enumerate(rows):
-        cells = row[:width]
+        cells = [row[at] if at < len(row) else "" for at in columns]
         try:
-            out[k, : len(cells)] = [float(cell) if cell else math.nan for cell in cells]
+            out[k] = [float(cell) if cell else math.nan for cell in cells]
         except ValueError:
-            for column, cell in enumerate(cells):
-                out[k, column] = _number(cell, path, first_line + k, column)
+            out[k] = [
+                _number(cell, path, first_line + k, at) for cell, at in zip(cells, columns, strict=True)
+            ]
     return np.where(np.isfinite(out), out, np.nan)
 
 
