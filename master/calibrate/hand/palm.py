@@ -25,8 +25,8 @@ _SIDES: tuple[Side, Side] = ("right", "left")
 _LEAST_JOINTS = 4
 _ROUNDS = 5
 _OUTLIER = 4.0  # of the median distance of a frame's palm from the shape
-_FLOOR_M = 1e-3
-_SURE = 0.5  # of the direction in which fingers bend, along -y
+_FLOOR_M = 5e-3  # real palms arch by a millimetre or two
+_SURE = 0.5  # of the mean axis about which fingers bend, along +x
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +105,7 @@ def _palm_axes(shape_m: Float, joints: list[int], side: Side) -> Float:
 
 
 def _side_shown(in_shape: Float, fits: dict[Side, Float], where: str) -> Side:
-    """The hand whose fingers bend towards -y.
+    """The hand whose fingers bend towards -y, that is about +x, whatever the knuckles do.
 
     Raises:
         FitError: They bend too little, or aside.
@@ -114,15 +114,14 @@ def _side_shown(in_shape: Float, fits: dict[Side, Float], where: str) -> Side:
     chains = chains[known(chains).all(axis=(1, 2))]
     bones = np.diff(chains, axis=2)
     bones /= np.linalg.norm(bones, axis=3, keepdims=True)
-    first, second = bones[:, :, :2], bones[:, :, 1:]
-    aside = (second - (first * second).sum(axis=3, keepdims=True) * first).sum(axis=(0, 1, 2))
-    length = float(np.linalg.norm(aside))
-    along = {side: float(aside @ R[:, 1]) / max(length, 1e-12) for side, R in fits.items()}
-    right: list[Side] = [side for side in _SIDES if along[side] < -_SURE]
+    turned = np.cross(bones[:, :, :2], bones[:, :, 1:]).sum(axis=(0, 1, 2))
+    length = float(np.linalg.norm(turned))
+    along = {side: float(turned @ R[:, 0]) / max(length, 1e-12) for side, R in fits.items()}
+    right: list[Side] = [side for side in _SIDES if along[side] > _SURE]
     if len(right) != 1:
         raise FitError(
-            f"{where}: fingers bend {along['right']:+.2f} along the back of a right hand and {along['left']:+.2f} along"
-            " that of a left one, where -1 is expected of one alone: record fists; if names were matched wrongly, say"
-            " --joints"
+            f"{where}: fingers bend about an axis that is {along['right']:+.2f} that of a right hand and"
+            f" {along['left']:+.2f} that of a left one, where +1 is expected of one alone: record fists; if names were"
+            " matched wrongly, say --joints"
         )
     return right[0]

@@ -25,6 +25,7 @@ _RANGE_RAD = np.radians(20.0)  # of the PIP from the 5th to the 95th hundredth, 
 _MADE_RAD = np.radians(0.5)
 _NO_HABIT_RAD = np.radians(25.0)
 _HUBER = 1.345
+_OUTLIER = 4.0
 _TOLD = 0.25  # of a variance: less is noise
 _ROUNDS = 20
 
@@ -69,7 +70,8 @@ def flexions(chains_m: Float) -> Float:
     normal = np.cross(bones[:, :, :2], bones[:, :, 1:])  # (T, 4, 2, 3)
     hinge = normal.sum(axis=(0, 2))
     hinge /= np.maximum(np.linalg.norm(hinge, axis=1, keepdims=True), 1e-12)
-    bend = np.arctan2((normal * hinge[:, None]).sum(axis=3), (bones[:, :, :2] * bones[:, :, 1:]).sum(axis=3))
+    back = np.sign(np.einsum("tfkj,fj->tfk", normal, hinge))  # bent back: -1
+    bend = np.arctan2(back * np.linalg.norm(normal, axis=3), (bones[:, :, :2] * bones[:, :, 1:]).sum(axis=3))
     first = bones[:, :, 0]
     level = np.hypot(first[..., 0], first[..., 2]) * np.sign(first[..., 2])
     return np.concatenate([np.arctan2(-first[..., 1], level)[..., None], bend], axis=2)
@@ -133,6 +135,8 @@ def _ratio(angle: Float, pip: Float, noise_rad: tuple[float, float]) -> Ratio:
         off = np.abs(y - slope * x)
         spread = max(1.4826 * float(np.median(off)), 1e-6)
         weight = np.minimum(1.0, _HUBER * spread / np.maximum(off, 1e-12))
+    usual = off < _OUTLIER * spread
+    spread = float(np.sqrt((off[usual] ** 2).mean()))
     noise = float(np.hypot(noise_rad[0], slope * noise_rad[1]))
     left = spread * spread - noise * noise
     return Ratio(slope, float(np.sqrt(left)) if left > _TOLD * spread * spread else 0.0, noise)
