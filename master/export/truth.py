@@ -16,9 +16,10 @@ from master.mocap.compare import compare, figures
 from master.mocap.joint_motion import MARKERS, JointMotion
 from master.mocap.read import Reading, read_motion
 from master.mocap.report import alignment_json, alignment_lines, table_lines
-from master.mocap.track import Track
+from master.mocap.track import Track, known
 from master.outputs.poses import Poses
 
+_ENOUGH = 0.1  # of the valid joints: if more are TRACKED, frame and clock are fitted by these alone
 _SIX = MARKERS[:6]  # the order of a rig's markers, where nothing else is said
 
 
@@ -135,13 +136,15 @@ def _marker_names(poses: Poses, wanted: Wanted) -> tuple[str, ...]:
 
 
 def _common(poses: Poses, motion: JointMotion, marker_names: tuple[str, ...]) -> tuple[Track, Track]:
-    """Points that both have, in one order.
+    """Points that both have, in one order; of ours those that are sure, where these are enough.
 
     Raises:
         RecordingError: None.
     """
-    valid = poses.valid & np.isfinite(poses.position_m).all(axis=2)
-    joints = np.where(valid[..., None], poses.position_m, np.nan)
+    valid = poses.valid & known(poses.position_m)
+    sure = valid & poses.tracked
+    used = sure if sure.sum() > _ENOUGH * valid.sum() else valid
+    joints = np.where(used[..., None], poses.position_m, np.nan)
     both = [name for name in JOINTS if name in motion.names]
     marked = [name for name in marker_names if name in motion.names]
     if not both and not marked:

@@ -72,11 +72,11 @@ def find_palm(joints_m: Float, side: Side | None, where: str) -> Palm:
     turned = np.swapaxes(T_file_shape[:, :3, :3], 1, 2)
     moved = joints_m[whole] - T_file_shape[:, None, :3, 3]
     in_shape[whole] = np.einsum("tij,tkj->tki", turned, moved)
-    fits: dict[Side, Float] = {one: _palm_axes(shape, there, one) for one in _SIDES}
+    fits: dict[Side, Float] = {one: palm_axes(shape, there, one) for one in _SIDES}
     shown = _side_shown(in_shape[~outlier], fits, where)
     wanted = side or shown
     flip = np.array([-1.0 if wanted != shown else 1.0, 1.0, 1.0])
-    R = _palm_axes(shape * flip, there, wanted)
+    R = palm_axes(shape * flip, there, wanted)
     local = (in_shape * flip - shape[there.index(WRIST)] * flip) @ R
     own = np.full((26, 3), np.nan)
     own[there] = (shape - shape[there.index(WRIST)]) * flip @ R
@@ -97,7 +97,7 @@ def _mean_shape(body_m: Float) -> tuple[Float, Float, Float]:
     return shape, T, np.sqrt(((back - shape) ** 2).sum(axis=2).mean(axis=1))
 
 
-def _palm_axes(shape_m: Float, joints: list[int], side: Side) -> Float:
+def palm_axes(shape_m: Float, joints: list[int], side: Side) -> Float:
     """The palm's axes as columns (3, 3), in those of a shape (K, 3) of some joints."""
     rest = HandModel.of(generated_profile("palm", side)).rest_position_m[joints]
     size = np.linalg.norm(shape_m - shape_m.mean(axis=0)) / np.linalg.norm(rest - rest.mean(axis=0))

@@ -129,10 +129,11 @@ def _ratio(angle: Float, pip: Float, noise_rad: tuple[float, float]) -> Ratio:
     """Of angles (T, 4) [rad] to PIPs, where these are bent, and the noise of both."""
     bent = pip > _BENT_RAD
     x, y = pip[bent], angle[bent]
-    weight, slope, spread = np.ones(len(x)), 0.0, 0.0
+    weight, slope = np.ones(len(x)), 0.0
+    off, spread = np.zeros(len(x)), 0.0
     for _ in range(_ROUNDS):
         slope = float((weight * x * y).sum() / (weight * x * x).sum())
-        off = np.abs(y - slope * x)
+        off = np.asarray(np.abs(y - slope * x), np.float64)
         spread = max(1.4826 * float(np.median(off)), 1e-6)
         weight = np.minimum(1.0, _HUBER * spread / np.maximum(off, 1e-12))
     usual = off < _OUTLIER * spread
