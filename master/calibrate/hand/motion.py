@@ -132,7 +132,7 @@ def missing(hand: MotionHand) -> list[str]:
     out = [f"{', '.join(bases)}: at 0.3 of the way to the knuckle"] if bases else []
     out.append("radii, painted caps and the marker on the back: those of a generated hand of this length")
     out.append("limits: the default (K)")
-    return out + list(hand.posture.remarks)
+    return out
 
 
 def _provenance(hand: MotionHand) -> dict[str, Provenance]:
@@ -142,7 +142,7 @@ def _provenance(hand: MotionHand) -> dict[str, Provenance]:
         "bone_spread_mm": round(1e3 * float(hand.bone_sigma_m.mean()), 3),
         "frames": float(hand.frames),
     }
-    note = "joints of a motion capture; not in it: " + "; ".join(missing(hand))
+    note = "joints of a motion capture; not in it: " + "; ".join([*missing(hand), *hand.posture.remarks])
     out = {"rest_joints": provenance(TOOL, data, residual, note)}
     posture = hand.posture
     if posture.couplings is not None and posture.dip is not None and posture.mcp is not None:
@@ -176,12 +176,13 @@ def motion_lines(hand: MotionHand) -> list[str]:
             mean, sigma = 1e3 * hand.bone_m[finger, k], 1e3 * hand.bone_sigma_m[finger, k]
             loose = "  changes with the pose: no joint centres" if sigma > 1e3 * _LOOSE_M else ""
             lines.append(f"{label + ' ' + bone:30}{mean:8.1f}{sigma:8.2f}{loose}")
-    if posture.couplings is not None and posture.dip is not None and posture.mcp is not None:
+    if posture.dip is not None and posture.mcp is not None:
         lines.append(
-            f"couplings of {posture.moved_s:.0f} s of movement: DIP {posture.dip.per_pip:.2f} PIP ±"
+            f"couplings, by {posture.moved_s:.0f} s of movement: DIP {posture.dip.per_pip:.2f} PIP ±"
             f" {np.degrees(posture.dip.spread_rad):.0f}°, MCP {posture.mcp.per_pip:.2f} PIP ±"
             f" {np.degrees(posture.mcp.spread_rad):.0f}°"
         )
+    lines += posture.remarks
     return lines + [f"not in the file: {what}" for what in missing(hand)]
 
 
@@ -214,4 +215,5 @@ def motion_json(hand: MotionHand) -> dict[str, object]:
         "moved_s": round(posture.moved_s, 2),
         "couplings": ratios,
         "not_in_the_file": missing(hand),
+        "remarks": [*hand.motion.remarks, *posture.remarks],
     }
