@@ -52,6 +52,14 @@ RecordingRig = Annotated[
 ResultTree = Annotated[
     Path | None, typer.Option("--out", help="Tree to write the files into; may be the one in use.")
 ]
+JointNames = Annotated[
+    Path | None,
+    typer.Option(
+        "--joints",
+        metavar="FILE",
+        help='JSON of names in a motion capture: {"index-finger-tip": "NAME", ...}, null: not there.',
+    ),
+]
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the numbers to this file.")]
 Bind = Annotated[str, typer.Option(help="Own ADDRESS:PORT for the data datagrams.")]
 

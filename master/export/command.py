@@ -8,8 +8,9 @@ import typer
 
 from common.clock import now_ns
 from common.errors import PhalanxError
-from master.options import CALIB_JSON, Calibration
+from master.options import CALIB_JSON, Calibration, JointNames, JsonFile
 from master.recording.lines import ProgressLine, bar
+from master.summary import write_summary
 
 _EVERY_NS = 100_000_000
 _MOTION = ("bvh", "gltf")
@@ -20,12 +21,20 @@ def export(
         Path, typer.Argument(help="poses.npz of a run or of solve, or an .mcap recording.", metavar="SOURCE")
     ],
     to: Annotated[
-        Literal["csv", "parquet", "bvh", "gltf", "rrd"],
+        Literal["csv", "parquet", "bvh", "gltf", "rrd"] | None,
         typer.Option(
             "--to",
             help="csv, parquet: tables. bvh: motion capture. gltf: an animated, skinned hand. rrd: for Rerun.",
         ),
-    ],
+    ] = None,
+    compare: Annotated[
+        Path | None,
+        typer.Option(
+            "--compare",
+            metavar="FILE",
+            help="Instead of --to: errors of the poses against motion capture of that hand, .csv, .tsv, .bvh, .c3d.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -51,7 +60,9 @@ def export(
     rig: Annotated[
         list[str] | None,
         typer.Option(
-            "--rig", help="Of an rrd: rig of CALIBRATION/rigs; an .mcap knows its own. Once for each."
+            "--rig",
+            help="Of an rrd: rig of CALIBRATION/rigs; an .mcap knows its own. Once for each. Of --compare: whose"
+            " markers the poses have.",
         ),
     ] = None,
     rate: Annotated[
@@ -60,7 +71,7 @@ def export(
             metavar="HZ",
             min=0.1,
             max=1000.0,
-            help="Frames a second of bvh and gltf. Default: that of the poses.",
+            help="Frames a second of bvh and gltf, default that of the poses; of a --compare table without times.",
         ),
     ] = None,
     from_s: Annotated[
@@ -69,7 +80,9 @@ def export(
     to_s: Annotated[float | None, typer.Option("--until", metavar="S", help="Until there.")] = None,
     unit: Annotated[
         Literal["m", "cm", "mm"] | None,
-        typer.Option(help="Of length in a bvh; default cm. All others have metres."),
+        typer.Option(
+            help="Of length in a bvh, default cm (all others have metres); in --compare FILE, default as it says."
+        ),
     ] = None,
     up: Annotated[
         Literal["y", "rig"] | None,
@@ -78,6 +91,19 @@ def export(
             " y down, z into the scene."
         ),
     ] = None,
+    joints: JointNames = None,
+    side: Annotated[
+        Literal["left", "right"] | None, typer.Option(help="Of --compare: which hand of a file with both.")
+    ] = None,
+    aligned: Annotated[
+        bool,
+        typer.Option(
+            "--aligned",
+            help="FILE of --compare has the rig's frame, and the poses' clock or seconds from the beginning of SOURCE."
+            " Default: both are fitted.",
+        ),
+    ] = False,
+    json_file: JsonFile = None,
 ) -> None:
     """Write what was recorded of hands for other tools: tables, motion capture, an animated model, Rerun.
 
@@ -96,11 +122,37 @@ def export(
       phalanx-master export out/demo/poses.npz --to gltf -o wave.glb --hand calib_json/hands/default-right.json
 
       phalanx-master export out/demo/poses.npz --to rrd --rig desk
+
+      phalanx-master export out/me/poses.npz --compare motive.csv --side right --json errors.json
+
+      phalanx-master export out/demo/poses.npz --compare truth.csv --aligned
     """
-    _refuse(to not in _MOTION and rate is not None, "--rate", "bvh and gltf", to)
-    _refuse(to not in _MOTION and up is not None, "--up", "bvh and gltf", to)
-    _refuse(to != "bvh" and unit is not None, "--unit", "bvh", to)
-    _refuse(to != "rrd" and bool(rig), "--rig", "rrd", to)
+    if compare is not None:
+        for given, option in ((to, "--to"), (out, "--out"), (hand, "--hand"), (up, "--up")):
+            _refuse(bool(given), option, "exporting", f"--compare {compare}")
+        from master.export import truth
+        from master.export.window import Window
+        from master.mocap.read import Reading
+
+        part, how = Window(from_s, to_s), Reading(joints, unit, side, rate)
+        wanted = truth.Wanted(how, tuple(only or ()), part, aligned, calibration, tuple(rig or ()))
+        found = truth.compare_source(source, compare, wanted, lambda line: typer.echo(f"compare: {line}"))
+        if json_file is not None:
+            write_summary(json_file, found)
+        return
+    if to is None:
+        raise PhalanxError("give --to FORMAT to export, or --compare FILE to hold the poses against it")
+    for given, option in (
+        (joints, "--joints"),
+        (side, "--side"),
+        (aligned, "--aligned"),
+        (json_file, "--json"),
+    ):
+        _refuse(bool(given), option, "--compare", f"--to {to}")
+    _refuse(to not in _MOTION and rate is not None, "--rate", "bvh and gltf", f"--to {to}")
+    _refuse(to not in _MOTION and up is not None, "--up", "bvh and gltf", f"--to {to}")
+    _refuse(to != "bvh" and unit is not None, "--unit", "bvh", f"--to {to}")
+    _refuse(to != "rrd" and bool(rig), "--rig", "rrd", f"--to {to}")
     # Imported here: what writes these formats takes a second to load, which no other command should wait for.
     from master.export.bvh import Axes
     from master.export.run import Wanted
@@ -122,9 +174,9 @@ def export(
     export_source(source, wanted, progress.say, progress.tell)
 
 
-def _refuse(wrong: bool, option: str, formats: str, to: str) -> None:
+def _refuse(wrong: bool, option: str, purpose: str, this: str) -> None:
     if wrong:
-        raise PhalanxError(f"{option} is for {formats}, and this is --to {to}")
+        raise PhalanxError(f"{option} is for {purpose}, and this is {this}")
 
 
 class _Progress:

@@ -18,14 +18,28 @@ from master.calibrate.hand.measure import hand_length_of, measure_hand
 from master.calibrate.hand.observed import read_observed
 from master.calibrate.hand.save import measured_profile, quick_profile, report_json, report_lines
 from master.calibrate.tree_files import load_marker_rig, write_hand
-from master.options import CALIB_JSON, HERE_BUS, BusEnd, Calibration, JsonFile
+from master.options import CALIB_JSON, HERE_BUS, BusEnd, Calibration, JointNames, JsonFile
 from master.summary import write_summary
 
 PosesPath = Annotated[
     Path | None, typer.Option("--poses", help="poses.npz of the routine, from `replay` or a running master.")
 ]
 Name = Annotated[str, typer.Option(help="Name of the new hand file, without .json.")]
-Side = Annotated[Literal["left", "right"], typer.Option(help="Which hand.")]
+Side = Annotated[
+    Literal["left", "right"] | None,
+    typer.Option(help="Which hand; default: right, of --from as names or geometry say."),
+]
+Source = Annotated[
+    Path | None,
+    typer.Option(
+        "--from", metavar="FILE", help="Motion capture of the hand's joints: .csv, .tsv, .bvh, .c3d."
+    ),
+]
+Length = Annotated[
+    Literal["m", "cm", "mm"] | None,
+    typer.Option(help="Of length in --from; default: as it says, else by the size of the hand."),
+]
+Rate = Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Of a --from table without times.")]
 LengthMm = Annotated[
     float | None,
     typer.Option(
@@ -56,7 +70,7 @@ _RATIO_SD = 0.03  # of one that was measured, with a goniometer or in a picture
 def hand_command(
     poses: PosesPath = None,
     name: Name = "me",
-    side: Side = "right",
+    side: Side = None,
     length_mm: LengthMm = None,
     base: Base = None,
     rig: RigName = "desk",
@@ -69,8 +83,12 @@ def hand_command(
     steps: Steps = False,
     live: Live = False,
     bus: BusEnd = HERE_BUS,
+    source: Source = None,
+    joints: JointNames = None,
+    unit: Length = None,
+    rate: Rate = None,
 ) -> None:
-    """Make a hand file: from the hand's length, or measured by a guided routine of 20 s.
+    """Make a hand file: from the hand's length, measured by a guided routine of 20 s, or from motion capture.
 
     Examples:
 
@@ -81,11 +99,28 @@ def hand_command(
       phalanx-master calibrate hand --poses poses.npz --side right --name me --out calib_json
 
       phalanx-master calibrate hand --live --side right --name me --out calib_json               step by step
+
+      phalanx-master calibrate hand --from me.bvh --side right --name me --out calib_json        joints of others
     """
     if steps:
         for line in step_lines():
             typer.echo(line)
         return
+    if source is not None:
+        _check_alone(
+            poses=poses, live=live, length_mm=length_mm, hand=base, dip_per_pip=dip_per_pip, picture=picture
+        )
+        from master.calibrate.hand.motion import hand_from_motion, motion_json, motion_lines
+        from master.mocap.read import Reading, read_motion
+
+        made = hand_from_motion(read_motion(source, Reading(joints, unit, side, rate)), name)
+        for line in motion_lines(made):
+            typer.echo(line)
+        _finish(out, made.profile, motion_json(made), json_file)
+        return
+    if joints is not None or unit is not None or rate is not None:
+        raise CalibrationError("--joints, --unit and --rate are for --from FILE")
+    side = side or "right"
     template = template_of(base, side, name)
     _check_together(poses, live, length_mm, three_back)
     if poses is None and length_mm is not None and not live:
@@ -110,10 +145,21 @@ def hand_command(
             from master.calibrate.hand.picture import draw_hand
 
             draw_hand(picture, found)
+    _finish(out, profile, told, json_file)
+
+
+def _finish(out: Path | None, profile: HandProfile, told: dict[str, object], json_file: Path | None) -> None:
     written = None if out is None else write_hand(out, profile)
     typer.echo("nothing written: give --out DIR" if written is None else f"wrote {written}")
     if json_file is not None:
         write_summary(json_file, told | {"written": None if written is None else str(written)})
+
+
+def _check_alone(**others: object) -> None:
+    """Refuse options of the other ways to make a hand."""
+    for name, value in others.items():
+        if value is not None and value is not False:
+            raise CalibrationError(f"--{name.replace('_', '-')} has no meaning with --from: leave it out")
 
 
 def _check_together(poses: Path | None, live: bool, length_mm: float | None, three_back: bool) -> None:

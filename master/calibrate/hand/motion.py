@@ -1,0 +1,219 @@
+"""A hand file from a motion capture: bones and hinges from its joints, couplings where it is long enough.
+
+Bones are the mean distances of joints over all good frames, hinges follow from the planes in which fingers bend
+(`common/hand_fitting.py`). What no motion capture tells is taken from the generated profile of the same length: radii,
+where the paint sits on the tips, where the marker on the back is.
+"""
+
+from dataclasses import dataclass
+from dataclasses import replace as changed
+from pathlib import Path
+
+import numpy as np
+from msgspec.structs import replace
+
+from common.arrays import Bool, Float
+from common.calibration import HandProfile, Provenance, RestJoint
+from common.errors import FitError
+from common.geometry import matrix_to_quaternion
+from common.hand_fitting import profile_from_joints
+from common.hand_model import CHAINS, FINGERS, JOINTS, METACARPALS, WRIST, HandModel
+from common.hand_profiles import generated_profile, joint_frame
+from master.calibrate.hand.measure import hand_length_of
+from master.calibrate.hand.palm import Palm, find_palm
+from master.calibrate.hand.posture import Posture, posture_of
+from master.calibrate.hand.save import TOOL
+from master.calibrate.tree_files import provenance
+from master.mocap.compare import joint_track
+from master.mocap.joint_motion import JointMotion
+from master.mocap.read import require
+from master.mocap.track import known
+
+_LEAST_FRAMES = 60
+_OUTLIER, _FLOOR_M = 6.0, 2e-3  # of a bone's spread about its median, and at least
+_LOOSE_M = 3e-3  # a bone that changes more has no joint centres at its ends
+_NEEDED = tuple(JOINTS[joint] for joint in (WRIST, *CHAINS.ravel().tolist()))
+_BONES = (("metacarpal", "proximal", "distal"), ("proximal", "intermediate", "distal"))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionHand:
+    """A hand from a motion capture.
+
+    Attributes:
+        profile: The hand file.
+        motion: What it is from.
+        palm: Its palm.
+        posture: Its couplings.
+        bone_m, bone_sigma_m: (5, 3) [m] mean and spread over frames.
+        frames: How many were used.
+        length_m: From the wrist to the end of the middle finger.
+    """
+
+    profile: HandProfile
+    motion: JointMotion
+    palm: Palm
+    posture: Posture
+    bone_m: Float
+    bone_sigma_m: Float
+    frames: int
+    length_m: float
+
+
+def hand_from_motion(motion: JointMotion, name: str) -> MotionHand:
+    """Make a hand file of a motion.
+
+    Args:
+        motion: Wrist and the four joints of each finger at least; its `side` None: as the geometry says.
+        name: Of the hand.
+
+    Raises:
+        RecordingError: Joints are missing.
+        FitError: Too few good frames, no hand by its size, or the fingers do not tell which side is the back.
+        CalibrationError: A finger never bends.
+    """
+    require(motion, _NEEDED, "a hand")
+    joints = joint_track(motion).position_m
+    palm = find_palm(joints, motion.side, motion.source)
+    good = _good(palm)
+    if good.sum() < _LEAST_FRAMES:
+        raise FitError(
+            f"{motion.source}: {int(good.sum())} of {len(good)} frames show the whole hand with bones that keep their"
+            f" length; {_LEAST_FRAMES} are needed"
+        )
+    chains = palm.chains_m[good]
+    posture = posture_of(chains, motion.t_ns[good])
+    bones = np.linalg.norm(np.diff(chains, axis=2), axis=3)
+    profile = profile_from_joints(name, palm.side, chains, couplings=posture.couplings)
+    profile = replace(profile, rest_joints=profile.rest_joints | _metacarpals(palm.shape_m))
+    length_m = hand_length_of(HandModel.of(profile))
+    try:
+        like = generated_profile(name, palm.side, length_m)
+    except ValueError as error:
+        raise FitError(f"{motion.source}: {error}: is --unit right?") from error
+    hand = MotionHand(
+        profile, motion, palm, posture, bones.mean(axis=0), bones.std(axis=0), int(good.sum()), length_m
+    )
+    told = _provenance(hand)
+    back = profile.markers["back"]
+    profile = replace(profile, markers=like.markers | {"back": back}, radius_m=like.radius_m, provenance=told)
+    HandModel.of(profile)  # refuses what cannot be
+    return changed(hand, profile=profile)
+
+
+def _good(palm: Palm) -> Bool:
+    """Frames (T,) with all joints, whose palm is one and whose bones are as long as usual."""
+    whole = np.asarray(known(palm.chains_m).all(axis=(1, 2)), np.bool_) & ~palm.outlier
+    lengths = np.linalg.norm(np.diff(palm.chains_m, axis=2), axis=3)
+    if not whole.any():
+        return whole
+    middle = np.median(lengths[whole], axis=0)
+    spread = np.median(np.abs(lengths[whole] - middle), axis=0)
+    usual = np.abs(lengths - middle) < np.maximum(_OUTLIER * spread, _FLOOR_M)
+    return whole & np.asarray(usual.all(axis=(1, 2)), np.bool_)
+
+
+def _metacarpals(shape_m: Float) -> dict[str, RestJoint]:
+    """Rest joints of the metacarpals that a file has, each towards its knuckle."""
+    out: dict[str, RestJoint] = {}
+    for base, knuckle in zip(METACARPALS, CHAINS[1:, 0].tolist(), strict=True):
+        if not (np.isfinite(shape_m[base]).all() and np.isfinite(shape_m[knuckle]).all()):
+            continue
+        frame = joint_frame(shape_m[knuckle] - shape_m[base], np.array([0.0, 1.0, 0.0]))
+        x, y, z = (float(value) for value in shape_m[base])
+        w, i, j, k = (float(value) for value in matrix_to_quaternion(frame))
+        out[JOINTS[base]] = RestJoint(position_m=(x, y, z), orientation_wxyz=(w, i, j, k))
+    return out
+
+
+def missing(hand: MotionHand) -> list[str]:
+    """What was not in the file, and what stands for it."""
+    bases = [JOINTS[joint] for joint in METACARPALS if not np.isfinite(hand.palm.shape_m[joint]).all()]
+    out = [f"{', '.join(bases)}: at 0.3 of the way to the knuckle"] if bases else []
+    out.append("radii, painted caps and the marker on the back: those of a generated hand of this length")
+    out.append("limits: the default (K)")
+    return out
+
+
+def _provenance(hand: MotionHand) -> dict[str, Provenance]:
+    data = (Path(hand.motion.source).name,)
+    residual = {
+        "palm_rms_mm": round(1e3 * hand.palm.rms_m, 3),
+        "bone_spread_mm": round(1e3 * float(hand.bone_sigma_m.mean()), 3),
+        "frames": float(hand.frames),
+    }
+    note = "joints of a motion capture; not in it: " + "; ".join([*missing(hand), *hand.posture.remarks])
+    out = {"rest_joints": provenance(TOOL, data, residual, note)}
+    posture = hand.posture
+    if posture.couplings is not None and posture.dip is not None and posture.mcp is not None:
+        spreads = {
+            "dip_spread_deg": round(float(np.degrees(posture.dip.spread_rad)), 2),
+            "mcp_spread_deg": round(float(np.degrees(posture.mcp.spread_rad)), 2),
+            "moved_s": round(posture.moved_s, 1),
+        }
+        out["couplings"] = provenance(TOOL, data, spreads, "index ... little together")
+    return out
+
+
+def motion_lines(hand: MotionHand) -> list[str]:
+    """The report for a person."""
+    palm, posture = hand.palm, hand.posture
+    lines = [*hand.motion.remarks]
+    said = "as its names or --side say" if hand.motion.side else "as its fingers bend"
+    lines.append(
+        f"{palm.side} hand ({said}), {1e3 * hand.length_m:.0f} mm long, from {hand.frames} of {len(palm.outlier)}"
+        f" frames; the palm's joints keep their places to {1e3 * palm.rms_m:.1f} mm"
+    )
+    if palm.mirrored:
+        other = "left" if palm.side == "right" else "right"
+        lines.append(
+            f"its geometry is that of a {other} hand: its axes are left-handed (Unity, Unreal) and were turned over;"
+            f" if it is a {other} hand, say --side {other}"
+        )
+    lines.append(f"{'bone':30}{'mm':>8}{'spread':>8}")
+    for finger, label in enumerate(FINGERS):
+        for k, bone in enumerate(_BONES[min(finger, 1)]):
+            mean, sigma = 1e3 * hand.bone_m[finger, k], 1e3 * hand.bone_sigma_m[finger, k]
+            loose = "  changes with the pose: no joint centres" if sigma > 1e3 * _LOOSE_M else ""
+            lines.append(f"{label + ' ' + bone:30}{mean:8.1f}{sigma:8.2f}{loose}")
+    if posture.dip is not None and posture.mcp is not None:
+        lines.append(
+            f"couplings, by {posture.moved_s:.0f} s of movement: DIP {posture.dip.per_pip:.2f} PIP ±"
+            f" {np.degrees(posture.dip.spread_rad):.0f}°, MCP {posture.mcp.per_pip:.2f} PIP ±"
+            f" {np.degrees(posture.mcp.spread_rad):.0f}°"
+        )
+    lines += posture.remarks
+    return lines + [f"not in the file: {what}" for what in missing(hand)]
+
+
+def motion_json(hand: MotionHand) -> dict[str, object]:
+    """The same for programs [mm, degrees]."""
+    posture = hand.posture
+    ratios = {
+        name: {
+            "per_pip": ratio.per_pip,
+            "spread_deg": float(np.degrees(ratio.spread_rad)),
+            "noise_deg": float(np.degrees(ratio.noise_rad)),
+        }
+        for name, ratio in (("dip", posture.dip), ("mcp", posture.mcp))
+        if ratio is not None
+    }
+    return {
+        "side": hand.palm.side,
+        "mirrored": hand.palm.mirrored,
+        "hand_length_mm": round(1e3 * hand.length_m, 2),
+        "frames": hand.frames,
+        "palm_rms_mm": round(1e3 * hand.palm.rms_m, 4),
+        "bones": {
+            f"{label}_{bone}": {
+                "mm": round(1e3 * float(hand.bone_m[finger, k]), 3),
+                "spread_mm": round(1e3 * float(hand.bone_sigma_m[finger, k]), 3),
+            }
+            for finger, label in enumerate(FINGERS)
+            for k, bone in enumerate(_BONES[min(finger, 1)])
+        },
+        "moved_s": round(posture.moved_s, 2),
+        "couplings": ratios,
+        "not_in_the_file": missing(hand),
+        "remarks": [*hand.motion.remarks, *posture.remarks],
+    }

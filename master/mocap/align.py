@@ -1,0 +1,206 @@
+"""Where the frame of a motion capture lies in ours, and how its clock stands to ours.
+
+The offset of the clocks is found first by speeds (`speed_match.py`). Then turn R, shift s and offset
+d together by Gauss-Newton with the weights of Geman & McClure, from the rigid fit of Kabsch (1976):
+
+    p_ours(t) = R p_theirs(t - d) + s
+
+How sure they are is told by the jackknife over consecutive parts (Efron & Tibshirani, 1993, chapter 11), because errors
+last from frame to frame. What is fitted hides what is constant: an error of where our frame lies, and a delay of ours.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float, Int
+from common.errors import FitError
+from common.geometry import fit_rigid, rigid, rotation_vector_to_matrix
+from master.mocap.speed_match import HALF_NS, clock_offset
+from master.mocap.track import Track, known
+
+_ITERATIONS = 30
+_PARTS = 8
+_LEAST_ROWS = 30
+_LEAST_SPREAD_M = 0.005  # across the line that points lie along: less does not tell a turn
+_MIRROR = 0.5  # of the residual
+_FLOOR_M = 1e-5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """From the frame and clock of a motion capture to ours.
+
+    Attributes:
+        T_rig_file: (4, 4) their positions to ours; a mirroring where `mirrored`.
+        offset_ns: Our time less theirs.
+        rotation_sigma_deg, shift_sigma_m, offset_sigma_s: Standard deviations; of the shift amid the points.
+        residual_m: Median distance that is left.
+        correlation: Of the speeds; NaN where nothing was fitted.
+        rival_s: Another offset is nearly as likely, this much later; NaN: none.
+        mirrored: Their axes are left-handed, or it is the other hand.
+    """
+
+    T_rig_file: Float
+    offset_ns: int = 0
+    rotation_sigma_deg: float = 0.0
+    shift_sigma_m: float = 0.0
+    offset_sigma_s: float = 0.0
+    residual_m: float = float("nan")
+    correlation: float = float("nan")
+    rival_s: float = float("nan")
+    mirrored: bool = False
+
+    def moved(self, track: Track) -> Track:
+        """Their points in our frame, on our clock."""
+        position = track.position_m @ self.T_rig_file[:3, :3].T + self.T_rig_file[:3, 3]
+        return Track(track.t_ns + self.offset_ns, position)
+
+
+def align(ours: Track, theirs: Track) -> Alignment:
+    """Find frame and clock of `theirs` from points that both have, in the same order.
+
+    Raises:
+        FitError: They do not move alike, share too little, or all points lie on a line.
+    """
+    offset_ns, correlation, rival_s = clock_offset(ours, theirs)
+    rows = _rows(ours)
+    target = ours.position_m[rows]
+    start = [_registered(theirs.at(ours.t_ns[rows] - offset_ns), target, mirror) for mirror in (False, True)]
+    mirrored = start[1][1] < _MIRROR * start[0][1]
+    flip = np.diag([1.0, 1.0, -1.0]) if mirrored else np.eye(3)
+    T = start[1][0] if mirrored else start[0][0]
+    fit = _Fit.of(ours, Track(theirs.t_ns, theirs.position_m @ flip), rows, T @ _four(flip), float(offset_ns))
+    sigma = fit.sigma()
+    return Alignment(
+        T_rig_file=fit.T @ _four(flip),
+        offset_ns=round(fit.offset_ns),
+        rotation_sigma_deg=float(np.degrees(np.linalg.norm(sigma[:3]))),
+        shift_sigma_m=float(np.linalg.norm(sigma[3:6])),
+        offset_sigma_s=float(sigma[6]),
+        residual_m=fit.residual_m,
+        correlation=correlation,
+        rival_s=rival_s,
+        mirrored=mirrored,
+    )
+
+
+def _rows(ours: Track) -> Int:
+    """At most some thousand rows, evenly."""
+    return np.unique(np.linspace(0, len(ours.t_ns) - 1, min(len(ours.t_ns), 4000)).astype(np.int64))
+
+
+def _registered(source: Float, target: Float, mirror: bool) -> tuple[Float, float]:
+    """The rigid motion (4, 4) of points (N, J, 3) to others, robustly, and the median distance left [m].
+
+    Raises:
+        FitError: Too few points, or all on a line.
+    """
+    if mirror:
+        source = source * [1.0, 1.0, -1.0]
+    both = known(source) & known(target)
+    p, q = source[both], target[both]
+    if both.any(axis=1).sum() < _LEAST_ROWS:
+        raise FitError(
+            f"poses and motion capture share {int(both.any(axis=1).sum())} instants, at least {_LEAST_ROWS} are needed"
+        )
+    _check_spread(p)
+    weight, off = np.ones(len(p)), np.zeros(len(p))
+    T = np.eye(4)
+    for _ in range(_ITERATIONS):
+        T = fit_rigid(q, p, weight)
+        off = np.linalg.norm(p @ T[:3, :3].T + T[:3, 3] - q, axis=1)
+        weight = _weights(off)
+    T = T @ _four(np.diag([1.0, 1.0, -1.0])) if mirror else T
+    return T, float(np.median(off))
+
+
+def _check_spread(points: Float) -> None:
+    """Refuse points (N, 3) that lie on a line.
+
+    Raises:
+        FitError: They do.
+    """
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1]
+    if spread < _LEAST_SPREAD_M * np.sqrt(len(points)):
+        raise FitError(
+            "the points that poses and motion capture share lie on a line: no turn is told by them"
+        )
+
+
+def _weights(off: Float) -> Float:
+    """Of Geman & McClure, with three times the median distance as scale."""
+    scale = max(3.0 * float(np.median(off)), _FLOOR_M)
+    return 1.0 / (1.0 + (off / scale) ** 2) ** 2
+
+
+def _four(linear: Float) -> Float:
+    return rigid(linear, np.zeros(3))
+
+
+@dataclass(slots=True)
+class _Fit:
+    """Turn, shift and offset together; holds the normal equations of each part of the time."""
+
+    T: Float
+    offset_ns: float
+    residual_m: float
+    normal: Float
+    gradient: Float
+
+    @classmethod
+    def of(cls, ours: Track, theirs: Track, rows: Int, T: Float, offset_ns: float) -> "_Fit":
+        """Fit from a start; `T` maps `theirs`."""
+        t_ns, target = ours.t_ns[rows], ours.position_m[rows]
+        part = np.minimum(_PARTS * np.arange(len(rows)) // len(rows), _PARTS - 1)
+        fit = cls(T, offset_ns, np.inf, np.zeros((_PARTS, 7, 7)), np.zeros((_PARTS, 7)))
+        for _ in range(_ITERATIONS):
+            at = t_ns - round(fit.offset_ns)
+            R = fit.T[:3, :3]
+            found = theirs.at(at) @ R.T + fit.T[:3, 3]
+            speed = theirs.velocity(at, HALF_NS) @ R.T
+            speed = np.where(np.isfinite(speed), speed, 0.0)
+            both = known(found) & known(target)
+            middle = found[both].mean(axis=0)
+            fit._normal(found, target, speed, both, part, middle)
+            step = _solved(fit.normal.sum(axis=0), fit.gradient.sum(axis=0))
+            turned = rotation_vector_to_matrix(step[:3])
+            fit.T = rigid(turned, middle - turned @ middle + step[3:6]) @ fit.T
+            fit.offset_ns += float(np.clip(1e9 * step[6], -5e7, 5e7))
+            if np.abs(step[:3]).max() < 1e-7 and np.abs(step[3:6]).max() < 1e-7 and abs(step[6]) < 1e-6:
+                break
+        return fit
+
+    def _normal(
+        self, found: Float, target: Float, speed: Float, both: Bool, part: Int, middle: Float
+    ) -> None:
+        """Normal equations of (turn [rad] about the middle, shift [m], offset [s]) for each part."""
+        off = np.where(both[..., None], target - found, 0.0)
+        distance = np.linalg.norm(off[both], axis=1)
+        self.residual_m = float(np.median(distance))
+        weight = np.zeros(both.shape)
+        weight[both] = _weights(distance)
+        jacobian = np.zeros((*both.shape, 3, 7))
+        arm = np.where(both[..., None], found - middle, 0.0)
+        for axis in range(3):
+            jacobian[..., axis] = np.cross(np.eye(3)[axis], arm)
+            jacobian[..., axis, 3 + axis] = 1.0
+        jacobian[..., 6] = -speed
+        weighted = jacobian * weight[..., None, None]
+        for k in range(_PARTS):
+            own = part == k
+            a = weighted[own].reshape(-1, 7)
+            self.normal[k] = a.T @ jacobian[own].reshape(-1, 7)
+            self.gradient[k] = a.T @ off[own].reshape(-1)
+
+    def sigma(self) -> Float:
+        """Standard deviations (7,) of turn [rad], shift [m] and offset [s]: what leaving out one part changes."""
+        A, g = self.normal.sum(axis=0), self.gradient.sum(axis=0)
+        without = [_solved(A - self.normal[k], g - self.gradient[k]) for k in range(_PARTS)]
+        spread = np.array(without) - np.mean(without, axis=0)
+        return np.sqrt((_PARTS - 1) / _PARTS * (spread**2).sum(axis=0))
+
+
+def _solved(normal: Float, gradient: Float) -> Float:
+    """The step (7,) of normal equations; what nothing tells (the offset of a hand that rests) stays as it is."""
+    return np.asarray(np.linalg.pinv(normal, rcond=1e-9, hermitian=True) @ gradient, np.float64)

@@ -1,0 +1,230 @@
+"""How far poses are from a motion capture of the same hand: errors, coverage of stated regions, false TRACKED.
+
+Angles are those between bones, from the joints of both alike, so that nobody's definition of zero matters: PIP and DIP
+between the two bones at the joint, MCP between the proximal bone and the metacarpal (the line from the wrist, where the
+file has no metacarpal joint); of a thumb the MCP and IP. A TRACKED joint is *false* where it is off by 15 mm, or the
+PIP of its finger by 20 degrees (a thumb's MCP), as in `bench/oracle_score.py`.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float, Int
+from common.hand_model import FINGER_JOINTS, FINGERS, JOINTS, WRIST
+from master.mocap.align import Alignment
+from master.mocap.joint_motion import JointMotion
+from master.mocap.track import Track, known
+from master.outputs.poses import Poses
+
+FALSE_MM, FALSE_DEG = 15.0, 20.0
+CHI2_95, CHI2_50 = 7.814727903, 2.365973884
+"""Quantiles of a chi-square of 3 degrees of freedom."""
+_FLOOR_M2 = 1e-10  # added to covariances: 0.01 mm, so that one without width can be inverted
+CLASSES = ("wrist", "palm", "metacarpal", "phalanx-proximal", "phalanx-intermediate", "phalanx-distal", "tip")
+_ANGLES = ("mcp", "pip", "dip")
+_OF_FINGER = np.zeros((26, 5), np.bool_)
+for _finger, _joints in enumerate(FINGER_JOINTS):
+    _OF_FINGER[list(_joints), _finger] = True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Compared:
+    """Poses against truth, at the T instants of the poses that lie in the time of the truth.
+
+    Attributes:
+        off_m: (T, 26, 3) [m], rig frame; NaN where the truth is not known or the joint is not valid.
+        known: (T, 26) whether there is a truth.
+        tracked: (T, 26).
+        chi2: (T, 26) of the error under the stated covariance; NaN: no error, or no covariance (outside any region).
+        angle_deg: (T, 5, 3) error of MCP, PIP, DIP (thumb: NaN, MCP, IP); NaN: not known.
+        marker_mm: (T, M) error of markers; NaN: not known.
+        marker_names: (M,)
+        own_frame_m: (T, 26, 3) `off_m` in the joint's axes, where a joint centre that is placed elsewhere is constant.
+    """
+
+    off_m: Float
+    known: Bool
+    tracked: Bool
+    chi2: Float
+    angle_deg: Float
+    marker_mm: Float
+    marker_names: tuple[str, ...]
+    own_frame_m: Float
+
+    @property
+    def mm(self) -> Float:
+        """(T, 26) length of the errors."""
+        return 1e3 * np.linalg.norm(self.off_m, axis=2)
+
+    @property
+    def false(self) -> Bool:
+        """(T, 26) TRACKED joints that are off."""
+        bent = np.nan_to_num(self.angle_deg[:, :, 1]) > FALSE_DEG
+        wrong = (np.nan_to_num(self.mm) > FALSE_MM) | (bent[:, None, :] & _OF_FINGER).any(axis=2)
+        return self.tracked & wrong
+
+
+def joint_track(motion: JointMotion) -> Track:
+    """All 26 joints of a motion; NaN where it has none."""
+    return Track(motion.t_ns, np.stack([motion.of(name) for name in JOINTS], axis=1))
+
+
+def compare(
+    poses: Poses, motion: JointMotion, alignment: Alignment, marker_names: tuple[str, ...]
+) -> Compared:
+    """Hold poses against a motion.
+
+    Args:
+        poses: Of one hand.
+        motion: The truth.
+        alignment: From its frame and clock to ours.
+        marker_names: Of the poses; empty: not known.
+    """
+    truth = alignment.moved(joint_track(motion))
+    inside = (poses.t_ns >= truth.t_ns[0]) & (poses.t_ns <= truth.t_ns[-1])
+    t_ns: Int = poses.t_ns[inside]
+    exact = truth.at(t_ns)
+    valid = poses.valid[inside] & known(poses.position_m[inside])
+    found = np.where(valid[..., None], poses.position_m[inside], np.nan)
+    off = found - exact
+    names = tuple(name for name in marker_names if name in motion.names)
+    own = Track(motion.t_ns, np.stack([motion.of(name) for name in names], axis=1)) if names else None
+    rows = [marker_names.index(name) for name in names]
+    marker_mm = np.zeros((len(t_ns), 0))
+    if own is not None:
+        marker_mm = 1e3 * np.linalg.norm(
+            poses.markers_m[inside][:, rows] - alignment.moved(own).at(t_ns), axis=2
+        )
+    return Compared(
+        off_m=off,
+        known=known(exact),
+        tracked=poses.tracked[inside] & valid & known(exact),
+        chi2=_chi2(off, poses.cov_m2[inside]),
+        angle_deg=_angle_errors(found, exact),
+        marker_mm=marker_mm,
+        marker_names=names,
+        own_frame_m=_in_joint_axes(off, poses.orientation_wxyz[inside]),
+    )
+
+
+def _chi2(off_m: Float, cov_m2: Float) -> Float:
+    """Squared Mahalanobis length (T, 26) of errors; infinite where there is an error and no covariance."""
+    stated = np.asarray(known(cov_m2).all(axis=2), np.bool_)
+    cov = np.where(stated[..., None, None], cov_m2, np.eye(3)) + _FLOOR_M2 * np.eye(3)
+    value = (off_m * np.linalg.solve(cov, off_m[..., None])[..., 0]).sum(axis=2)
+    return np.where(stated | np.isnan(value), value, np.inf)
+
+
+def _in_joint_axes(off_m: Float, q_wxyz: Float) -> Float:
+    """Vectors (T, 26, 3) in the axes of their joints."""
+    w, axis = q_wxyz[..., :1], -q_wxyz[..., 1:]
+    side = 2.0 * np.cross(axis, off_m)
+    return off_m + w * side + np.cross(axis, side)
+
+
+def _angle_errors(found: Float, exact: Float) -> Float:
+    """|Errors| (T, 5, 3) [deg] of the angles between bones."""
+    bases = np.asarray(known(exact).any(axis=0), np.bool_)
+    return np.abs(_angles(found, bases) - _angles(exact, bases))
+
+
+def _angles(joints: Float, bases: Bool) -> Float:
+    """Angles (T, 5, 3) [deg] between bones of joints (T, 26, 3); `bases` (26,): metacarpals of fingers to be used."""
+    out = np.full((len(joints), 5, 3), np.nan)
+    for finger, (first, *chain) in enumerate(FINGER_JOINTS):
+        base = first if finger == 0 or bases[first] else WRIST
+        for at, (a, b, c) in enumerate(zip((base, *chain), chain, chain[1:], strict=False)):
+            column = at + (finger == 0)  # a thumb's chain has one joint less, at its beginning
+            out[:, finger, column] = _between(joints[:, b] - joints[:, a], joints[:, c] - joints[:, b])
+    return out
+
+
+def _between(first: Float, second: Float) -> Float:
+    """Angles (T,) [deg] between vectors (T, 3)."""
+    sine = np.linalg.norm(np.cross(first, second), axis=1)
+    return np.degrees(np.arctan2(sine, (first * second).sum(axis=1)))
+
+
+def figures(compared: Compared) -> dict[str, object]:
+    """All figures by name: of the whole hand, by class of joint, by finger, by angle; None: nothing to average."""
+    every = np.ones(26, np.bool_)
+    fingers = {name: _finger_figures(compared, f) for f, name in enumerate(FINGERS)}
+    classes = {kind: _figures(compared, _of_class(kind)) for kind in CLASSES}
+    angles = {name: _spread(compared.angle_deg[:, 1:, k], "deg") for k, name in enumerate(_ANGLES)}
+    markers = {name: _spread(compared.marker_mm[:, k], "mm") for k, name in enumerate(compared.marker_names)}
+    return {
+        "poses": len(compared.off_m),
+        **_figures(compared, every),
+        "mcp_deg": angles["mcp"]["mean_deg"],
+        "pip_deg": angles["pip"]["mean_deg"],
+        "angles": angles,
+        "classes": {kind: own for kind, own in classes.items() if own["joint_mm"] is not None},
+        "fingers": fingers,
+        "markers": markers,
+    }
+
+
+def _of_class(kind: str) -> Bool:
+    return np.array([name == kind or name.endswith(f"-{kind}") for name in JOINTS])
+
+
+def _finger_figures(compared: Compared, finger: int) -> dict[str, object]:
+    angles = ("none", "mcp", "ip") if finger == 0 else _ANGLES
+    own = {
+        f"{name}_deg": _mean(compared.angle_deg[:, finger, k])
+        for k, name in enumerate(angles)
+        if name != "none"
+    }
+    return {**_figures(compared, _OF_FINGER[:, finger]), **own}
+
+
+def _figures(compared: Compared, joints: Bool) -> dict[str, float | None]:
+    """Of some of the joints."""
+    mm, chi2 = compared.mm[:, joints], compared.chi2[:, joints]
+    exact, tracked = compared.known[:, joints], compared.tracked[:, joints]
+    scored = np.isfinite(mm)
+    chi2 = np.where(scored, chi2, np.nan)
+    of_tracked = np.where(tracked, chi2, np.nan)
+    constant = compared.own_frame_m[:, joints]
+    return {
+        "joint_mm": _mean(mm),
+        "joint_mm_p95": _percentile(mm, 95.0),
+        "joint_mm_constant": _constant_mm(constant),
+        "valid_percent": _percent(scored[exact]),
+        "tracked_percent": _percent(tracked[exact]),
+        "false_tracked_percent": _percent(compared.false[:, joints][tracked]),
+        "coverage_95_percent": _percent((chi2 <= CHI2_95)[scored]),
+        "coverage_50_percent": _percent((chi2 <= CHI2_50)[scored]),
+        "tracked_coverage_95_percent": _percent((of_tracked <= CHI2_95)[tracked]),
+        "tracked_mm": _mean(mm[tracked]),
+    }
+
+
+def _constant_mm(own_frame_m: Float) -> float | None:
+    """The mean over joints of the length of the mean error in the joint's axes [mm]."""
+    there = known(own_frame_m)
+    lengths = [
+        float(np.linalg.norm(own_frame_m[there[:, j], j].mean(axis=0)))
+        for j in range(own_frame_m.shape[1])
+        if there[:, j].any()
+    ]
+    return 1e3 * float(np.mean(lengths)) if lengths else None
+
+
+def _spread(values: Float, unit: str) -> dict[str, float | None]:
+    return {f"mean_{unit}": _mean(values), f"p95_{unit}": _percentile(values, 95.0)}
+
+
+def _mean(values: Float) -> float | None:
+    some = values[np.isfinite(values)]
+    return float(some.mean()) if some.size else None
+
+
+def _percentile(values: Float, share: float) -> float | None:
+    some = values[np.isfinite(values)]
+    return float(np.percentile(some, share)) if some.size else None
+
+
+def _percent(values: Bool) -> float | None:
+    return 100.0 * float(values.mean()) if values.size else None
