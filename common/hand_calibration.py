@@ -36,13 +36,15 @@ HandAngle = Annotated[float, Meta(ge=-6.2832, le=6.2832)]  # [rad] a turn
 Span = tuple[HandAngle, HandAngle]
 Ratio = Annotated[float, Meta(ge=0.0, le=10.0)]  # of two angles of one finger
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+Tolerance = Annotated[float, Meta(ge=0.0, le=1.0)]  # [rad]
 
 
 class FingerLimits(Part, frozen=True):
     """Low and high of the four angles [rad], zero in the rest pose; for the thumb CMC, CMC, MCP, IP.
 
     `spread_at_full_flexion`: share of the abduction range that is left at the highest flexion, less on the way there;
-    1: the range stays.
+    1: the range stays. `tolerance_rad`: standard deviation by which people differ from these limits, for each angle; 0:
+    a wall.
     """
 
     abduction_rad: Span
@@ -50,6 +52,7 @@ class FingerLimits(Part, frozen=True):
     pip_rad: Span
     dip_rad: Span
     spread_at_full_flexion: Share = 1.0
+    tolerance_rad: tuple[Tolerance, Tolerance, Tolerance, Tolerance] = (0.0, 0.0, 0.0, 0.0)
 
 
 class Limits(Part, frozen=True):
@@ -75,6 +78,33 @@ class Couplings(Part, frozen=True):
     neighbours: bool = True
 
 
+Variance = Annotated[float, Meta(ge=-10.0, le=10.0)]  # [rad^2] or covariance
+Four = tuple[HandAngle, HandAngle, HandAngle, HandAngle]
+FourVariances = tuple[Variance, Variance, Variance, Variance]
+
+
+class FingerPosture(Part, frozen=True):
+    """How a person holds a finger: a normal distribution of its four angles (columns of `HandModel`).
+
+    Attributes:
+        mean_rad: Abduction, flexion, PIP, DIP (thumb CMC, CMC, MCP, IP).
+        cov_rad2: (4, 4) covariance.
+    """
+
+    mean_rad: Four
+    cov_rad2: tuple[FourVariances, FourVariances, FourVariances, FourVariances]
+
+
+class Posture(Part, frozen=True):
+    """The posture prior of one person, fitted to motion."""
+
+    thumb: FingerPosture
+    index: FingerPosture
+    middle: FingerPosture
+    ring: FingerPosture
+    little: FingerPosture
+
+
 Preset = Literal["K", "D"]
 Finger = Literal["thumb", "index", "middle", "ring", "little"]
 PalmarScale = Annotated[float, Meta(ge=0.5, le=2.0)]
@@ -84,6 +114,8 @@ class HandProfile(Part, frozen=True):
     """hands/<name>.json: bones and markers of one hand, optionally radii, skin, limits and couplings.
 
     Limits and couplings may be the name of a preset: K (Kalbfleisch; also where there are none) or D (Digits).
+    `posture`: how this person holds the fingers, in place of the couplings' prior; needs a DIP that is not coupled
+    exactly.
     `palmar_scale`: finger -> how thick its palmar flesh is against that which the radii or the size of the hand tell,
     as a wrist device measures it; 1 where a finger is not named.
     """
@@ -97,6 +129,7 @@ class HandProfile(Part, frozen=True):
     palmar_scale: dict[Finger, PalmarScale] = {}
     limits_rad: Limits | Preset | None = None
     couplings: Couplings | Preset | None = None
+    posture: Posture | None = None
     provenance: dict[str, Provenance] = {}
 
 

@@ -7,22 +7,34 @@ hinges follow from the planes in which fingers bend. With n the normal of that p
     finger   n = R_y(abduction) n_rest: its height in the palm is the same in every frame and gives the hinge's roll
     thumb    n = R_rest R_y(abduction) x: all n lie in one plane, whose normal is the abduction's axis
 
-A finger's rest direction lies in the palm's plane and in that in which it bends where it is most extended; at rest all
-its bones are in one line. What is left is how far our joints (`docs/frames.md`) differ from the recorded ones:
+A finger's rest heading is the median of where its first bone points in the palm's plane, less what the roll of its
+hinge turns it by at its flexion: so abduction is zero in the middle of the motion. At rest all bones of a finger are in
+one line. What is left is how far our joints (`docs/frames.md`) differ from the recorded ones:
 abduction turns about the palm's y for every finger, and other hands lean that axis by 10 to 20 degrees.
 """
 
+import logging
+
 import numpy as np
+from msgspec.structs import replace
 
 from common.arrays import Float, Int
 from common.calibration import Couplings, HandProfile, Limits, MarkerMount, Quaternion, RestJoint, Vector3
 from common.errors import CalibrationError
 from common.geometry import matrix_to_quaternion
-from common.hand_model import CHAINS, METACARPALS, PALM_FRAME, TIPS, WEBXR_JOINTS
+from common.hand_model import CHAINS, METACARPALS, PALM_FRAME, TIPS, WEBXR_JOINTS, HandModel
+from common.hand_posture import fit_posture, joint_angles, reached_limits
+from common.hand_presets import preset_limits
 from common.hand_profiles import THUMB_DORSAL, joint_frame
 
+_LOG = logging.getLogger(__name__)
+
 _BENT = np.radians(5.0)  # a finger that never bends further has no plane
-_EXTENDED = 0.1  # share of the frames that counts as most extended
+_EXTENDED = 0.1  # share of the frames that counts as most extended, of a thumb
+_LEVEL = 0.5  # cosine of the flexion beyond which the heading of a finger is not to be told
+_LEAST_SPREAD = np.radians(2.0)  # of a DIP about its share of the PIP: no hand is a gear
+_FOLLOWED_M = 5e-3  # mean distance of recorded joints beyond which a finger is not followed
+_ASIDE_DEG = 15.0  # of a rest heading, from the median of the motion
 _BASE = 0.3  # metacarpal joints lie about there on the way from the wrist to the knuckles
 _BACK_M = 0.012  # the skin of the back above the bones
 _MARKERS = ("thumb", "index", "middle", "ring", "little")
@@ -86,11 +98,12 @@ def profile_from_joints(
         name: Of the profile.
         side: "left" or "right".
         fingers_m: (T, 5, 4, 3) [m] joints of the fingers' chains (`CHAINS`) in the palm frame, origin at the wrist.
-        limits: Of the angles; None: the default.
-        couplings: None: the default.
+        limits: Of the angles; None: those of preset K, moved out to where the motion went.
+        couplings: None: couplings and posture prior are fitted to the motion.
 
     Raises:
-        CalibrationError: The side is neither, or a finger never bends by 5 degrees: its hinge is not known.
+        CalibrationError: The side is neither, a finger never bends by 5 degrees, so that its hinge is not known, or it
+            always points down or up, so that its heading is not.
     """
     roots = np.median(fingers_m[:, :, 0], axis=0)
     steps = np.diff(fingers_m, axis=2)
@@ -116,20 +129,75 @@ def profile_from_joints(
         position[base] = _BASE * position[knuckle]
         rotation[base] = joint_frame(position[knuckle], np.array([0.0, 1.0, 0.0]))
     from_palm = np.diag([-1.0, 1.0, -1.0])
-    return profile_from_rest(
+    profile = profile_from_rest(
         name, side, position[1:] @ from_palm, from_palm @ rotation[1:], limits, couplings
     )
+    model = HandModel.of(profile)
+    angles = joint_angles(model, fingers_m)
+    _warn(model, fingers_m, angles)
+    if limits is None:
+        profile = replace(profile, limits_rad=reached_limits(preset_limits("K"), angles))
+    return profile if couplings is not None else _with_posture(profile, angles)
+
+
+def _warn(model: HandModel, fingers_m: Float, angles: Float) -> None:
+    """Say which fingers the profile does not follow, and whose rest heading is not that of the motion."""
+    known = np.nan_to_num(angles)
+    off = np.linalg.norm(model.chains(known).position_m - fingers_m, axis=3).mean(axis=(0, 2))
+    steps = np.diff(fingers_m[:, 1:, :2], axis=2)[:, :, 0]
+    flat = np.hypot(steps[..., 0], steps[..., 2]) > _LEVEL * np.linalg.norm(steps, axis=2)
+    azimuth = np.where(flat, np.arctan2(steps[..., 0], steps[..., 2]), np.nan)
+    rest = -model.rest_rotation[CHAINS[1:, 0], :, 2]
+    aside = np.degrees(np.nanmedian(azimuth, axis=0) - np.arctan2(rest[:, 0], rest[:, 2]))
+    for f, finger in enumerate(_MARKERS):
+        if off[f] > _FOLLOWED_M:
+            _LOG.warning(
+                "hand %r: the %s of the profile is %.0f mm off the recorded joints: its hinges differ from ours",
+                model.profile.name,
+                finger,
+                1e3 * off[f],
+            )
+        if f and abs(aside[f - 1]) > _ASIDE_DEG:
+            _LOG.warning(
+                "hand %r: the rest heading of the %s is %.0f degrees off the median of the motion: record it open, too",
+                model.profile.name,
+                finger,
+                aside[f - 1],
+            )
+
+
+def _with_posture(profile: HandProfile, angles: Float) -> HandProfile:
+    """The profile with couplings and posture prior fitted to angles (T, 5, 4) [rad]."""
+    flexion, pip, dip = angles[:, 1:, 1].ravel(), angles[:, 1:, 2].ravel(), angles[:, 1:, 3].ravel()
+    power = float(pip @ pip)
+    ratio = max(float(pip @ dip) / power, 0.0)
+    spread = max(float((dip - ratio * pip).std()), _LEAST_SPREAD)
+    couplings = Couplings(
+        dip_per_pip=round(ratio, 4),
+        dip_spread_rad=round(spread, 4),
+        mcp_per_pip=round(max(float(pip @ flexion) / power, 0.0), 4),
+    )
+    return replace(profile, couplings=couplings, posture=fit_posture(angles))
 
 
 def _finger_rest(bones: Float, normals: Float) -> Float:
     """Rest frame (3, 3) of a finger of unit bones (T, 3, 3) and bend normals (T, 3), palm frame."""
-    bent = np.linalg.norm(normals, axis=1)
-    height = normals[:, 1].sum() / bent.sum()
-    known = bent > 2.0 * np.sin(_BENT)
-    heading = np.cross(normals[known][_extended(bones[known])].sum(axis=0), [0.0, 1.0, 0.0])
-    heading /= np.linalg.norm(heading)
+    height = normals[:, 1].sum() / np.linalg.norm(normals, axis=1).sum()
+    level = np.sqrt(1.0 - height * height)  # cosine of the roll of the hinge, `height` its sine
+    # The proximal bone at flexion a: -level sin a above the palm, and ahead and aside of the rest heading in it.
+    sine = np.clip(-bones[:, 0, 1] / level, -1.0, 1.0)
+    ahead = np.sqrt(1.0 - sine * sine)
+    turned = np.arctan2(bones[:, 0, 0], bones[:, 0, 2]) - np.arctan2(height * sine, ahead)
+    turned = turned[ahead > _LEVEL]
+    if len(turned) == 0:
+        raise CalibrationError(
+            "a finger points down or up in every frame, so its heading is not known: open the hand"
+        )
+    middle = np.arctan2(np.sin(turned).mean(), np.cos(turned).mean())
+    middle += np.median((turned - middle + np.pi) % (2.0 * np.pi) - np.pi)
+    heading = np.array([np.sin(middle), 0.0, np.cos(middle)])
     across = np.cross([0.0, 1.0, 0.0], heading)
-    hinge = -(np.sqrt(1.0 - height * height) * across + height * np.array([0.0, 1.0, 0.0]))
+    hinge = -(level * across + height * np.array([0.0, 1.0, 0.0]))
     return np.stack([hinge, np.cross(-heading, hinge), -heading], axis=1)
 
 

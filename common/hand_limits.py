@@ -52,6 +52,11 @@ def limit_table(limits: Limits, where: str) -> Float:
     return table
 
 
+def tolerance_table(limits: Limits) -> Float:
+    """Standard deviations (5, 4) [rad] by which people differ from the limits."""
+    return np.array([getattr(limits, finger).tolerance_rad for finger in _FINGERS])
+
+
 def spread_table(limits: Limits, where: str) -> Float:
     """Share (5,) of the abduction range left at the highest flexion.
 

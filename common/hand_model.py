@@ -22,7 +22,7 @@ from common.arrays import Bool, Float
 from common.calibration import Couplings, HandProfile
 from common.errors import CalibrationError
 from common.geometry import quaternion_to_matrix
-from common.hand_limits import ABDUCTION, FLEXION, limit_table, spread_left, spread_table
+from common.hand_limits import ABDUCTION, FLEXION, limit_table, spread_left, spread_table, tolerance_table
 from common.hand_presets import preset_couplings, preset_limits, radius_share
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
@@ -110,6 +110,7 @@ class HandModel:
         rest_rotation: (26, 3, 3), joint frame -> palm frame.
         radius_m: (26,) [m].
         limits_rad: (5, 4, 2) low and high of every angle; the abduction's where nothing narrows it.
+        tolerance_rad: (5, 4) standard deviation by which the person may differ from them; 0: walls.
         spread_at_full_flexion: (5,) share of the abduction range left at the highest flexion.
         dip_per_pip: Coupling of index ... little, or None where the DIP is free.
         dip_spread_rad: Standard deviation of the DIP about that ratio; 0: it is kept exactly.
@@ -128,6 +129,7 @@ class HandModel:
     rest_rotation: Float
     radius_m: Float
     limits_rad: Float
+    tolerance_rad: Float
     spread_at_full_flexion: Float
     dip_per_pip: float | None
     dip_spread_rad: float
@@ -170,6 +172,7 @@ class HandModel:
             rest_rotation=rotation,
             radius_m=_radii(profile, where),
             limits_rad=limit_table(limits, where),
+            tolerance_rad=tolerance_table(limits),
             spread_at_full_flexion=spread_table(limits, where),
             dip_per_pip=couplings.dip_per_pip,
             dip_spread_rad=couplings.dip_spread_rad,

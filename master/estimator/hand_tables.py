@@ -8,7 +8,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.hand_model import CHAINS, FINGER_JOINTS, HandModel
 from common.records import filled
-from master.estimator.parameters import HandParameters
+from master.estimator.parameters import REACH, HandParameters
 
 _STIFF_RAD = 1e-9  # an angle whose highest flexion is 0 narrows nothing
 
@@ -28,6 +28,7 @@ class HandTables:
         most: (5,) [rad] highest flexion.
         left: (5,) share of the abduction left there.
         low, high: (n,) [rad] limits of the free angles.
+        legal_low, legal_high, beyond_w2: (n,) as of `HandParameters`.
         rests: (n,) whether it often stands at its low limit, as that of a straight finger.
         anywhere: (6 + n,) inverse variances of a hand of which nothing is known but its limits.
         limits: (5, 4, 2) [rad] low and high of all angles, abductions before they narrow.
@@ -53,6 +54,9 @@ class HandTables:
     left: Float
     low: Float
     high: Float
+    legal_low: Float
+    legal_high: Float
+    beyond_w2: Float
     rests: Bool
     anywhere: Float
     limits: Float
@@ -98,9 +102,13 @@ class HandTables:
             "left": model.spread_at_full_flexion,
             "low": parameters.low,
             "high": parameters.high,
+            "legal_low": parameters.legal_low,
+            "legal_high": parameters.legal_high,
+            "beyond_w2": parameters.beyond_w2,
             "rests": parameters.rests,
             "anywhere": parameters.anywhere,
-            "limits": model.limits_rad,
+            "limits": model.limits_rad
+            + REACH * np.stack([-model.tolerance_rad, model.tolerance_rad], axis=2),
             "finger": finger,
             "level": level,
             "middle": middle,

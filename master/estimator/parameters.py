@@ -6,7 +6,8 @@ finger. Where flexion narrows the abduction (`common.hand_limits`), the paramete
 
     abduction = share(flexion) parameter
 
-so that a box of parameters is all the legal poses, and habits of spreading fade in a fist as the range does.
+so that a box of parameters is all the legal poses, and habits of spreading fade in a fist as the range does. Where
+limits have a tolerance, what is beyond them costs, and the box ends three standard deviations farther out.
 """
 
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from common.hand_model import HandModel
 
 _LEAST_SHARE = 1e-6  # an abduction that is narrowed to nothing may come from any
 _PALM = (1.0, 0.1)  # [rad], [m]: a hand in front of cameras, before anything is seen of it
+REACH = 3.0  # standard deviations beyond a limit, where there is no hand
 _NARROWEST_RAD = 1e-3  # limits that leave an angle no room
 
 
@@ -30,6 +32,8 @@ class HandParameters:
         free: (n,) their indices in the flat (20,) table of angles.
         complete: (20, n) all angles = complete @ free ones, couplings included; abductions before they narrow.
         low, high: (n,) [rad] bounds that keep coupled angles inside their limits, too.
+        legal_low, legal_high: (n,) [rad] the limits themselves.
+        beyond_w2: (n,) [1/rad^2] inverse variance by which they are exceeded; 0: not at all.
         rests: (n,) whether it often stands at its low bound: that of a straight finger.
         abduction, flexion: Columns of the free angles of the K fingers whose abduction narrows; slices where they are
             evenly spaced, as they mostly are: those are views.
@@ -43,6 +47,9 @@ class HandParameters:
     complete: Float
     low: Float
     high: Float
+    legal_low: Float
+    legal_high: Float
+    beyond_w2: Float
     rests: Bool
     abduction: Int | slice
     flexion: Int | slice
@@ -64,15 +71,19 @@ class HandParameters:
             if ratio > 0:
                 low[1:, 2] = np.maximum(low[1:, 2], low[1:, 3] / ratio)
                 high[1:, 2] = np.minimum(high[1:, 2], high[1:, 3] / ratio)
-        low, high = low.reshape(20), high.reshape(20)
+        low, high, tolerance = low.reshape(20), high.reshape(20), model.tolerance_rad.reshape(20)[free]
+        inverse = np.where(tolerance > 0.0, tolerance, np.inf) ** -2.0
         span = np.maximum(high - low, _NARROWEST_RAD)[free]
         most = model.limits_rad[:, FLEXION, 1]
         narrows = np.flatnonzero((model.spread_at_full_flexion < 1.0) & (most > 0.0))
         return cls(
             free,
             complete,
+            low[free] - REACH * tolerance,
+            high[free] + REACH * tolerance,
             low[free],
             high[free],
+            inverse,
             (free >= 4) & (free % 4 != ABDUCTION),
             _evenly(np.searchsorted(free, 4 * narrows + ABDUCTION)),
             _evenly(np.searchsorted(free, 4 * narrows + FLEXION)),

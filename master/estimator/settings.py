@@ -12,6 +12,9 @@ from common.records import filled
 
 _HANDS = "round value for hands at work; a handful compared on simulated and recorded hands, nothing fitted"
 _COORDINATION = "Hager-Ross, Schieber 2000; Ingram et al. 2008: fingers move together"
+_STRAY = (
+    "how far joint angles get in a time: hands that handle things, by motion capture, and Leap recordings"
+)
 _CHI = "quantile of chi square"
 
 
@@ -54,6 +57,9 @@ class Settings(NamedTuple):
     natural_share: Annotated[
         float, Range("1", 0.01, 0.99, "small: habits that fit win by their narrowness")
     ] = 1.0 / 3.0
+    posture_widened: Annotated[
+        float, Range("1", 1.0, 10.0, "by which a measured posture is wider of a hand that defies it")
+    ] = 3.0
     # A finger that was never seen is curled out of sight: a stretched one would show.
     curled_rad: Annotated[float, Range("rad", 0.01, 1.5, _HANDS)] = radians(15.0)
     curled_flexion_rad: Annotated[float, Range("rad", 0.0, 1.6, _HANDS)] = radians(65.0)
@@ -73,6 +79,9 @@ class Settings(NamedTuple):
     # How far a hand that is seen moves in a time, as a random walk: wide, so that what is seen decides.
     walk_rad_s: Annotated[float, Range("rad/s", 0.5, 50.0, _HANDS)] = 8.0
     palm_walk_rad_s: Annotated[float, Range("rad/s", 0.1, 50.0, _HANDS)] = 2.5
+    palm_held_rad_s: Annotated[
+        float, Range("rad/s", 0.05, 50.0, "with a finger hidden little tells how the palm turns")
+    ] = 1.2
     palm_walk_m_s: Annotated[float, Range("m/s", 0.05, 20.0, _HANDS)] = 2.0
     shortest_s: Annotated[
         float, Range("s", 1e-5, 1e-2, "a shorter step would weld the hand to its last pose")
@@ -85,10 +94,10 @@ class Settings(NamedTuple):
     rate_memory_s: Annotated[
         float, Range("s", 1e-3, 1.0, "half of a new rate counts at 60 frames a second")
     ] = 0.024
-    stray_rad: Annotated[float, Range("rad", 0.05, 2.0, "simulated scenes and recorded motion")] = radians(
-        40.0
-    )
-    stray_s: Annotated[float, Range("s", 0.05, 10.0, "simulated scenes and recorded motion")] = 1.2
+    stray_rad: Annotated[float, Range("rad", 0.05, 2.0, _STRAY)] = radians(30.0)
+    stray_aside_rad: Annotated[float, Range("rad", 0.02, 2.0, _STRAY)] = radians(9.0)
+    stray_thumb_rad: Annotated[float, Range("rad", 0.02, 2.0, _STRAY)] = radians(15.0)
+    stray_s: Annotated[float, Range("s", 0.05, 10.0, _STRAY)] = 1.0
     alike: Annotated[float, Range("1", 0.0, 0.99, _COORDINATION)] = 0.7
     held_rad: Annotated[float, Range("rad", 0.001, 0.5, "a finger that was just lost")] = radians(3.0)
     # A palm without markers.

@@ -13,6 +13,7 @@ the sum of squares of the rows (`master.estimator.residuals`) and of what is bel
 
 from common.arrays import Float
 from common.kernels import inlined, inner
+from master.estimator.hand_tables import HandTables
 from master.estimator.kinematics import (
     PLACE,
     angles_of,
@@ -129,6 +130,19 @@ def _believed(
 
 
 @inlined
+def _beyond(hand: HandTables, x: Float, gradient: Float, normal: Float) -> float:
+    """Add what angles beyond their limits cost; return it."""
+    cost = 0.0
+    for i in range(x.shape[0]):
+        off = max(x[i] - hand.legal_high[i], 0.0) + min(x[i] - hand.legal_low[i], 0.0)
+        if off != 0.0:
+            cost += 0.5 * hand.beyond_w2[i] * off * off
+            gradient[6 + i] += hand.beyond_w2[i] * off
+            normal[6 + i, 6 + i] += hand.beyond_w2[i]
+    return cost
+
+
+@inlined
 def _faced(belief: Belief, T: Float, gradient: Float, normal: Float) -> float:
     """Add that the back (the palm's +y) looks along `facing`; return its cost."""
     w2 = belief.facing_w2[0]
@@ -173,6 +187,7 @@ def linearise(
     """
     work = search.rows
     cost = _believed(habits, belief, h, T, x, z, gradient, normal, search)
+    cost += _beyond(rig.hand, x, gradient, normal)
     if belief.facing_w2[0] > 0.0:
         cost += _faced(belief, T, gradient, normal)
     if belief.turned[0] > 0.0:

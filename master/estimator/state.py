@@ -134,7 +134,7 @@ class Hidden:
 
     Attributes:
         angles: (20,) [rad]; those of fingers that are seen mean nothing.
-        sigma: (5,) [rad] standard deviation of that.
+        sigma: (20,) [rad] standard deviations of these.
         gone_s: (5,) time since they were seen last; 0: seen now.
         own: (5,) share of the variance of a step that the fingers that are seen do not tell.
     """
@@ -152,13 +152,18 @@ class Hidden:
     @classmethod
     def none(cls, n: int) -> "Hidden":
         """Room for one hand."""
-        return record(cls, angles=20, sigma=5, gone_s=5, own=5, x=n, K=(4, 4), L=(4, 4), weight=4, ahead=20)
+        return record(cls, angles=20, sigma=20, gone_s=5, own=5, x=n, K=(4, 4), L=(4, 4), weight=4, ahead=20)
 
 
 @inlined
-def strayed(settings: Settings, gone_s: float) -> float:
-    """Variance [rad^2] of a finger's angle about where it was heading, a time after it was last seen."""
-    return settings.stray_rad**2 * (1.0 - exp(-((gone_s / settings.stray_s) ** 2)))
+def strayed(settings: Settings, a: int, gone_s: float) -> float:
+    """Variance [rad^2] of angle a of 20 about where it was heading, a time after its finger was last seen."""
+    most = settings.stray_rad
+    if a < 4:
+        most = settings.stray_thumb_rad
+    elif a % 4 == 0:
+        most = settings.stray_aside_rad
+    return most**2 * (1.0 - exp(-((gone_s / settings.stray_s) ** 2)))
 
 
 @inner
@@ -196,7 +201,9 @@ def hide(
     for a in range(20):
         hidden.angles[a] = state.angles[a]
     for f in range(5):
-        hidden.sigma[f], hidden.gone_s[f], hidden.own[f] = settings.held_rad, 0.0, 1.0
+        hidden.gone_s[f], hidden.own[f] = 0.0, 1.0
+        for a in range(4 * f, 4 * f + 4):
+            hidden.sigma[a] = settings.held_rad
         if shown[f]:
             continue
         if state.hidden_ns[f] == NEVER_NS:
@@ -213,7 +220,8 @@ def hide(
         hidden.gone_s[f] = gone_s
         if f > 0:
             _neighbours(settings, state, f, shown, hidden)
-        hidden.sigma[f] = sqrt(settings.held_rad**2 + hidden.own[f] * strayed(settings, gone_s))
+        for a in range(4 * f, 4 * f + 4):
+            hidden.sigma[a] = sqrt(settings.held_rad**2 + hidden.own[f] * strayed(settings, a, gone_s))
     clamp(hand, hidden.angles)
 
 
@@ -243,12 +251,16 @@ def predict(
     age_s = max((t_ns - state.seen_ns[0]) * 1e-9, settings.shortest_s)
     walked = 1.0 / (settings.walk_rad_s * age_s) ** 2
     for f in range(5):
-        held = 0.0 if shown[f] else 1.0 / hidden.sigma[f] ** 2
         for c in range(hand.first[f], hand.first[f + 1]):
+            held = 0.0 if shown[f] else 1.0 / hidden.sigma[4 * f + c - hand.first[f]] ** 2
             belief.past_w2[c] = walked + held
             belief.past[c] = (walked * state.x[c] + held * hidden.x[c]) / (walked + held)
+    turns_rad_s = settings.palm_walk_rad_s
+    for f in range(5):
+        if not shown[f]:
+            turns_rad_s = settings.palm_held_rad_s
     for i in range(3):
-        belief.palm_w2[i] = 1.0 / (settings.palm_walk_rad_s * age_s) ** 2
+        belief.palm_w2[i] = 1.0 / (turns_rad_s * age_s) ** 2
         belief.palm_w2[3 + i] = 1.0 / (settings.palm_walk_m_s * age_s) ** 2
     copy(state.palm, belief.palm)
 
@@ -292,9 +304,10 @@ def grow(
         state.cov[3 + i, 3 + i] += shift2
     for f in range(5):
         gone_s = hidden.gone_s[f]
-        added = (settings.walk_rad_s * dt_s) ** 2
-        if gone_s > 0.0:
-            added = strayed(settings, gone_s) - strayed(settings, max(gone_s - dt_s, 0.0))
-            added *= hidden.own[f]
         for c in range(hand.first[f], hand.first[f + 1]):
+            added = (settings.walk_rad_s * dt_s) ** 2
+            if gone_s > 0.0:
+                a = 4 * f + c - hand.first[f]
+                added = strayed(settings, a, gone_s) - strayed(settings, a, max(gone_s - dt_s, 0.0))
+                added *= hidden.own[f]
             state.cov[6 + c, 6 + c] += added

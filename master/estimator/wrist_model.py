@@ -96,4 +96,6 @@ def loosened(model: HandModel) -> HandModel:
     if model.profile.couplings is None:
         ratio = _DIP_PER_PIP
     spread = max(model.dip_spread_rad, _DIP_SPREAD_RAD)
-    return replace(model, limits_rad=limits, dip_per_pip=ratio, dip_spread_rad=spread)
+    return replace(
+        model, tolerance_rad=np.zeros((5, 4)), limits_rad=limits, dip_per_pip=ratio, dip_spread_rad=spread
+    )

@@ -1,0 +1,143 @@
+"""The posture prior of a person: joint angles of recorded joints, and a normal distribution fitted to them.
+
+Each finger has a distribution of its own over abduction, flexion, PIP and DIP. A recording is one sample of how a
+person moves, so it is shrunk towards a wide prior as if that had been seen in `_PRIOR_SAMPLES` independent frames
+(the normal-inverse-Wishart mean; Gelman et al., "Bayesian Data Analysis", 3rd edition 2013, section 3.6). How many
+independent frames there are follows from the correlation of one frame with the next: T (1 - r) / (1 + r).
+"""
+
+import numpy as np
+from msgspec.structs import replace
+
+from common.arrays import Float
+from common.calibration import FingerLimits, FingerPosture, Limits, Posture
+from common.errors import CalibrationError
+from common.hand_model import CHAINS, FINGERS, HandModel
+
+_PRIOR_SAMPLES = 5.0
+# What is expected of any hand: means and standard deviations [deg], rounded, of hands at work.
+_PRIOR_MEAN = np.radians([[5.0, 5.0, 10.0, 15.0], *[[0.0, 20.0, 30.0, 15.0]] * 4])
+_PRIOR_SIGMA = np.radians([[15.0, 15.0, 20.0, 25.0], *[[8.0, 25.0, 30.0, 18.0]] * 4])
+_FEWEST = 20  # frames below which a motion says nothing
+_UPRIGHT = 0.3  # cosine of the flexion beyond which a finger shows no abduction
+
+
+def joint_angles(model: HandModel, fingers_m: Float) -> Float:
+    """Angles (T, 5, 4) [rad] of recorded joints, regardless of limits.
+
+    Args:
+        model: The hand.
+        fingers_m: (T, 5, 4, 3) [m] joints of `CHAINS`, palm frame.
+
+    Returns:
+        Flexions by the hinges of the model; abductions are NaN where a finger points straight down or up.
+    """
+    bones = np.diff(fingers_m, axis=2)
+    bones = bones / np.linalg.norm(bones, axis=3, keepdims=True)
+    rest = model.rest_rotation[CHAINS[:, 0]]
+    angles = np.empty((len(bones), 5, 4))
+    for f in range(5):
+        # The first bone is R_y(s a) R (0, -sin b, -cos b): of fingers R is the rest frame and R_y turns in the palm,
+        # of the thumb it is the other way round.
+        bone = bones[:, f, 0] @ rest[f] if f == 0 else bones[:, f, 0]
+        frame = np.eye(3) if f == 0 else rest[f]
+        level = np.hypot(frame[1, 1], frame[1, 2])
+        lean = np.arctan2(frame[1, 2], frame[1, 1])  # by which the bone is raised at flexion 0
+        sine = np.clip(-bone[:, 1] / level, -1.0, 1.0)
+        flexion = np.arcsin(sine) - lean
+        ahead = np.stack([np.zeros_like(flexion), -np.sin(flexion), -np.cos(flexion)], axis=1) @ frame.T
+        turn = np.arctan2(bone[:, 0], bone[:, 2]) - np.arctan2(ahead[:, 0], ahead[:, 2])
+        turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
+        angles[:, f, 0] = np.where(np.cos(flexion) > _UPRIGHT, model.side_sign * turn, np.nan)
+        angles[:, f, 1] = flexion
+        hinge = _hinge(rest[f], turn, f == 0)
+        for k in (1, 2):
+            sine_of = (np.cross(bones[:, f, k - 1], bones[:, f, k]) * hinge).sum(axis=1)
+            angles[:, f, 1 + k] = np.arctan2(sine_of, (bones[:, f, k - 1] * bones[:, f, k]).sum(axis=1))
+    return angles
+
+
+def _hinge(rest: Float, turn: Float, thumb: bool) -> Float:
+    """(T, 3) what a flexion turns about, -x of the joint, palm frame, at turns (T,) by the abduction."""
+    about = np.zeros((len(turn), 3, 3))
+    about[:, 0, 0] = about[:, 2, 2] = np.cos(turn)
+    about[:, 0, 2], about[:, 2, 0], about[:, 1, 1] = np.sin(turn), -np.sin(turn), 1.0
+    return -(rest @ about)[:, :, 0] if thumb else -(about @ rest)[:, :, 0]
+
+
+def fit_posture(angles_rad: Float) -> Posture:
+    """Fit the posture prior to a motion, shrunk as its length demands.
+
+    Args:
+        angles_rad: (T, 5, 4) [rad], evenly spaced in time; NaN: not known.
+
+    Raises:
+        CalibrationError: Fewer than 20 frames are known of a finger.
+    """
+    fingers: dict[str, FingerPosture] = {}
+    for f, name in enumerate(FINGERS):
+        known = angles_rad[np.isfinite(angles_rad[:, f]).all(axis=1), f]
+        if len(known) < _FEWEST:
+            raise CalibrationError(
+                f"posture: the {name} is known in {len(known)} frames: {_FEWEST} are needed"
+            )
+        count = _independent(known)
+        share = count / (count + _PRIOR_SAMPLES)
+        mean = share * known.mean(axis=0) + (1.0 - share) * _PRIOR_MEAN[f]
+        off = known.mean(axis=0) - _PRIOR_MEAN[f]
+        cov = share * np.cov(known.T) + (1.0 - share) * (
+            np.diag(_PRIOR_SIGMA[f] ** 2) + share * np.outer(off, off)
+        )
+        abduction, flexion, pip, dip = (_four(row) for row in cov)
+        fingers[name] = FingerPosture(_four(mean), (abduction, flexion, pip, dip))
+    return Posture(**fingers)
+
+
+def reached_limits(limits: Limits, angles_rad: Float) -> Limits:
+    """The limits, moved out to where a motion went for a hundredth of its time.
+
+    Args:
+        limits: Those of a preset.
+        angles_rad: (T, 5, 4) [rad]; NaN: not known.
+    """
+    low, high = np.nanpercentile(angles_rad, [1.0, 99.0], axis=0)
+    fingers: dict[str, FingerLimits] = {}
+    for f, name in enumerate(FINGERS):
+        own: FingerLimits = getattr(limits, name)
+        spans: dict[str, tuple[float, float]] = {}
+        for k, angle in enumerate(("abduction_rad", "flexion_rad", "pip_rad", "dip_rad")):
+            least, most = getattr(own, angle)
+            spans[angle] = round(min(least, float(low[f, k])), 4), round(max(most, float(high[f, k])), 4)
+        fingers[name] = replace(own, **spans)
+    return Limits(**fingers)
+
+
+def _independent(samples: Float) -> float:
+    """How many independent samples (T, 4) of a motion are worth, by the correlation of neighbours."""
+    off = samples - samples.mean(axis=0)
+    correlation = np.clip(
+        (off[1:] * off[:-1]).sum(axis=0) / np.maximum((off * off).sum(axis=0), 1e-12), 0.0, 0.9999
+    )
+    return float(np.median(len(samples) * (1.0 - correlation) / (1.0 + correlation)))
+
+
+def posture_arrays(posture: Posture, where: str) -> tuple[Float, Float]:
+    """Means (5, 4) [rad] and covariances (5, 4, 4) [rad^2].
+
+    Raises:
+        CalibrationError: A covariance is not symmetric and positive definite.
+    """
+    fingers: list[FingerPosture] = [getattr(posture, name) for name in FINGERS]
+    mean = np.array([finger.mean_rad for finger in fingers])
+    cov = np.array([finger.cov_rad2 for finger in fingers])
+    for name, matrix in zip(FINGERS, cov, strict=True):
+        if not np.allclose(matrix, matrix.T, atol=1e-9) or np.linalg.eigvalsh(matrix)[0] <= 0.0:
+            raise CalibrationError(
+                f"{where}: posture.{name}.cov_rad2: a covariance is symmetric and positive definite"
+            )
+    return mean, cov
+
+
+def _four(values: Float) -> tuple[float, float, float, float]:
+    a, b, c, d = (round(float(value), 6) for value in values)
+    return a, b, c, d
