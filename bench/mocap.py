@@ -158,8 +158,10 @@ def _recorded_rows(folder: Path) -> Iterator[Row]:
 def _made_rows(noise_m: float) -> Iterator[Row]:
     hands = [_made(person, noise_m) for person in range(_PEOPLE)]
     off = 1e3 * np.concatenate([np.abs(found - exact).ravel() for _, found, exact in hands])
-    ratios = np.array([one.posture.dip.per_pip for one, _, _ in hands if one.posture.dip is not None])
-    spreads = np.degrees([one.posture.dip.spread_rad for one, _, _ in hands if one.posture.dip is not None])
+    ratios = np.array([one.couplings.dip.per_pip for one, _, _ in hands if one.couplings.dip is not None])
+    spreads = np.degrees(
+        [one.couplings.dip.spread_rad for one, _, _ in hands if one.couplings.dip is not None]
+    )
     at = f"made hands, {1e3 * noise_m:g} mm noise: "
     yield Row(at + "bones", float(off.mean()), "mm", f"at most {off.max():.2f}")
     yield Row(

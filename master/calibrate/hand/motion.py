@@ -18,10 +18,11 @@ from common.errors import FitError
 from common.geometry import matrix_to_quaternion
 from common.hand_fitting import profile_from_joints
 from common.hand_model import CHAINS, FINGERS, JOINTS, METACARPALS, WRIST, HandModel
+from common.hand_presets import preset_couplings
 from common.hand_profiles import generated_profile, joint_frame
 from master.calibrate.hand.measure import hand_length_of
+from master.calibrate.hand.motion_couplings import MotionCouplings, motion_couplings
 from master.calibrate.hand.palm import Palm, find_palm
-from master.calibrate.hand.posture import Posture, posture_of
 from master.calibrate.hand.save import TOOL
 from master.calibrate.tree_files import provenance
 from master.mocap.compare import joint_track
@@ -44,7 +45,7 @@ class MotionHand:
         profile: The hand file.
         motion: What it is from.
         palm: Its palm.
-        posture: Its couplings.
+        couplings: Its couplings; where it tells any, the profile has a posture prior, too.
         bone_m, bone_sigma_m: (5, 3) [m] mean and spread over frames.
         frames: How many were used.
         length_m: From the wrist to the end of the middle finger.
@@ -53,7 +54,7 @@ class MotionHand:
     profile: HandProfile
     motion: JointMotion
     palm: Palm
-    posture: Posture
+    couplings: MotionCouplings
     bone_m: Float
     bone_sigma_m: Float
     frames: int
@@ -82,9 +83,12 @@ def hand_from_motion(motion: JointMotion, name: str) -> MotionHand:
             f" length; {_LEAST_FRAMES} are needed"
         )
     chains = palm.chains_m[good]
-    posture = posture_of(chains, motion.t_ns[good])
+    couplings = motion_couplings(chains, motion.t_ns[good])
     bones = np.linalg.norm(np.diff(chains, axis=2), axis=3)
-    profile = profile_from_joints(name, palm.side, chains, couplings=posture.couplings)
+    if couplings.couplings is None:
+        profile = profile_from_joints(name, palm.side, chains, couplings=preset_couplings("K"))
+    else:
+        profile = replace(profile_from_joints(name, palm.side, chains), couplings=couplings.couplings)
     profile = replace(profile, rest_joints=profile.rest_joints | _metacarpals(palm.shape_m))
     length_m = hand_length_of(HandModel.of(profile))
     try:
@@ -92,7 +96,7 @@ def hand_from_motion(motion: JointMotion, name: str) -> MotionHand:
     except ValueError as error:
         raise FitError(f"{motion.source}: {error}: is --unit right?") from error
     hand = MotionHand(
-        profile, motion, palm, posture, bones.mean(axis=0), bones.std(axis=0), int(good.sum()), length_m
+        profile, motion, palm, couplings, bones.mean(axis=0), bones.std(axis=0), int(good.sum()), length_m
     )
     told = _provenance(hand)
     back = profile.markers["back"]
@@ -131,7 +135,7 @@ def missing(hand: MotionHand) -> list[str]:
     bases = [JOINTS[joint] for joint in METACARPALS if not np.isfinite(hand.palm.shape_m[joint]).all()]
     out = [f"{', '.join(bases)}: at 0.3 of the way to the knuckle"] if bases else []
     out.append("radii, painted caps and the marker on the back: those of a generated hand of this length")
-    out.append("limits: the default (K)")
+    out.append("limits: the default (K), moved out to where the motion went")
     return out
 
 
@@ -142,14 +146,14 @@ def _provenance(hand: MotionHand) -> dict[str, Provenance]:
         "bone_spread_mm": round(1e3 * float(hand.bone_sigma_m.mean()), 3),
         "frames": float(hand.frames),
     }
-    note = "joints of a motion capture; not in it: " + "; ".join([*missing(hand), *hand.posture.remarks])
+    note = "joints of a motion capture; not in it: " + "; ".join([*missing(hand), *hand.couplings.remarks])
     out = {"rest_joints": provenance(TOOL, data, residual, note)}
-    posture = hand.posture
-    if posture.couplings is not None and posture.dip is not None and posture.mcp is not None:
+    found = hand.couplings
+    if found.couplings is not None and found.dip is not None and found.mcp is not None:
         spreads = {
-            "dip_spread_deg": round(float(np.degrees(posture.dip.spread_rad)), 2),
-            "mcp_spread_deg": round(float(np.degrees(posture.mcp.spread_rad)), 2),
-            "moved_s": round(posture.moved_s, 1),
+            "dip_spread_deg": round(float(np.degrees(found.dip.spread_rad)), 2),
+            "mcp_spread_deg": round(float(np.degrees(found.mcp.spread_rad)), 2),
+            "moved_s": round(found.moved_s, 1),
         }
         out["couplings"] = provenance(TOOL, data, spreads, "index ... little together")
     return out
@@ -157,7 +161,7 @@ def _provenance(hand: MotionHand) -> dict[str, Provenance]:
 
 def motion_lines(hand: MotionHand) -> list[str]:
     """The report for a person."""
-    palm, posture = hand.palm, hand.posture
+    palm, found = hand.palm, hand.couplings
     lines = [*hand.motion.remarks]
     said = "as its names or --side say" if hand.motion.side else "as its fingers bend"
     lines.append(
@@ -176,26 +180,26 @@ def motion_lines(hand: MotionHand) -> list[str]:
             mean, sigma = 1e3 * hand.bone_m[finger, k], 1e3 * hand.bone_sigma_m[finger, k]
             loose = "  changes with the pose: no joint centres" if sigma > 1e3 * _LOOSE_M else ""
             lines.append(f"{label + ' ' + bone:30}{mean:8.1f}{sigma:8.2f}{loose}")
-    if posture.dip is not None and posture.mcp is not None:
+    if found.dip is not None and found.mcp is not None:
         lines.append(
-            f"couplings, by {posture.moved_s:.0f} s of movement: DIP {posture.dip.per_pip:.2f} PIP ±"
-            f" {np.degrees(posture.dip.spread_rad):.0f}°, MCP {posture.mcp.per_pip:.2f} PIP ±"
-            f" {np.degrees(posture.mcp.spread_rad):.0f}°"
+            f"couplings, by {found.moved_s:.0f} s of movement: DIP {found.dip.per_pip:.2f} PIP ±"
+            f" {np.degrees(found.dip.spread_rad):.0f}°, MCP {found.mcp.per_pip:.2f} PIP ±"
+            f" {np.degrees(found.mcp.spread_rad):.0f}°"
         )
-    lines += posture.remarks
+    lines += found.remarks
     return lines + [f"not in the file: {what}" for what in missing(hand)]
 
 
 def motion_json(hand: MotionHand) -> dict[str, object]:
     """The same for programs [mm, degrees]."""
-    posture = hand.posture
+    found = hand.couplings
     ratios = {
         name: {
             "per_pip": ratio.per_pip,
             "spread_deg": float(np.degrees(ratio.spread_rad)),
             "noise_deg": float(np.degrees(ratio.noise_rad)),
         }
-        for name, ratio in (("dip", posture.dip), ("mcp", posture.mcp))
+        for name, ratio in (("dip", found.dip), ("mcp", found.mcp))
         if ratio is not None
     }
     return {
@@ -212,8 +216,8 @@ def motion_json(hand: MotionHand) -> dict[str, object]:
             for finger, label in enumerate(FINGERS)
             for k, bone in enumerate(_BONES[min(finger, 1)])
         },
-        "moved_s": round(posture.moved_s, 2),
+        "moved_s": round(found.moved_s, 2),
         "couplings": ratios,
         "not_in_the_file": missing(hand),
-        "remarks": [*hand.motion.remarks, *posture.remarks],
+        "remarks": [*hand.motion.remarks, *found.remarks],
     }

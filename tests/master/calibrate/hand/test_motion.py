@@ -12,8 +12,8 @@ from common.errors import CalibrationError, FitError, RecordingError
 from common.hand_model import CHAINS, JOINTS, HandModel, couplings_of
 from master.calibrate.cli import calibrate_app
 from master.calibrate.hand.motion import hand_from_motion, motion_lines
+from master.calibrate.hand.motion_couplings import flexions, motion_couplings
 from master.calibrate.hand.palm import find_palm
-from master.calibrate.hand.posture import flexions, posture_of
 from master.mocap.joint_motion import Side
 from tests.master.mocap.moved import LEFT, RIGHT, SHIFT, TURN, hand_at, motion_of, ns, write_table
 
@@ -83,8 +83,8 @@ def test_noise_of_joints_is_no_spread_of_a_person() -> None:
     chains = find_palm(
         joints + np.random.default_rng(1).normal(0.0, 8e-4, joints.shape), "right", "file"
     ).chains_m
-    clean = posture_of(find_palm(joints, "right", "file").chains_m, ns(T_S)).dip
-    noisy = posture_of(chains, ns(T_S)).dip
+    clean = motion_couplings(find_palm(joints, "right", "file").chains_m, ns(T_S)).dip
+    noisy = motion_couplings(chains, ns(T_S)).dip
     assert clean is not None
     assert noisy is not None
     assert noisy.noise_rad > np.radians(4.0)

@@ -46,7 +46,7 @@ class Ratio:
 
 
 @dataclass(frozen=True, slots=True)
-class Posture:
+class MotionCouplings:
     """What a motion tells of couplings.
 
     Attributes:
@@ -77,7 +77,7 @@ def flexions(chains_m: Float) -> Float:
     return np.concatenate([np.arctan2(-first[..., 1], level)[..., None], bend], axis=2)
 
 
-def posture_of(chains_m: Float, t_ns: Int) -> Posture:
+def motion_couplings(chains_m: Float, t_ns: Int) -> MotionCouplings:
     """Couplings from chains (T, 5, 4, 3) [m] in the palm frame at times (T,) [ns]."""
     angles = flexions(chains_m)
     step_s = 1e-9 * np.diff(t_ns)
@@ -86,7 +86,7 @@ def posture_of(chains_m: Float, t_ns: Int) -> Posture:
     low, high = np.percentile(angles[:, :, 1], [5.0, 95.0])
     if moved_s < MOVED_S or high - low < _RANGE_RAD:
         why = f"fingers move for {moved_s:.0f} s, and {np.degrees(high - low):.0f}° at the PIP"
-        return Posture(
+        return MotionCouplings(
             moved_s, None, None, None, (f"couplings are the default: {why}; 20 s and 20° are needed",)
         )
     first, middle, last = _joint_noise(chains_m)
@@ -107,7 +107,7 @@ def posture_of(chains_m: Float, t_ns: Int) -> Posture:
         )
     else:
         couplings, taken = replace(couplings, mcp_per_pip=mcp.per_pip), True
-    return Posture(moved_s, dip, mcp, couplings if taken else None, tuple(remarks))
+    return MotionCouplings(moved_s, dip, mcp, couplings if taken else None, tuple(remarks))
 
 
 def _joint_noise(chains_m: Float) -> tuple[float, float, float]:
