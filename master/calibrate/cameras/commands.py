@@ -43,9 +43,11 @@ Cameras = Annotated[
     typer.Option("--camera", help="A camera; may be repeated. Default: all that have images."),
 ]
 Flat = Annotated[
-    bool,
+    bool | None,
     typer.Option(
-        "--flat-board", help="The board is exact and flat (glass, screen): do not estimate its shape."
+        "--flat-board/--bent-board",
+        help="Take the board as drawn (glass, screen), or estimate its own shape. Default: the one that predicts views"
+        " better that were held out of the fit.",
     ),
 ]
 Picture = Annotated[Path | None, typer.Option(help="Write a picture of corners and residuals to this .png.")]
@@ -58,7 +60,7 @@ def intrinsics(
     marker_mm: MarkerMm = None,
     dictionary: Dictionary = "4X4_50",
     camera: Cameras = None,
-    flat_board: Flat = False,
+    flat_board: Flat = None,
     calibration: Calibration = CALIB_JSON,
     out: ResultTree = None,
     json_file: JsonFile = None,
@@ -78,7 +80,7 @@ def intrinsics(
     known = _known_cameras(views, calibration, out)
     results: dict[str, CamerasResult] = {}
     for name in views.cameras:
-        fit = fit_cameras(_only(views, name), shaped=not flat_board)
+        fit = fit_cameras(_only(views, name), bent=_bent(flat_board))
         results[name] = result(fit, {})
         _say_all(report_lines(results[name]))
         _draw(picture if len(views.cameras) == 1 else _named(picture, name), fit)
@@ -103,7 +105,7 @@ def stereo(
     keep_intrinsics: Annotated[
         bool, typer.Option("--keep-intrinsics", help="Keep the lenses that the camera files have.")
     ] = False,
-    flat_board: Flat = False,
+    flat_board: Flat = None,
     calibration: Calibration = CALIB_JSON,
     out: ResultTree = None,
     json_file: JsonFile = None,
@@ -134,7 +136,7 @@ def stereo(
     for name, file in known.items():
         if keep_intrinsics and file is not None and file.intrinsics is not None:
             held[name] = lens_of(file.intrinsics)
-    fit = fit_cameras(views, held, shaped=not flat_board)
+    fit = fit_cameras(views, held, bent=_bent(flat_board))
     found = result(fit, held)
     _say_all(report_lines(found))
     _draw(picture, fit)
@@ -162,6 +164,10 @@ def stereo(
     if dropped and written:
         typer.echo(dropped)
     _written(written, known)
+
+
+def _bent(flat_board: bool | None) -> bool | None:
+    return None if flat_board is None else not flat_board
 
 
 def _views(source: Path, board: Board, cameras: list[str] | None) -> BoardViews:
