@@ -99,7 +99,7 @@ class VideoFrames:
         if not self._decoded:
             raise PictureError(f"has no frame {number} that can be decoded")
         done, image = self._capture.retrieve()
-        if not done or image is None:
+        if not done:
             raise PictureError(f"frame {number} cannot be decoded")
         return np.asarray(image, np.uint8)
 

@@ -2,7 +2,7 @@
 
 import argparse
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -110,7 +110,7 @@ def click(text: str) -> tuple[str, tuple[float, float]]:
 
 
 @contextmanager
-def _recording(options: argparse.Namespace, aside: Callable[[str], None]) -> Iterator[Path]:
+def _recording(options: argparse.Namespace, aside: Callable[[str], None]) -> Generator[Path]:
     """The recording; of a video or pictures one that lasts as long as it is needed.
 
     Raises:

@@ -86,7 +86,8 @@ def import_pictures(wish: Wish, out: Path, say: Callable[[str], None]) -> dict[s
         raise RecordingError(f"--camera {min(twice)}: is given twice")
     if absent := [name for name in rig.cameras if all(source.camera != name for source in sources)]:
         say(f"rig {rig.name!r} has {', '.join(absent)}, too, of which there is nothing")
-    rig, cameras = _only(rig, sources), {}
+    rig = _only(rig, sources)
+    cameras: dict[str, CameraCalibration] = {}
     for source in sources:
         file = wish.calibration / "cameras" / f"{source.camera}.json"
         cameras[source.camera] = load(file, CameraCalibration)
@@ -118,8 +119,6 @@ def import_pictures(wish: Wish, out: Path, say: Callable[[str], None]) -> dict[s
 def _only(rig: RigCalibration, sources: Sequence[Source]) -> RigCalibration:
     """The rig with the cameras that there are pictures of."""
     names = tuple(name for name in rig.cameras if any(source.camera == name for source in sources))
-    if rig.T_rig_camera is None:
-        return msgspec.structs.replace(rig, cameras=names)
     places = {name: rig.T_rig_camera[name] for name in names if name in rig.T_rig_camera}
     return msgspec.structs.replace(rig, cameras=names, T_rig_camera=places)
 

@@ -96,7 +96,7 @@ def by_table(path: Path, times: Times, number: Int) -> Timed:
 
 def by_rate(number: Int, rate_hz: float, whose: str) -> Timed:
     """Frames at a constant rate, the first of them at 0."""
-    t_ns = np.round(1e9 / rate_hz * (number - number[0])).astype(np.int64)
+    t_ns: Int = np.round(1e9 / rate_hz * (number - number[0])).astype(np.int64)
     return Timed(number, t_ns, f"{rate_hz:g} frames per second, {whose}")
 
 

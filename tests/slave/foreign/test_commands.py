@@ -61,8 +61,6 @@ def test_colours_of_a_video_by_clicks_find_its_markers(
     assert set(load(made, CameraCalibration).markers or {}) == set(NAMES)
     found = detect_recording(painted / "recording", "left", painted / "made")
     np.testing.assert_allclose(found.t_ns, [0, 1e9 / 60, 2e9 / 60], atol=1e6)
-        found.t_ns, [0, 1e9 / 60, 2e9 / 60], atol=1e6
-    )
     for k in range(3):  # JPEG halves the colour's resolution
         np.testing.assert_allclose(found.uv[k], CENTRES + SHIFT + [10.0 * k, 0.0], atol=0.7)
 

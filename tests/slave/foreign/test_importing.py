@@ -198,6 +198,15 @@ def _broken_pictures(tmp_path: Path) -> list[Path]:
     return [tmp_path / "left"]
 
 
+def _absent(tmp_path: Path) -> list[Path]:
+    return [tmp_path / "absent.mp4"]
+
+
+def _text(tmp_path: Path) -> list[Path]:
+    (tmp_path / "notes.txt").write_text("x")
+    return [tmp_path / "notes.txt"]
+
+
 @pytest.mark.parametrize(
     ("make", "says"),
     [
@@ -216,14 +225,13 @@ def _broken_pictures(tmp_path: Path) -> list[Path]:
         (_empty, r"left\.mp4: is no video .*it is empty"),
         (_no_pictures, r"left: no recording\.json, no video and no picture"),
         (_broken_pictures, r"left: not one of its 1 pictures can be decoded"),
-        (lambda tmp_path: [tmp_path / "absent.mp4"], r"absent\.mp4: no such file or folder"),
-        (lambda tmp_path: [tmp_path / "notes.txt"], r"notes\.txt: is no video"),
+        (_absent, r"absent\.mp4: no such file or folder"),
+        (_text, r"notes\.txt: is no video"),
     ],
 )
 def test_what_cannot_be_used_is_refused_by_name_with_the_fix(
     tmp_path: Path, make: Callable[[Path], list[Path]], says: str
 ) -> None:
-    (tmp_path / "notes.txt").write_text("x")
     with pytest.raises(RecordingError, match=says):
         imported(tmp_path, *make(tmp_path))
     assert not (tmp_path / "out").exists()
