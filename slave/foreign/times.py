@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from common.arrays import Int
+from common.arrays import Float, Int
 from common.errors import RecordingError
 from common.message_parts import MAX_TIME_NS
 from common.recorded_files import read_table
@@ -96,7 +96,8 @@ def by_table(path: Path, times: Times, number: Int) -> Timed:
 
 def by_rate(number: Int, rate_hz: float, whose: str) -> Timed:
     """Frames at a constant rate, the first of them at 0."""
-    t_ns: Int = np.round(1e9 / rate_hz * (number - number[0])).astype(np.int64)
+    since: Float = (number - number[0]) * (1e9 / rate_hz)
+    t_ns = np.round(since).astype(np.int64)
     return Timed(number, t_ns, f"{rate_hz:g} frames per second, {whose}")
 
 

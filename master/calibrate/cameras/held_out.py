@@ -6,9 +6,7 @@ views of that one only the board may move. It is placed by one half of its corne
 then the other way round. Both boards are scored on the same corners, view by view, and the simpler one is
 taken unless the other is better by more than the views scatter (the rule of one standard error: Breiman et al.,
 Classification and Regression Trees, 1984, section 3.4; Hastie et al., The Elements of Statistical Learning, 2009,
-section 7.10; here paired, and with the quantile of Student's t in place of one), and by a tenth: corners of a real
-recording have small errors in common (blur, rolling shutters, markers beside them), which a shape takes up in views
-held out as well, and which are none of the board.
+section 7.10; here paired, and with the quantile of Student's t in place of one).
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,8 +21,7 @@ from master.calibrate.cameras.bundle import Bundle, Free, Observation, predict, 
 from master.calibrate.cameras.judge import Seen, Shot, place_boards
 
 MIN_VIEWS = 8  # dealt into five folds they leave six to fit: fewer cannot tell a bent board from a bent lens
-LEAST_GAIN = 0.1  # three real recordings: gains of 0 to 4 % went with places that were worse by 0 to 4 %
-CHANCE = 0.05  # that a flat board is taken for a bent one
+CHANCE = 0.01  # that a flat board is taken for a bent one
 _FOLDS = 5  # Hastie et al., section 7.10: five or ten
 _MIN_IMAGES = 3  # of each camera in every fit: three views determine a lens
 _MIN_HALF = 4  # corners that place a board
@@ -88,7 +85,7 @@ def choose(seen: Seen, shots: Sequence[Shot], flat: Model, bent: Model) -> Board
     gain = flat_log - bent_log
     bound = float(stdtrit(views - 1, 1.0 - CHANCE)) * float(gain.std(ddof=1)) / np.sqrt(views)
     return BoardChoice(
-        bent=bool(gain.mean() > max(bound, -np.log(1.0 - LEAST_GAIN))),
+        bent=bool(gain.mean() > bound),
         flat_px=float(np.exp(flat_log.mean())),
         bent_px=float(np.exp(bent_log.mean())),
         views=views,

@@ -51,7 +51,7 @@ def _board_line(result: CamerasResult) -> str:
     return (
         f"board: {taken}: in {board.views} views held out of the fit, corners are {board.flat_px:.3f} px off where a"
         f" flat board predicts them and {board.bent_px:.3f} px with a shape of its own"
-        f"{'' if board.bent or board.bent_px >= board.flat_px else ', which is not clearly less'}"
+        f"{'' if board.bent or board.bent_px >= board.flat_px else ', which is not certainly less'}"
     )
 
 
