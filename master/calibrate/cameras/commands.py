@@ -46,7 +46,7 @@ Flat = Annotated[
     bool,
     typer.Option(
         "--flat-board",
-        help="The board is exact and flat (glass, screen): do not estimate its shape. Default: what views held out say.",
+        help="The board is exact and flat (glass, screen): do not estimate its shape. Default: as views held out say.",
     ),
 ]
 Bent = Annotated[
