@@ -1,4 +1,4 @@
-"""A recording of raw frames: a folder with recording.json, frames.csv and PNG files.
+"""A recording of raw frames: a folder with recording.json, frames.csv and pictures, or videos.
 
 The replay camera and the offline solver read it; `common.frame_writing` writes it. Whatever ended the recording,
 what is there can be read: the manifest comes first, and a frame's row after its file. So only the last row can be
@@ -120,7 +120,15 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class FrameRow:
-    """One line of frames.csv; `t_ns` is the middle of the exposure of row 0."""
+    """One line of frames.csv.
+
+    Attributes:
+        camera: Name of the camera.
+        seq: Its frame counter.
+        t_ns: Middle of the exposure of row 0 [ns].
+        illumination: What lit the frame.
+        file: A picture, FOLDER/NAME, or a frame of a video, VIDEO/NUMBER (`common.frame_pictures`).
+    """
 
     camera: str
     seq: int

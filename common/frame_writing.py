@@ -121,6 +121,18 @@ class RecordingWriter:
         self._counts[camera] = count + 1
         return row
 
+    def refer(self, row: FrameRow) -> None:
+        """Write the row of a frame whose file, or video, is in the folder already.
+
+        Raises:
+            RecordingError: The disk is full or gone, or a limit is met.
+        """
+        try:
+            self._append((row.camera, row.seq, row.t_ns, row.illumination.value, row.file))
+        except OSError as error:
+            raise RecordingError(f"{self._folder / FRAMES}: cannot write: {error.strerror}") from error
+        self._counts[row.camera] = self._counts.get(row.camera, 0) + 1
+
     def close(self) -> None:
         """End the recording. Safe to call twice."""
         self._table.close()

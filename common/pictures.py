@@ -1,6 +1,6 @@
 """Decode pictures that come from elsewhere, never larger than they may be.
 
-This is the only place that calls a decoder.
+This is the only place that calls a decoder of pictures; that of videos is in `common.video`.
 """
 
 import stat

@@ -58,13 +58,16 @@ def _demo(options: argparse.Namespace) -> int:
 
 def _replay(options: argparse.Namespace) -> int:
     settings = ReplaySettings(
-        options.recording,
+        options.paths,
         options.out,
         options.calibration,
         options.hand,
         level=options.level,
         solver=options.solver,
         only=options.only,
+        cameras=options.camera,
+        rig=options.rig,
+        times=options.times,
     )
     _finish(run_replay(settings, _say), None)
     print(f"\nposes   {settings.out / 'poses.npz'}\nsummary {settings.out / 'summary.json'}")

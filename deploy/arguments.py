@@ -20,6 +20,11 @@ _EXAMPLES = {
 """,
     "replay": """examples:
   phalanx replay RECORDING --out out/replay     the same line on recorded frames, the same bytes on every run
+  phalanx replay left.mp4 right.mp4 --calibration calib_json --out out/wave      your own videos, one per camera
+  phalanx replay takes/7 --times takes/7/times.csv --calibration calib_json --out out/take7
+                                                a folder with a video, or a folder of pictures, for each camera; the
+                                                table: camera,frame,time (frames from 0, seconds)
+  phalanx replay --camera left=GOPR0012.MP4 --camera right=GOPR0944.MP4 --calibration calib_json --out out/gopro
   phalanx replay CURL --hand HAND.json --out out/curl       recorded frames of a wrist device
   phalanx replay GRASP --out out/grasp          cameras and wrist device of one hand, solved together
   phalanx replay GRASP --only markers --out out/grasp-markers    without what the wrist device tells, to compare
@@ -111,16 +116,41 @@ def _add_scene(demo: argparse.ArgumentParser) -> None:
 def _add_replay(add_parser: AddParser) -> None:
     replay = add_parser(
         "replay",
-        help="a recording of raw frames, offline",
+        help="a recording of raw frames, or your own videos, offline",
         description="Detects markers, or fingers before a wrist device, in every camera's frames, solves the hand of "
         "what all of them tell, scores it where there is a truth.",
         epilog=_EXAMPLES["replay"],
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    replay.add_argument("recording", type=Path, metavar="RECORDING", help="folder with recording.json")
+    replay.add_argument(
+        "paths",
+        type=Path,
+        nargs="*",
+        metavar="RECORDING|VIDEO",
+        help="folder with recording.json; or a video or a folder of pictures for each camera, or a folder of these",
+    )
+    replay.add_argument(
+        "--camera",
+        action="append",
+        default=[],
+        metavar="NAME=PATH",
+        help="whose a video or folder is (default: that of its name, else in the order of the rig)",
+    )
+    replay.add_argument(
+        "--rig", metavar="NAME", help="of videos: rig in DIR/rigs (default: the one with these cameras)"
+    )
+    replay.add_argument(
+        "--times",
+        type=Path,
+        metavar="FILE.csv",
+        help="of videos: when each frame was taken; camera,frame,time",
+    )
     replay.add_argument("--out", type=Path, required=True, metavar="DIR")
     replay.add_argument(
-        "--calibration", type=Path, metavar="DIR", help="calib_json tree: marker colours, hands"
+        "--calibration",
+        type=Path,
+        metavar="DIR",
+        help="calib_json tree: marker colours, hands; of videos also cameras and rig",
     )
     replay.add_argument(
         "--hand", type=Path, metavar="FILE", help="hand profile; default: DIR/hands/<rig's hand>.json"

@@ -1,10 +1,13 @@
-"""Replay: `phalanx-slave detect` in every camera of a recording, then `phalanx-master solve` of all together."""
+"""Replay: `phalanx-slave detect` in every camera of a recording, then `phalanx-master solve` of all together.
+
+Videos and pictures of other programs become a recording before that: `phalanx-slave import`.
+"""
 
 import json
 import re
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -22,22 +25,26 @@ class ReplaySettings:
     """What the user chose.
 
     Attributes:
-        recording: Folder of raw frames.
+        paths: A folder of raw frames; or videos, folders of pictures, or folders of these.
         out: Folder for detections, poses and summary.
         calibration: calib_json tree for marker colours and hands, or None.
         hand: Hand profile, or None for the rig's.
         level: What the fingers before a wrist device are solved from: fk, ik, auto; None: as its rig says.
         solver: Whose hand a rig of markers publishes: estimator, fabrik; None: as it says.
+        cameras, rig, times: Of videos: NAME=PATH each, the rig's name, the table of times.
         only: "markers" or "wrist": the rigs of that kind alone; None: all.
     """
 
-    recording: Path
+    paths: Sequence[Path]
     out: Path
     calibration: Path | None
     hand: Path | None
     level: str | None = None
     solver: str | None = None
     only: str | None = None
+    cameras: Sequence[str] = ()
+    rig: str | None = None
+    times: Path | None = None
 
 
 def run_replay(settings: ReplaySettings, say: Callable[[str], None]) -> dict[str, object]:
@@ -46,11 +53,12 @@ def run_replay(settings: ReplaySettings, say: Callable[[str], None]) -> dict[str
     Raises:
         ReplayError: The recording is unreadable, or a step failed (its own message is on stderr).
     """
-    rigs = _rigs(settings.recording, settings.only)
+    folder = _recording_of(settings, say)
+    rigs = _rigs(folder, settings.only)
     if settings.level is not None and all(rig.kind != "wrist" for rig in rigs):
-        raise ReplayError(f"--level: {settings.recording} is of no wrist device, which alone has levels")
+        raise ReplayError(f"--level: {folder} is of no wrist device, which alone has levels")
     if settings.solver is not None and all(rig.kind != "markers" for rig in rigs):
-        raise ReplayError(f"--solver: {settings.recording} is of no rig of markers, which alone has solvers")
+        raise ReplayError(f"--solver: {folder} is of no rig of markers, which alone has solvers")
     if settings.hand is not None and not settings.hand.is_file():  # said now, not after all the detection
         raise ReplayError(f"{settings.hand}: no such hand profile")
     out = settings.out
@@ -58,7 +66,7 @@ def run_replay(settings: ReplaySettings, say: Callable[[str], None]) -> dict[str
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ReplayError(f"--out {out}: cannot make the folder: {error.strerror}") from error
-    recording = str(settings.recording)
+    recording = str(folder)
     calibration = [] if settings.calibration is None else ["--calibration", str(settings.calibration)]
     hand = [] if settings.hand is None else ["--hand", str(settings.hand)]
     for camera, kind in {camera: rig.kind for rig in rigs for camera in rig.cameras}.items():
@@ -73,6 +81,34 @@ def run_replay(settings: ReplaySettings, say: Callable[[str], None]) -> dict[str
     results = ["--detections", str(out), "--out", str(out)]
     _step("master", "solve", recording, *calibration, *hand, *which, *results)
     return cast(dict[str, object], json.loads((out / "summary.json").read_text()))
+
+
+def _recording_of(settings: ReplaySettings, say: Callable[[str], None]) -> Path:
+    """The recording, made of videos or pictures in OUT/recording if need be.
+
+    Raises:
+        ReplayError: Nothing is named, or the import failed.
+    """
+    paths, foreign = settings.paths, (*settings.cameras, settings.rig, settings.times)
+    if not paths and not settings.cameras:
+        raise ReplayError("replay: name a recording, or a video for each camera")
+    manifest = paths[0] / "recording.json" if len(paths) == 1 and paths[0].is_dir() else None
+    if manifest is not None and (manifest.is_symlink() or manifest.exists() or settings.calibration is None):
+        if any(value is not None for value in foreign):
+            raise ReplayError(f"--camera, --rig, --times: {paths[0]} is a recording, which has its own")
+        return paths[0]
+    if settings.calibration is None:
+        raise ReplayError(
+            "videos and pictures need --calibration DIR: lenses, places and colours of their cameras"
+        )
+    say("reading the videos or pictures ...")
+    made = settings.out / "recording"
+    options = ["--calibration", str(settings.calibration), "-o", str(made)]
+    options += [text for camera in settings.cameras for text in ("--camera", camera)]
+    options += [] if settings.rig is None else ["--rig", settings.rig]
+    options += [] if settings.times is None else ["--times", str(settings.times)]
+    _step("slave", "import", *options, *("--", *map(str, paths)) * bool(paths))
+    return made
 
 
 @dataclass(frozen=True, slots=True)

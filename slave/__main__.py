@@ -11,7 +11,7 @@ import cv2
 from common.errors import PhalanxError
 from common.supervisor import supervised_threads
 from slave.arguments import parser
-from slave.commands import colours, detect, imu, join, lights, record, run, tracker
+from slave.commands import colours, detect, importing, imu, join, lights, record, run, tracker
 from slave.service import Service
 
 
@@ -69,6 +69,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "lights": lambda options: lights.run(options, _say),
     "record": lambda options: record.run(options, _say, _aside),
     "join": lambda options: join.run(options, _say, _aside),
+    "import": lambda options: importing.run(options, _say),
     "detect": lambda options: detect.run(options, _aside),
     "install": _install,
     "doctor": _doctor,

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
-from slave.commands import colours, detect, imu, join, lights, record, run, tracker
+from slave.commands import colours, detect, importing, imu, join, lights, record, run, tracker
 from slave.commands.options import BEACON_PORT
 from slave.doctor import options as doctor
 from slave.install import arguments as install
@@ -32,6 +32,7 @@ HELP = {
     "lights": Help(lights.PURPOSE, lights.EXAMPLES, lights.add_options),
     "record": Help(record.PURPOSE, record.EXAMPLES, record.add_options),
     "join": Help(join.PURPOSE, join.EXAMPLES, join.add_options),
+    "import": Help(importing.PURPOSE, importing.EXAMPLES, importing.add_options),
     "detect": Help(detect.PURPOSE, detect.EXAMPLES, detect.add_options),
     "install": Help(install.PURPOSE, install.EXAMPLES, install.add_install),
     "doctor": Help(doctor.PURPOSE, doctor.EXAMPLES, partial(doctor.add_options, beacon_port=BEACON_PORT)),

@@ -1,6 +1,6 @@
 """Detect a whole recording offline: deterministic, without clock or network, into one file per camera."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,9 +11,9 @@ import numpy as np
 from common.arrays import Float, Int
 from common.calibration import CameraCalibration, HandProfile, load, save
 from common.errors import CalibrationError, RecordingError
+from common.frame_pictures import FramePictures
 from common.frame_recording import FrameRecording, open_recording
 from common.npz import write_npz
-from slave.cameras.replay import read_png
 from slave.markers.autocolour import calibrate_moving, frames_for
 from slave.markers.autocolour_names import by_clicks, by_hand, by_hues, checked
 from slave.markers.autocolour_surroundings import spread
@@ -63,7 +63,10 @@ def camera_of(recording: FrameRecording, camera: str, calibration: Path | None) 
         path = calibration / "cameras" / f"{camera}.json"
         markers = load(path, CameraCalibration).markers
         if markers is None:
-            raise CalibrationError(f"{path}: markers: missing; make them with `phalanx-slave colours`")
+            raise CalibrationError(
+                f"{path}: markers: missing; make them: phalanx-slave colours {recording.folder} --camera {camera}"
+                f" {_clicks(recording)} -o {path}  (U,V: a pixel on each marker in the camera's first picture)"
+            )
     else:
         markers = own.markers
         if markers is None:
@@ -72,6 +75,11 @@ def camera_of(recording: FrameRecording, camera: str, calibration: Path | None) 
                 f"DIR/cameras/{camera}.json (make it with `phalanx-slave colours`)"
             )
     return msgspec.structs.replace(own, markers=markers)
+
+
+def _clicks(recording: FrameRecording) -> str:
+    """The options of `colours` that name a pixel of each marker."""
+    return " ".join(f"--click {name}=U,V" for name in recording.manifest.marker_rig().markers)
 
 
 def detect_recording(
@@ -94,9 +102,8 @@ def detect_recording(
         windows_only: Scan windows where markers are expected, as `MarkerDetector`.
 
     Raises:
-        RecordingError: The recording is broken or has no such camera or no frame of it.
+        RecordingError: The recording or a frame is broken, or it has no such camera or no frame of it.
         CalibrationError: No marker colours.
-        CameraError: A frame cannot be read.
     """
     recording = open_recording(folder)
     rows = recording.frames_of(camera)
@@ -111,10 +118,11 @@ def detect_recording(
     shape = (len(rows), len(names))
     uv, rival_uv = np.full((*shape, 2), np.nan), np.full((*shape, 2), np.nan)
     area, quality, sigma_px = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan)
+    pictures = FramePictures(folder, (model.width_px, model.height_px))
     for i, row in enumerate(rows):
         if i > 0 and not recording.manifest.continuous:
             detector = detector.fresh()
-        image = read_png(folder / row.file, (model.height_px, model.width_px))
+        image = pictures.read(row.file)
         found = detector.push(image, row.t_ns)
         if tags is not None:
             tags.push(image, row)
@@ -131,6 +139,7 @@ def calibrate_colours(
     camera: str,
     output: Path,
     *,
+    clicks: Mapping[str, tuple[float, float]] | None = None,
     auto: bool = False,
     like: Path | None = None,
     hand: Path | None = None,
@@ -145,6 +154,7 @@ def calibrate_colours(
         folder: Recording. Its `clicks` name one pixel per marker in the camera's first frame, or none.
         camera: Camera name.
         output: Camera file to write: the recording's, with `markers` filled.
+        clicks: Marker -> (u, v) [px] in the camera's first frame, before those of the recording.
         auto: Use all frames though there are clicks; these then only name the paints.
         like: Camera file whose hues name the paints; the shape of the hand checks them where it can.
         hand: Hand profile whose shape names the paints, or checks their names; by default
@@ -155,25 +165,29 @@ def calibrate_colours(
         RecordingError: The recording is broken, has no frame of the camera, or clicks for some markers only.
         FitError: A click is not on a paint, two paints look the same, or the frames do not tell the paints or
             their names for certain; the text says what to do.
-        CameraError, CalibrationError: A frame or file cannot be read, the file cannot be written.
+        CalibrationError: A file cannot be read or written.
     """
     recording = open_recording(folder)
     rows = recording.frames_of(camera)
     if not rows:
         raise RecordingError(f"{folder}/frames.csv: no frame of camera {camera!r}")
-    clicks = recording.manifest.clicks.get(camera, {})
     rig = recording.manifest.marker_rig()
+    if unknown := sorted((clicks or {}).keys() - set(rig.markers)):
+        raise RecordingError(
+            f"--click: rig {rig.name!r} has no marker {unknown[0]!r}; it has {', '.join(rig.markers)}"
+        )
+    clicks = {**recording.manifest.clicks.get(camera, {}), **(clicks or {})}
     missing = [name for name in rig.markers if name not in clicks]
     moving = auto or like is not None or hand is not None or not clicks
     if missing and not moving:
         raise RecordingError(
             f"{folder}/recording.json: clicks.{camera}: nothing for {', '.join(missing)}; give one pixel [u, v] on "
-            f"each marker in the first frame, or --auto"
+            f"each marker in the first frame (--click NAME=U,V), or --auto"
         )
     own = recording.manifest.cameras[camera]
-    size = (own.height_px, own.width_px)
+    pictures = FramePictures(folder, (own.width_px, own.height_px))
     if not moving:
-        image = read_png(folder / rows[0].file, size)
+        image = pictures.read(rows[0].file)
         table = calibrate(image, {name: clicks[name] for name in rig.markers})
     else:
         profile = Path("calib_json/hands") / f"{rig.hand}.json" if hand is None else hand
@@ -189,7 +203,7 @@ def calibrate_colours(
             namer = by_hand(load(profile, HandProfile), rig.markers, say)
         chosen = spread(len(rows), frames_for(own.width_px * own.height_px))
         say(f"{camera}: reading {len(chosen)} of {len(rows)} frames")
-        images = [read_png(folder / rows[k].file, size) for k in chosen]
+        images = [pictures.read(rows[k].file) for k in chosen]
         table = calibrate_moving(images, rig.markers, namer, say)
     make_folder(output.parent)
     save(output, msgspec.structs.replace(own, markers={row.name: row.range for row in table}))

@@ -8,6 +8,7 @@ from common.calibration import CameraCalibration
 from common.camera_settings import figures, same_exposed
 from common.clock import Clock
 from common.errors import CameraError, PictureError, RecordingError
+from common.frame_pictures import FramePictures
 from common.frame_recording import FrameRow, Manifest, open_recording
 from common.pictures import decode, read_picture
 from slave.cameras.source import Frame
@@ -17,7 +18,7 @@ STEP_S = 0.05  # longest sleep at a time, so that a signal ends a wait soon
 
 
 class ReplayCamera:
-    """A `FrameSource` that reads PNG files.
+    """A `FrameSource` that reads the pictures of a recording.
 
     Holds the list of frames and the next index. Paced, the first frame comes at once and each further one when
     as much time has passed as in the recording, a gap of more than ten minutes left out; its `t_ns` is on the
@@ -41,6 +42,8 @@ class ReplayCamera:
         self._calibration = calibration
         self._grey = is_grey(recording.manifest, camera)
         self._folder = folder
+        size = (calibration.width_px, calibration.height_px)
+        self._pictures = FramePictures(folder, size, grey=self._grey)
         self._paced = paced
         self._clock = clock
         self._next = 0
@@ -50,7 +53,7 @@ class ReplayCamera:
         """Next frame in the order of time, or None after the last.
 
         Raises:
-            CameraError: A PNG is missing, broken or of another size than the camera file says.
+            CameraError: A picture is missing, broken or of another size than the camera file says.
         """
         if self._next >= len(self._rows):
             return None
@@ -92,8 +95,10 @@ class ReplayCamera:
         return {}
 
     def _load(self, row: FrameRow) -> Image:
-        size = (self._calibration.height_px, self._calibration.width_px)
-        return read_png(self._folder / row.file, size, grey=self._grey)
+        try:
+            return self._pictures.read(row.file)
+        except RecordingError as error:
+            raise CameraError(str(error)) from error
 
     def _wait_until(self, t_ns: int) -> None:
         while (left_s := (t_ns - self._clock.now_ns()) * 1e-9) > 0.0:

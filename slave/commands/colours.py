@@ -1,14 +1,21 @@
 """`phalanx-slave colours`: the colours of the markers of a camera, from a recording."""
 
 import argparse
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 PURPOSE = "colours of the markers"
 EXAMPLES = """\
   phalanx-slave colours recordings/paints --camera left -o calib_json/cameras/left.json
         HSV ranges from one click per marker, or, without clicks, from a few seconds of the moving hand;
         prints what collides with what
+  phalanx-slave colours left.mp4 --camera left --calibration calib_json -o calib_json/cameras/left.json \
+      --click thumb=312,204 --click index=350,122 --click middle=371,101 --click ring=395,117 --click little=420,150 \
+      --click back=360,260
+        the same of a video or a folder of pictures: one pixel (column,row) on each marker in its first picture
   phalanx-slave colours recordings/paints --camera right --like calib_json/cameras/left.json -o right.json
         the same, the names taken from a camera file that has them
 """
@@ -20,9 +27,29 @@ def add_options(command: argparse.ArgumentParser) -> None:
         "recording",
         type=Path,
         metavar="RECORDING",
-        help="folder; with clicks in recording.json, or a few seconds of the moving, open hand",
+        help="folder; with clicks in recording.json, or a few seconds of the moving, open hand; or a video or a folder "
+        "of pictures, with --calibration",
     )
     command.add_argument("--camera", required=True, metavar="NAME")
+    command.add_argument(
+        "--click",
+        action="append",
+        type=click,
+        default=[],
+        metavar="MARKER=U,V",
+        help="a pixel on a marker in the first picture, column and row from the top left; once for each marker",
+    )
+    command.add_argument(
+        "--calibration",
+        type=Path,
+        metavar="DIR",
+        help="of a video or pictures: calib_json tree with the camera",
+    )
+    command.add_argument(
+        "--rig",
+        metavar="NAME",
+        help="of a video or pictures: rig in DIR/rigs (default: the one with the camera)",
+    )
     command.add_argument(
         "--auto",
         action="store_true",
@@ -55,14 +82,59 @@ def run(options: argparse.Namespace, say: Callable[[str], None], aside: Callable
     from slave.markers.colours import report
     from slave.offline import calibrate_colours
 
-    table = calibrate_colours(
-        options.recording,
-        options.camera,
-        options.output,
-        auto=options.auto,
-        like=options.like,
-        hand=options.hand,
-        say=aside,
-    )
+    with _recording(options, aside) as folder:
+        table = calibrate_colours(
+            folder,
+            options.camera,
+            options.output,
+            clicks=dict(options.click),
+            auto=options.auto,
+            like=options.like,
+            hand=options.hand,
+            say=aside,
+        )
     say(report(table))
     return 0
+
+
+def click(text: str) -> tuple[str, tuple[float, float]]:
+    """A marker and a pixel (u, v) on it.
+
+    Raises:
+        argparse.ArgumentTypeError: The text is not MARKER=U,V.
+    """
+    found = re.fullmatch(r"([^=]+)=(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", text)
+    if found is None:
+        raise argparse.ArgumentTypeError(f"{text!r}: expected MARKER=U,V, such as thumb=312,204")
+    return found[1], (float(found[2]), float(found[3]))
+
+
+@contextmanager
+def _recording(options: argparse.Namespace, aside: Callable[[str], None]) -> Generator[Path]:
+    """The recording; of a video or pictures one that lasts as long as it is needed.
+
+    Raises:
+        PhalanxError: They cannot be read, or are not those of the camera.
+    """
+    from common.errors import RecordingError
+    from common.frame_recording import MANIFEST
+    from slave.foreign.importing import Wish, import_pictures
+
+    if (options.recording / MANIFEST).is_file():
+        if options.calibration is not None or options.rig is not None:
+            raise RecordingError(
+                f"--calibration, --rig: {options.recording} is a recording, which has its own"
+            )
+        yield options.recording
+        return
+    if options.calibration is None:
+        raise RecordingError(
+            f"{options.recording}: no {MANIFEST} in it; of a video or pictures give --calibration DIR, whose"
+            f" cameras/{options.camera}.json they are of"
+        )
+    with TemporaryDirectory() as folder:
+        wish = Wish(
+            named={options.camera: options.recording}, calibration=options.calibration, rig=options.rig
+        )
+        import_pictures(wish, Path(folder) / "recording", aside)
+        yield Path(folder) / "recording"

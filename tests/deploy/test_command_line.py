@@ -78,7 +78,7 @@ def steps_of_replay(
     (folder / "recording.json").write_text(json.dumps({"rigs": [wrist, markers]}))
     (folder / "hand.json").write_text("{}")
     values: dict[str, object] = {"calibration": None, "hand": folder / "hand.json"}
-    settings = replay.ReplaySettings(folder, folder / "out", **(values | changes))  # type: ignore[arg-type]
+    settings = replay.ReplaySettings([folder], folder / "out", **(values | changes))  # type: ignore[arg-type]
     assert replay.run_replay(settings, lambda _line: None) == {"poses": len(steps)}
     return steps
 

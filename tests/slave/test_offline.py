@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from common.calibration import save
-from common.errors import CalibrationError, CameraError, RecordingError
+from common.errors import CalibrationError, RecordingError
 from common.frame_recording import open_recording
 from slave.__main__ import main
 from slave.offline import camera_of, detect_recording, save_detections
@@ -105,7 +105,7 @@ def test_wrong_camera_broken_frame_and_unwritable_file(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="cannot write"):
         save_detections(tmp_path, detect_recording(folder, "left"))
     (folder / "1.png").write_bytes(b"junk")
-    with pytest.raises(CameraError, match=r"1\.png: is no JPEG or PNG"):
+    with pytest.raises(RecordingError, match=r"1\.png: is no JPEG or PNG"):
         detect_recording(folder, "left")
 
 

@@ -45,8 +45,13 @@ Cameras = Annotated[
 Flat = Annotated[
     bool,
     typer.Option(
-        "--flat-board", help="The board is exact and flat (glass, screen): do not estimate its shape."
+        "--flat-board",
+        help="The board is exact and flat (glass, screen): do not estimate its shape. Default: as views held out say.",
     ),
+]
+Bent = Annotated[
+    bool,
+    typer.Option("--bent-board", help="Estimate the board's own shape. Default: what views held out say."),
 ]
 Picture = Annotated[Path | None, typer.Option(help="Write a picture of corners and residuals to this .png.")]
 
@@ -59,6 +64,7 @@ def intrinsics(
     dictionary: Dictionary = "4X4_50",
     camera: Cameras = None,
     flat_board: Flat = False,
+    bent_board: Bent = False,
     calibration: Calibration = CALIB_JSON,
     out: ResultTree = None,
     json_file: JsonFile = None,
@@ -78,7 +84,7 @@ def intrinsics(
     known = _known_cameras(views, calibration, out)
     results: dict[str, CamerasResult] = {}
     for name in views.cameras:
-        fit = fit_cameras(_only(views, name), shaped=not flat_board)
+        fit = fit_cameras(_only(views, name), bent=_bent(flat=flat_board, bent=bent_board))
         results[name] = result(fit, {})
         _say_all(report_lines(results[name]))
         _draw(picture if len(views.cameras) == 1 else _named(picture, name), fit)
@@ -104,6 +110,7 @@ def stereo(
         bool, typer.Option("--keep-intrinsics", help="Keep the lenses that the camera files have.")
     ] = False,
     flat_board: Flat = False,
+    bent_board: Bent = False,
     calibration: Calibration = CALIB_JSON,
     out: ResultTree = None,
     json_file: JsonFile = None,
@@ -134,7 +141,7 @@ def stereo(
     for name, file in known.items():
         if keep_intrinsics and file is not None and file.intrinsics is not None:
             held[name] = lens_of(file.intrinsics)
-    fit = fit_cameras(views, held, shaped=not flat_board)
+    fit = fit_cameras(views, held, bent=_bent(flat=flat_board, bent=bent_board))
     found = result(fit, held)
     _say_all(report_lines(found))
     _draw(picture, fit)
@@ -162,6 +169,17 @@ def stereo(
     if dropped and written:
         typer.echo(dropped)
     _written(written, known)
+
+
+def _bent(*, flat: bool, bent: bool) -> bool | None:
+    """What the options say of the board; None: views held out decide.
+
+    Raises:
+        FitError: It is both.
+    """
+    if flat and bent:
+        raise FitError("--flat-board and --bent-board: a board is one of both")
+    return bent if flat or bent else None
 
 
 def _views(source: Path, board: Board, cameras: list[str] | None) -> BoardViews:

@@ -1,6 +1,7 @@
 """All cameras that saw a board in one bundle: lenses, places, and the board's shape; what is wrong is left out.
 
-every camera alone -> links between them -> robust bundle <-> judge images and views -> plain least squares
+every camera alone -> links between them -> robust bundle <-> judge images and views -> plain least squares,
+with the board as drawn and with a shape of its own -> the one that predicts views held out better
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,9 +12,11 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.errors import FitError
-from master.calibrate.cameras.alone import MIN_VIEWS, Rejection, fit_alone
+from master.calibrate.cameras.alone import MIN_VIEWS, Alone, Rejection, fit_alone
 from master.calibrate.cameras.boards import board_corners
 from master.calibrate.cameras.bundle import Bundle, Free, Observation, Solution, predict, rms, solve
+from master.calibrate.cameras.held_out import MIN_VIEWS as MIN_SHAPE_VIEWS
+from master.calibrate.cameras.held_out import BoardChoice, Model, choose
 from master.calibrate.cameras.judge import Seen, Shot, judge, place_boards
 from master.calibrate.cameras.links import link
 from master.calibrate.cameras.views import BoardViews
@@ -21,7 +24,6 @@ from master.calibrate.cameras.views import BoardViews
 MIN_SHARED = 3  # views that a camera must share with the others: one can be wrong, two cannot outvote it
 _ROUNDS = 6
 _SURE = 3.0  # standard deviations that a term of the distortion must be away from zero
-_MIN_SHAPE_VIEWS = 6  # fewer cannot tell a bent board from a bent lens
 _TANGENTIAL = (6, 7)
 _TERMS = ((8,), _TANGENTIAL, (5,), (4,))  # k3, p1 and p2, k2, k1: in this order they are given up
 
@@ -35,16 +37,18 @@ class CamerasFit:
         shots: The accepted images.
         observations: Their corners, in the order of `shots`.
         solution: Plain least squares over them; the rig's frame is that of the first camera.
+        free: What was estimated.
         rejected: Images that are not used, and views whose cameras do not agree.
-        flat_rms_px: Rms with the board taken as drawn; equal to `rms_px` where its shape was not estimated.
+        board: Whether the board's shape was estimated, and why.
     """
 
     views: BoardViews
     shots: tuple[Shot, ...]
     observations: tuple[Observation, ...]
     solution: Solution
+    free: Free
     rejected: tuple[Rejection, ...]
-    flat_rms_px: float
+    board: BoardChoice
 
     @property
     def rms_px(self) -> float:
@@ -62,14 +66,15 @@ class CamerasFit:
 
 
 def fit_cameras(
-    views: BoardViews, held: Mapping[str, Float] | None = None, *, shaped: bool = True
+    views: BoardViews, held: Mapping[str, Float] | None = None, *, bent: bool | None = None
 ) -> CamerasFit:
     """Lenses and places of all cameras of `views`.
 
     Args:
         views: What was seen.
         held: Camera -> known lens (9,), in the order of `bundle.LENS`; those of the others are estimated.
-        shaped: Estimate the board's shape too; False: it is exactly as drawn (a print on glass, a screen).
+        bent: Estimate the board's shape too; False: it is exactly as drawn (a print on glass, a screen); None: the
+            one that predicts views better that were held out of the fit, flat where that is not certain.
 
     Raises:
         FitError: The views do not determine what is asked for; the text says what is missing.
@@ -79,13 +84,42 @@ def fit_cameras(
     links = link(views.board, views.cameras, {camera: fit.T_camera_board for camera, fit in alone.items()})
     seen = Seen(views, links.turned)
     drawn = board_corners(views.board)
-    bundle = Bundle(
+    start = Bundle(
         lenses=np.stack([alone[camera].lens for camera in views.cameras]),
         T_camera_rig=np.stack([links.T_camera_rig[camera] for camera in views.cameras]),
         T_rig_board=np.zeros((0, 4, 4)),
         drawn_m=drawn,
         shape_m=np.zeros_like(drawn),
     )
+    if bent is not None:
+        return _fit(seen, alone, start, held, BoardChoice(bent, reason="as asked for"))
+    flat = _fit(seen, alone, start, held, BoardChoice(bent=False))
+    count = len({shot.place for shot in flat.shots})
+    if count < MIN_SHAPE_VIEWS:
+        reason = f"{count} views are too few to tell its shape, at least {MIN_SHAPE_VIEWS} are needed"
+        return replace(flat, board=BoardChoice(bent=False, reason=reason))
+    try:
+        shaped = _fit(seen, alone, start, held, BoardChoice(bent=True))
+    except FitError as error:
+        return replace(flat, board=BoardChoice(bent=False, reason=f"with a shape of its own {error}"))
+    both = [shot for shot in flat.shots if shot in shaped.shots]
+    choice = choose(seen, both, _model(flat), _model(shaped))
+    return replace(shaped if choice.bent else flat, board=choice)
+
+
+def _model(fit: CamerasFit) -> Model:
+    return Model(fit.solution.bundle, fit.free, fit.solution.sigma_px)
+
+
+def _fit(
+    seen: Seen, alone: Mapping[str, Alone], start: Bundle, held: Mapping[str, Float], board: BoardChoice
+) -> CamerasFit:
+    """The fit with one kind of board.
+
+    Raises:
+        FitError: Too little is left, or too few views for the shape of a board.
+    """
+    views, bundle = seen.views, start
     candidates = tuple(
         Shot(view.name, camera, view.name)
         for view in views.views
@@ -98,15 +132,15 @@ def fit_cameras(
     # At first the lenses stay as each camera by itself found them: they would bend to suit a board that moved.
     stages = [replace(free, lenses=np.zeros_like(free.lenses))] + [free] * _ROUNDS
     for stage in stages:
-        _check_enough(views, shots, held)
-        bundle, sigma = _robust(seen, shots, bundle, stage, sigma, shaped=shaped)
+        _check_enough(views, shots, held, board)
+        bundle, sigma = _robust(seen, shots, bundle, stage, sigma, bent=board.bent)
         judged, notes = judge(seen, candidates, bundle)
         if judged == shots and stage is free:
             break
         shots = judged
-    _check_enough(views, shots, held)
+    _check_enough(views, shots, held, board)
     first = tuple(no for fit in alone.values() for no in fit.rejected)
-    return _final(seen, shots, bundle, free, sigma, first + notes, shaped=shaped)
+    return _final(seen, shots, bundle, replace(free, shape=board.bent), sigma, first + notes, board)
 
 
 def _free(views: BoardViews, held: Mapping[str, Float]) -> Free:
@@ -116,14 +150,12 @@ def _free(views: BoardViews, held: Mapping[str, Float]) -> Free:
 
 
 def _robust(
-    seen: Seen, shots: Sequence[Shot], bundle: Bundle, free: Free, sigma: float, *, shaped: bool
+    seen: Seen, shots: Sequence[Shot], bundle: Bundle, free: Free, sigma: float, *, bent: bool
 ) -> tuple[Bundle, float]:
     """The bundle by Cauchy's loss, its scale three robust standard deviations, first flat and then with its shape."""
     observations = seen.observations(shots)
     bundle = place_boards(observations, bundle)
-    for shape in (False, True):
-        if shape and not (shaped and len(bundle.T_rig_board) >= _MIN_SHAPE_VIEWS):
-            break
+    for shape in (False, True) if bent else (False,):
         bundle = solve(observations, bundle, replace(free, shape=shape), 3 * sigma, sigma).bundle
         distances = [np.linalg.norm(o.uv - predict(bundle, o), axis=1) for o in observations]
         sigma = max(float(np.median(np.concatenate(distances))) / 1.1774, 1e-3)
@@ -137,27 +169,23 @@ def _final(
     free: Free,
     sigma: float,
     rejected: tuple[Rejection, ...],
-    *,
-    shaped: bool,
+    board: BoardChoice,
 ) -> CamerasFit:
     observations = seen.observations(shots)
     start = place_boards(observations, start)
-    shape = shaped and len(start.T_rig_board) >= _MIN_SHAPE_VIEWS
     estimated: Bool = np.any(free.lenses, axis=1, keepdims=True)
     lenses: Bool = np.repeat(estimated, 9, axis=1)
     while True:
         # From the start anew each time: what a term that is not determined did to the others must not stay.
         begin = replace(start, lenses=np.where(lenses | ~estimated, start.lenses, _bare(start.lenses)))
-        solution = solve(observations, begin, Free(lenses, free.cameras, shape), None, sigma)
+        solution = solve(observations, begin, replace(free, lenses=lenses), None, sigma)
         fewer = _determined(solution, lenses)
         if np.array_equal(fewer, lenses):
             break
         lenses = fewer
-    flat = solution
-    if shape:
-        begin = replace(solution.bundle, shape_m=np.zeros_like(start.shape_m))
-        flat = solve(observations, begin, Free(lenses, free.cameras, shape=False))
-    return CamerasFit(seen.views, shots, observations, solution, rejected, rms(flat.residuals))
+    return CamerasFit(
+        seen.views, shots, observations, solution, replace(free, lenses=lenses), rejected, board
+    )
 
 
 def _bare(lenses: Float) -> Float:
@@ -184,13 +212,20 @@ def _determined(solution: Solution, lenses: Bool) -> Bool:
     return kept
 
 
-def _check_enough(views: BoardViews, shots: Sequence[Shot], held: Mapping[str, Float]) -> None:
+def _check_enough(
+    views: BoardViews, shots: Sequence[Shot], held: Mapping[str, Float], board: BoardChoice
+) -> None:
     """Refuse where too little is left.
 
     Raises:
-        FitError: A camera has too few images, or shares too few views.
+        FitError: A camera has too few images, or shares too few views, or they are too few for the board's shape.
     """
     places = [shot.place for shot in shots]
+    if board.bent and len(set(places)) < MIN_SHAPE_VIEWS:
+        raise FitError(
+            f"{len(set(places))} good views are too few for the board's own shape, at least {MIN_SHAPE_VIEWS} are"
+            " needed: take more, or take the board as flat (--flat-board)"
+        )
     for camera in views.cameras:
         own = [shot for shot in shots if shot.camera == camera]
         if camera not in held and len(own) < max(MIN_VIEWS, len(views.of(camera)) / 2):

@@ -9,6 +9,7 @@ import numpy as np
 
 from common.arrays import Image
 from common.errors import PictureError, RecordingError
+from common.frame_pictures import FramePictures
 from common.frame_recording import MANIFEST, FrameRow, Illumination, open_recording
 from common.pictures import decode_file, read_picture
 from master.calibrate.cameras.views import ImageSet
@@ -120,9 +121,12 @@ def _of_recording(folder: Path, cameras: Sequence[str]) -> list[tuple[str, Image
     recording = open_recording(folder)
     names = list(cameras) or list(recording.manifest.cameras)
     rows = {name: _showing(recording.frames_of(name)) for name in names}
+    pictures: dict[str, FramePictures] = {}
     for name, own in rows.items():
         if not own:
             raise RecordingError(f"{folder}: camera {name!r} has no frame")
+        camera = recording.manifest.cameras[name]
+        pictures[name] = FramePictures(folder, (camera.width_px, camera.height_px))
     reference = rows[names[0]]
     times = {name: np.array([row.t_ns for row in own], dtype=np.int64) for name, own in rows.items()}
     # Nearer to this frame than to its neighbours; frames alone in the recording have no neighbour to be nearer to.
@@ -137,6 +141,6 @@ def _of_recording(folder: Path, cameras: Sequence[str]) -> list[tuple[str, Image
         for name, own in rows.items():
             nearest = int(np.abs(times[name] - row.t_ns).argmin())
             if abs(own[nearest].t_ns - row.t_ns) <= gap:
-                images[name] = partial(_load, folder / own[nearest].file)
+                images[name] = partial(pictures[name].read, own[nearest].file)
         sets.append((str(row.seq), images))
     return sets

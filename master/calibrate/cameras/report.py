@@ -32,14 +32,27 @@ def report_lines(result: CamerasResult) -> Iterator[str]:
         )
     what = "stereo rms" if len(result.lenses) > 1 else "rms"
     yield f"{what} {result.rms_px:.3f} px over {result.views} views"
-    if result.shape_mm != (0.0, 0.0):
-        yield (
-            f"board: corners {result.shape_mm[0]:.2f} mm in its plane and {result.shape_mm[1]:.2f} mm out of it from"
-            f" where they are drawn (rms); taken as drawn, all images had {result.flat_rms_px:.3f} px"
-        )
+    yield _board_line(result)
     yield "nothing was left out" if not result.rejected else f"left out ({len(result.rejected)}):"
     for no in result.rejected:
         yield f"  {no}"
+
+
+def _board_line(result: CamerasResult) -> str:
+    """Which board was taken, and by what it was chosen."""
+    board, (along, out) = result.board, result.shape_mm
+    taken = (
+        f"corners {along:.2f} mm in its plane and {out:.2f} mm out of it from where they are drawn (rms)"
+        if board.bent
+        else "taken as drawn, flat"
+    )
+    if board.reason:
+        return f"board: {taken}: {board.reason}"
+    return (
+        f"board: {taken}: in {board.views} views held out of the fit, corners are {board.flat_px:.3f} px off where a"
+        f" flat board predicts them and {board.bent_px:.3f} px with a shape of its own"
+        f"{'' if board.bent or board.bent_px >= board.flat_px else ', which is not certainly less'}"
+    )
 
 
 def _lens_lines(name: str, lens: LensResult) -> Iterator[str]:
@@ -70,7 +83,6 @@ def report_json(result: CamerasResult) -> dict[str, object]:
     """The numbers; lengths in the unit of their key."""
     return {
         "rms_px": result.rms_px,
-        "flat_board_rms_px": result.flat_rms_px,
         "views": result.views,
         "cameras": {name: _lens_json(lens) for name, lens in result.lenses.items()},
         "T_first_camera": {name: [list(row) for row in place] for name, place in result.T_rig_camera.items()},
@@ -91,9 +103,17 @@ def report_json(result: CamerasResult) -> dict[str, object]:
             }
             for pair in result.pairs
         ],
-        "board_shape_rms_mm": {"in_plane": result.shape_mm[0], "out_of_plane": result.shape_mm[1]},
+        "board": _board_json(result),
         "rejected": [{"view": no.view, "camera": no.camera, "reason": no.reason} for no in result.rejected],
     }
+
+
+def _board_json(result: CamerasResult) -> dict[str, object]:
+    board, (along, out) = result.board, result.shape_mm
+    compared: dict[str, object] = {"reason": board.reason}
+    if not board.reason:
+        compared = {"flat_px": board.flat_px, "bent_px": board.bent_px, "views_held_out": board.views}
+    return {"bent": board.bent, "shape_rms_mm": {"in_plane": along, "out_of_plane": out}} | compared
 
 
 def _lens_json(lens: LensResult) -> dict[str, object]:

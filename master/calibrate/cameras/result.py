@@ -15,6 +15,7 @@ from master.calibrate.cameras.audit import PairAudit, audit_pair, pairs_with_vie
 from master.calibrate.cameras.bundle import rms
 from master.calibrate.cameras.coverage import Coverage, advice, coverage
 from master.calibrate.cameras.fit import CamerasFit
+from master.calibrate.cameras.held_out import BoardChoice
 from master.calibrate.cameras.lens_files import camera_model, intrinsics_of, matrix_of
 
 MOST_FOCAL_SD = 0.01  # of the focal length: one percent of every depth
@@ -54,7 +55,7 @@ class CamerasResult:
         place_sd: Camera -> standard deviations of its centre (3,) [m] and turn (3,) [rad].
         baseline_sd_m: Camera -> standard deviation of its distance from the first [m].
         rms_px: Reprojection rms over all accepted images that share their view; one camera: over all.
-        flat_rms_px: The same of all accepted images, had the board been taken as drawn.
+        board: Whether the board's shape was estimated, and why.
         shape_mm: How far the board's corners are from the drawn ones, in its plane and out of it, root mean square.
         pairs: Audit of each two cameras that share views.
         views: Number of views that cameras share; one camera: of all.
@@ -66,7 +67,7 @@ class CamerasResult:
     place_sd: Mapping[str, Float]
     baseline_sd_m: Mapping[str, float]
     rms_px: float
-    flat_rms_px: float
+    board: BoardChoice
     shape_mm: tuple[float, float]
     pairs: tuple[PairAudit, ...]
     views: int
@@ -104,7 +105,7 @@ def result(fit: CamerasFit, held: Mapping[str, Float]) -> CamerasResult:
         place_sd={name: sd for name, (sd, _) in centres.items()},
         baseline_sd_m={name: sd for name, (_, sd) in centres.items()},
         rms_px=rms([fit.solution.residuals[i] for i in used]),
-        flat_rms_px=fit.flat_rms_px,
+        board=fit.board,
         shape_mm=(
             float(np.sqrt((shape[:, :2] ** 2).sum(axis=1).mean())),
             float(np.sqrt((shape[:, 2] ** 2).mean())),

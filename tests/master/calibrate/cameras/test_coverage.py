@@ -61,7 +61,7 @@ def test_frames_of_a_recording_nearest_in_time_make_a_view(tmp_path: Path, datas
             if camera == "right" and i == 0:
                 continue  # a dropped frame
             file = f"{camera}{i}.png"
-            cv2.imwrite(str(tmp_path / file), np.full((8, 8), i, np.uint8))
+            cv2.imwrite(str(tmp_path / file), np.full((480, 640), i, np.uint8))
             rows.append(f"{camera},{i},{i * 16_666_667 + late_ns},none,{file}")
     (tmp_path / FRAMES).write_text("\n".join(rows) + "\n")
     sets = image_sets(tmp_path, ["left", "right"])

@@ -12,6 +12,7 @@ from common.geometry import invert
 from master.calibrate.cameras.boards import Charuco, Checkerboard, board_corners, orderings
 from master.calibrate.cameras.detect import Sighting
 from master.calibrate.cameras.fit import CamerasFit, fit_cameras
+from master.calibrate.cameras.report import report_lines
 from master.calibrate.cameras.result import result
 from master.calibrate.cameras.views import BoardViews, View
 from tests.master.calibrate.cameras.board_scenes import Scene, nudged, scene
@@ -46,7 +47,7 @@ def with_sighting(
 @pytest.mark.parametrize(("cameras", "seed"), [(1, 0), (1, 1), (2, 0), (2, 1), (3, 0), (4, 1)])
 def test_cameras_are_found_where_they_are(cameras: int, seed: int) -> None:
     truth = scene(seed, cameras, views=16, shape_mm=0.1)
-    fit = fit_cameras(truth.views(NOISE_PX, seed))
+    fit = fit_cameras(truth.views(NOISE_PX, seed), bent=True)  # less than 16 views tell for certain
     focal, place, turn = errors(fit, truth)
     assert focal < 2.0
     assert place < 0.8
@@ -249,3 +250,37 @@ def test_a_picture_upside_down_among_three_cameras_is_parted_however_far_it_driv
         fit = fit_cameras(views)
         assert [(no.view, no.camera) for no in fit.rejected] == [(name, "top")]
         assert errors(fit, truth)[1] < 0.8
+
+
+@pytest.mark.parametrize(("shape_mm", "bent"), [(0.3, True), (0.0, False)])
+def test_a_bent_board_is_told_from_a_flat_one_by_views_held_out(shape_mm: float, bent: bool) -> None:
+    truth = scene(21, 2, views=12, shape_mm=shape_mm)
+    fit = fit_cameras(truth.views(NOISE_PX, 21))
+    assert fit.board.bent == bent == bool(fit.solution.bundle.shape_m.any())
+    assert fit.board.views == 12
+    assert (fit.board.bent_px < 0.8 * fit.board.flat_px) == bent
+    # Placed by half of its corners, the other half is off by little more than its noise.
+    assert min(fit.board.flat_px, fit.board.bent_px) == pytest.approx(NOISE_PX * 2**0.5, rel=0.25)
+    (line,) = [line for line in report_lines(result(fit, {})) if line.startswith("board:")]
+    assert ("taken as drawn" not in line) == bent
+    for figure in ("12 views held out", f"{fit.board.flat_px:.3f} px", f"{fit.board.bent_px:.3f} px"):
+        assert figure in line
+
+
+def test_few_noisy_corners_of_a_flat_board_are_not_taken_for_a_bent_one() -> None:
+    truth = scene(22, 2, views=24, board=Charuco(4, 5, 0.054, 0.0405))
+    views = truth.views(1.0, 22)
+    fit, shaped = fit_cameras(views), fit_cameras(views, bent=True)
+    assert not fit.board.bent
+    assert not fit.solution.bundle.shape_m.any()
+    assert shaped.rms_px < fit.rms_px  # of the corners fitted, which says nothing
+    assert shaped.board.reason == "as asked for"
+
+
+def test_few_views_take_the_board_as_drawn_and_say_so() -> None:
+    views = scene(23, 1, views=7, shape_mm=0.3).views(NOISE_PX, 23)
+    fit = fit_cameras(views)
+    assert not fit.board.bent
+    assert "7 views are too few to tell its shape, at least 8" in fit.board.reason
+    with pytest.raises(FitError, match="7 good views are too few for the board's own shape"):
+        fit_cameras(views, bent=True)

@@ -1,0 +1,262 @@
+"""Make a recording of foreign videos and pictures: calibration, times and rows; pictures are linked, not decoded anew.
+
+A video or picture gets a second name in the recording's folder (a hard link), which takes no room; where the disks
+differ it is copied. It is read once, to count its frames and what is broken in it.
+"""
+
+import os
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from common.arrays import Int
+from common.calibration import CameraCalibration, RigCalibration, load
+from common.errors import PictureError, RecordingError
+from common.frame_pictures import frame_name
+from common.frame_recording import MANIFEST, FrameRow, Illumination, Manifest, load_manifest
+from common.frame_writing import RecordingWriter, refuse_occupied
+from common.object_profile import ObjectProfile
+from common.picture_size import size_of
+from common.pictures import decode, read_picture
+from common.video import VideoFrames
+from slave.foreign.sources import Source, found_in, pictures_in, rig_for, sources_of
+from slave.foreign.times import Timed, by_rate, by_table, read_times
+
+NOTE = "imported from "
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What is to be imported.
+
+    Attributes:
+        calibration: calib_json tree.
+        paths: Videos, folders of pictures, or folders of these.
+        named: Camera -> its video or folder of pictures.
+        rig: Name of the rig; None: the one that has these cameras.
+        times: Table of the times of all cameras; None: those beside each video, or its own.
+    """
+
+    calibration: Path
+    paths: Sequence[Path] = ()
+    named: Mapping[str, Path] = field(default_factory=dict[str, Path])
+    rig: str | None = None
+    times: Path | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Taken:
+    """What one camera took: numbers of its frames, what they are called in the recording, and when they were taken."""
+
+    source: Source
+    files: Mapping[int, str]
+    timed: Timed
+    simultaneous: bool
+
+
+def import_pictures(wish: Wish, out: Path, say: Callable[[str], None]) -> dict[str, int]:
+    """Write the recording; a former import in the same folder is replaced, nothing else is.
+
+    Returns:
+        Camera -> number of its frames.
+
+    Raises:
+        PhalanxError: A file is missing or broken, of no camera or of another size than the camera file says, or has no
+            frame that can be decoded; the text says what to do.
+    """
+    paths = found_in(wish.paths)
+    for path in wish.named.values():
+        if found_in([path]) != [path]:
+            raise RecordingError(f"{path}: must be one video or one folder of pictures")
+    rig = rig_for(wish.calibration, wish.rig, paths, wish.named)
+    if rig.kind != "markers":
+        raise RecordingError(
+            f"rig {rig.name!r}: the strobed frames of a wrist device come from `phalanx-slave record`"
+        )
+    if unknown := sorted(wish.named.keys() - set(rig.cameras)):
+        raise RecordingError(f"--camera {unknown[0]}: rig {rig.name!r} has {', '.join(rig.cameras)}")
+    sources = [Source(camera, path) for camera, path in wish.named.items()]
+    if paths:
+        sources += sources_of(paths, rig, say)
+    if twice := {s.camera for s in sources if [o.camera for o in sources].count(s.camera) > 1}:
+        raise RecordingError(f"--camera {min(twice)}: is given twice")
+    if absent := [name for name in rig.cameras if all(source.camera != name for source in sources)]:
+        say(f"rig {rig.name!r} has {', '.join(absent)}, too, of which there is nothing")
+    rig = _only(rig, sources)
+    cameras: dict[str, CameraCalibration] = {}
+    for source in sources:
+        file = wish.calibration / "cameras" / f"{source.camera}.json"
+        cameras[source.camera] = load(file, CameraCalibration)
+    taken = [_taken(s, cameras[s.camera], wish, say) for s in sources]
+    own = [one.source for one in taken if one.simultaneous]
+    if own and len(own) < len(taken):
+        raise RecordingError(
+            f"{own[0].path}: no table of times, but others have one: give one for every camera"
+        )
+    if len(own) > 1:
+        say(
+            "the first frames of all cameras are taken as simultaneous; where they are not, give their --times"
+        )
+    _clear(out)
+    manifest = Manifest(
+        version=1,
+        kind="markers",
+        cameras=cameras,
+        rig=rig,
+        note=NOTE + ", ".join(source.path.name for source in sources),
+        objects={
+            name: load(wish.calibration / "objects" / f"{name}.json", ObjectProfile) for name in rig.objects
+        },
+    )
+    _write(out, manifest, taken)
+    return {one.source.camera: len(one.timed.number) for one in taken}
+
+
+def _only(rig: RigCalibration, sources: Sequence[Source]) -> RigCalibration:
+    """The rig with the cameras that there are pictures of."""
+    names = tuple(name for name in rig.cameras if any(source.camera == name for source in sources))
+    places = {name: rig.T_rig_camera[name] for name in names if name in rig.T_rig_camera}
+    return msgspec.structs.replace(rig, cameras=names, T_rig_camera=places)
+
+
+def _taken(source: Source, camera: CameraCalibration, wish: Wish, say: Callable[[str], None]) -> _Taken:
+    """Numbers, names and times of the frames of one camera, said in a line.
+
+    Raises:
+        RecordingError: No frame can be decoded, the size is another one, or the times are of no use.
+    """
+    size = (camera.width_px, camera.height_px)
+    try:
+        read = _video if source.is_video else _pictures
+        number, files, own, faults = read(source, size, camera.frame_rate_hz, wish)
+    except OSError as error:
+        raise RecordingError(f"{source.path}: cannot read: {error.strerror}") from error
+    except PictureError as error:
+        raise RecordingError(f"{source.path}: {error}") from error
+    beside = (
+        source.path.with_suffix(".csv") if source.is_video else source.path.parent / f"{source.path.name}.csv"
+    )
+    table = wish.times or (beside if beside.is_file() else None)
+    timed = own if table is None else by_table(table, read_times(table, source.camera), number)
+    if timed is None:
+        raise RecordingError(
+            f"{source.path}: has no times and no frame rate; give --times FILE.csv (frame,time)"
+        )
+    seconds = 1e-9 * float(timed.t_ns[-1] - timed.t_ns[0])
+    say(
+        f"{source.camera}: {source.path}: {len(timed.number)} frames in {seconds:.2f} s ({timed.note}){faults}"
+    )
+    return _Taken(source, files, timed, table is None)
+
+
+_Read = tuple[Int, Mapping[int, str], Timed | None, str]
+"""Numbers (T,) of the frames that decode, their names in the recording, their own times, and what is broken."""
+
+
+def _video(source: Source, size: tuple[int, int], _rate_hz: float, wish: Wish) -> _Read:
+    video = VideoFrames(source.path)
+    try:
+        _check_size(source, video.size_px, size, wish)
+        times = video.times()
+    finally:
+        video.close()
+    name = source.camera + source.path.suffix.lower()
+    own: Timed | None = None
+    if times.stamped:
+        own = Timed(times.number, times.t_ns, "time stamps of the video")
+    elif times.rate_hz > 0.0:
+        own = by_rate(times.number, times.rate_hz, "as the video states")
+    faults = f"; {times.broken} frames between them cannot be decoded" if times.broken else ""
+    faults += (
+        f"; it ends {times.missing} frames before the {times.missing + int(times.number[-1]) + 1} that it states"
+        * (times.missing > 0)
+    )
+    return times.number, {int(n): frame_name(name, int(n)) for n in times.number}, own, faults
+
+
+def _pictures(source: Source, size: tuple[int, int], rate_hz: float, wish: Wish) -> _Read:
+    files: dict[int, str] = {}
+    pictures = pictures_in(source.path)
+    for number, picture in enumerate(pictures):
+        data = read_picture(picture)
+        try:
+            found = size_of(data)
+        except PictureError:
+            continue
+        _check_size(source, found, size, wish)
+        try:
+            decode(data, size)
+        except PictureError:
+            continue
+        files[number] = f"{source.camera}/{number:06d}{picture.suffix.lower()}"
+    if not files:
+        raise PictureError(f"not one of its {len(pictures)} pictures can be decoded")
+    number = np.array(list(files), np.int64)
+    broken = len(pictures) - len(files)
+    faults = f"; {broken} pictures cannot be decoded" if broken else ""
+    return number, files, by_rate(number, rate_hz, "as the camera file states"), faults
+
+
+def _check_size(source: Source, found: tuple[int, int], size: tuple[int, int], wish: Wish) -> None:
+    if found != size:
+        raise RecordingError(
+            f"{source.path}: is of {found[0]} x {found[1]} px, the calibration"
+            f" {wish.calibration / 'cameras' / source.camera}.json of {size[0]} x {size[1]}: record in the size that"
+            " was calibrated, or calibrate in this one (`phalanx-master calibrate stereo`)"
+        )
+
+
+def _write(out: Path, manifest: Manifest, taken: Sequence[_Taken]) -> None:
+    """The manifest, the pictures under their names in the recording, and then the rows, by time."""
+    first = min(int(one.timed.t_ns[0]) for one in taken)  # tables may count from any instant
+    rows: list[FrameRow] = []
+    for one in taken:
+        shift = int(one.timed.t_ns[0]) if one.simultaneous else first  # or all begin at 0
+        for number, t_ns in zip(one.timed.number.tolist(), one.timed.t_ns.tolist(), strict=True):
+            file = one.files[number]
+            rows.append(FrameRow(one.source.camera, number, t_ns - shift, Illumination.NONE, file))
+    writer = RecordingWriter(out, manifest)
+    try:
+        for one in taken:
+            _place(out, one)
+        for row in sorted(rows, key=lambda row: (row.t_ns, row.camera)):
+            writer.refer(row)
+    finally:
+        writer.close()
+
+
+def _place(out: Path, one: _Taken) -> None:
+    """Give the video or the pictures of a camera their names in the recording.
+
+    Raises:
+        RecordingError: The disk is full, or cannot be written.
+    """
+    if one.source.is_video:
+        pairs = [(one.source.path, out / (one.source.camera + one.source.path.suffix.lower()))]
+    else:
+        pictures = pictures_in(one.source.path)
+        pairs = [(pictures[number], out / file) for number, file in one.files.items()]
+    for source, name in pairs:
+        try:
+            name.parent.mkdir(exist_ok=True)
+            try:
+                os.link(source.resolve(), name)
+            except OSError:  # another disk, or one without hard links
+                shutil.copyfile(source, name)
+        except OSError as error:
+            raise RecordingError(f"{name}: cannot write: {error.strerror}") from error
+
+
+def _clear(out: Path) -> None:
+    """Take a former import away.
+
+    Raises:
+        RecordingError: There is something else.
+    """
+    if (out / MANIFEST).is_file() and load_manifest(out).note.startswith(NOTE):
+        shutil.rmtree(out)
+    refuse_occupied(out)
