@@ -102,8 +102,7 @@ def profile_from_joints(
         couplings: None: couplings and posture prior are fitted to the motion.
 
     Raises:
-        CalibrationError: The side is neither, a finger never bends by 5 degrees, so that its hinge is not known, or it
-            always points down or up, so that its heading is not.
+        CalibrationError: The side is neither, or a finger never bends by 5 degrees: its hinge is not known.
     """
     roots = np.median(fingers_m[:, :, 0], axis=0)
     steps = np.diff(fingers_m, axis=2)
@@ -142,13 +141,15 @@ def profile_from_joints(
 
 def _warn(model: HandModel, fingers_m: Float, angles: Float) -> None:
     """Say which fingers the profile does not follow, and whose rest heading is not that of the motion."""
-    known = np.nan_to_num(angles)
-    off = np.linalg.norm(model.chains(known).position_m - fingers_m, axis=3).mean(axis=(0, 2))
+    off = np.linalg.norm(model.chains(angles).position_m - fingers_m, axis=3).mean(axis=(0, 2))
     steps = np.diff(fingers_m[:, 1:, :2], axis=2)[:, :, 0]
     flat = np.hypot(steps[..., 0], steps[..., 2]) > _LEVEL * np.linalg.norm(steps, axis=2)
     azimuth = np.where(flat, np.arctan2(steps[..., 0], steps[..., 2]), np.nan)
     rest = -model.rest_rotation[CHAINS[1:, 0], :, 2]
-    aside = np.degrees(np.nanmedian(azimuth, axis=0) - np.arctan2(rest[:, 0], rest[:, 2]))
+    opened = flat.any(axis=0)
+    aside = np.zeros(4)
+    aside[opened] = np.nanmedian(azimuth[:, opened], axis=0) - np.arctan2(rest[:, 0], rest[:, 2])[opened]
+    aside = np.degrees((aside + np.pi) % (2.0 * np.pi) - np.pi)
     for f, finger in enumerate(_MARKERS):
         if off[f] > _FOLLOWED_M:
             _LOG.warning(
@@ -188,11 +189,11 @@ def _finger_rest(bones: Float, normals: Float) -> Float:
     sine = np.clip(-bones[:, 0, 1] / level, -1.0, 1.0)
     ahead = np.sqrt(1.0 - sine * sine)
     turned = np.arctan2(bones[:, 0, 0], bones[:, 0, 2]) - np.arctan2(height * sine, ahead)
-    turned = turned[ahead > _LEVEL]
-    if len(turned) == 0:
-        raise CalibrationError(
-            "a finger points down or up in every frame, so its heading is not known: open the hand"
-        )
+    shows = ahead > _LEVEL
+    if not shows.any():  # a finger that is never opened: across the hinge
+        shows = np.linalg.norm(normals, axis=1) > 2.0 * np.sin(_BENT)
+        turned = np.arctan2(-normals[:, 2], normals[:, 0])
+    turned = turned[shows]
     middle = np.arctan2(np.sin(turned).mean(), np.cos(turned).mean())
     middle += np.median((turned - middle + np.pi) % (2.0 * np.pi) - np.pi)
     heading = np.array([np.sin(middle), 0.0, np.cos(middle)])

@@ -30,7 +30,7 @@ def joint_angles(model: HandModel, fingers_m: Float) -> Float:
         fingers_m: (T, 5, 4, 3) [m] joints of `CHAINS`, palm frame.
 
     Returns:
-        Flexions by the hinges of the model; abductions are NaN where a finger points straight down or up.
+        Flexions by the hinges of the model; an abduction is 0 where a finger points straight down or up: it shows none.
     """
     bones = np.diff(fingers_m, axis=2)
     bones = bones / np.linalg.norm(bones, axis=3, keepdims=True)
@@ -48,7 +48,10 @@ def joint_angles(model: HandModel, fingers_m: Float) -> Float:
         ahead = np.stack([np.zeros_like(flexion), -np.sin(flexion), -np.cos(flexion)], axis=1) @ frame.T
         turn = np.arctan2(bone[:, 0], bone[:, 2]) - np.arctan2(ahead[:, 0], ahead[:, 2])
         turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
-        angles[:, f, 0] = np.where(np.cos(flexion) > _UPRIGHT, model.side_sign * turn, np.nan)
+        beyond = np.abs(turn) > 0.5 * np.pi  # bent by more than a right angle, not turned about
+        flexion = np.where(beyond, np.pi - flexion - 2.0 * lean, flexion)
+        turn = np.where(beyond, turn - np.copysign(np.pi, turn), turn)
+        angles[:, f, 0] = np.where(np.cos(flexion) > _UPRIGHT, model.side_sign * turn, 0.0)
         angles[:, f, 1] = flexion
         hinge = _hinge(rest[f], turn, f == 0)
         for k in (1, 2):
@@ -69,18 +72,16 @@ def fit_posture(angles_rad: Float) -> Posture:
     """Fit the posture prior to a motion, shrunk as its length demands.
 
     Args:
-        angles_rad: (T, 5, 4) [rad], evenly spaced in time; NaN: not known.
+        angles_rad: (T, 5, 4) [rad], evenly spaced in time.
 
     Raises:
-        CalibrationError: Fewer than 20 frames are known of a finger.
+        CalibrationError: There are fewer than 20 frames.
     """
+    if len(angles_rad) < _FEWEST:
+        raise CalibrationError(f"posture: a motion of {len(angles_rad)} frames; {_FEWEST} are needed")
     fingers: dict[str, FingerPosture] = {}
     for f, name in enumerate(FINGERS):
-        known = angles_rad[np.isfinite(angles_rad[:, f]).all(axis=1), f]
-        if len(known) < _FEWEST:
-            raise CalibrationError(
-                f"posture: the {name} is known in {len(known)} frames: {_FEWEST} are needed"
-            )
+        known = angles_rad[:, f]
         count = _independent(known)
         share = count / (count + _PRIOR_SAMPLES)
         mean = share * known.mean(axis=0) + (1.0 - share) * _PRIOR_MEAN[f]
@@ -98,9 +99,9 @@ def reached_limits(limits: Limits, angles_rad: Float) -> Limits:
 
     Args:
         limits: Those of a preset.
-        angles_rad: (T, 5, 4) [rad]; NaN: not known.
+        angles_rad: (T, 5, 4) [rad].
     """
-    low, high = np.nanpercentile(angles_rad, [1.0, 99.0], axis=0)
+    low, high = np.percentile(angles_rad, [1.0, 99.0], axis=0)
     fingers: dict[str, FingerLimits] = {}
     for f, name in enumerate(FINGERS):
         own: FingerLimits = getattr(limits, name)

@@ -3,22 +3,51 @@
 import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common.arrays import Float
-from common.calibration import CameraCalibration, HandProfile, Intrinsics, RigCalibration, load
+from common.calibration import (
+    CameraCalibration,
+    HandProfile,
+    Intrinsics,
+    Limits,
+    Preset,
+    RigCalibration,
+    load,
+)
 from common.camera_model import CameraModel
 from common.geometry import rigid
-from common.hand_model import CHAINS, HandJoints, HandModel
+from common.hand_model import CHAINS, FINGERS, HandJoints, HandModel
+from common.hand_presets import preset_limits
 from common.hand_profiles import generated_profile
 from common.messages import MarkerDetections
 from master.fabrik.cap_views import seen_shift
 from master.fabrik.caps import CapTables
 
 MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
-RIGHT = HandModel.of(generated_profile("made-right", "right"))
-LEFT = HandModel.of(generated_profile("made-left", "left"))
+
+
+def walls(preset: Preset) -> Limits:
+    """The limits of a preset without their tolerance."""
+    limits = preset_limits(preset)
+    return msgspec.structs.replace(
+        limits,
+        **{
+            finger: msgspec.structs.replace(getattr(limits, finger), tolerance_rad=(0.0, 0.0, 0.0, 0.0))
+            for finger in FINGERS
+        },
+    )
+
+
+def walled(name: str, side: str) -> HandModel:
+    """A generated hand that never leaves its limits."""
+    return HandModel.of(msgspec.structs.replace(generated_profile(name, side), limits_rad=walls("K")))
+
+
+RIGHT = walled("made-right", "right")
+LEFT = walled("made-left", "left")
 
 # The back of the hand towards cameras at the origin that look along +z, fingers up (-y in the image).
 FACING = np.array([0.0, 0.0, -1.0])

@@ -64,6 +64,8 @@ def match_names(
             continue
         one = fingers.setdefault((side, finger), _Finger())
         part = next((_PARTS[word] for word in rest if word in _PARTS), _BASE if "in" in rest else None)
+        if name in ends and part is not None:
+            part = _TIP  # it is called after the joint before it
         number = next((int(word) for word in rest if word.isdigit()), None)
         if part is not None:
             one.worded.setdefault(part, []).append(name)

@@ -86,7 +86,9 @@ def hand_from_motion(motion: JointMotion, name: str) -> MotionHand:
     couplings = motion_couplings(chains, motion.t_ns[good])
     bones = np.linalg.norm(np.diff(chains, axis=2), axis=3)
     if couplings.couplings is None:
-        profile = profile_from_joints(name, palm.side, chains, couplings=preset_couplings("K"))
+        profile = replace(
+            profile_from_joints(name, palm.side, chains, couplings=preset_couplings("K")), couplings=None
+        )
     else:
         profile = replace(profile_from_joints(name, palm.side, chains), couplings=couplings.couplings)
     profile = replace(profile, rest_joints=profile.rest_joints | _metacarpals(palm.shape_m))

@@ -12,12 +12,11 @@ from common.arrays import Float
 from common.calibration import Couplings
 from common.geometry import rotation_vector_to_matrix
 from common.hand_model import PALM, HandModel
-from common.hand_presets import preset_limits
 from common.messages import Source
 from master.estimator.epoch import FittedHand, Turn
 from master.estimator.estimator import Estimator
 from master.estimator.settings import DEFAULT
-from tests.hand_helpers import RIGHT, natural_angles, palm, small_cov
+from tests.hand_helpers import RIGHT, natural_angles, palm, small_cov, walls
 from tests.master.estimator.fitted import (
     STEP_NS,
     estimator,
@@ -225,7 +224,7 @@ def test_a_hidden_finger_between_two_that_show_bends_as_they_do() -> None:
 
 
 def narrowing() -> Estimator:
-    limits = preset_limits("D")
+    limits = walls("D")
     narrow = {
         f: msgspec.structs.replace(getattr(limits, f), spread_at_full_flexion=0.0)
         for f in ("index", "little")

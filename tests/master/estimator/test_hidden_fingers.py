@@ -23,7 +23,7 @@ TABLES, SETTINGS = HandTables.of(RIGHT, PARAMETERS), DEFAULT.record()
 
 @dataclass(frozen=True)
 class HiddenFingers:
-    """What is believed of fingers that nobody sees: (5, 4) [rad], (5,) [rad], (5,) [s]."""
+    """What is believed of fingers that nobody sees: (5, 4) [rad], their (5, 4) [rad], (5,) [s]."""
 
     angles_rad: Float
     sigma_rad: Float
@@ -51,7 +51,9 @@ class Memory:
         boxes = boxed(TABLES), boxed(SETTINGS), boxed(self.state)
         hide_at(*boxes, t_ns, seen, boxed(hidden))
         self.state.hidden_ns[seen] = NEVER_NS  # as the end of an epoch leaves it
-        return HiddenFingers(hidden.angles.reshape(5, 4), hidden.sigma.copy(), hidden.gone_s.copy())
+        return HiddenFingers(
+            hidden.angles.reshape(5, 4), hidden.sigma.reshape(5, 4).copy(), hidden.gone_s.copy()
+        )
 
 
 def bent(degrees: Float | float) -> Float:
@@ -100,7 +102,7 @@ def test_a_hand_that_defies_habits_moves_its_fingers_one_by_one() -> None:
     closing = [np.array([p, p, 40.0, p]) for p in np.linspace(40.0, 80.0, 30)]
     natural, free = (after(frozenset({RING}), closing, natural=p)[-1] for p in (1.0, 0.0))
     assert pip_deg(free) == pytest.approx(40.0)
-    assert free.sigma_rad[RING] > 1.5 * natural.sigma_rad[RING]
+    assert free.sigma_rad[RING, 2] > 1.5 * natural.sigma_rad[RING, 2]
 
 
 @pytest.mark.parametrize("speed_deg_s", [90.0, 200.0, -200.0])
@@ -118,8 +120,8 @@ def test_it_stops_where_the_others_stop() -> None:
 
 
 def test_uncertainty_grows_with_time_and_less_between_neighbours_that_show() -> None:
-    alone = np.array([h.sigma_rad[RING] for h in after(ALL, [40.0] * 200)])
-    between = np.array([h.sigma_rad[RING] for h in after(frozenset({RING}), [40.0] * 200)])
+    alone = np.array([h.sigma_rad[RING, 2] for h in after(ALL, [40.0] * 200)])
+    between = np.array([h.sigma_rad[RING, 2] for h in after(frozenset({RING}), [40.0] * 200)])
     assert (np.diff(alone) > 0.0).all()
     assert (np.diff(between) > 0.0).all()
     assert (between < alone).all()

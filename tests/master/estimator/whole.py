@@ -9,7 +9,7 @@ from common.arrays import Float
 from common.calibration import Couplings
 from common.geometry import rigid, rotation_vector_to_matrix
 from common.hand_model import HandModel
-from common.hand_presets import preset_couplings, preset_limits
+from common.hand_presets import preset_couplings
 from common.hand_profiles import generated_profile
 from common.kernels import constant
 from common.records import boxed
@@ -22,7 +22,7 @@ from master.estimator.residuals import Observations
 from master.estimator.settings import DEFAULT
 from master.estimator.workspace import Model
 from master.estimator.wrist_device import EXTRAS, NO_EXTRAS, Device
-from tests.hand_helpers import MARKERS, natural_angles, palm
+from tests.hand_helpers import MARKERS, natural_angles, palm, walls
 from tests.master.estimator.fitted import PAIR
 from tests.master.estimator.kernels import linearise_at
 
@@ -33,7 +33,7 @@ H = 1e-6
 
 def made(side: str, preset: str, coupled: bool) -> HandModel:
     profile = generated_profile("made", side)
-    limits = preset_limits("K" if preset == "K" else "D")
+    limits = walls("K" if preset == "K" else "D")
     couplings = preset_couplings("D") if coupled else Couplings(dip_per_pip=None)
     return HandModel.of(msgspec.structs.replace(profile, limits_rad=limits, couplings=couplings))
 
