@@ -16,7 +16,7 @@ from common.calibration import Couplings, HandProfile
 from common.geometry import rotation_vector_to_matrix
 from common.hand_limits import ABDUCTION, FLEXION
 from common.hand_model import HandModel
-from common.hand_presets import preset_limits
+from common.hand_presets import preset_limits, without_tolerance
 from common.hand_profiles import generated_profile
 
 MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
@@ -65,9 +65,12 @@ class Draw:
 
 
 def bench_model(*, coupled: bool = True) -> HandModel:
-    """The quick-start hand of 19 cm with preset K; `coupled`: the DIP follows the PIP by 2/3 exactly."""
+    """The quick-start hand of 19 cm with preset K; `coupled`: the DIP follows the PIP by 2/3 exactly.
+
+    Its limits are walls, as all solvers that are compared have them.
+    """
     profile: HandProfile = msgspec.structs.replace(
-        generated_profile("bench", "right"), limits_rad=preset_limits("K")
+        generated_profile("bench", "right"), limits_rad=without_tolerance(preset_limits("K"))
     )
     if not coupled:
         profile = msgspec.structs.replace(profile, couplings=Couplings(dip_per_pip=None))

@@ -134,7 +134,8 @@ def grasped(path: Path, backs: int, half: bool) -> Grasped:
     solver = PointHand(model, names)
     cov = np.tile(_SIGMA_M**2 * np.eye(3), (len(names), 1, 1))
     second = range(count // 2, count)
-    pip, sigma, joint, chi2, tracked = [], [], [], [], []
+    pip, sigma, joint, chi2 = (list[Float]() for _ in range(4))
+    tracked: list[Bool] = []
     for k in second:
         now = np.where(np.isfinite(points[k, :, :1, None]), cov, np.nan)
         hand = solver.push(int(t_ns[k]), points[k], now, towards)
@@ -142,12 +143,13 @@ def grasped(path: Path, backs: int, half: bool) -> Grasped:
         at = hand.solution.joints.position_m[CHAINS]
         off = at - truth[k]
         pip.append(_pips_deg(at) - _pips_deg(truth[k]))
-        column = 6 + solver.estimator.parameters.free.searchsorted(4 * np.arange(1, 5) + 2)
-        sigma.append(np.degrees(np.sqrt(np.diag(hand.solution.alone)[column])))
+        column = 6 + np.searchsorted(solver.estimator.parameters.free, 4 * np.arange(1, 5) + 2)
+        variance: Float = hand.solution.alone.diagonal()[column]
+        sigma.append(np.degrees(np.sqrt(variance)))
         joint.append(np.linalg.norm(off, axis=2).ravel())
         inverse = np.linalg.inv(hand.solution.cov_m2[CHAINS] + 1e-12 * np.eye(3))
         chi2.append(np.einsum("fki,fkij,fkj->fk", off, inverse, off))
-        tracked.append(hand.tracked[TIPS[1:]])
+        tracked.append(np.asarray(hand.tracked[TIPS[1:]], np.bool_))
     return Grasped(np.array(pip), np.array(sigma), np.array(joint), np.array(chi2), np.array(tracked))
 
 
@@ -244,7 +246,7 @@ def hidden_tip(t_ns: Int, points_m: Float, finger: int, hidden_s: float) -> tupl
             continue
         error = model.marker_points(hand.joints, MARKERS)[finger] - shown[k, finger]
         region = hand.cov_m2[TIPS[finger]] + _GLOVE_NOISE_M**2 * np.eye(3)
-        off.append(float(np.linalg.norm(error)))
+        off.append(float(np.linalg.norm(np.asarray(error, np.float64))))
         inside.append(bool(error @ np.linalg.solve(region, error) < _REGION))
     return np.array(off), np.array(inside)
 

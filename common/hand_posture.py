@@ -43,10 +43,9 @@ def joint_angles(model: HandModel, fingers_m: Float) -> Float:
         frame = np.eye(3) if f == 0 else rest[f]
         level = np.hypot(frame[1, 1], frame[1, 2])
         lean = np.arctan2(frame[1, 2], frame[1, 1])  # by which the bone is raised at flexion 0
-        sine = np.clip(-bone[:, 1] / level, -1.0, 1.0)
-        flexion = np.arcsin(sine) - lean
+        flexion: Float = np.arcsin(np.clip(-bone[:, 1] / level, -1.0, 1.0)) - lean
         ahead = np.stack([np.zeros_like(flexion), -np.sin(flexion), -np.cos(flexion)], axis=1) @ frame.T
-        turn = np.arctan2(bone[:, 0], bone[:, 2]) - np.arctan2(ahead[:, 0], ahead[:, 2])
+        turn: Float = np.arctan2(bone[:, 0], bone[:, 2]) - np.arctan2(ahead[:, 0], ahead[:, 2])
         turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
         beyond = np.abs(turn) > 0.5 * np.pi  # bent by more than a right angle, not turned about
         flexion = np.where(beyond, np.pi - flexion - 2.0 * lean, flexion)

@@ -13,6 +13,7 @@ of motion: normal values in young adults", J. Hand Surg. Am. 16, 1991). So a pre
 from math import radians
 
 import numpy as np
+from msgspec.structs import replace
 
 from common.calibration import Couplings, FingerLimits, Limits, Preset
 
@@ -43,6 +44,15 @@ def preset_limits(preset: Preset) -> Limits:
 
     side = finger(abduction)
     return Limits(thumb=thumb, index=side, middle=finger(0.0 if k else abduction), ring=side, little=side)
+
+
+def without_tolerance(limits: Limits) -> Limits:
+    """The same limits as walls."""
+    walls = {
+        name: replace(getattr(limits, name), tolerance_rad=(0.0, 0.0, 0.0, 0.0))
+        for name in Limits.__struct_fields__
+    }
+    return Limits(**walls)
 
 
 def preset_couplings(preset: Preset) -> Couplings:

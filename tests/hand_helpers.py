@@ -19,8 +19,8 @@ from common.calibration import (
 )
 from common.camera_model import CameraModel
 from common.geometry import rigid
-from common.hand_model import CHAINS, FINGERS, HandJoints, HandModel
-from common.hand_presets import preset_limits
+from common.hand_model import CHAINS, HandJoints, HandModel
+from common.hand_presets import preset_limits, without_tolerance
 from common.hand_profiles import generated_profile
 from common.messages import MarkerDetections
 from master.fabrik.cap_views import seen_shift
@@ -31,14 +31,7 @@ MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
 
 def walls(preset: Preset) -> Limits:
     """The limits of a preset without their tolerance."""
-    limits = preset_limits(preset)
-    return msgspec.structs.replace(
-        limits,
-        **{
-            finger: msgspec.structs.replace(getattr(limits, finger), tolerance_rad=(0.0, 0.0, 0.0, 0.0))
-            for finger in FINGERS
-        },
-    )
+    return without_tolerance(preset_limits(preset))
 
 
 def walled(name: str, side: str) -> HandModel:

@@ -138,6 +138,9 @@ def _covariance(
             A[i, j] = one.normal[i, j]
         if i < 6 + belief.past_w2.shape[0]:
             A[i, i] += rig.hand.anywhere[i] - (belief.palm_w2[i] if i < 6 else belief.past_w2[i - 6])
+    for i in range(one.x.shape[0]):  # a limit keeps an angle, and measures none
+        if one.x[i] > rig.hand.legal_high[i] or one.x[i] < rig.hand.legal_low[i]:
+            A[6 + i, 6 + i] -= rig.hand.beyond_w2[i]
     for i in range(3):
         for j in range(i + 1):
             A[3 + i, 3 + j] -= belief.depth_w2[0] * belief.sight[i] * belief.sight[j]

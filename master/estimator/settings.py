@@ -80,7 +80,7 @@ class Settings(NamedTuple):
     walk_rad_s: Annotated[float, Range("rad/s", 0.5, 50.0, _HANDS)] = 8.0
     palm_walk_rad_s: Annotated[float, Range("rad/s", 0.1, 50.0, _HANDS)] = 2.5
     palm_held_rad_s: Annotated[
-        float, Range("rad/s", 0.05, 50.0, "with a finger hidden little tells how the palm turns")
+        float, Range("rad/s", 0.05, 50.0, "with a hidden thumb little tells how the palm turns")
     ] = 1.2
     palm_walk_m_s: Annotated[float, Range("m/s", 0.05, 20.0, _HANDS)] = 2.0
     shortest_s: Annotated[
@@ -94,9 +94,9 @@ class Settings(NamedTuple):
     rate_memory_s: Annotated[
         float, Range("s", 1e-3, 1.0, "half of a new rate counts at 60 frames a second")
     ] = 0.024
-    stray_rad: Annotated[float, Range("rad", 0.05, 2.0, _STRAY)] = radians(30.0)
-    stray_aside_rad: Annotated[float, Range("rad", 0.02, 2.0, _STRAY)] = radians(9.0)
-    stray_thumb_rad: Annotated[float, Range("rad", 0.02, 2.0, _STRAY)] = radians(15.0)
+    stray_rad: Annotated[float, Range("rad", 0.05, 2.0, _STRAY)] = radians(36.0)
+    stray_aside_rad: Annotated[float, Range("rad", 0.02, 2.0, _STRAY)] = radians(14.0)
+    stray_thumb_rad: Annotated[float, Range("rad", 0.02, 2.0, _STRAY)] = radians(20.0)
     stray_s: Annotated[float, Range("s", 0.05, 10.0, _STRAY)] = 1.0
     alike: Annotated[float, Range("1", 0.0, 0.99, _COORDINATION)] = 0.7
     held_rad: Annotated[float, Range("rad", 0.001, 0.5, "a finger that was just lost")] = radians(3.0)

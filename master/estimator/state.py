@@ -255,10 +255,7 @@ def predict(
             held = 0.0 if shown[f] else 1.0 / hidden.sigma[4 * f + c - hand.first[f]] ** 2
             belief.past_w2[c] = walked + held
             belief.past[c] = (walked * state.x[c] + held * hidden.x[c]) / (walked + held)
-    turns_rad_s = settings.palm_walk_rad_s
-    for f in range(5):
-        if not shown[f]:
-            turns_rad_s = settings.palm_held_rad_s
+    turns_rad_s = settings.palm_walk_rad_s if shown[0] else settings.palm_held_rad_s
     for i in range(3):
         belief.palm_w2[i] = 1.0 / (turns_rad_s * age_s) ** 2
         belief.palm_w2[3 + i] = 1.0 / (settings.palm_walk_m_s * age_s) ** 2

@@ -1,0 +1,98 @@
+"""Angles of recorded joints are those they were made with, and a posture prior is that of the motion."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from common.arrays import Float
+from common.calibration import Couplings, Posture
+from common.errors import CalibrationError
+from common.hand_fitting import profile_from_joints
+from common.hand_model import HandModel
+from common.hand_posture import fit_posture, joint_angles, posture_arrays, reached_limits
+from common.hand_presets import preset_limits
+from common.hand_profiles import generated_profile
+from master.estimator.parameters import HandParameters
+from master.estimator.priors import habits_of
+
+MODELS = [HandModel.of(generated_profile("made", side)) for side in ("right", "left")]
+
+
+def wandering(count: int, seed: int = 3) -> Float:
+    """Angles (T, 5, 4) [rad] of a hand whose DIPs go their own way, 60 a second, each settled after half a second."""
+    rng = np.random.default_rng(seed)
+    angles = np.zeros((count, 5, 4))
+    state = rng.normal(size=(5, 4))
+    for k in range(count):
+        state = 0.97 * state + np.sqrt(1.0 - 0.97**2) * rng.normal(size=(5, 4))
+        angles[k] = np.radians([0.0, 25.0, 45.0, 30.0] + state * [4.0, 12.0, 15.0, 10.0])
+    angles[:, 0] -= np.radians([0.0, 20.0, 30.0, 10.0])
+    return angles
+
+
+@pytest.mark.parametrize("model", MODELS, ids=["right", "left"])
+def test_angles_come_back_from_joints(model: HandModel) -> None:
+    low, high = model.limits_rad[..., 0], model.limits_rad[..., 1]
+    angles = np.random.default_rng(1).uniform(0.9 * low, 0.7 * high, (200, 5, 4))
+    np.testing.assert_allclose(joint_angles(model, model.chains(angles).position_m), angles, atol=1e-5)
+
+
+def test_a_finger_that_bends_by_more_than_a_right_angle_is_not_turned_about() -> None:
+    model = MODELS[0]
+    angles = np.zeros((1, 5, 4))
+    angles[0, 1:, 1], angles[0, 1:, 2], angles[0, 1:, 0] = np.radians(105.0), 0.5, 0.1
+    found = joint_angles(model, model.chains(angles).position_m)
+    np.testing.assert_allclose(found[0, 1:, 1], np.radians(105.0), atol=1e-5)
+    np.testing.assert_allclose(found[0, 1:, 2], 0.5, atol=1e-5)
+
+
+def test_a_long_motion_has_its_own_posture_and_a_short_one_that_of_others() -> None:
+    mean, cov = posture_arrays(fit_posture(wandering(60_000)), "made")
+    np.testing.assert_allclose(np.degrees(mean[1:]), [[0.0, 25.0, 45.0, 30.0]] * 4, atol=1.5)
+    np.testing.assert_allclose(
+        np.degrees(np.sqrt(np.diagonal(cov, 0, 1, 2)))[1:], [[4.0, 12.0, 15.0, 10.0]] * 4, rtol=0.15
+    )
+    _, short = posture_arrays(fit_posture(wandering(120)), "made")
+    # Two seconds are two independent frames of seven: the width is mostly that of any hand.
+    assert (np.degrees(np.sqrt(short[1:, 2, 2])) > 20.0).all()
+    with pytest.raises(CalibrationError, match="20 are needed"):
+        fit_posture(wandering(19))
+
+
+def test_a_profile_from_motion_believes_in_its_posture() -> None:
+    model = MODELS[0]
+    angles = wandering(3000)
+    profile = profile_from_joints("moved", "right", model.chains(angles).position_m)
+    found = HandModel.of(profile)
+    parameters = HandParameters.of(found)
+    habits = habits_of(found, parameters)
+    believed = np.linalg.solve(habits.normal[0], habits.pull[0]).reshape(5, 4)
+    np.testing.assert_allclose(np.degrees(believed[1:, 1:]), [[25.0, 45.0, 30.0]] * 4, atol=6.0)
+    # A hand that defies it is believed three times as widely, about the same mean.
+    np.testing.assert_allclose(
+        np.linalg.inv(habits.normal[1]), 9.0 * np.linalg.inv(habits.normal[0]), rtol=1e-9
+    )
+
+
+def test_couplings_that_are_given_leave_no_posture() -> None:
+    chains = MODELS[0].chains(wandering(600)).position_m
+    profile = profile_from_joints("moved", "right", chains, couplings=Couplings(dip_per_pip=1.0))
+    assert profile.posture is None
+    assert profile.couplings == Couplings(dip_per_pip=1.0)
+
+
+def test_limits_move_out_to_where_a_motion_went() -> None:
+    angles = wandering(6000)
+    angles[:, 4, 1] -= np.radians(40.0)  # a little finger that is bent back
+    limits = reached_limits(preset_limits("K"), angles)
+    assert limits.little.flexion_rad[0] == pytest.approx(np.percentile(angles[:, 4, 1], 1.0), abs=1e-4)
+    assert limits.index.pip_rad == pytest.approx(preset_limits("K").index.pip_rad, abs=1e-4)
+    assert limits.index.tolerance_rad == preset_limits("K").index.tolerance_rad
+
+
+def test_a_covariance_that_is_none_is_refused() -> None:
+    posture = fit_posture(wandering(600))
+    (a, *rest) = posture.ring.cov_rad2
+    broken = msgspec.structs.replace(posture.ring, cov_rad2=((-a[0], a[1], a[2], a[3]), *rest))
+    with pytest.raises(CalibrationError, match=r"posture.ring.cov_rad2"):
+        posture_arrays(Posture(posture.thumb, posture.index, posture.middle, broken, posture.little), "made")
