@@ -244,9 +244,9 @@ def hidden_tip(t_ns: Int, points_m: Float, finger: int, hidden_s: float) -> tupl
         hand = solver.push(int(t_ns[k]), now, cov, towards).solution
         if hand is None or not hidden[k] or not np.isfinite(shown[k, finger]).all():
             continue
-        error = model.marker_points(hand.joints, MARKERS)[finger] - shown[k, finger]
+        error: Float = model.marker_points(hand.joints, MARKERS)[finger] - shown[k, finger]
         region = hand.cov_m2[TIPS[finger]] + _GLOVE_NOISE_M**2 * np.eye(3)
-        off.append(float(np.linalg.norm(np.asarray(error, np.float64))))
+        off.append(float(np.sqrt(error @ error)))
         inside.append(bool(error @ np.linalg.solve(region, error) < _REGION))
     return np.array(off), np.array(inside)
 
@@ -256,5 +256,5 @@ def _dorsal(points_m: Float) -> Float:
     tips = points_m[:, 1:5]
     along = tips.mean(axis=1) - points_m[:, 5]
     across = tips[:, 0] - tips[:, 3]
-    back = np.nanmean(np.cross(along, across), axis=0)
-    return back / np.linalg.norm(back)
+    back: Float = np.nanmean(np.cross(along, across), axis=0)
+    return back / np.sqrt(back @ back)
