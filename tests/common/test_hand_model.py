@@ -210,7 +210,7 @@ def test_presets_hold_the_published_couplings() -> None:
 
 @pytest.mark.parametrize("preset", ["K", "D"])
 def test_a_profile_may_name_a_preset(preset: str) -> None:
-    text = msgspec.json.encode(RIGHT.profile).decode()
+    text = msgspec.json.encode(generated_profile("named", "right")).decode()
     named = text.replace(
         '"limits_rad":null,"couplings":null', f'"limits_rad":"{preset}","couplings":"{preset}"'
     )

@@ -88,6 +88,7 @@ class Problem:
         first: Unknown,
     ) -> None:
         self._sights, self._hand, self._imu, self._triples, self._first = sights, hand, imu, triples, first
+        model = replace(model, tolerance_rad=np.zeros((5, 4)))  # nothing here weighs what is beyond limits
         self._model, self._parameters = model, HandParameters.of(model)
         count = len(triples.t_s)
         self._hands = HandProblem(

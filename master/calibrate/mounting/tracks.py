@@ -170,17 +170,20 @@ class ImuTrack:
         return out
 
     def _sum_up(self) -> None:
-        """Orientations by rates alone, and what errors of the rates make of them."""
+        """Orientations by rates alone, and what errors of the rates make of them.
+
+        A rate is the mean over the time that ends at its stamp.
+        """
         step_s = np.diff(self.t_s)[:, None]
-        arcs = rotation_vector_to_matrix(0.5 * step_s * (self._rate[1:] + self._rate[:-1]))
+        arcs = rotation_vector_to_matrix(step_s * self._rate[1:])
         now = np.eye(3)
         for k, arc in enumerate([np.eye(3), *arcs]):
             self._turned[k] = now = now @ arc
         middle = len(self.t_s) // 2
         self._turned = self._held[middle] @ self._turned[middle].T @ self._turned
-        by_gain = self._turned[..., None] * self._rate[:, None, None]  # axis, row and column of the gain
-        each = np.concatenate([self._turned, by_gain.reshape(-1, 3, 9)], axis=-1)
-        mean = 0.5 * step_s[..., None] * (each[1:] + each[:-1])
+        turned = 0.5 * (self._turned[1:] + self._turned[:-1])
+        by_gain = turned[..., None] * self._rate[1:, None, None]  # axis, row and column of the gain
+        mean = step_s[..., None] * np.concatenate([turned, by_gain.reshape(-1, 3, 9)], axis=-1)
         drift = np.concatenate([np.zeros((1, 3, 12)), np.cumsum(mean, axis=0)])
         self._drift = drift - drift[middle]
 
@@ -192,7 +195,7 @@ class ImuTrack:
         """The IMU at times (T,) [s] by its stamps, by its rates."""
         after, share, known = self._between(t_s)
         R = self._turned[after - 1] @ _share_of_arc(self._turned[after - 1], self._turned[after], share)
-        rate = (1.0 - share) * self._rate[after - 1] + share * self._rate[after]
+        rate = self._rate[after]
         drift = (1.0 - share)[..., None] * self._drift[after - 1] + share[..., None] * self._drift[after]
         R[~known] = np.nan
         return Turns(R, rate, drift)

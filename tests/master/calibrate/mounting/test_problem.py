@@ -67,7 +67,8 @@ def test_the_pull_of_what_all_instants_share_is_the_slope_of_the_cost() -> None:
     pull, little = at.normal(unknown, hands).shared_pull, 1e-4 * believed()
     slope = slopes(at, unknown, hands, np.diag(little)) / little
     scale = np.abs(pull * believed())
-    np.testing.assert_allclose(slope * believed(), pull * believed(), rtol=0.01, atol=0.3)
+    most = float(scale.max())  # small pulls are differences of large ones
+    np.testing.assert_allclose(slope * believed(), pull * believed(), rtol=0.01, atol=2e-3 * most)
     assert np.count_nonzero(scale > 0.1) > UNKNOWN // 2  # most unknowns are told something
 
 
