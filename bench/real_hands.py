@@ -23,6 +23,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from bench.hand_draws import MARKERS
+from bench.real_motion import pip_deg
 from bench.row import Row
 from bench.solved_hand import PointHand
 from common.arrays import Bool, Float, Int
@@ -142,7 +143,7 @@ def grasped(path: Path, backs: int, half: bool) -> Grasped:
         assert hand.solution is not None
         at = hand.solution.joints.position_m[CHAINS]
         off = at - truth[k]
-        pip.append(_pips_deg(at) - _pips_deg(truth[k]))
+        pip.append(pip_deg(at.reshape(1, 20, 3))[0] - pip_deg(truth[k].reshape(1, 20, 3))[0])
         column = 6 + np.searchsorted(solver.estimator.parameters.free, 4 * np.arange(1, 5) + 2)
         variance: Float = hand.solution.alone.diagonal()[column]
         sigma.append(np.degrees(np.sqrt(variance)))
@@ -190,13 +191,6 @@ def _more_backs(profile: HandProfile) -> tuple[HandProfile, tuple[str, ...]]:
         x, y, z = (float(value) for value in back + aside)
         more[f"back_{k + 2}"] = MarkerMount(joint="palm_frame", offset_m=(x, y, z))
     return replace(profile, markers=profile.markers | more), (*MARKERS, *more)
-
-
-def _pips_deg(chains: Float) -> Float:
-    """Angles (4,) [deg] between proximal and intermediate bones of index ... little, chains (5, 4, 3)."""
-    bones = np.diff(chains[1:], axis=1)
-    bones = bones / np.linalg.norm(bones, axis=2, keepdims=True)
-    return np.degrees(np.arccos(np.clip((bones[:, 0] * bones[:, 1]).sum(axis=1), -1.0, 1.0)))
 
 
 def _glove_rows(path: Path) -> Iterator[Row]:

@@ -162,7 +162,7 @@ def play(recorded: Recorded, model: HandModel, seed: int) -> Score:
     def places(hands: list[FittedHand]) -> Float:
         return np.array([hand.joints.position_m[CHAINS].reshape(20, 3) for hand in hands])
 
-    pip = _pip_deg(places(shown)) - _pip_deg(truth)
+    pip = pip_deg(places(shown)) - pip_deg(truth)
     return Score(
         np.linalg.norm(places(solved) - truth, axis=2),
         np.linalg.norm(places(shown) - truth, axis=2),
@@ -204,7 +204,7 @@ def _track(
     return solved, shown
 
 
-def _pip_deg(places: Float) -> Float:
+def pip_deg(places: Float) -> Float:
     """Angles (T, 4) [deg] between proximal and intermediate bones of index ... little of joints (T, 20, 3)."""
     bones = np.diff(places.reshape(-1, 5, 4, 3)[:, 1:], axis=2)
     bones = bones / np.linalg.norm(bones, axis=3, keepdims=True)
@@ -331,4 +331,4 @@ def _pose_error(model: HandModel, joints: Float, rng: np.random.Generator | None
     hand = PointHand(model, MARKERS, continuous=False).push(0, caps, cov)
     assert hand.solution is not None
     found = hand.solution.joints.position_m[CHAINS].reshape(1, 20, 3)
-    return np.abs(_pip_deg(found) - _pip_deg(truth))[0]
+    return np.abs(pip_deg(found) - pip_deg(truth))[0]

@@ -114,8 +114,7 @@ class HandProfile(Part, frozen=True):
     """hands/<name>.json: bones and markers of one hand, optionally radii, skin, limits and couplings.
 
     Limits and couplings may be the name of a preset: K (Kalbfleisch; also where there are none) or D (Digits).
-    `posture`: how this person holds the fingers, in place of the couplings' prior; needs a DIP that is not coupled
-    exactly.
+    `posture`: how this person holds the fingers, in place of the couplings' prior; DIPs are free then.
     `palmar_scale`: finger -> how thick its palmar flesh is against that which the radii or the size of the hand tell,
     as a wrist device measures it; 1 where a finger is not named.
     """
