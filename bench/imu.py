@@ -99,6 +99,11 @@ class Errors:
         return 60.0 * float(t @ self.heading_deg / (t @ t))
 
 
+def recorded() -> dict[str, Recording]:
+    """Those of BROAD in PHALANX_DATASETS, by name; none where they are absent."""
+    return recordings(_DATASETS / "broad")
+
+
 def recordings(folder: Path, every: int = 1) -> dict[str, Recording]:
     """Those of BROAD in a folder, by name."""
     return {path.stem: Recording.of(path, every) for path in sorted(folder.glob("*.npz"))}
@@ -128,7 +133,7 @@ def played(push: Push, recording: Recording) -> Float:
 
 def rows() -> Iterator[Row]:
     """Measure; one row per figure."""
-    found = recordings(_DATASETS / "broad")
+    found = recorded()
     if not found:
         yield Row(
             "recorded: skipped", 0.0, "", f"no recordings at {_DATASETS / 'broad'}: set PHALANX_DATASETS"

@@ -28,7 +28,7 @@ from master.rig import load_setup
 from master.rig_setup import RigSetup
 
 _CALIBRATION = Path(__file__).parent.parent / "calib_json"
-_HAND = _CALIBRATION / "hands/default-right.json"
+HAND = _CALIBRATION / "hands/default-right.json"
 _DATASETS = Path(os.environ.get("PHALANX_DATASETS", Path(__file__).parents[2] / "shared/datasets")).resolve()
 _REGION = 7.815  # chi square, three degrees, 95 %
 NOISE_M = {"1 mm": (1e-3, 1e-3, 1e-3), "depth 4.5 mm": (0.3e-3, 0.3e-3, 4.5e-3)}
@@ -210,7 +210,7 @@ def kinds(found: Coverage) -> Iterator[tuple[str, Coverage]]:
 
 def rows() -> Iterator[Row]:
     """Coverage by motion and noise, of rendered hands, and of all motions together."""
-    profile = load(_HAND, HandProfile)
+    profile = load(HAND, HandProfile)
     everything: list[Coverage] = []
     for noise, sigma_m in NOISE_M.items():
         for played in zip(*(motions(profile, seed) for seed in SEEDS), strict=True):

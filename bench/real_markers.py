@@ -1,7 +1,7 @@
 """Markers in real pictures: a lit ball that a hand holds, and photographs without paint.
 
 .venv/bin/python -m bench real_markers
-PHALANX_PHOTOS=FOLDER .venv/bin/python -m bench.real_markers --picture out/reliability.png
+.venv/bin/python -m bench.real_markers --picture out/ball.png
 """
 
 import argparse
@@ -115,7 +115,7 @@ def _plain(image: Image, colour: HsvRange) -> Float:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Draw the reliability diagram, and some frames of the ball with what was found."""
+    """Draw some frames of the ball with what was found."""
     parser = argparse.ArgumentParser(
         prog="python -m bench.real_markers", description=(__doc__ or "").partition("\n")[0]
     )
@@ -125,7 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rng = np.random.default_rng(SEED)
     marked, images = ball()
     colour = clicked_ranges(marked, images, rng, 1)[0]
-    draw(options.picture, table_of(looked_at(rng)), marked, images, colour)
+    draw(options.picture, marked, images, colour)
     print(f"{options.picture}: circles of {MARKED.name}, and what is found with colours of one click")
     return 0
 

@@ -1,11 +1,10 @@
-"""The figure of markers in real pictures: stated quality against what is right, and a ball with what is found of it."""
+"""The picture of a ball in real frames, with what is found of it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
 import cv2
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -22,7 +21,6 @@ AROUND: Final = 1.7  # radii of the ball
 
 def draw(
     file: Path,
-    table: Sequence[tuple[float, float, float]],
     marked: Mapping[str, tuple[float, float, float]],
     images: Mapping[str, Image],
     colour: HsvRange,
@@ -31,31 +29,15 @@ def draw(
 
     Args:
         file: To write.
-        table: (stated, right, share) of each bin.
         marked: Frame -> (u, v, radius) [px] of the ball.
         images: Frame -> (H, W, 3) BGR.
         colour: With which the ball is found.
     """
-    figure = Figure(figsize=(12.0, 5.2), dpi=110, layout="constrained")
+    figure = Figure(figsize=(7.2, 5.2), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(2, 5)
-    axes = figure.add_subplot(grid[:, :2])
-    stated, right, share = np.array(table).T
-    axes.plot([0.0, 1.0], [0.0, 1.0], color="#999999", linewidth=1.0)
-    axes.bar(stated, right, 0.06, color="#c9d8e3", label="is a marker")
-    axes.plot(stated, right, "o-", color="#14507a", linewidth=1.4)
-    for x, y, part in zip(stated, right, share, strict=True):
-        axes.annotate(
-            f"{100.0 * part:.0f} %", (x, y), (0, 7), textcoords="offset points", fontsize=8, ha="center"
-        )
-    axes.set_xlabel("stated quality (share of what is found above the points)", fontsize=9)
-    axes.set_ylabel("share that is a marker", fontsize=9)
-    axes.set_xlim(0.0, 1.0)
-    axes.set_ylim(0.0, 1.08)
-    axes.spines[["top", "right"]].set_visible(False)
     names = sorted(marked)[:: max(len(marked) // SHOWN, 1)][:SHOWN]
     for k, name in enumerate(names):
-        _show(figure.add_subplot(grid[k // 3, 2 + k % 3]), name, marked[name], images[name], colour)
+        _show(figure.add_subplot(2, 3, k + 1), name, marked[name], images[name], colour)
     file.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(file)
 

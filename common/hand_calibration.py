@@ -79,30 +79,21 @@ class Couplings(Part, frozen=True):
 
 
 Variance = Annotated[float, Meta(ge=-10.0, le=10.0)]  # [rad^2] or covariance
-Four = tuple[HandAngle, HandAngle, HandAngle, HandAngle]
-FourVariances = tuple[Variance, Variance, Variance, Variance]
-
-
-class FingerPosture(Part, frozen=True):
-    """How a person holds a finger: a normal distribution of its four angles (columns of `HandModel`).
-
-    Attributes:
-        mean_rad: Abduction, flexion, PIP, DIP (thumb CMC, CMC, MCP, IP).
-        cov_rad2: (4, 4) covariance.
-    """
-
-    mean_rad: Four
-    cov_rad2: tuple[FourVariances, FourVariances, FourVariances, FourVariances]
 
 
 class Posture(Part, frozen=True):
-    """The posture prior of one person, fitted to motion."""
+    """How a person holds the hand: a normal distribution of its 20 angles, fitted to motion.
 
-    thumb: FingerPosture
-    index: FingerPosture
-    middle: FingerPosture
-    ring: FingerPosture
-    little: FingerPosture
+    Attributes:
+        mean_rad: Abduction, flexion, PIP, DIP (thumb CMC, CMC, MCP, IP) of thumb ... little, columns of `HandModel`.
+        cov_rad2: (20, 20) covariance, for fingers move together.
+    """
+
+    mean_rad: Annotated[tuple[HandAngle, ...], Meta(min_length=20, max_length=20)]
+    cov_rad2: Annotated[
+        tuple[Annotated[tuple[Variance, ...], Meta(min_length=20, max_length=20)], ...],
+        Meta(min_length=20, max_length=20),
+    ]
 
 
 Preset = Literal["K", "D"]

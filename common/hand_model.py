@@ -116,6 +116,7 @@ class HandModel:
         dip_spread_rad: Standard deviation of the DIP about that ratio; 0: it is kept exactly.
         mcp_per_pip: Natural flexion, a prior only, or None where there is none.
         neighbours: Whether fingers side by side tend to bend alike, a prior only.
+        posture: Mean (20,) [rad] and covariance (20, 20) [rad^2] of the angles of this person, or None.
         mounts: Marker name -> where it sits.
         side_sign: +1 right, -1 left.
         bone_m: (5, 3, 3) link k of each finger in the frame of its joint k.
@@ -135,6 +136,7 @@ class HandModel:
     dip_spread_rad: float
     mcp_per_pip: float | None
     neighbours: bool
+    posture: tuple[Float, Float] | None
     mounts: dict[str, Mount]
     side_sign: float
     bone_m: Float
@@ -150,7 +152,8 @@ class HandModel:
         """Build and check.
 
         Raises:
-            CalibrationError: A joint or marker is missing or unknown, a bone has no length, limits are crossed.
+            CalibrationError: A joint or marker is missing or unknown, a bone has no length, limits are crossed, or a
+                posture has no covariance.
         """
         where = f"hand {profile.name!r}"
         position, rotation = _rest(profile, where)
@@ -178,6 +181,7 @@ class HandModel:
             dip_spread_rad=couplings.dip_spread_rad,
             mcp_per_pip=couplings.mcp_per_pip,
             neighbours=couplings.neighbours,
+            posture=_posture(profile, where),
             mounts=_mounts(profile, where),
             side_sign=side_sign,
             bone_m=bone,
@@ -321,6 +325,15 @@ def _radii(profile: HandProfile, where: str) -> Float:
     length = float(np.linalg.norm(b - a))
     given = profile.radius_m or {}
     return np.array([given.get(name, length * radius_share(name)) for name in JOINTS])
+
+
+def _posture(profile: HandProfile, where: str) -> tuple[Float, Float] | None:
+    if profile.posture is None:
+        return None
+    mean, cov = np.array(profile.posture.mean_rad), np.array(profile.posture.cov_rad2)
+    if not np.allclose(cov, cov.T, atol=1e-9) or np.linalg.eigvalsh(cov)[0] <= 0.0:
+        raise CalibrationError(f"{where}: posture.cov_rad2: a covariance is symmetric and positive definite")
+    return mean, cov
 
 
 def couplings_of(profile: HandProfile) -> Couplings:

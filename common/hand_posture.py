@@ -1,7 +1,8 @@
 """The posture prior of a person: joint angles of recorded joints, and a normal distribution fitted to them.
 
-Each finger has a distribution of its own over abduction, flexion, PIP and DIP. A recording is one sample of how a
-person moves, so it is shrunk towards a wide prior as if that had been seen in `_PRIOR_SAMPLES` independent frames
+It is one distribution of all 20 angles, for fingers move together: four that each had their own would tell four times
+how the palm is turned. A recording is one sample of how a person moves, so it is shrunk towards a wide prior as if that
+had been seen in `_PRIOR_SAMPLES` independent frames
 (the normal-inverse-Wishart mean; Gelman et al., "Bayesian Data Analysis", 3rd edition 2013, section 3.6). How many
 independent frames there are follows from the correlation of one frame with the next: T (1 - r) / (1 + r).
 """
@@ -10,14 +11,15 @@ import numpy as np
 from msgspec.structs import replace
 
 from common.arrays import Float
-from common.calibration import FingerLimits, FingerPosture, Limits, Posture
+from common.calibration import FingerLimits, Limits, Posture
 from common.errors import CalibrationError
 from common.hand_model import CHAINS, FINGERS, HandModel
 
-_PRIOR_SAMPLES = 5.0
+_PRIOR_SAMPLES = 1.0
 # What is expected of any hand: means and standard deviations [deg], rounded, of hands at work.
 _PRIOR_MEAN = np.radians([[5.0, 5.0, 10.0, 15.0], *[[0.0, 20.0, 30.0, 15.0]] * 4])
 _PRIOR_SIGMA = np.radians([[15.0, 15.0, 20.0, 25.0], *[[8.0, 25.0, 30.0, 18.0]] * 4])
+_ALIKE = 0.8  # correlation of an angle with that of the next finger
 _FEWEST = 20  # frames below which a motion says nothing
 _UPRIGHT = 0.3  # cosine of the flexion beyond which a finger shows no abduction
 
@@ -78,19 +80,22 @@ def fit_posture(angles_rad: Float) -> Posture:
     """
     if len(angles_rad) < _FEWEST:
         raise CalibrationError(f"posture: a motion of {len(angles_rad)} frames; {_FEWEST} are needed")
-    fingers: dict[str, FingerPosture] = {}
-    for f, name in enumerate(FINGERS):
-        known = angles_rad[:, f]
-        count = _independent(known)
-        share = count / (count + _PRIOR_SAMPLES)
-        mean = share * known.mean(axis=0) + (1.0 - share) * _PRIOR_MEAN[f]
-        off = known.mean(axis=0) - _PRIOR_MEAN[f]
-        cov = share * np.cov(known.T) + (1.0 - share) * (
-            np.diag(_PRIOR_SIGMA[f] ** 2) + share * np.outer(off, off)
-        )
-        abduction, flexion, pip, dip = (_four(row) for row in cov)
-        fingers[name] = FingerPosture(_four(mean), (abduction, flexion, pip, dip))
-    return Posture(**fingers)
+    known = angles_rad.reshape(len(angles_rad), 20)
+    count = _independent(known)
+    share = count / (count + _PRIOR_SAMPLES)
+    off = known.mean(axis=0) - _PRIOR_MEAN.ravel()
+    mean = _PRIOR_MEAN.ravel() + share * off
+    cov = share * np.cov(known.T) + (1.0 - share) * (_prior_cov() + share * np.outer(off, off))
+    return Posture(_numbers(mean), tuple(_numbers(row) for row in cov))
+
+
+def _prior_cov() -> Float:
+    """(20, 20) [rad^2]: neighbouring fingers move alike, the thumb by itself."""
+    f, g = np.indices((5, 5))
+    alike = np.where((f > 0) & (g > 0), _ALIKE ** np.abs(f - g), f == g)
+    joint = np.kron(alike, np.eye(4))
+    cov: Float = joint * np.outer(_PRIOR_SIGMA, _PRIOR_SIGMA)
+    return cov
 
 
 def reached_limits(limits: Limits, angles_rad: Float) -> Limits:
@@ -121,23 +126,5 @@ def _independent(samples: Float) -> float:
     return float(np.median(len(samples) * (1.0 - correlation) / (1.0 + correlation)))
 
 
-def posture_arrays(posture: Posture, where: str) -> tuple[Float, Float]:
-    """Means (5, 4) [rad] and covariances (5, 4, 4) [rad^2].
-
-    Raises:
-        CalibrationError: A covariance is not symmetric and positive definite.
-    """
-    fingers: list[FingerPosture] = [getattr(posture, name) for name in FINGERS]
-    mean = np.array([finger.mean_rad for finger in fingers])
-    cov = np.array([finger.cov_rad2 for finger in fingers])
-    for name, matrix in zip(FINGERS, cov, strict=True):
-        if not np.allclose(matrix, matrix.T, atol=1e-9) or np.linalg.eigvalsh(matrix)[0] <= 0.0:
-            raise CalibrationError(
-                f"{where}: posture.{name}.cov_rad2: a covariance is symmetric and positive definite"
-            )
-    return mean, cov
-
-
-def _four(values: Float) -> tuple[float, float, float, float]:
-    a, b, c, d = (round(float(value), 6) for value in values)
-    return a, b, c, d
+def _numbers(values: Float) -> tuple[float, ...]:
+    return tuple(round(float(value), 6) for value in values)

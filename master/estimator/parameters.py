@@ -60,7 +60,7 @@ class HandParameters:
     @classmethod
     def of(cls, model: HandModel) -> "HandParameters":
         """The free angles of a hand: 20, or 16 where the DIPs follow exactly and no posture prior has their spread."""
-        follows = model.dip_spread_rad == 0.0 and model.profile.posture is None
+        follows = model.dip_spread_rad == 0.0 and model.posture is None
         ratio = model.dip_per_pip if follows else None
         free = np.array([a for a in range(20) if not (ratio is not None and a >= 4 and a % 4 == 3)])
         complete = np.zeros((20, len(free)))

@@ -13,9 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.calibration import Posture
 from common.hand_model import HandModel
-from common.hand_posture import posture_arrays
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT, Settings
 
@@ -73,7 +71,7 @@ def habits_of(
     constant = np.array([0.5 * float(means @ means) for _, means in tables])
     least = constant - 0.5 * np.vecdot(pull, np.linalg.solve(normal, pull[..., None])[..., 0])
     volume = normal.copy()
-    if model.profile.posture is None:
+    if model.posture is None:
         flexion = np.flatnonzero((parameters.free >= 4) & (parameters.free % 4 == 1))
         span = np.maximum(parameters.legal_high - parameters.legal_low, _NARROWEST_RAD)[flexion]
         # The highest density of a normal distribution of this width is that of any angle within the span.
@@ -101,8 +99,8 @@ def curled(parameters: HandParameters, settings: Settings, fingers: Bool) -> tup
 
 def _natural_rows(model: HandModel, s: Settings, unlike: frozenset[int]) -> list[Row]:
     """Natural flexion, small abduction, neighbours alike, a loose thumb; angles by their place in the flat table."""
-    if model.profile.posture is not None:
-        return _posture_rows(model.profile.posture, model.profile.name, 1.0)
+    if model.posture is not None:
+        return _posture_rows(*model.posture, 1.0)
     thumb = (
         s.thumb_abduction_mean_rad,
         s.thumb_flexion_mean_rad,
@@ -126,23 +124,16 @@ def _natural_rows(model: HandModel, s: Settings, unlike: frozenset[int]) -> list
     return rows
 
 
-def _posture_rows(posture: Posture, name: str, wider: float) -> list[Row]:
-    """How this person holds the fingers, where that was measured: four whitened rows a finger."""
-    rows: list[Row] = []
-    means, covariances = posture_arrays(posture, f"hand {name!r}")
-    whitening = np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariances)), -1, -2)
-    for f in range(5):
-        mean: Float = means[f]
-        for k in range(4):
-            row: Float = whitening[f, k]
-            rows.append(({4 * f + i: float(row[i]) for i in range(4)}, float(row @ mean), wider))
-    return rows
+def _posture_rows(mean: Float, cov: Float, wider: float) -> list[Row]:
+    """How this person holds the fingers, where that was measured: whitened rows."""
+    whitening: Float = np.linalg.cholesky(np.linalg.inv(cov)).T
+    return [({a: float(row[a]) for a in range(20)}, float(row @ mean), wider) for row in whitening]
 
 
 def _free_rows(model: HandModel, s: Settings) -> list[Row]:
     """Joints that know nothing of each other: as if drawn evenly from their limits."""
-    if model.profile.posture is not None:
-        return _posture_rows(model.profile.posture, model.profile.name, s.posture_widened)
+    if model.posture is not None:
+        return _posture_rows(*model.posture, s.posture_widened)
     low, high = model.limits_rad[..., 0], model.limits_rad[..., 1]
     middle, span = (0.5 * (low + high)).tolist(), high - low
     even = (span / np.sqrt(12.0)).tolist()  # standard deviation of an even distribution

@@ -145,6 +145,9 @@ class Settings(NamedTuple):
     tracked_m: Annotated[
         float, Range("m", 0.002, 0.1, "half the largest axis of the 95 % region of a joint that is TRACKED")
     ] = 0.022
+    tracked_pip_rad: Annotated[
+        float, Range("rad", 0.02, 1.0, "standard deviation of the PIP of a finger that is TRACKED")
+    ] = radians(15.0)
     tracked_age_s: Annotated[
         float, Range("s", 0.0, 1.0, "how old the newest measurement of a TRACKED finger may be")
     ] = 0.03
@@ -204,12 +207,6 @@ class Settings(NamedTuple):
     refused_unlit: Annotated[
         float, Range("chi square", 3.0, 100.0, "the same where the light of the fingertip fits no pose")
     ] = 8.0
-    tracked_pip_rad: Annotated[
-        float,
-        Range(
-            "rad", 0.02, 1.0, "standard deviation of the PIP of a finger that is TRACKED by a wrist device"
-        ),
-    ] = radians(15.0)
     contrary: Annotated[
         float,
         Range(

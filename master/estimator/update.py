@@ -370,12 +370,12 @@ def take_over_epoch(
             for j in range(3):
                 state.turn[i, j] = space.room.search.palm[i, j]
     for f in range(5):
+        pip = 6 + hand.first[f] + 2
+        bend_open = state.cov[pip, pip] > settings.tracked_pip_rad**2
         if space.ground.rests[f] > 0:
-            state.level[f], state.vague[f] = 0, False
+            state.level[f], state.vague[f] = 0, f > 0 and bend_open
         elif space.scan.known[f] > 0.0:
-            state.level[f] = task.level[f]
-            pip2 = state.cov[6 + hand.first[f] + 2, 6 + hand.first[f] + 2]
-            state.vague[f] = task.ambiguous[f] or pip2 > settings.tracked_pip_rad**2
+            state.level[f], state.vague[f] = task.level[f], task.ambiguous[f] or bend_open
     copy(found.palm, out.palm)
     for a in range(20):
         out.angles[a] = state.angles[a] = work.angles[a]

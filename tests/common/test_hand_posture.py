@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.calibration import Couplings, Posture
+from common.calibration import Couplings
 from common.errors import CalibrationError
 from common.hand_fitting import profile_from_joints
 from common.hand_model import HandModel
-from common.hand_posture import fit_posture, joint_angles, posture_arrays, reached_limits
+from common.hand_posture import fit_posture, joint_angles, reached_limits
 from common.hand_presets import preset_limits
 from common.hand_profiles import generated_profile
 from master.estimator.parameters import HandParameters
@@ -47,16 +47,27 @@ def test_a_finger_that_bends_by_more_than_a_right_angle_is_not_turned_about() ->
 
 
 def test_a_long_motion_has_its_own_posture_and_a_short_one_that_of_others() -> None:
-    mean, cov = posture_arrays(fit_posture(wandering(60_000)), "made")
+    posture = fit_posture(wandering(60_000))
+    mean = np.reshape(posture.mean_rad, (5, 4))
+    sigma = np.sqrt(np.diagonal(posture.cov_rad2)).reshape(5, 4)
     np.testing.assert_allclose(np.degrees(mean[1:]), [[0.0, 25.0, 45.0, 30.0]] * 4, atol=1.5)
-    np.testing.assert_allclose(
-        np.degrees(np.sqrt(np.diagonal(cov, 0, 1, 2)))[1:], [[4.0, 12.0, 15.0, 10.0]] * 4, rtol=0.15
-    )
-    _, short = posture_arrays(fit_posture(wandering(120)), "made")
-    # Two seconds are two independent frames of seven: the width is mostly that of any hand.
-    assert (np.degrees(np.sqrt(short[1:, 2, 2])) > 20.0).all()
+    np.testing.assert_allclose(np.degrees(sigma[1:]), [[4.0, 12.0, 15.0, 10.0]] * 4, rtol=0.15)
+    short = fit_posture(wandering(30))
+    # Half a second is no independent frame: the width is mostly that of any hand.
+    assert np.degrees(np.sqrt(short.cov_rad2[10][10])) > 20.0
     with pytest.raises(CalibrationError, match="20 are needed"):
         fit_posture(wandering(19))
+
+
+def test_fingers_that_move_together_are_believed_to() -> None:
+    angles = wandering(60_000)
+    angles[:, 3] = angles[:, 2] + 0.3 * (
+        angles[:, 3] - angles[:, 2]
+    )  # the ring finger mostly as the middle finger
+    cov = np.array(fit_posture(angles).cov_rad2)
+    correlation = cov / np.sqrt(np.outer(np.diagonal(cov), np.diagonal(cov)))
+    assert correlation[10, 14] == pytest.approx(0.7 / np.hypot(0.7, 0.3), abs=0.05)  # their PIPs
+    assert abs(correlation[6, 10]) < 0.15  # index and middle finger go their own ways
 
 
 def test_a_profile_from_motion_believes_in_its_posture() -> None:
@@ -91,8 +102,9 @@ def test_limits_move_out_to_where_a_motion_went() -> None:
 
 
 def test_a_covariance_that_is_none_is_refused() -> None:
-    posture = fit_posture(wandering(600))
-    (a, *rest) = posture.ring.cov_rad2
-    broken = msgspec.structs.replace(posture.ring, cov_rad2=((-a[0], a[1], a[2], a[3]), *rest))
-    with pytest.raises(CalibrationError, match=r"posture.ring.cov_rad2"):
-        posture_arrays(Posture(posture.thumb, posture.index, posture.middle, broken, posture.little), "made")
+    profile = profile_from_joints("moved", "right", MODELS[0].chains(wandering(600)).position_m)
+    assert profile.posture is not None
+    first, *rest = profile.posture.cov_rad2
+    broken = msgspec.structs.replace(profile.posture, cov_rad2=((-first[0], *first[1:]), *rest))
+    with pytest.raises(CalibrationError, match=r"hand 'moved': posture.cov_rad2: .* positive definite"):
+        HandModel.of(msgspec.structs.replace(profile, posture=broken))

@@ -340,7 +340,8 @@ def test_an_orientation_without_heading_does_not_tell_the_palm_by_one_finger(
 @pytest.mark.parametrize("tracked_m", [0.005, 0.012, DEFAULT.tracked_m])
 def test_tracked_is_what_is_fresh_and_sure(tracked_m: float) -> None:
     """A joint is tracked while its region is smaller than `tracked_m` and its finger was measured just now."""
-    rng, machine = np.random.default_rng(4), estimator(settings=DEFAULT.changed("tracked_m", tracked_m))
+    settings = DEFAULT.changed("tracked_m", tracked_m).changed("tracked_pip_rad", 1.0)
+    rng, machine = np.random.default_rng(4), estimator(settings=settings)
     told_ns, kept = np.full(6, -(10**12)), 0
     for k in range(60):
         gone = rng.random(6) < 0.4
@@ -357,6 +358,15 @@ def test_tracked_is_what_is_fresh_and_sure(tracked_m: float) -> None:
         np.testing.assert_array_equal(hand.tracked, fresh & sure(hand, tracked_m))
         kept += int(hand.tracked.sum())
     assert 40 < kept < 60 * 26
+
+
+def test_a_finger_whose_bend_is_open_is_not_tracked() -> None:
+    last = run(estimator(), range(20), speed_deg_s=0.0)[-1]
+    strict = run(estimator(settings=DEFAULT.changed("tracked_pip_rad", 0.02)), range(20), speed_deg_s=0.0)[-1]
+    assert last.tracked[CHAINS[1:]].all()
+    assert not strict.tracked[CHAINS[1:]].any()
+    np.testing.assert_array_equal(strict.tracked[CHAINS[0]], last.tracked[CHAINS[0]])
+    assert strict.tracked[0]
 
 
 @pytest.mark.parametrize("age_s", [0.0, 0.03, 0.2])
