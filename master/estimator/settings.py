@@ -81,7 +81,7 @@ class Settings(NamedTuple):
     palm_walk_rad_s: Annotated[float, Range("rad/s", 0.1, 50.0, _HANDS)] = 2.5
     palm_held_rad_s: Annotated[
         float, Range("rad/s", 0.05, 50.0, "with a hidden thumb little tells how the palm turns")
-    ] = 1.2
+    ] = 0.9
     palm_walk_m_s: Annotated[float, Range("m/s", 0.05, 20.0, _HANDS)] = 2.0
     shortest_s: Annotated[
         float, Range("s", 1e-5, 1e-2, "a shorter step would weld the hand to its last pose")
