@@ -18,7 +18,7 @@ from common.errors import FitError
 from common.geometry import matrix_to_quaternion
 from common.hand_fitting import profile_from_joints
 from common.hand_model import CHAINS, FINGERS, JOINTS, METACARPALS, WRIST, HandModel
-from common.hand_presets import preset_couplings
+from common.hand_posture import joint_angles
 from common.hand_profiles import generated_profile, joint_frame
 from master.calibrate.hand.measure import hand_length_of
 from master.calibrate.hand.motion_couplings import MotionCouplings, motion_couplings
@@ -83,14 +83,13 @@ def hand_from_motion(motion: JointMotion, name: str) -> MotionHand:
             f" length; {_LEAST_FRAMES} are needed"
         )
     chains = palm.chains_m[good]
-    couplings = motion_couplings(chains, motion.t_ns[good])
     bones = np.linalg.norm(np.diff(chains, axis=2), axis=3)
-    if couplings.couplings is None:
-        profile = replace(
-            profile_from_joints(name, palm.side, chains, couplings=preset_couplings("K")), couplings=None
-        )
+    profile = profile_from_joints(name, palm.side, chains)
+    couplings = motion_couplings(joint_angles(HandModel.of(profile), chains), chains, motion.t_ns[good])
+    if couplings.couplings is None:  # too little moves for a posture prior, too
+        profile = replace(profile, couplings=None, posture=None)
     else:
-        profile = replace(profile_from_joints(name, palm.side, chains), couplings=couplings.couplings)
+        profile = replace(profile, couplings=couplings.couplings)
     profile = replace(profile, rest_joints=profile.rest_joints | _metacarpals(palm.shape_m))
     length_m = hand_length_of(HandModel.of(profile))
     try:

@@ -63,23 +63,15 @@ class MotionCouplings:
     remarks: tuple[str, ...]
 
 
-def flexions(chains_m: Float) -> Float:
-    """MCP, PIP and DIP (T, 4, 3) [rad] of index ... little, from chains (T, 5, 4, 3) [m] in the palm frame."""
-    bones = np.diff(chains_m[:, 1:], axis=2)
-    bones /= np.linalg.norm(bones, axis=3, keepdims=True)
-    normal = np.cross(bones[:, :, :2], bones[:, :, 1:])  # (T, 4, 2, 3)
-    hinge = normal.sum(axis=(0, 2))
-    hinge /= np.maximum(np.linalg.norm(hinge, axis=1, keepdims=True), 1e-12)
-    back = np.sign(np.einsum("tfkj,fj->tfk", normal, hinge))  # bent back: -1
-    bend = np.arctan2(back * np.linalg.norm(normal, axis=3), (bones[:, :, :2] * bones[:, :, 1:]).sum(axis=3))
-    first = bones[:, :, 0]
-    level = np.hypot(first[..., 0], first[..., 2]) * np.sign(first[..., 2])
-    return np.concatenate([np.arctan2(-first[..., 1], level)[..., None], bend], axis=2)
+def motion_couplings(angles_rad: Float, chains_m: Float, t_ns: Int) -> MotionCouplings:
+    """Couplings from a motion.
 
-
-def motion_couplings(chains_m: Float, t_ns: Int) -> MotionCouplings:
-    """Couplings from chains (T, 5, 4, 3) [m] in the palm frame at times (T,) [ns]."""
-    angles = flexions(chains_m)
+    Args:
+        angles_rad: (T, 5, 4) [rad] of `common.hand_posture.joint_angles`.
+        chains_m: (T, 5, 4, 3) [m] the joints that these are of: their noise is told by bones that change.
+        t_ns: (T,) [ns] times.
+    """
+    angles = angles_rad[:, 1:, 1:]
     step_s = 1e-9 * np.diff(t_ns)
     rate = np.abs(np.diff(angles[:, :, 1], axis=0)).max(axis=1) / step_s
     moved_s = float(step_s[(rate > _MOVES_RAD_S) & (step_s < _STEP_S)].sum())
