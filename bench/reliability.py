@@ -62,9 +62,8 @@ def tilts() -> dict[str, Float]:
     out: dict[str, Float] = {}
     for name, recording in imu.recorded().items():
         errors = imu.tilt_errors(*imu.stated(recording), recording)
-        out[name.replace("undisturbed_", "").replace("_", " ")] = np.vecdot(errors.error_rad, errors.error_rad) / np.square(
-            errors.sigma_rad
-        )
+        squares: Float = np.vecdot(errors.error_rad, errors.error_rad)
+        out[name.replace("undisturbed_", "").replace("_", " ")] = squares / np.square(errors.sigma_rad)
     return out
 
 

@@ -94,8 +94,7 @@ def _prior_cov() -> Float:
     f, g = np.indices((5, 5))
     alike = np.where((f > 0) & (g > 0), _ALIKE ** np.abs(f - g), f == g)
     joint = np.kron(alike, np.eye(4))
-    cov: Float = joint * np.outer(_PRIOR_SIGMA, _PRIOR_SIGMA)
-    return cov
+    return np.asarray(joint * np.outer(_PRIOR_SIGMA, _PRIOR_SIGMA), np.float64)
 
 
 def reached_limits(limits: Limits, angles_rad: Float) -> Limits:

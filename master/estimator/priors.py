@@ -126,8 +126,12 @@ def _natural_rows(model: HandModel, s: Settings, unlike: frozenset[int]) -> list
 
 def _posture_rows(mean: Float, cov: Float, wider: float) -> list[Row]:
     """How this person holds the fingers, where that was measured: whitened rows."""
-    whitening: Float = np.linalg.cholesky(np.linalg.inv(cov)).T
-    return [({a: float(row[a]) for a in range(20)}, float(row @ mean), wider) for row in whitening]
+    rows: list[Row] = []
+    factor = np.linalg.cholesky(np.linalg.inv(cov)).astype(np.float64)
+    for k in range(20):
+        row = factor[:, k]
+        rows.append(({a: float(row[a]) for a in range(20)}, float(row @ mean), wider))
+    return rows
 
 
 def _free_rows(model: HandModel, s: Settings) -> list[Row]:

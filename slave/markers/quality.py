@@ -36,7 +36,6 @@ class Evidence(NamedTuple):
         fullness: Area over that of the ellipse with the same second moments: 1 is an ellipse, less has gaps or arms.
         slender: Logarithm of the ratio of the axes of that ellipse.
         hue: Distance of the hue from the middle of the range in half ranges, squared.
-        vivid: Logarithm of the saturation over the least of the range, at most 1.
         rival: 1: a second blob of the colour may be the marker.
         ragged: 1: hardly a pixel has four neighbours of the colour.
         cut: 1: it touches the border of the image.
@@ -48,24 +47,22 @@ class Evidence(NamedTuple):
     fullness: float
     slender: float
     hue: float
-    vivid: float
     rival: float
     ragged: float
     cut: float
 
 
-BIAS = -7.56
+BIAS = -4.90
 WEIGHTS = Evidence(
-    contrast=0.55,
-    unclear=-1.41,
-    outlined=5.22,
-    fullness=10.66,
-    slender=-2.17,
-    hue=-5.29,
-    vivid=2.25,
-    rival=-2.61,
-    ragged=-0.70,
-    cut=-1.76,
+    contrast=0.92,
+    unclear=-1.15,
+    outlined=7.29,
+    fullness=8.73,
+    slender=-3.23,
+    hue=-9.37,
+    rival=-2.44,
+    ragged=-2.17,
+    cut=-3.00,
 )
 
 
@@ -81,7 +78,7 @@ def evidence_of(
         support: Of its outline, 0: none was found, or none was sought.
         rival: Whether a second blob of the colour may be the marker.
     """
-    hue, saturation = _hue_saturation(*(c / gain for c, gain in zip(seen.colour, gains, strict=True)))
+    hue = _hue(*(c / gain for c, gain in zip(seen.colour, gains, strict=True)))
     middle, apart = 0.5 * (seen.xx + seen.yy), math.hypot(0.5 * (seen.xx - seen.yy), seen.xy)
     longest, shortest = middle + apart, max(middle - apart, 0.02)
     low, high = colour.hsv_low, colour.hsv_high
@@ -94,7 +91,6 @@ def evidence_of(
         fullness=min(seen.area / (4.0 * math.pi * math.sqrt(longest * shortest)), 1.0),
         slender=0.5 * math.log(longest / shortest),
         hue=min(away * away, 1.0),
-        vivid=math.log(min(max(saturation / max(low[1], 1), 1.0), math.e)),
         rival=float(rival),
         ragged=float(seen.thin),
         cut=float(seen.cut),
@@ -122,20 +118,20 @@ def clarity_of(seen: Measured, whole: float) -> float:
     return min(max(clarity, 0.01), 1.0)
 
 
-def _hue_saturation(blue: float, green: float, red: float) -> tuple[float, float]:
-    """OpenCV's H (0..180) and S (0..255) of a colour in linear light."""
+def _hue(blue: float, green: float, red: float) -> float:
+    """OpenCV's H (0..180) of a colour in linear light."""
     blue, green, red = _srgb(blue), _srgb(green), _srgb(red)
     value = max(blue, green, red)
     span = value - min(blue, green, red)
     if span <= 0.0:
-        return 0.0, 0.0
+        return 0.0
     if value == red:
         sector = (green - blue) / span
     elif value == green:
         sector = 2.0 + (blue - red) / span
     else:
         sector = 4.0 + (red - green) / span
-    return 30.0 * sector % HUES, 255.0 * span / value
+    return 30.0 * sector % HUES
 
 
 def _srgb(linear: float) -> float:
