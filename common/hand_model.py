@@ -152,8 +152,8 @@ class HandModel:
         """Build and check.
 
         Raises:
-            CalibrationError: A joint or marker is missing or unknown, a bone has no length, limits are crossed, or a
-                posture has no covariance.
+            CalibrationError: A joint or marker is missing or unknown, a bone has no length, limits are crossed, or the
+                posture's covariance is none.
         """
         where = f"hand {profile.name!r}"
         position, rotation = _rest(profile, where)

@@ -20,6 +20,7 @@ _PRIOR_SAMPLES = 1.0
 _PRIOR_MEAN = np.radians([[5.0, 5.0, 10.0, 15.0], *[[0.0, 20.0, 30.0, 15.0]] * 4])
 _PRIOR_SIGMA = np.radians([[15.0, 15.0, 20.0, 25.0], *[[8.0, 25.0, 30.0, 18.0]] * 4])
 _ALIKE = 0.8  # correlation of an angle with that of the next finger
+_LEAST_RAD = np.radians(0.5)  # no angle is known better by the others, whatever its tracker says
 _FEWEST = 20  # frames below which a motion says nothing
 _UPRIGHT = 0.3  # cosine of the flexion beyond which a finger shows no abduction
 
@@ -86,6 +87,7 @@ def fit_posture(angles_rad: Float) -> Posture:
     off = known.mean(axis=0) - _PRIOR_MEAN.ravel()
     mean = _PRIOR_MEAN.ravel() + share * off
     cov = share * np.cov(known.T) + (1.0 - share) * (_prior_cov() + share * np.outer(off, off))
+    cov += _LEAST_RAD**2 * np.eye(20)
     return Posture(_numbers(mean), tuple(_numbers(row) for row in cov))
 
 
@@ -117,7 +119,7 @@ def reached_limits(limits: Limits, angles_rad: Float) -> Limits:
 
 
 def _independent(samples: Float) -> float:
-    """How many independent samples (T, 4) of a motion are worth, by the correlation of neighbours."""
+    """How many independent samples (T, K) of a motion are worth, by the correlation of neighbours."""
     off = samples - samples.mean(axis=0)
     correlation = np.clip(
         (off[1:] * off[:-1]).sum(axis=0) / np.maximum((off * off).sum(axis=0), 1e-12), 0.0, 0.9999

@@ -101,6 +101,13 @@ def test_limits_move_out_to_where_a_motion_went() -> None:
     assert limits.index.tolerance_rad == preset_limits("K").index.tolerance_rad
 
 
+def test_a_dip_that_a_tracker_made_of_the_pip_leaves_a_covariance() -> None:
+    angles = wandering(120_000)
+    angles[:, 1:, 3] = angles[:, 1:, 2]
+    smallest = np.linalg.eigvalsh(np.array(fit_posture(angles).cov_rad2))[0]
+    assert np.degrees(np.sqrt(smallest)) == pytest.approx(0.5, abs=0.05)
+
+
 def test_a_covariance_that_is_none_is_refused() -> None:
     profile = profile_from_joints("moved", "right", MODELS[0].chains(wandering(600)).position_m)
     assert profile.posture is not None
