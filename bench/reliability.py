@@ -4,10 +4,12 @@
 
 Markers: of all that is found with about a quality, the share that is a marker. Joints and IMU: of all regions of a
 probability, the share that the truth lies in; below the diagonal is too sure. PHALANX_DATASETS, and where they are
-yours PHALANX_PHOTOS and PHALANX_MOTION, are folders as in `bench.real_markers` and `bench.real_hands`.
+yours PHALANX_PHOTOS and PHALANX_MOTION, are folders as in `bench.real_markers` and `bench.real_hands`; what is left out
+for want of them is said.
 """
 
 import argparse
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,6 +23,7 @@ from matplotlib.figure import Figure
 from scipy.stats import chi2
 
 from bench import imu, joint_certainty, real_hands, real_markers
+from bench.marker_photos import DATASETS
 from common.arrays import Float
 from common.calibration import HandProfile, load
 
@@ -119,6 +122,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--picture", type=Path, required=True, metavar="FILE", help="PNG to write")
     options = parser.parse_args(arguments)
+    if not (DATASETS / "real_ball").is_dir():
+        parser.error(f"no data sets at {DATASETS}: set PHALANX_DATASETS")
+    for folder, what in (("PHALANX_PHOTOS", "your photographs"), ("PHALANX_MOTION", "grasping")):
+        if folder not in os.environ:
+            print(f"left out: {what}, for {folder} is not set")
     cv2.setNumThreads(1)
     markers = real_markers.table_of(real_markers.looked_at(np.random.default_rng(real_markers.SEED)))
     draw(options.picture, markers, joints(), tilts())
