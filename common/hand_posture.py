@@ -2,9 +2,9 @@
 
 It is one distribution of all 20 angles, for fingers move together: four that each had their own would tell four times
 how the palm is turned. A recording is one sample of how a person moves, so it is shrunk towards a wide prior as if that
-had been seen in `_PRIOR_SAMPLES` independent frames
-(the normal-inverse-Wishart mean; Gelman et al., "Bayesian Data Analysis", 3rd edition 2013, section 3.6). How many
-independent frames there are follows from the correlation of one frame with the next: T (1 - r) / (1 + r).
+had been seen in `_PRIOR_SAMPLES` independent frames (the normal-inverse-Wishart mean; Gelman et al., "Bayesian Data
+Analysis", 3rd edition 2013, section 3.6). How many independent frames there are follows from the correlation of one
+frame with the next: T (1 - r) / (1 + r).
 """
 
 import numpy as np
