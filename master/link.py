@@ -1,6 +1,6 @@
 """The master's side of the datagram link: sessions of all slaves, as a push machine without a socket.
 
-Rules that must stay in step with `slave.link` and docs/wire.md:
+`common.link.handshake.RULES` says what follows from each event; this file classifies datagrams as events.
 - A hello makes a *pending* session; it replaces the live one only when its slave has sealed
   something with the new keys. So a replayed or late hello never ends a live session.
 - A hello counts only with the proof that who says it has the secret of its name: a stolen device of the rig begins no
@@ -28,6 +28,7 @@ from common.clock import Clock
 from common.clock_offset import ClockEstimate
 from common.datagram import Address, Header, Kind, Opened, Opener, Refusal, parse
 from common.errors import BoundsError, MessageError
+from common.link.handshake import RULES, WELL_NS, Event, Role, State
 from common.link_key import LinkKey
 from common.messages import (
     WIRE_VERSION,
@@ -70,7 +71,6 @@ ECHO_NS = 200_000_000
 EARLY_NS = 5_000_000_000
 PENDING_NS = 1_000_000_000  # a hello whose slave never confirms is forgotten
 SILENT_NS = 1_000_000_000
-WELL_NS = 500_000_000  # a slave heard this recently is well, and twins are refused
 START_LEAD_NS = 100_000_000  # room for two repetitions of the start before it is due
 START_AGAIN_NS = 50_000_000
 
@@ -194,6 +194,13 @@ class MasterLink:
         """Whether the start has been given."""
         return self._start_ns is not None
 
+    def state(self, sender: str, t_ns: int) -> State:
+        """Return how far the session of `sender` is at `t_ns`, on this clock."""
+        of = self._senders[sender]
+        if of.live is None:
+            return State.IDLE if of.pending is None else State.PENDING
+        return State.LIVE if t_ns - of.live.heard_ns < WELL_NS else State.SILENT
+
     def connected(self) -> frozenset[str]:
         """Return the senders heard in a live session within the last second."""
         t_ns = self._clock.now_ns()
@@ -243,33 +250,50 @@ class MasterLink:
         hello = self._keys.hear(header, datagram, Hello)
         if isinstance(hello, Refusal):
             return hello
-        if hello.master_nonce != self._nonce:
-            return Refusal.REPLAYED
         sender = self._senders.get(hello.name)
         if sender is None:
-            return Refusal.UNKNOWN
-        if not self._keys.proves(hello):
+            return Refusal.UNKNOWN if hello.master_nonce == self._nonce else Refusal.REPLAYED
+        event = self._hello_event(hello, sender)
+        rule = RULES[Role.MASTER, self.state(hello.name, t_ns), event]
+        if rule.refusal is Refusal.TWIN:
+            self.turned_away.twin(hello.name, address[0], WIRE_VERSION, t_ns)
+        if rule.reply is Kind.UNPROVEN:
             self.turned_away.unproven(hello.name, address[0], WIRE_VERSION, t_ns)
             unproven = Unproven(self._nonce, hello.slave_nonce, self._keys.apart)
             self._outbox.append((seal(self._sealer, unproven), address))
-            return Refusal.SECRET
-        for session in (sender.live, sender.pending):
-            if session is not None and session.hello.slave_nonce == hello.slave_nonce:
-                self._welcome(session)  # ours was lost; always to the address of the first hello
-                return None
+        if rule.reply is Kind.WELCOME:
+            session = self._of_nonce(sender, hello.slave_nonce)  # its welcome was lost
+            self._welcome(session or self._begin(hello, sender, address, t_ns))
+        return rule.refusal
+
+    def _hello_event(self, hello: Hello, sender: Sender) -> Event:
+        if hello.master_nonce != self._nonce:
+            return Event.HELLO_OTHER_MASTER
+        if not self._keys.proves(hello):
+            return Event.HELLO_UNPROVEN
+        if self._of_nonce(sender, hello.slave_nonce) is not None:
+            return Event.HELLO_AGAIN
         if hello.slave_nonce in sender.old_nonces:
-            return Refusal.REPLAYED
+            return Event.HELLO_USED
         live = sender.live
-        if live is not None and live.hello.process != hello.process and t_ns - live.heard_ns < WELL_NS:
-            self.turned_away.twin(hello.name, address[0], WIRE_VERSION, t_ns)
-            return Refusal.TWIN
+        return (
+            Event.HELLO if live is None or live.hello.process == hello.process else Event.HELLO_OTHER_PROCESS
+        )
+
+    @staticmethod
+    def _of_nonce(sender: Sender, slave_nonce: bytes) -> Session | None:
+        for session in (sender.live, sender.pending):
+            if session is not None and session.hello.slave_nonce == slave_nonce:
+                return session
+        return None
+
+    def _begin(self, hello: Hello, sender: Sender, address: Address, t_ns: int) -> Session:
         if sender.pending is not None:  # a newer attempt of the slave, which has given that one up
             sender.old_nonces.append(sender.pending.hello.slave_nonce)
             del self._sessions[sender.pending.key_id]
         sender.pending = self._new_session(hello, address, t_ns)
         self._sessions[sender.pending.key_id] = sender.pending
-        self._welcome(sender.pending)
-        return None
+        return sender.pending
 
     def _new_session(self, hello: Hello, address: Address, t_ns: int) -> Session:
         session_nonce = self._random(NONCE_BYTES)

@@ -1,6 +1,6 @@
 """The slave's side of the datagram link: from the first beacon to data, as a push machine.
 
-Rules that must stay in step with `master.link` and docs/wire.md:
+`common.link.handshake.RULES` says what follows from each event; this file classifies datagrams as events.
 - While the master of the session is heard, beacons of any other life are ignored: an old one
   replayed cannot end a live session, and two masters do not tear a slave apart.
 - An offer (one slave nonce) lasts until a welcome that carries it, with the proof that the master has the secret of
@@ -20,6 +20,7 @@ from hmac import compare_digest
 from common.clock import Clock
 from common.datagram import HEADER, OVERHEAD, Address, Header, Kind, Opener, Refusal, Sealer, parse
 from common.endpoints import reached_at
+from common.link.handshake import RULES, WELL_NS, Event, Role, Rule, State
 from common.link_key import LinkKey
 from common.messages import WIRE_VERSION, Message, encode
 from common.session import (
@@ -30,6 +31,7 @@ from common.session import (
     Hello,
     Random,
     RigKeys,
+    SessionKeys,
     Start,
     Started,
     Unproven,
@@ -39,7 +41,6 @@ from common.session import (
     seal,
 )
 
-WELL_NS = 500_000_000  # a master heard this recently is well, and rivals are ignored
 VANISHED_NS = 2_000_000_000  # a master silent for so long is gone
 UNLISTED_NS = 1_000_000_000
 HELLO_AGAIN_NS = 50_000_000
@@ -128,6 +129,12 @@ class SlaveLink:
             return None
         return self._wrong[1]
 
+    def state(self, t_ns: int) -> State:
+        """Return how far the session with a master is at `t_ns`, on this slave's clock."""
+        if self._session is None:
+            return State.IDLE if self._offer is None else State.OFFERED
+        return State.LIVE if t_ns - self._session.heard_ns < WELL_NS else State.SILENT
+
     @property
     def started(self) -> bool:
         """Whether the master has said start and is still there."""
@@ -207,20 +214,27 @@ class SlaveLink:
         beacon = self._keys.hear(header, datagram, Beacon)
         if isinstance(beacon, Refusal):
             return beacon
-        session = self._session
-        if session is not None:
-            if beacon.master_nonce == session.master_nonce:
-                silent = t_ns - session.heard_ns >= VANISHED_NS  # then no counter is worth being deaf for it
-                if header.counter <= session.beacon_counter and not silent:
-                    return Refusal.REPLAYED
-                session.beacon_counter = header.counter
-                listed = beacon.sessions.get(self._name) == session.key_id
-                if listed or t_ns - session.since_ns < UNLISTED_NS:
-                    return None
-            elif t_ns - session.heard_ns < WELL_NS:
-                return Refusal.RIVAL
+        rule = self._rule(self._beacon_event(beacon, header.counter, t_ns), t_ns)
+        if rule.reply is not Kind.HELLO:
+            return rule.refusal
         self._answer(beacon, header.counter, address, t_ns)
         return self._has_twin(beacon, t_ns)
+
+    def _rule(self, event: Event, t_ns: int) -> Rule:
+        return RULES[Role.SLAVE, self.state(t_ns), event]
+
+    def _beacon_event(self, beacon: Beacon, counter: int, t_ns: int) -> Event:
+        session = self._session
+        if session is None or beacon.master_nonce != session.master_nonce:
+            return Event.BEACON_OTHER
+        vanished = t_ns - session.heard_ns >= VANISHED_NS  # then no counter is worth being deaf for it
+        if counter <= session.beacon_counter and not vanished:
+            return Event.BEACON_OLD
+        session.beacon_counter = counter
+        listed = beacon.sessions.get(self._name) == session.key_id
+        return (
+            Event.BEACON_LISTED if listed or t_ns - session.since_ns < UNLISTED_NS else Event.BEACON_UNLISTED
+        )
 
     def _answer(self, beacon: Beacon, counter: int, address: Address, t_ns: int) -> None:
         old, since_ns = self._offer, t_ns
@@ -273,15 +287,12 @@ class SlaveLink:
         if isinstance(welcome, Refusal):
             return welcome
         offer = self._offer
-        if self._session is not None and welcome.slave_nonce == self._session.slave_nonce:
-            return Refusal.DUPLICATE
-        if offer is None or welcome.slave_nonce != offer.slave_nonce:
-            return Refusal.REPLAYED
-        if welcome.master_nonce != offer.beacon.master_nonce:
-            return Refusal.STALE  # a beacon of another life came meanwhile, and hello went there
-        keys = self._keys.session(self._hello(offer), welcome.session_nonce)
-        if not compare_digest(keys.proof, welcome.proof):
-            return Refusal.SECRET
+        keys = None
+        if offer is not None and welcome.slave_nonce == offer.slave_nonce:
+            keys = self._keys.session(self._hello(offer), welcome.session_nonce)
+        rule = self._rule(self._welcome_event(welcome, offer, keys), t_ns)
+        if rule.refusal is not None or offer is None or keys is None:
+            return rule.refusal
         self._session = _Session(
             welcome.master_nonce,
             welcome.slave_nonce,
@@ -297,18 +308,27 @@ class SlaveLink:
         self._offer = None
         return None
 
-    def _hear_unproven(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal:
+    def _welcome_event(self, welcome: Welcome, offer: _Offer | None, keys: SessionKeys | None) -> Event:
+        if self._session is not None and welcome.slave_nonce == self._session.slave_nonce:
+            return Event.WELCOME_AGAIN
+        if offer is None or keys is None:
+            return Event.WELCOME_UNASKED
+        if welcome.master_nonce != offer.beacon.master_nonce:
+            return Event.WELCOME_STALE  # a beacon of another life came meanwhile, and hello went there
+        return Event.WELCOME if compare_digest(keys.proof, welcome.proof) else Event.WELCOME_UNPROVEN
+
+    def _hear_unproven(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
         """Why there is no welcome. It changes nothing here: whoever has the rig key can say it."""
         unproven = self._keys.hear(header, datagram, Unproven)
         if isinstance(unproven, Refusal):
             return unproven
-        if self._offer is None or unproven.slave_nonce != self._offer.slave_nonce:
-            return Refusal.REPLAYED
-        why = _SECRET
-        if unproven.apart != self._keys.apart:
-            why = _NO_SECRET if unproven.apart else _MASTER_HAS_NONE
-        self._wrong = t_ns, why.format(self._name, address[0])
-        return Refusal.SECRET
+        ours = self._offer is not None and unproven.slave_nonce == self._offer.slave_nonce
+        if ours:
+            why = _SECRET
+            if unproven.apart != self._keys.apart:
+                why = _NO_SECRET if unproven.apart else _MASTER_HAS_NONE
+            self._wrong = t_ns, why.format(self._name, address[0])
+        return self._rule(Event.UNPROVEN if ours else Event.UNPROVEN_UNASKED, t_ns).refusal
 
     def _hear_master(self, header: Header, datagram: bytes, t_ns: int) -> Refusal | None:
         session = self._session

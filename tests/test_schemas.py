@@ -10,6 +10,7 @@ from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, schema
 from common.frame_recording import Manifest
 from common.gesture_settings import GestureSettings
+from common.link.handshake import state_pages
 from common.message_schema import bounds_table, bus_schema
 from common.messages import AnyMessage, HandPose
 from common.object_profile import ObjectProfile
@@ -30,13 +31,16 @@ KINDS: dict[str, type[msgspec.Struct]] = {
 
 ALL = (*KINDS, MESSAGES)
 WIRE = FOLDER.parent / "wire.md"
-BEGIN, END = "<!-- bounds: `make schema` writes this table -->\n\n", "\n<!-- end of bounds -->"
+MADE = {"bounds": bounds_table, "handshake": state_pages}
 
 
-def with_bounds(page: str) -> str:
-    """The page of the wire with its table of bounds as the types have it."""
-    before, rest = page.split(BEGIN)
-    return before + BEGIN + bounds_table() + END + rest.split(END)[1]
+def with_made_parts(page: str) -> str:
+    """Return the page of the wire with its generated parts as the code has them."""
+    for name, make in MADE.items():
+        begin, end = f"<!-- {name}: `make schema` writes this -->\n\n", f"\n<!-- end of {name} -->"
+        before, rest = page.split(begin)
+        page = before + begin + make() + end + rest.split(end)[1]
+    return page
 
 
 def text_of(name: str) -> str:
@@ -52,7 +56,7 @@ def test_the_schema_equals_the_type(name: str) -> None:
 
 
 def test_the_page_of_the_wire_lists_the_bounds_of_every_message() -> None:
-    assert with_bounds(WIRE.read_text()) == WIRE.read_text(), f"{WIRE} is out of date: run `make schema`"
+    assert with_made_parts(WIRE.read_text()) == WIRE.read_text(), f"{WIRE} is out of date: run `make schema`"
     for kind in get_args(AnyMessage):
         numbers = {field.name for field in msgspec.structs.fields(kind) if field.type in (float, int, Float)}
         assert not numbers, f"{kind.__name__}: {', '.join(numbers)}: a number without bounds"
@@ -88,4 +92,4 @@ if __name__ == "__main__":
     FOLDER.mkdir(exist_ok=True)
     for file in ALL:
         (FOLDER / file).write_text(text_of(file))
-    WIRE.write_text(with_bounds(WIRE.read_text()))
+    WIRE.write_text(with_made_parts(WIRE.read_text()))
