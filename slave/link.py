@@ -214,7 +214,10 @@ class SlaveLink:
         beacon = self._keys.hear(header, datagram, Beacon)
         if isinstance(beacon, Refusal):
             return beacon
-        rule = self._rule(self._beacon_event(beacon, header.counter, t_ns), t_ns)
+        event = self._beacon_event(beacon, header.counter, t_ns)
+        if self._session is not None and event in (Event.BEACON_LISTED, Event.BEACON_UNLISTED):
+            self._session.beacon_counter = header.counter
+        rule = self._rule(event, t_ns)
         if rule.reply is not Kind.HELLO:
             return rule.refusal
         self._answer(beacon, header.counter, address, t_ns)
@@ -230,7 +233,6 @@ class SlaveLink:
         vanished = t_ns - session.heard_ns >= VANISHED_NS  # then no counter is worth being deaf for it
         if counter <= session.beacon_counter and not vanished:
             return Event.BEACON_OLD
-        session.beacon_counter = counter
         listed = beacon.sessions.get(self._name) == session.key_id
         return (
             Event.BEACON_LISTED if listed or t_ns - session.since_ns < UNLISTED_NS else Event.BEACON_UNLISTED
@@ -287,10 +289,8 @@ class SlaveLink:
         if isinstance(welcome, Refusal):
             return welcome
         offer = self._offer
-        keys = None
-        if offer is not None and welcome.slave_nonce == offer.slave_nonce:
-            keys = self._keys.session(self._hello(offer), welcome.session_nonce)
-        rule = self._rule(self._welcome_event(welcome, offer, keys), t_ns)
+        event, keys = self._welcome_event(welcome, offer)
+        rule = self._rule(event, t_ns)
         if rule.refusal is not None or offer is None or keys is None:
             return rule.refusal
         self._session = _Session(
@@ -308,14 +308,18 @@ class SlaveLink:
         self._offer = None
         return None
 
-    def _welcome_event(self, welcome: Welcome, offer: _Offer | None, keys: SessionKeys | None) -> Event:
+    def _welcome_event(self, welcome: Welcome, offer: _Offer | None) -> tuple[Event, SessionKeys | None]:
+        """Return what a welcome is, and the keys of its session if it is a proven one."""
         if self._session is not None and welcome.slave_nonce == self._session.slave_nonce:
-            return Event.WELCOME_AGAIN
-        if offer is None or keys is None:
-            return Event.WELCOME_UNASKED
+            return Event.WELCOME_AGAIN, None
+        if offer is None or welcome.slave_nonce != offer.slave_nonce:
+            return Event.WELCOME_UNASKED, None
         if welcome.master_nonce != offer.beacon.master_nonce:
-            return Event.WELCOME_STALE  # a beacon of another life came meanwhile, and hello went there
-        return Event.WELCOME if compare_digest(keys.proof, welcome.proof) else Event.WELCOME_UNPROVEN
+            return Event.WELCOME_STALE, None  # a beacon of another life came meanwhile, and hello went there
+        keys = self._keys.session(self._hello(offer), welcome.session_nonce)
+        if not compare_digest(keys.proof, welcome.proof):
+            return Event.WELCOME_UNPROVEN, None
+        return Event.WELCOME, keys
 
     def _hear_unproven(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
         """Why there is no welcome. It changes nothing here: whoever has the rig key can say it."""

@@ -1,1 +1,1 @@
-"""What both ends of the sealed datagram link share; datagrams enter, events leave."""
+"""What both ends of the datagram link share; datagrams enter, events leave."""

@@ -1,8 +1,10 @@
 """The states of a session, for both ends of the link: one transition table.
 
-Each end keeps one state per sender. It classifies what arrives, or what time
-brings, as an `Event`, and `RULES` says what follows: the next state, the
-datagram to send back, or the reason to refuse. What is in no row cannot occur.
+Each end classifies what arrives as an `Event`, and `RULES` says what follows:
+the next state, the datagram to send back, or the reason to refuse. What is in
+no row cannot occur. An end obeys reply and refusal. Its state it derives from
+the sessions that it holds and from time, so `next`, and the rows of `SEALED`,
+`EXPIRED` and `SILENCE`, are what the tests hold it to.
 `docs/wire.md` shows `state_pages()`, written by `make schema`.
 
 A slave or master that holds a live session may negotiate another one meanwhile;
