@@ -190,8 +190,8 @@ class _WristErrors:
     def _tips(self, truth: WristTruth) -> tuple[Float, Float]:
         missed, false = self._missed(), self._false() < _TIP_FALSE
         off, aside = 0.8 * self._tip() + 0.6 * self._rng.normal(size=(5, 2)), self._aside()
-        usual = np.array([_THUMB_TIP_FOUND, *4 * [_TIP_FOUND]])
-        found = truth.tip_visible & (missed < usual) & np.isfinite(truth.tip_uv[:, 0])
+        typical = np.array([_THUMB_TIP_FOUND, *4 * [_TIP_FOUND]])
+        found = truth.tip_visible & (missed < typical) & np.isfinite(truth.tip_uv[:, 0])
         away = _TIP_FALSE_PX * aside / np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 0.5)
         at = truth.tip_uv + np.where(false[:, None], away, 0.0) + _TIP_PX * off
         claimed = np.where(false, _TIP_FALSE_CLAIMED_PX, _TIP_CLAIMED_PX)

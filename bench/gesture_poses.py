@@ -61,9 +61,9 @@ def rows() -> Iterator[Row]:
 def people(numbers: Sequence[int] | range, seconds: float = 15.0) -> Told:
     """People of the study before cameras that see all markers: own bones, a measured model, 1 mm of noise."""
     out = Told()
-    wrist, usual = load(CALIBRATION / "rigs/wrist.json", RigCalibration), _hand("right")
+    wrist, typical = load(CALIBRATION / "rigs/wrist.json", RigCalibration), _hand("right")
     for number in numbers:
-        who = participant(_SEED, number, wrist, usual)
+        who = participant(_SEED, number, wrist, typical)
         true, known = HandModel.of(who.hand), HandModel.of(who.measured)
         motion = StudyPoses(true, np.array([0.0, 0.0, 0.5]), _SEED + number)
         solver = PointHand(known, MARKERS)

@@ -47,7 +47,7 @@ def rows() -> Iterator[Row]:
     for name, group in played.items():
         angles = [(model, angles_of(motion)) for model, motion in group]
         together, alone = (
-            np.concatenate([strayed_deg(model, a, alike=alike) for model, a in angles], axis=1)
+            np.concatenate([growth_deg(model, a, alike=alike) for model, a in angles], axis=1)
             for alike in (True, False)
         )
         for k, after_s in enumerate(HIDDEN_S[1:], 1):
@@ -62,7 +62,7 @@ def angles_of(motion: HandMotion) -> Float:
     return np.array([motion.at(t).angles_rad for t in times.tolist()])
 
 
-def strayed_deg(model: HandModel, angles_rad: Float, *, alike: bool) -> Float:
+def growth_deg(model: HandModel, angles_rad: Float, *, alike: bool) -> Float:
     """Errors (K, N, 2) [deg] of flexion and PIP, at each of the times `HIDDEN_S` after the last marker of a finger.
 
     Args:

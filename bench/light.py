@@ -157,8 +157,8 @@ def _starts() -> Row:
 def _candle() -> Row:
     """A light that leaves the bounds: what is lost, and whether it was foreseen."""
     still, got = total(STILL), total(CANDLE)
-    lost, usual = got.visible - got.found, still.visible - still.found
-    note = f"goal 0; lost in all {lost}, in calibrated light {usual}"
+    lost, typical = got.visible - got.found, still.visible - still.found
+    note = f"goal 0; lost in all {lost}, in calibrated light {typical}"
     return Row("4300 -> 2000 K: swapped before a warning", got.swaps_unwarned, "count", note)
 
 

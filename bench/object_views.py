@@ -23,13 +23,13 @@ PERIOD_S = 1.0 / 60.0
 class Noise:
     """Standard deviations per axis [px]: what stays of a feature in a camera, and what is new in each frame."""
 
-    stays_px: float = 0.1
-    fresh_px: float = 0.08
+    correlated_px: float = 0.1
+    independent_px: float = 0.08
 
     @property
     def sigma_px(self) -> float:
         """Both."""
-        return float(np.hypot(self.stays_px, self.fresh_px))
+        return float(np.hypot(self.correlated_px, self.independent_px))
 
 
 def wander(seed: int, centre_m: Float, speed_m_s: float, turn_rad_s: float) -> Where:
@@ -63,12 +63,12 @@ def detections(
     """Messages of all cameras in the order of their frames, each camera `offset_s` after the one before it."""
     rng = np.random.default_rng([seed, 7])
     features = Features.of(profile, markers)
-    stays = {name: rng.normal(0.0, noise.stays_px, (len(features.points), 2)) for name in models}
+    stays = {name: rng.normal(0.0, noise.correlated_px, (len(features.points), 2)) for name in models}
     for seq in range(int(seconds / PERIOD_S)):
         for c, (name, model) in enumerate(models.items()):
             t_s = seq * PERIOD_S + c * offset_s
             uv, shown = _seen(features, model, where, t_s)
-            uv = uv + stays[name] + rng.normal(0.0, noise.fresh_px, uv.shape)
+            uv = uv + stays[name] + rng.normal(0.0, noise.independent_px, uv.shape)
             hidden = [k for k in range(features.count) if hides(name, k, t_s)]
             shown[hidden] = False
             yield from _messages(features, markers, name, seq, t_s, uv, shown, noise.sigma_px, model, where)

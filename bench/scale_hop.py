@@ -58,9 +58,9 @@ def hop_ms(folder: Path) -> tuple[float, float]:
         _until_heard(master, heard)
         ages = [_ages(master, source) for source in heard]
     # The rare long ones at the master are of another moment of the machine: they are no part of what hops add.
-    usual = float(np.median(ages[0]))
+    typical = float(np.median(ages[0]))
     p50, p99 = (float(value) for value in np.percentile(ages[1], [50, 99]))
-    return (p50 - usual) / HOPS, (p99 - usual) / HOPS
+    return (p50 - typical) / HOPS, (p99 - typical) / HOPS
 
 
 def _reader(endpoint: str, keys: Path, site: str | None) -> ZenohBus:

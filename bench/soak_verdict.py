@@ -146,7 +146,7 @@ def _latency(minutes: Sequence[Minute], name: str) -> Finding:
     if np.isnan(found.per_h):
         return Finding(f"latency {name}", "too short to say", "does not grow", None)
     hours = minutes[-1].t_s / 3600.0
-    usual = float(np.nanmedian([getattr(one, f"{name}_ms") for one in minutes]))
-    grew = found.low > 0.0 and found.per_h * hours > max(GROWS_MS, GROWS_SHARE * usual)
-    value = f"{usual:.1f} ms, {found.per_h:+.2f} ms/h ({found.low:+.2f} ... {found.high:+.2f})"
+    typical = float(np.nanmedian([getattr(one, f"{name}_ms") for one in minutes]))
+    grew = found.low > 0.0 and found.per_h * hours > max(GROWS_MS, GROWS_SHARE * typical)
+    value = f"{typical:.1f} ms, {found.per_h:+.2f} ms/h ({found.low:+.2f} ... {found.high:+.2f})"
     return Finding(f"latency {name}", value, "does not grow", not grew)

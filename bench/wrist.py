@@ -175,7 +175,7 @@ def baseline(camera: CameraCalibration, triples: list[Triple]) -> Step:
         cv2.CV_16SC2,
     )
 
-    def usual(one: Triple) -> Float:
+    def typical(one: Triple) -> Float:
         ambient = one.ambient.image
         laser, _led = (
             cv2.remap(cv2.subtract(frame.image, ambient), across, down, cv2.INTER_LINEAR)
@@ -185,7 +185,7 @@ def baseline(camera: CameraCalibration, triples: list[Triple]) -> Step:
         _count, _labels, sizes, centroids = cv2.connectedComponentsWithStats(bright)
         return np.asarray(centroids[np.argsort(sizes[:, cv2.CC_STAT_AREA])[-6:-1]], np.float64)
 
-    return _each(triples, usual)
+    return _each(triples, typical)
 
 
 def _slave(camera: CameraCalibration, view: WristView, frames: list[Frame], engine: Engine) -> Step:

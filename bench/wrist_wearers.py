@@ -47,9 +47,9 @@ class Person:
         """Draw one; even seeds have right hands. `knuckles_m`: how far each knuckle is off, per axis, either way."""
         left = bool(seed % 2)
         rig = load(CALIB / "rigs" / f"wrist{'-left' if left else ''}.json", RigCalibration)
-        usual = load(CALIB / "hands" / f"{rig.hand}.json", HandProfile)
+        typical = load(CALIB / "hands" / f"{rig.hand}.json", HandProfile)
         camera = load(CALIB / "cameras" / f"{rig.cameras[0]}.json", CameraCalibration)
-        who = participant(seed, 1, rig, usual)
+        who = participant(seed, 1, rig, typical)
         moved = np.random.default_rng([seed, 5]).uniform(-knuckles_m, knuckles_m, (4, 3))
         return cls(seed, camera, rig, who.measured, who.rig, with_knuckles(who.hand, moved))
 

@@ -196,9 +196,9 @@ class HandModel:
 
     def joints(self, T_rig_palm: Float, chains: Chains) -> HandJoints:
         """All joints of a palm pose (..., 4, 4) whose fingers are bent like `chains`."""
-        lead, R_palm = chains.position_m.shape[:-3], T_rig_palm[..., :3, :3]
-        position = np.empty((*lead, 26, 3))
-        rotation = np.empty((*lead, 26, 3, 3))
+        batch, R_palm = chains.position_m.shape[:-3], T_rig_palm[..., :3, :3]
+        position = np.empty((*batch, 26, 3))
+        rotation = np.empty((*batch, 26, 3, 3))
         position[...] = self.rest_position_m
         rotation[...] = self.rest_rotation
         position[..., CHAINS, :] = chains.position_m

@@ -34,7 +34,7 @@ ATTITUDE, BIAS, SCALE, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9
 BIAS_RAD_S = radians(2.5)
 G_M_S2 = 9.80665
 _SIZE, _HEADING = 11, 2
-_BIAS_WALK = radians(0.01)  # [rad/s per root second]
+_BIAS_PROCESS_NOISE = radians(0.01)  # [rad/s per root second]
 _REST = radians(0.09)  # [rad/s times root second]: with the walk, 0.03 deg/s are reached
 _NOISE = radians(0.015)  # [rad per root second]
 _SCALE = 0.01
@@ -123,4 +123,6 @@ class ErrorState:
         return found
 
     def _warmed(self, step_s: float) -> None:
-        self._variance[BIAS] = np.minimum(self._variance[BIAS] + _BIAS_WALK**2 * step_s, BIAS_RAD_S**2)
+        self._variance[BIAS] = np.minimum(
+            self._variance[BIAS] + _BIAS_PROCESS_NOISE**2 * step_s, BIAS_RAD_S**2
+        )

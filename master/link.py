@@ -71,7 +71,7 @@ ECHO_NS = 200_000_000
 EARLY_NS = 5_000_000_000
 PENDING_NS = 1_000_000_000  # a hello whose slave never confirms is forgotten
 SILENT_NS = 1_000_000_000
-START_LEAD_NS = 100_000_000  # room for two repetitions of the start before it is due
+START_DELAY_NS = 100_000_000  # room for two repetitions of the start before it is due
 START_AGAIN_NS = 50_000_000
 
 
@@ -415,7 +415,7 @@ class MasterLink:
             return
         ready = all(sender.live is not None and sender.live.clock.ready for sender in self._awaited)
         if ready or t_ns - self._first_ns > self._start_timeout_ns:
-            self._start_ns = t_ns + START_LEAD_NS
+            self._start_ns = t_ns + START_DELAY_NS
 
     def _send_start(self, sender: Sender, t_ns: int) -> None:
         session = sender.live

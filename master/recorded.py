@@ -69,14 +69,14 @@ def recorded_triples(folder: Path, camera: str) -> Iterator[WristDetections]:
     try:
         t_ns = data["t_ns"].astype(np.int64, casting="same_kind")
         laser, tip = (data[name].astype(np.float64) for name in ("laser_uv", "tip_uv"))
-        usual = {
+        typical = {
             "seq": TRIPLE * np.arange(len(laser)),
             "laser_sigma_px": _where_seen(laser, _LASER_PX),
             "laser_px": np.full(laser.shape[:2], np.nan),
             "tip_sigma_px": _where_seen(tip, _TIP_PX),
             "tip_depth": np.full(tip.shape[:2], np.nan),
         }
-        rest = {name: data[name] if name in data else usual[name] for name in also}
+        rest = {name: data[name] if name in data else typical[name] for name in also}
         seq = rest.pop("seq").astype(np.int64, casting="same_kind")
         each = {name: array.astype(np.float64) for name, array in rest.items()}
     except (TypeError, ValueError, IndexError) as error:

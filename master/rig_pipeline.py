@@ -35,7 +35,7 @@ from master.rig_setup import RigSetup
 
 _ANY_CURL_RAD = 100.0  # a finger that is not seen may be bent anyhow
 _MOUNTED_RAD = np.radians(0.5)  # standard deviation of the pitch of cameras mounted by eye
-_LEAD_M_S = 0.3  # of a palm, and of a finger on it, where it is solved elsewhere: 5 mm a frame at 60 Hz
+_BLEND_M_S = 0.3  # of a palm, and of a finger on it, where it is solved elsewhere: 5 mm a frame at 60 Hz
 
 
 class Pipeline(Protocol):
@@ -70,9 +70,9 @@ def _point_filter(setup: RigSetup) -> PointFilter:
 
 def _hand_filter(setup: RigSetup) -> HandOneEuro:
     """The filter of the solved hand, by the same settings."""
-    lead_m_s = None if setup.wrist is None else _LEAD_M_S
+    blend_m_s = None if setup.wrist is None else _BLEND_M_S
     hand = setup.hand if setup.wrist is None else loosened(setup.hand)
-    return HandOneEuro(hand, setup.hand_markers, OneEuroParameters.of(setup.rig.filter), lead_m_s)
+    return HandOneEuro(hand, setup.hand_markers, OneEuroParameters.of(setup.rig.filter), blend_m_s)
 
 
 def _rays(setup: RigSetup) -> RayTriangulator | None:

@@ -141,11 +141,11 @@ def score_wrist(poses: Poses, truth: WristTruth) -> dict[str, float]:
     found = row[there]
     error = np.degrees(poses.angles_rad[found][:, 1:, 2] - truth.pip_rad[there, 1:])
     tracked = _any_of(poses.tracked[found]) & np.isfinite(error)
-    usual = truth.pip_rad[there, 1:] <= _STRAIGHT_RAD
-    put(out, "pip_rms_deg", error[tracked & usual], _rms)
+    typical = truth.pip_rad[there, 1:] <= _STRAIGHT_RAD
+    put(out, "pip_rms_deg", error[tracked & typical], _rms)
     for f, name in enumerate(FINGERS[1:]):
-        put(out, f"pip_rms_deg_{name}", error[:, f][(tracked & usual)[:, f]], _rms)
-    out["pip_untracked"] = float((usual & ~tracked).sum())
+        put(out, f"pip_rms_deg_{name}", error[:, f][(tracked & typical)[:, f]], _rms)
+    out["pip_untracked"] = float((typical & ~tracked).sum())
     valid = poses.valid[found][:, 1:]
     distance = np.linalg.norm(poses.position_m[found][:, 1:] - truth.joints_m[there], axis=2)
     put(out, "pip_deg", np.abs(error[_any_of(poses.valid[found]) & np.isfinite(error)]), np.mean)

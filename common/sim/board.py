@@ -205,8 +205,8 @@ def _poses(optics: list[CameraModel], seed: int) -> Float:
     rng = np.random.default_rng([seed, 5])
     found: list[Float] = []
     for _ in range(200 * POSES):
-        lead = optics[len(found) % len(optics)]
-        T = lead.T_rig_camera @ _before(lead, rng)
+        first_camera = optics[len(found) % len(optics)]
+        T = first_camera.T_rig_camera @ _before(first_camera, rng)
         seen = [_sees(camera, T) for camera in optics]
         if seen[len(found) % len(optics)] and (all(seen) or len(found) % 4 == 3):
             found.append(T)

@@ -81,8 +81,8 @@ class SceneTake:
         self.count = max(round(seconds / self._period_s), 1)
         self._renderers = [Renderer(scene, name) for name in names]
         self._offsets = [scene.timing(name).start_offset_ns * 1e-9 for name in names]
-        lead = scene.cameras[names[0]]
-        self._centre_s = 0.5 * (lead.height_px - 1) * lead.row_time_us * 1e-6
+        reference = scene.cameras[names[0]]
+        self._centre_s = 0.5 * (reference.height_px - 1) * reference.row_time_us * 1e-6
         self._rows: list[_Row] = []
 
     @property

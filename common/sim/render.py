@@ -125,9 +125,9 @@ class Renderer:
         phalanges = depth[CAPSULES].mean(axis=1).tolist()
         for part in _finger_parts(snapshot):
             # A part that grows out of the palm goes under its edge, wherever the rest of it is.
-            grown = part[0] in ROOTS
+            margin = part[0] in ROOTS
             far = sum(phalanges[k] for k in part) / len(part)
-            parts.append((max(far, palm_depth + 1e-6) if grown else far, part))
+            parts.append((max(far, palm_depth + 1e-6) if margin else far, part))
         palm = list(zip(raster.fixed_each(snapshot.web), raster.fixed_each(snapshot.palm), strict=True))
         behind = snapshot.into_sleeve
         if behind:

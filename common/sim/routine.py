@@ -11,8 +11,8 @@ from common.hand_model import HandModel
 from common.hand_routine import MOVES, ROUTINE_S, STEPS, posture_at
 from common.sim.motion import Drift, HandState, angles_of
 
-LEAD_S, TAIL_S = 1.0, 0.8
-PERIOD_S = LEAD_S + ROUTINE_S + TAIL_S
+REACTION_S, TAIL_S = 1.0, 0.8
+PERIOD_S = REACTION_S + ROUTINE_S + TAIL_S
 LATE_S = (0.05, 0.45)  # by how much a step is begun late, least and most
 REST = 0.1  # share of the drift of a hand in the air that is left when the palm rests on something
 TILT_DEG = 15.0  # of the fingers towards the cameras
@@ -36,7 +36,7 @@ class HandRoutine:
         starts = [next(m.start_s for m in MOVES if m.step == k) for k in range(len(STEPS))]
         late = rng.uniform(*LATE_S, len(STEPS))
         self._script_s = np.array([*starts, ROUTINE_S])
-        self._done_s = LEAD_S + np.array([*(starts + late), ROUTINE_S + LATE_S[1]])
+        self._done_s = REACTION_S + np.array([*(starts + late), ROUTINE_S + LATE_S[1]])
 
     @property
     def period_s(self) -> float:

@@ -131,9 +131,9 @@ class HandSurface:
 
 def _chain_rows(chains: Chains) -> Float:
     """Positions [m], then axes, of the joints of all chains, finger by finger (..., 80, 3), palm frame."""
-    lead = chains.position_m.shape[:-3]
+    batch = chains.position_m.shape[:-3]
     axes = np.swapaxes(chains.rotation, -1, -2)
-    return np.concatenate([chains.position_m.reshape(*lead, 20, 3), axes.reshape(*lead, 60, 3)], axis=-2)
+    return np.concatenate([chains.position_m.reshape(*batch, 20, 3), axes.reshape(*batch, 60, 3)], axis=-2)
 
 
 def _spheres(model: HandModel) -> list[Float]:

@@ -35,7 +35,7 @@ from common.sim.motion import (
 from common.sim.poses import StudyPoses
 
 TOGETHER = ("grasp", "both-poses", "both-curl", "both-travel", "both-moves", "gestures")
-USUAL_BEND_DEG = np.array([8.0, 5.0])
+TYPICAL_FLEXION_DEG = np.array([8.0, 5.0])
 CURL_S, STRAIGHT_DEG, CURL_PIP_DEG, MCP_PER_PIP = 10.0, 4.0, 101.0, 0.54  # Kamper's ratio, row D8
 _CURL_LAG_RAD = np.array([0.3, 0.0, 0.1, 0.2, 0.3])  # no finger follows another at once
 _CURL_SPREAD_DEG = np.array([8.0, 4.0, 0.0, -4.0, -8.0])
@@ -85,7 +85,7 @@ class Bent:
 
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
-        bend = np.radians(USUAL_BEND_DEG) * self._waves.at(max(t_s, 0.0))
+        bend = np.radians(TYPICAL_FLEXION_DEG) * self._waves.at(max(t_s, 0.0))
         return replace(self._motion.at(t_s), bend_rad=bend)
 
 

@@ -75,9 +75,9 @@ class LaserCut:
 
     def line(self, spheres: Float, radius: Float, thumb: Bool | np.bool_) -> Line:
         """The line on fingers with spheres (..., K, 3) [m], camera frame, of radii (..., K), thumbs or not (...)."""
-        lead, spheres = spheres.shape[:-2], spheres.reshape(-1, *spheres.shape[-2:])
-        radius = np.broadcast_to(radius, (*lead, spheres.shape[1])).reshape(-1, spheres.shape[1])
-        thumb = np.broadcast_to(thumb, lead).ravel()
+        batch, spheres = spheres.shape[:-2], spheres.reshape(-1, *spheres.shape[-2:])
+        radius = np.broadcast_to(radius, (*batch, spheres.shape[1])).reshape(-1, spheres.shape[1])
+        thumb = np.broadcast_to(thumb, batch).ravel()
         laser = self._setup.laser_m[:, None, None]
         chain = Cones(spheres[:, :-1], spheres[:, 1:], radius[:, :-1], radius[:, 1:])
         known = _known(chain, self._setup.laser_m)
@@ -109,9 +109,9 @@ class LaserCut:
         ray = np.ones((len(total), 3))
         ray[:, :2] = (share * middle).sum(axis=1).T
         point = ray * (self._setup.offset_m / (ray @ self._setup.normal))[:, None]
-        place = (share * body[1:]).sum(axis=0).reshape(lead)
-        length = (total * self._setup.optics.matrix[0, 0]).reshape(lead)
-        return Line(self._axes.flat(point).reshape(*lead, 2), length, place)
+        place = (share * body[1:]).sum(axis=0).reshape(batch)
+        length = (total * self._setup.optics.matrix[0, 0]).reshape(batch)
+        return Line(self._axes.flat(point).reshape(*batch, 2), length, place)
 
     def _fan(self, spheres: Float, radius: Float, known: Float) -> Float:
         """Rays (3, R, N) in the laser plane from one tangent of each finger to the other."""

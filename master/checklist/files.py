@@ -103,7 +103,7 @@ def _judge_camera(
             "Measure the lens with the size that is used, or start master and slave anew.",
         )
     lens = file.provenance.get("intrinsics")
-    for key, part in (("T_rig_camera", "the places of the cameras"), *_RESTS_ON_LENS[rig.kind]):
+    for key, part in (("T_rig_camera", "the places of the cameras"), *_NEEDS_LENS[rig.kind]):
         if _older(rig.provenance.get(key), lens):
             yield _stale(
                 name,
@@ -120,7 +120,7 @@ def _judge_camera(
 
 
 _MEND = "Mend it, or take the copy that was in use; meanwhile everything goes on with what was read before."
-_RESTS_ON_LENS = {
+_NEEDS_LENS = {
     "markers": (),
     "wrist": (("laser_plane", "the plane of the laser"), ("T_camera_palm", "the palm")),
 }

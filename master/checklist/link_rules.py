@@ -153,7 +153,7 @@ class LinkRules:
                 f"Is its slave running (phalanx-slave run --name {name}), on this network, with the same rig key?",
             )
         if camera.wrist:  # without a hand there are no triples: it is the frames that count
-            frames = None if said is None or not said.fresh(t_ns) else said.grown("frames")
+            frames = None if said is None or not said.is_recent(t_ns) else said.increase("frames")
             mute = frames == 0 and self._mute(name, t_ns)
         else:
             mute = self._mute(name, t_ns)
@@ -187,13 +187,13 @@ class LinkRules:
         """Of what is sent, not of what comes: loss has a code of its own."""
         heard, rate_hz = self._heard[camera.name], float("nan")
         if camera.wrist:
-            if said is not None and said.fresh(t_ns) and said.number != heard.report:
+            if said is not None and said.is_recent(t_ns) and said.number != heard.report:
                 heard.report = said.number
                 heard.frames.push(said.t_ns, said.counts.get("frames", 0))
                 if heard.settled(t_ns) and heard.frames.full and heard.frames.moved:
-                    rate_hz = heard.frames.grown()[0] / heard.frames.seconds
+                    rate_hz = heard.frames.increase()[0] / heard.frames.seconds
         elif heard.settled(t_ns) and heard.messages.full and heard.messages.moved:
-            rate_hz = sum(heard.messages.grown()) / heard.messages.seconds
+            rate_hz = sum(heard.messages.increase()) / heard.messages.seconds
         share = rate_hz / camera.rate_hz
         wrong = beyond(-share, -SLOW, -SLOW_WELL) if share == share else None
         return Verdict(
@@ -210,7 +210,7 @@ class LinkRules:
         heard = self._heard[name]
         settled = heard.settled(t_ns)
         clocked = heard.settled(t_ns, CLOCK_SETTLED_NS)
-        came, missed = heard.messages.grown() or (0, 0)
+        came, missed = heard.messages.increase() or (0, 0)
         share = missed / max(came + missed, 1)
         lossy = beyond(share, LOSS, LOSS_WELL) if settled and heard.messages.full else None
         if lossy and missed < LOSS_LEAST:

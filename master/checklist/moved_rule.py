@@ -33,7 +33,7 @@ class MovedRule:
             self._window.clear()
         out = [counts.get(f"mostly_left_out.{name}"[:_NAME], 0) for name in cameras]
         self._window.push(t_ns, counts.get("poses", 0), counts.get("epipolar_misfits", 0), *out)
-        poses, apart, *left_out = self._window.grown()
+        poses, apart, *left_out = self._window.increase()
         enough = self._window.full and poses >= LEAST_POSES
         if len(cameras) == 2:
             share = apart / max(poses * markers, 1)

@@ -37,7 +37,7 @@ class Said:
             self.number += 1
         self._now = health
 
-    def fresh(self, t_ns: int) -> bool:
+    def is_recent(self, t_ns: int) -> bool:
         """Whether it says something of now."""
         return self._now is not None and t_ns - self._came_ns < STALE_NS
 
@@ -61,7 +61,7 @@ class Said:
         """Event -> how often, of the newest report."""
         return {} if self._now is None else self._now.counts
 
-    def grown(self, event: str) -> int | None:
+    def increase(self, event: str) -> int | None:
         """How often it happened between the last two reports; None: it is not told, or there are no two."""
         if self._now is None or self._before is None or event not in self._now.counts:
             return None

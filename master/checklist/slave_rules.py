@@ -46,7 +46,7 @@ class SlaveRules:
 
     def look(self, name: str, said: Said, t_ns: int) -> Iterator[Verdict]:
         """All that its last reports tell; nothing where they are old."""
-        if not said.fresh(t_ns):
+        if not said.is_recent(t_ns):
             return
         if said.number != self._judged:
             self._judged = said.number
@@ -160,14 +160,14 @@ def _file(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
 
 def _background(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
     """Whether things beside the hand have the colour of a marker."""
-    frames = said.grown("frames")
+    frames = said.increase("frames")
     if not frames:
         return
     for marker in camera.markers:
         event = BESIDE + marker
         if event not in said.counts:
             continue
-        share = (said.grown(event) or 0) / frames
+        share = (said.increase(event) or 0) / frames
         u, v = said.gauges.get(f"{event}.u"), said.gauges.get(f"{event}.v")
         where = "" if u is None or v is None else f", near pixel {u:.0f}, {v:.0f}"
         yield Verdict(
@@ -183,7 +183,7 @@ def _background(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
 
 def _strobe(name: str, said: Said) -> Iterator[Verdict]:
     """Whether laser and LEDs are on in the frames in which they should be."""
-    frames, out, unlit = (said.grown(event) for event in ("frames", "strobe.out_of_step", "strobe.unlit"))
+    frames, out, unlit = (said.increase(event) for event in ("frames", "strobe.out_of_step", "strobe.unlit"))
     if not frames or out is None:
         return
     cycles = frames / CYCLE

@@ -50,10 +50,10 @@ class UnseenMarkers:
         if said.session != self._session:
             self._session = said.session
             self._markers = {name: _Marker() for name in self._markers}
-        frames = said.grown("frames")
+        frames = said.increase("frames")
         if not frames:
             return
-        share = {name: (said.grown(SEEN + name) or 0) / frames for name in self._markers}
+        share = {name: (said.increase(SEEN + name) or 0) / frames for name in self._markers}
         needed = min(OTHERS, len(share) - 1)
         for name, one in self._markers.items():
             if self._recoloured(one, said.gauges.get(COLOUR + name)):

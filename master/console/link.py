@@ -76,12 +76,12 @@ class Link:
                 self._closing.wait(LOOK_S)
                 continue
             try:
-                self._stay(bus)
+                self._wait(bus)
             finally:
                 self._bus, self._alive = None, frozenset()
                 bus.close()
 
-    def _stay(self, bus: Bus) -> None:
+    def _wait(self, bus: Bus) -> None:
         """Read and look around until the others are gone or the console ends."""
         ended = threading.Event()
         inboxes = {stream: bus.subscribe(stream, depth=_DEPTH) for stream in self._take}

@@ -191,7 +191,7 @@ def tilts(
     work: Scratch,
     room: Certainty,
     tilt: Float,
-    walk: Float,
+    process_noise: Float,
 ) -> None:
     """Write the covariances of the last phalanges' directions (5, 3, 3) [rad^2], and how fast they walk (5,).
 
@@ -211,11 +211,11 @@ def tilts(
             room.at[a] = a if a < 6 else hand.first[f] + a
             for i in range(3):
                 room.J[a, i] = 0.0 if 3 <= a < 6 else room.J[a, i]
-        walk[f] = 0.0
+        process_noise[f] = 0.0
         for a in range(6 + count):
-            rate = settings.palm_walk_rad_s if a < 3 else settings.walk_rad_s
+            rate = settings.palm_process_noise_rad_s if a < 3 else settings.process_noise_rad_s
             for i in range(3):
-                walk[f] += (rate * room.J[a, i]) ** 2
+                process_noise[f] += (rate * room.J[a, i]) ** 2
         _project(cov, 6 + count, room, tilt[f])
 
 

@@ -50,14 +50,14 @@ class Turn:
         information: (3, 3) [1/rad^2] about its turn, rig axes.
         sure: Whether it is known about every axis how the palm lies.
         axes: (3, 3) as rows, rig axes: about which tilt 2 and heading turn the forearm; None: the IMU is on the palm.
-        walked_rad2: Variance of what the heading has drifted since the epoch before.
+        process_noise_rad2: Variance of what the heading has drifted since the epoch before.
     """
 
     rotation: Float
     information: Float
     sure: bool
     axes: Float | None = None
-    walked_rad2: float = 0.0
+    process_noise_rad2: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,8 +129,8 @@ class Fitted:
     valid: Bool
     tracked: Bool
     source: Code
-    rests: Int
-    anew: bool = False
+    sources: Int
+    reinitialised: bool = False
     level: Code = field(default_factory=lambda: np.zeros(5, np.uint8))
     ambiguous: Bool = field(default_factory=lambda: np.zeros(5, np.bool_))
     turn_left_out: bool = False

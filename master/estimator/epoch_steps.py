@@ -11,11 +11,11 @@ from common.kernels import bound
 from common.records import boxed, fields
 from master.estimator.cameras import CameraArrays
 from master.estimator.epoch import Epoch
-from master.estimator.extras import usual_of
-from master.estimator.ground import count_rows
+from master.estimator.extras import stationary_of
 from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.hypotheses import Blank
 from master.estimator.kinematics import Scratch, pose
+from master.estimator.observation_sources import count_rows
 from master.estimator.parameters import HandParameters
 from master.estimator.priors import Habits
 from master.estimator.problem import Rig
@@ -112,7 +112,7 @@ class EpochSteps:
         """Write the rows of an epoch, and count them."""
         task, sights = self.at.task, self.at.belief.sights
         task.t_ns[0], task.second_order[0], task.continuous[0] = at.t_ns, at.second_order, continuous
-        task.walked_rad2[0] = 0.0 if at.turn is None else at.turn.walked_rad2
+        task.process_noise_rad2[0] = 0.0 if at.turn is None else at.turn.process_noise_rad2
         if at.wrist is None:
             sights.rows[0] = 0.0
             sights.lit[:] = sights.shown[:] = 0.0
@@ -233,8 +233,8 @@ class EpochSteps:
         prior.abduction[0] = prior.flexion[0] = 0.5 * s.thumb_rad
         if wrist.only_natural:
             prior.only_natural[0], prior.flexion[:] = 1.0, _STIFF_RAD
-        state.usual[:] = usual_of(s, loose=wrist.loose, tilt_rad=wrist.tilt_rad)
-        state.z_cov[:] = np.diag(state.usual)
+        state.stationary[:] = stationary_of(s, loose=wrist.loose, tilt_rad=wrist.tilt_rad)
+        state.z_cov[:] = np.diag(state.stationary)
         if wrist.heading_rad is not None:
             state.z_cov[HEADING, HEADING] = wrist.heading_rad**2
 

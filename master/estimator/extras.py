@@ -47,7 +47,7 @@ class ExtrasRoom:
         return record(cls, M=(K, K), A=(K, K), B=(K, K), L=(K, K))
 
 
-def usual_of(settings: Settings, *, loose: bool, tilt_rad: float) -> Float:
+def stationary_of(settings: Settings, *, loose: bool, tilt_rad: float) -> Float:
     """Variances (K,) that doubt grows to; the heading's is that at the beginning.
 
     Args:
@@ -55,16 +55,16 @@ def usual_of(settings: Settings, *, loose: bool, tilt_rad: float) -> Float:
         loose: Whether the wrist may bend; False: the palm was calibrated and stands still.
         tilt_rad: Of the IMU's vertical.
     """
-    usual = np.zeros(EXTRAS)
-    usual[:BEND] = settings.hinge_rad**2
-    usual[:1] = 1e-6  # a thumb's hinges are no parallel ones
+    stationary = np.zeros(EXTRAS)
+    stationary[:BEND] = settings.hinge_rad**2
+    stationary[:1] = 1e-6  # a thumb's hinges are no parallel ones
     bend = np.array([settings.flexion_rad, settings.deviation_rad] if loose else 2 * [settings.worn_rad])
-    usual[BEND : BEND + 2] = bend**2
-    usual[RATE : RATE + 2] = (settings.pace_1_s * bend) ** 2
-    usual[TILT : TILT + 2] = max(tilt_rad, 1e-3) ** 2
-    usual[HEADING] = np.pi**2 / 3.0
-    usual[LIGHT] = settings.light_unit**2
-    return usual
+    stationary[BEND : BEND + 2] = bend**2
+    stationary[RATE : RATE + 2] = (settings.pace_1_s * bend) ** 2
+    stationary[TILT : TILT + 2] = max(tilt_rad, 1e-3) ** 2
+    stationary[HEADING] = np.pi**2 / 3.0
+    stationary[LIGHT] = settings.light_unit**2
+    return stationary
 
 
 @inlined
@@ -74,7 +74,12 @@ def _lasts(settings: Settings, i: int) -> float:
 
 @inner
 def predict_extras(
-    settings: Settings, state: HandState, dt_s: float, walked_rad2: float, belief: Belief, room: ExtrasRoom
+    settings: Settings,
+    state: HandState,
+    dt_s: float,
+    process_noise_rad2: float,
+    belief: Belief,
+    room: ExtrasRoom,
 ) -> None:
     """Step the extras to an epoch, in the state, and write `Belief.z` and `z_info`.
 
@@ -82,7 +87,7 @@ def predict_extras(
         settings: Paces.
         state: Changed.
         dt_s: Since they were stepped last.
-        walked_rad2: Variance of what the heading has drifted in that time.
+        process_noise_rad2: Variance of what the heading has drifted in that time.
         belief, room: Written.
     """
     K, z, P, M = state.z.shape[0], state.z, state.z_cov, room.M
@@ -107,8 +112,8 @@ def predict_extras(
             total += M[i, j] * z[j]
             inside = 0.0
             for k in range(K):
-                usual = state.usual[k] if k == j and k != HEADING else 0.0
-                inside += M[i, k] * (P[k, j] - usual)
+                stationary = state.stationary[k] if k == j and k != HEADING else 0.0
+                inside += M[i, k] * (P[k, j] - stationary)
             room.A[i, j] = inside
         room.B[0, i] = total
     for i in range(K):
@@ -121,8 +126,8 @@ def predict_extras(
             P[i, j] = total
     for i in range(K):
         if i != HEADING:
-            P[i, i] += state.usual[i]
-    P[HEADING, HEADING] += walked_rad2
+            P[i, i] += state.stationary[i]
+    P[HEADING, HEADING] += process_noise_rad2
     for b in range(2):
         z[BEND + b] += state.habit[b]
     for i in range(K):
@@ -134,8 +139,8 @@ def predict_extras(
         return
     for i in range(K):  # by rounding: nothing is known
         for j in range(K):
-            P[i, j] = state.usual[i] if i == j else 0.0
-            belief.z_info[i, j] = 1.0 / state.usual[i] if i == j else 0.0
+            P[i, j] = state.stationary[i] if i == j else 0.0
+            belief.z_info[i, j] = 1.0 / state.stationary[i] if i == j else 0.0
 
 
 @inner

@@ -25,10 +25,10 @@ def expect_coupling(settings: Settings, state: HandState, dt_s: float, prior: Pr
     kept, sums = exp(-dt_s / settings.coupled_s), state.coupling
     for i in range(3):
         sums[i] *= kept
-    usual = settings.coupled_fingers * _BENT_RAD2
-    squared = usual + sums[0]
+    stationary = settings.coupled_fingers * _BENT_RAD2
+    squared = stationary + sums[0]
     share = sums[1] / squared
-    spread2 = (usual * settings.coupled_spread**2 + sums[2]) / squared - share * share
+    spread2 = (stationary * settings.coupled_spread**2 + sums[2]) / squared - share * share
     prior.coupled_share[0], prior.coupled_spread[0] = share, sqrt(max(spread2, 0.0))
 
 

@@ -54,7 +54,7 @@ def _densities(hand: HandTables, settings: Settings, prior: Prior, f: int, unsee
         flexion2 = (1.0 - share) * scan.flexion2[f, node] + share * scan.flexion2[f, node + 1]
         if unseen:
             shows = (1.0 - share) * scan.showing[f, node] + share * scan.showing[f, node + 1]
-            base -= (settings.unseen_again if prior.recent[f] > 0.0 else settings.unseen) * shows
+            base -= (settings.unseen_again if prior.had_previous[f] > 0.0 else settings.unseen) * shows
         off = flexion - prior.natural[f, 1] - prior.slope[f, 1] * pip
         variance = prior.flexion[f] ** 2 + flexion2
         if f > 0 and prior.only_natural[0] == 0.0:
@@ -134,8 +134,8 @@ def choose(hand: HandTables, settings: Settings, sights: Sights, prior: Prior, f
         total += p[k]
     for k in range(count):
         p[k] /= total
-        off = (low + k * step - prior.last[f]) / prior.walked[f]
-        scan.near[k] = p[k] * exp(-0.5 * off * off) if prior.recent[f] > 0.0 else p[k]
+        off = (low + k * step - prior.last[f]) / prior.process_noise[f]
+        scan.near[k] = p[k] * exp(-0.5 * off * off) if prior.had_previous[f] > 0.0 else p[k]
     # Parts: the density is walked from top to top.
     begin, best_begin, best_end, best, parts = 0, 0, count, -1.0, 0
     while begin < count:

@@ -30,8 +30,8 @@ from master.estimator.wrist_device import Sights
 NODES, FINE = 16, 4
 ROWS = 8  # laser 2, tip 2, depth, abduction, DIP, twist
 HANDS = 3
-_STEPS, _STEPS_AFRESH = 3, 5  # from the pose of the PIP before, and from one that was tried
-_AFRESH = 5  # every so many nodes others are tried
+_STEPS, _STEPS_RESTART = 3, 5  # from the pose of the PIP before, and from one that was tried
+_RESTART = 5  # every so many nodes others are tried
 _FARTHEST_RAD = 0.3  # of one step
 _COARSE_RAD = (0.15, 0.6, 1.05, 1.4)  # flexions that are tried
 _COARSE = 4
@@ -51,7 +51,7 @@ class Prior:
         abduction, flexion: (5,) standard deviations of abduction and flexion about them [rad].
         coupled_share, coupled_spread: (1,) by how much of the PIP more this hand bends in its MCP, and within how much
             of it (`master.estimator.finger_coupling`).
-        last: (5,) PIPs where the fingers are expected, `walked` (5,) how far from there they may be, and `recent` (5,)
+        last: (5,) PIPs where the fingers are expected, `process_noise` (5,) how far from there they may be, and `had_previous` (5,)
             whether they are expected anywhere.
         near_rad: (5,) how far from there a finger that is well known is searched; 0: everywhere.
         only_natural: (1,) 1 where fingers are taken to bend naturally, whatever is seen (level "fk").
@@ -72,8 +72,8 @@ class Prior:
     coupled_share: Float
     coupled_spread: Float
     last: Float
-    walked: Float
-    recent: Float
+    process_noise: Float
+    had_previous: Float
     near_rad: Float
     only_natural: Float
     law: Float
@@ -97,8 +97,8 @@ class Prior:
             coupled_share=1,
             coupled_spread=1,
             last=5,
-            walked=5,
-            recent=5,
+            process_noise=5,
+            had_previous=5,
             near_rad=5,
             only_natural=1,
             law=5,
@@ -313,7 +313,7 @@ def scan_finger(
             prior.natural[f, 0] + prior.slope[f, 0] * pip,
         )
         best, at = inf, _COARSE
-        if (node - scan.first[f]) % _AFRESH == 0:
+        if (node - scan.first[f]) % _RESTART == 0:
             for start in range(_COARSE):
                 _put(hand, f, aside, _COARSE_RAD[start], dip, prior.twist[f], scan)
                 look(hand, device, prior.palm, prior.bend_axes, a, f, NO_MOVES, surface)
@@ -329,7 +329,7 @@ def scan_finger(
                     at = _COARSE
         if at < _COARSE:
             _put(hand, f, aside, _COARSE_RAD[at], dip, prior.twist[f], scan)
-        steps = _STEPS if at == _COARSE else _STEPS_AFRESH
+        steps = _STEPS if at == _COARSE else _STEPS_RESTART
         length = cost = 0.0
         for k in range(steps + 1):
             look(hand, device, prior.palm, prior.bend_axes, a, f, OWN_MOVES, surface)

@@ -28,7 +28,9 @@ from master.estimator.wrist_device import BEND, HEADING, TILT
 
 ANYWHERE_RAD = pi / sqrt(3.0)  # standard deviation of a uniform circle
 LOST_RAD = 1.0  # a heading less sure than this may point anywhere
-_WALK2, _MOST2 = np.radians([0.2, 5.0]) ** 2  # [rad^2/s] a heading walks at least and, unless evenly, at most
+_PROCESS_NOISE2, _MOST2 = (
+    np.radians([0.2, 5.0]) ** 2
+)  # [rad^2/s] a heading walks at least and, unless evenly, at most
 _CONTRARY_NS, _CONTRARY = 500_000_000, 5  # what contradicts for so long, and so often, is right
 _RESTARTED_S = 0.25  # an IMU that begins anew is silent for longer, until it knows where up is
 _SMALL_RAD = 1e-9  # a tilt by less is taken as small
@@ -88,15 +90,15 @@ class Forearm:
         found = self._between(t_ns)
         if found is None or self._rig_world is None:
             return None
-        walked = self._walked_rad2(t_ns, found)
+        process_noise = self._process_noise_rad2(t_ns, found)
         tilted, turned = self._tilted(self._rig_world, z), 0.5 * float(z[HEADING])
         heading = cos(turned), 0.0, 0.0, sin(turned)
         rotation = matrix_of(quaternion_product(quaternion_product(tilted, heading), self._forearm(found)))
-        sigma = hypot(DEFAULT.strap_rad, DEFAULT.palm_walk_rad_s * found.away_s)
+        sigma = hypot(DEFAULT.strap_rad, DEFAULT.palm_process_noise_rad_s * found.away_s)
         axes = matrix_of(self._rig_world).T.copy()  # about x and y of the world the forearm tilts,
         axes[2] = matrix_of(tilted)[:, 2]  # about the vertical that is believed it turns
-        wide = z_cov[HEADING, HEADING] + walked + np.trace(z_cov[BEND : BEND + 2, BEND : BEND + 2])
-        return Turn(rotation, _EYE / sigma**2, bool(wide < SURE_RAD**2), axes, walked)
+        wide = z_cov[HEADING, HEADING] + process_noise + np.trace(z_cov[BEND : BEND + 2, BEND : BEND + 2])
+        return Turn(rotation, _EYE / sigma**2, bool(wide < SURE_RAD**2), axes, process_noise)
 
     def heading_of(self, t_ns: int, R_rig_palm: Float, z: Float) -> float | None:
         """The heading that comes nearest to a palm (3, 3) [rad]; None: no sample is near."""
@@ -132,7 +134,7 @@ class Forearm:
         found = self._between(t_ns)
         if found is None:
             return NO_WORLD
-        turned = DEFAULT.palm_walk_rad_s * found.away_s
+        turned = DEFAULT.palm_process_noise_rad_s * found.away_s
         forearm, (flexion, deviation) = self._forearm(found), bend_rad.tolist()
         (ff, fd), (_, dd) = bend_cov.tolist()
         c, s = cos(deviation), sin(deviation)
@@ -161,7 +163,7 @@ class Forearm:
         share = sin(0.5 * angle) / angle if angle > _SMALL_RAD else 0.5
         return quaternion_product(rig_world, (cos(0.5 * angle), share * x, share * y, 0.0))
 
-    def _walked_rad2(self, t_ns: int, found: Between) -> float:
+    def _process_noise_rad2(self, t_ns: int, found: Between) -> float:
         """Variance [rad^2] of what the heading has drifted since the epoch before.
 
         Drifts that a filter tells are no walks: mostly a bias that nobody knows, whose variance grows with the square
@@ -169,11 +171,11 @@ class Forearm:
         """
         since_s = 0.0 if self._asked_ns is None else 1e-9 * abs(t_ns - self._asked_ns)
         even_rad = abs(found.drift_rad - self._drift_rad)
-        walked = found.drift_rad**2 - self._drift_rad**2
+        process_noise = found.drift_rad**2 - self._drift_rad**2
         if found.drift_rad >= ANYWHERE_RAD:  # as much as is ever told
-            even_rad, walked = max(even_rad, self._imu.heading_drift_rad_s * since_s), _MOST2 * since_s
+            even_rad, process_noise = max(even_rad, self._imu.heading_drift_rad_s * since_s), _MOST2 * since_s
         self._asked_ns, self._drift_rad = t_ns, found.drift_rad
-        return float(max(even_rad**2, min(max(walked, _WALK2 * since_s), _MOST2 * since_s)))
+        return float(max(even_rad**2, min(max(process_noise, _PROCESS_NOISE2 * since_s), _MOST2 * since_s)))
 
 
 def _wxyz(rotation: Float) -> Wxyz:

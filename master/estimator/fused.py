@@ -17,14 +17,14 @@ from common.messages import Detections, HandPose, WristDetections
 from master.estimator.epoch import Fitted, Turn, WristRows
 from master.estimator.estimator import Estimator
 from master.estimator.forearm import LOST_RAD, Forearm
-from master.estimator.ground import ON_MARKERS
+from master.estimator.observation_sources import ON_MARKERS
 from master.estimator.pipeline import MarkerPipeline, SolvedPose
 from master.estimator.triple_reader import TripleReader
 from master.estimator.wrist_device import BEND, HEADING
 from master.wrist_setup import WristSetup
 
 _SILENT_FRAMES = 2.2  # of the slowest camera: when so long no epoch came, the device's triples lead
-_FRESH_NS = 70_000_000  # an older triple says nothing of fingers now
+_MAX_AGE_NS = 70_000_000  # an older triple says nothing of fingers now
 _OWN_NS = 17_000_000  # half of the time from triple to triple: of epochs that are unrelated
 _KEPT = 8
 
@@ -76,7 +76,7 @@ class WristSide:
         else:
             while self._waiting and self._waiting[0].t_ns + late_ns <= t_ns:
                 message = self._waiting.popleft()
-            if message is not None and t_ns - message.t_ns - late_ns > _FRESH_NS:
+            if message is not None and t_ns - message.t_ns - late_ns > _MAX_AGE_NS:
                 message = None
         if message is None:
             return None
@@ -109,7 +109,7 @@ class WristSide:
         self._count("tip_refused", hand.refused)
         self._count("off", hand.off)
         self._count("ambiguous", hand.ambiguous)
-        if self.forearm is None or hand.solution is None or not hand.rests[5] & ON_MARKERS:
+        if self.forearm is None or hand.solution is None or not hand.sources[5] & ON_MARKERS:
             return
         if turned and self.forearm.contradicted(t_ns, by_palm=hand.turn_left_out):
             estimator.forget_heading()
@@ -133,7 +133,7 @@ class WristSide:
             changes["wrist_bend_rad"], changes["wrist_bend_sigma_rad"] = bend, np.sqrt(np.diag(cov))
             world = self.forearm.world_at(pose.t_ns, bend, cov)
             changes["palm_world_wxyz"], changes["palm_world_sigma_rad"] = world
-        if abs(pose.t_ns - self.laser_ns) <= _FRESH_NS:
+        if abs(pose.t_ns - self.laser_ns) <= _MAX_AGE_NS:
             changes["laser_m"], changes["level"], changes["ambiguous"] = (
                 self.laser_m,
                 self.level,

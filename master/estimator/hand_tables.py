@@ -57,7 +57,7 @@ class HandTables:
     legal_low: Float
     legal_high: Float
     beyond_w2: Float
-    rests: Bool
+    at_low_limit: Bool
     anywhere: Float
     limits: Float
     finger: Int
@@ -105,7 +105,7 @@ class HandTables:
             "legal_low": parameters.legal_low,
             "legal_high": parameters.legal_high,
             "beyond_w2": parameters.beyond_w2,
-            "rests": parameters.rests,
+            "at_low_limit": parameters.at_low_limit,
             "anywhere": parameters.anywhere,
             "limits": model.limits_rad
             + REACH * np.stack([-model.tolerance_rad, model.tolerance_rad], axis=2),

@@ -75,7 +75,7 @@ class OrientationTrack:
         rotation = self._rig_world @ matrix_of(found.q_wxyz) @ self._palm_imu.T
         if heading_rad is None and near is not None:
             rotation = _turn_about(self._up, near.T_rig_palm[:3, :3] @ rotation.T) @ rotation
-        tilt_2 = self._imu.orientation_sigma_rad**2 + (DEFAULT.palm_walk_rad_s * found.away_s) ** 2
+        tilt_2 = self._imu.orientation_sigma_rad**2 + (DEFAULT.palm_process_noise_rad_s * found.away_s) ** 2
         about_2 = max((_FREE_RAD if heading_rad is None else heading_rad) ** 2, tilt_2)
         along = np.outer(self._up, self._up)
         information = _EYE / tilt_2 + (1.0 / about_2 - 1.0 / tilt_2) * along
@@ -85,8 +85,8 @@ class OrientationTrack:
         """Standard deviation of the heading after such a drift; None: not known."""
         if self._imu.heading_sigma_rad is None:
             return None
-        grown = hypot(self._imu.heading_sigma_rad, drift_rad)
-        return grown if grown < _LOST_RAD else None
+        predicted = hypot(self._imu.heading_sigma_rad, drift_rad)
+        return predicted if predicted < _LOST_RAD else None
 
 
 def _turn_about(axis: Float, rotation: Float) -> Float:

@@ -201,7 +201,7 @@ class MarkerPipeline:
 
     def _recent(self, t_ns: int) -> SolvedHand | None:
         """The hand that was fitted last, if it still says anything."""
-        if self._estimator is None or self._last is None or not self._estimator.recent(t_ns):
+        if self._estimator is None or self._last is None or not self._estimator.has_previous(t_ns):
             return None
         return self._last.solution
 

@@ -12,7 +12,7 @@ from common.records import filled
 
 _HANDS = "round value for hands at work; a handful compared on simulated and recorded hands, nothing fitted"
 _COORDINATION = "Hager-Ross, Schieber 2000; Ingram et al. 2008: fingers move together"
-_STRAY = (
+_GROWTH = (
     "how far joint angles get in a time: hands that handle things, by motion capture, and Leap recordings"
 )
 _CHI = "quantile of chi square"
@@ -77,12 +77,12 @@ class Settings(NamedTuple):
     ] = radians(22.0)
     bones_m: Annotated[float, Range("m", 1e-4, 1e-2, "bones and caps are known to about 1 mm")] = 1.0e-3
     # How far a hand that is seen moves in a time, as a random walk: wide, so that what is seen decides.
-    walk_rad_s: Annotated[float, Range("rad/s", 0.5, 50.0, _HANDS)] = 8.0
-    palm_walk_rad_s: Annotated[float, Range("rad/s", 0.1, 50.0, _HANDS)] = 2.5
+    process_noise_rad_s: Annotated[float, Range("rad/s", 0.5, 50.0, _HANDS)] = 8.0
+    palm_process_noise_rad_s: Annotated[float, Range("rad/s", 0.1, 50.0, _HANDS)] = 2.5
     palm_held_rad_s: Annotated[
         float, Range("rad/s", 0.05, 50.0, "with a hidden thumb little tells how the palm turns")
     ] = 0.9
-    palm_walk_m_s: Annotated[float, Range("m/s", 0.05, 20.0, _HANDS)] = 2.0
+    palm_process_noise_m_s: Annotated[float, Range("m/s", 0.05, 20.0, _HANDS)] = 2.0
     shortest_s: Annotated[
         float, Range("s", 1e-5, 1e-2, "a shorter step would weld the hand to its last pose")
     ] = 1e-3
@@ -94,10 +94,10 @@ class Settings(NamedTuple):
     rate_memory_s: Annotated[
         float, Range("s", 1e-3, 1.0, "half of a new rate counts at 60 frames a second")
     ] = 0.024
-    stray_rad: Annotated[float, Range("rad", 0.05, 2.0, _STRAY)] = radians(36.0)
-    stray_aside_rad: Annotated[float, Range("rad", 0.02, 2.0, _STRAY)] = radians(14.0)
-    stray_thumb_rad: Annotated[float, Range("rad", 0.02, 2.0, _STRAY)] = radians(20.0)
-    stray_s: Annotated[float, Range("s", 0.05, 10.0, _STRAY)] = 1.0
+    growth_rad: Annotated[float, Range("rad", 0.05, 2.0, _GROWTH)] = radians(36.0)
+    growth_aside_rad: Annotated[float, Range("rad", 0.02, 2.0, _GROWTH)] = radians(14.0)
+    growth_thumb_rad: Annotated[float, Range("rad", 0.02, 2.0, _GROWTH)] = radians(20.0)
+    growth_s: Annotated[float, Range("s", 0.05, 10.0, _GROWTH)] = 1.0
     alike: Annotated[float, Range("1", 0.0, 0.99, _COORDINATION)] = 0.7
     held_rad: Annotated[float, Range("rad", 0.001, 0.5, "a finger that was just lost")] = radians(3.0)
     # A palm without markers.
@@ -279,7 +279,7 @@ class Settings(NamedTuple):
 
     @classmethod
     def of(cls, changes: Sequence[str]) -> Self:
-        """The defaults with changes such as `estimator.walk_rad_s=6`.
+        """The defaults with changes such as `estimator.process_noise_rad_s=6`.
 
         Raises:
             CalibrationError: One is malformed, there is no such setting, or the value is out of its range.

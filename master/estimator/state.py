@@ -45,7 +45,7 @@ class HandState:
         rates: (20,) [rad/s].
         cov: (N, N) of turn [rad], shift [m], rig axes, free angles [rad] and extras.
         z, z_cov: (K,), (K, K) mean and covariance of the extras, which are filtered (`master.estimator.extras`).
-        z_ns: (1,) when they were stepped last, `usual` (K,) variances that their doubt grows to, and `habit` (2,) [rad]
+        z_ns: (1,) when they were stepped last, `stationary` (K,) variances that their doubt grows to, and `habit` (2,) [rad]
             the bend of the wrist that is kept.
         level: (5,) `Level` codes of what a wrist device told each finger from last; 0: markers told it since.
         searched: (5,) triples since the whole valley of a finger was searched.
@@ -72,7 +72,7 @@ class HandState:
     z: Float
     z_cov: Float
     z_ns: Int
-    usual: Float
+    stationary: Float
     habit: Float
     level: Code
     searched: Int
@@ -107,7 +107,7 @@ class HandState:
             z=extras,
             z_cov=(extras, extras),
             z_ns=("i8", 1),
-            usual=extras,
+            stationary=extras,
             habit=2,
             level=("u1", 5),
             searched=("i8", 5),
@@ -156,14 +156,14 @@ class Hidden:
 
 
 @inlined
-def strayed(settings: Settings, a: int, gone_s: float) -> float:
+def growth(settings: Settings, a: int, gone_s: float) -> float:
     """Variance [rad^2] of angle a of 20 about where it was heading, a time after its finger was last seen."""
-    most = settings.stray_rad
+    most = settings.growth_rad
     if a < 4:
-        most = settings.stray_thumb_rad
+        most = settings.growth_thumb_rad
     elif a % 4 == 0:
-        most = settings.stray_aside_rad
-    return most**2 * (1.0 - exp(-((gone_s / settings.stray_s) ** 2)))
+        most = settings.growth_aside_rad
+    return most**2 * (1.0 - exp(-((gone_s / settings.growth_s) ** 2)))
 
 
 @inner
@@ -221,7 +221,7 @@ def hide(
         if f > 0:
             _neighbours(settings, state, f, shown, hidden)
         for a in range(4 * f, 4 * f + 4):
-            hidden.sigma[a] = sqrt(settings.held_rad**2 + hidden.own[f] * strayed(settings, a, gone_s))
+            hidden.sigma[a] = sqrt(settings.held_rad**2 + hidden.own[f] * growth(settings, a, gone_s))
     clamp(hand, hidden.angles)
 
 
@@ -249,16 +249,16 @@ def predict(
     hide(hand, settings, state, t_ns, shown, hidden)
     free_of(hand, hidden.angles, hidden.x)
     age_s = max((t_ns - state.seen_ns[0]) * 1e-9, settings.shortest_s)
-    walked = 1.0 / (settings.walk_rad_s * age_s) ** 2
+    process_noise = 1.0 / (settings.process_noise_rad_s * age_s) ** 2
     for f in range(5):
         for c in range(hand.first[f], hand.first[f + 1]):
             held = 0.0 if shown[f] else 1.0 / hidden.sigma[4 * f + c - hand.first[f]] ** 2
-            belief.past_w2[c] = walked + held
-            belief.past[c] = (walked * state.x[c] + held * hidden.x[c]) / (walked + held)
-    turns_rad_s = settings.palm_walk_rad_s if shown[0] else settings.palm_held_rad_s
+            belief.past_w2[c] = process_noise + held
+            belief.past[c] = (process_noise * state.x[c] + held * hidden.x[c]) / (process_noise + held)
+    turns_rad_s = settings.palm_process_noise_rad_s if shown[0] else settings.palm_held_rad_s
     for i in range(3):
         belief.palm_w2[i] = 1.0 / (turns_rad_s * age_s) ** 2
-        belief.palm_w2[3 + i] = 1.0 / (settings.palm_walk_m_s * age_s) ** 2
+        belief.palm_w2[3 + i] = 1.0 / (settings.palm_process_noise_m_s * age_s) ** 2
     copy(state.palm, belief.palm)
 
 
@@ -278,8 +278,11 @@ def grow(
     - a finger that is hidden: by how far hidden fingers stray,
     - a palm without markers: by a turn and a shift that grow with the time it is lost, the shift with its speed, too.
     """
-    walked_s = max(dt_s, settings.shortest_s)
-    turn2, shift2 = (settings.palm_walk_rad_s * walked_s) ** 2, (settings.palm_walk_m_s * walked_s) ** 2
+    elapsed_noise_s = max(dt_s, settings.shortest_s)
+    turn2, shift2 = (
+        (settings.palm_process_noise_rad_s * elapsed_noise_s) ** 2,
+        (settings.palm_process_noise_m_s * elapsed_noise_s) ** 2,
+    )
     if palm_shown:
         squared = 0.0
         for i in range(3):
@@ -302,9 +305,9 @@ def grow(
     for f in range(5):
         gone_s = hidden.gone_s[f]
         for c in range(hand.first[f], hand.first[f + 1]):
-            added = (settings.walk_rad_s * dt_s) ** 2
+            added = (settings.process_noise_rad_s * dt_s) ** 2
             if gone_s > 0.0:
                 a = 4 * f + c - hand.first[f]
-                added = strayed(settings, a, gone_s) - strayed(settings, a, max(gone_s - dt_s, 0.0))
+                added = growth(settings, a, gone_s) - growth(settings, a, max(gone_s - dt_s, 0.0))
                 added *= hidden.own[f]
             state.cov[6 + c, 6 + c] += added

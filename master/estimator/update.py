@@ -11,10 +11,10 @@ from common.messages import Source
 from master.estimator.arcs import add_arcs
 from master.estimator.certainty import is_small, linear, only_limits, surer, tilts
 from master.estimator.extras import keep_extras
-from master.estimator.ground import Ground
 from master.estimator.hypotheses import Blank, likelier
 from master.estimator.kinematics import angles_of, chains, clamp, free_of, joints, marker_point
 from master.estimator.matrices import copy, inverse_3
+from master.estimator.observation_sources import Ground
 from master.estimator.posterior import posterior
 from master.estimator.priors import Habits
 from master.estimator.problem import Belief, Rig, Search
@@ -41,7 +41,7 @@ class Estimate(NamedTuple):
         position, rotation: (26, 3) [m], (26, 3, 3), rig frame.
         cov: (26, 3, 3) [m^2] of the joints.
         tilt: (5, 3, 3) [rad^2] of the last phalanges' directions, by this instant alone.
-        tilt_walk: (5,) [rad^2/s^2] by how much their trace is expected to grow, by the time squared.
+        tilt_process_noise: (5,) [rad^2/s^2] by how much their trace is expected to grow, by the time squared.
         tracked: (26,), and `source` (26,) as of `HandPose`.
     """
 
@@ -51,7 +51,7 @@ class Estimate(NamedTuple):
     rotation: Float
     cov: Float
     tilt: Float
-    tilt_walk: Float
+    tilt_process_noise: Float
     tracked: Bool
     source: Code
 
@@ -65,7 +65,7 @@ class Estimate(NamedTuple):
             rotation=np.empty((26, 3, 3)),
             cov=np.empty((26, 3, 3)),
             tilt=np.empty((5, 3, 3)),
-            tilt_walk=np.empty(5),
+            tilt_process_noise=np.empty(5),
             tracked=np.empty(26, np.bool_),
             source=np.empty(26, np.uint8),
         )
@@ -73,7 +73,7 @@ class Estimate(NamedTuple):
 
 @inner
 def chi_square(
-    rig: Rig, observed: Observations, T: Float, x: Float, walked_m: float, search: Search
+    rig: Rig, observed: Observations, T: Float, x: Float, process_noise_m: float, search: Search
 ) -> float:
     """Chi square of the markers on a hand that may have walked so far, in any direction, since."""
     work, mounts = search.rows, rig.mounts
@@ -89,10 +89,10 @@ def chi_square(
         for i in range(3):
             for j in range(3):
                 kept[i, j], work.K[i, j] = own[i, j], 0.0
-        if walked_m > 0.0:
+        if process_noise_m > 0.0:
             inverse_3(own, work.K, own)
             for i in range(3):
-                own[i, i] += walked_m * walked_m
+                own[i, i] += process_noise_m * process_noise_m
             inverse_3(own, work.K, own)
         _, chi2 = marker_rows(rig.cameras, observed, m, work.point, work)
         copy(kept, own)
@@ -120,12 +120,12 @@ def _judge(
         part = f if f >= 0 else PALM_PART
         by_wrist = f >= 0 and state.level[f] > 0
         most_s = settings.tracked_triple_s if by_wrist else settings.tracked_age_s
-        fresh = (t_ns - state.told_ns[part]) * 1e-9 <= most_s
+        measured_lately = (t_ns - state.told_ns[part]) * 1e-9 <= most_s
         sure = f < 0 or not state.vague[f]
-        out.tracked[joint] = fresh and sure and is_small(hand, out.cov, joint, settings.tracked_m)
+        out.tracked[joint] = measured_lately and sure and is_small(hand, out.cov, joint, settings.tracked_m)
         now = state.told_ns[part] == t_ns
         out.source[joint] = _SOLVED if now else _HELD
-        if by_wrist and fresh:
+        if by_wrist and measured_lately:
             out.source[joint] = _WRIST
     for m in range(rig.mounts.finger.shape[0]):
         f = rig.mounts.finger[m]
@@ -181,8 +181,8 @@ def predict_epoch(model: Model, boxed_state: Any, observed: Observations, boxed_
     if task.may_leave[0] > 0:
         free_of(rig.hand, task.angles, task.x)
         limit = chi_square(rig, observed, task.palm, task.x, 0.0, room.search) + settings.misled
-        walked_m = settings.palm_walk_m_s * dt_s
-        if chi_square(rig, observed, state.palm, state.x, walked_m, room.search) > limit:
+        process_noise_m = settings.palm_process_noise_m_s * dt_s
+        if chi_square(rig, observed, state.palm, state.x, process_noise_m, room.search) > limit:
             return -1.0
     predict(rig.hand, settings, state, t_ns, space.ground.shown, space.hidden, belief)
     _turn_on(state, belief, room.search)
@@ -339,7 +339,7 @@ def take_over_epoch(
     chains(hand, found.palm, work.angles, work.R, work.P)
     joints(hand, found.palm, work.R, work.P, out.position, out.rotation)
     linear(hand, found.palm, state.cov, work, room, out.cov)
-    tilts(hand, settings, found.palm, found.cov, work, room, out.tilt, out.tilt_walk)
+    tilts(hand, settings, found.palm, found.cov, work, room, out.tilt, out.tilt_process_noise)
     if task.second_order[0] > 0:
         add_arcs(
             rig,
@@ -372,7 +372,7 @@ def take_over_epoch(
     for f in range(5):
         pip = 6 + hand.first[f] + 2
         bend_open = state.cov[pip, pip] > settings.tracked_pip_rad**2
-        if space.ground.rests[f] > 0:
+        if space.ground.sources[f] > 0:
             state.level[f], state.vague[f] = 0, f > 0 and bend_open
         elif space.scan.known[f] > 0.0:
             state.level[f], state.vague[f] = task.level[f], task.ambiguous[f] or bend_open

@@ -8,9 +8,9 @@ from master.estimator.cameras import CameraArrays
 from master.estimator.certainty import Certainty
 from master.estimator.extras import ExtrasRoom
 from master.estimator.finger_scan import Prior, Scan
-from master.estimator.ground import Ground
 from master.estimator.hand_tables import Mounts
 from master.estimator.hypotheses import Posterior, Room
+from master.estimator.observation_sources import Ground
 from master.estimator.problem import Belief
 from master.estimator.state import Hidden
 
@@ -27,7 +27,7 @@ class Task:
         rough: (1,) whether a search is to end early, in place, under the widest hypothesis alone.
         natural: (1,) probability of a natural hand a moment ago, and `counts` (1,) what that counts, 0 ... 1.
         second_order: (1,) whether covariance is wanted to second order.
-        walked_rad2: (1,) variance of what the heading has drifted since the last epoch.
+        process_noise_rad2: (1,) variance of what the heading has drifted since the last epoch.
         continuous: (1,) whether epochs follow each other.
         scanned: (20,) angles of fingers whose valley was searched, where it is likeliest.
         refused: (5,) fingertips, and `off` (5,) laser points, that no pose explains.
@@ -45,7 +45,7 @@ class Task:
     natural: Float
     counts: Float
     second_order: Bool
-    walked_rad2: Float
+    process_noise_rad2: Float
     continuous: Bool
     scanned: Float
     refused: Bool
@@ -68,7 +68,7 @@ class Task:
             natural=1,
             counts=1,
             second_order=("u1", 1),
-            walked_rad2=1,
+            process_noise_rad2=1,
             continuous=("u1", 1),
             scanned=20,
             refused=("u1", 5),

@@ -11,10 +11,10 @@ from master.estimator.finger_coupling import expect_coupling, learn_coupling
 from master.estimator.finger_density import choose, weigh_hands
 from master.estimator.finger_scan import ROWS, Prior, Scan, scan_finger
 from master.estimator.finger_surface import MOVES, look
-from master.estimator.ground import Ground
 from master.estimator.hand_tables import HandTables
 from master.estimator.hypotheses import Posterior
 from master.estimator.kinematics import Scratch, angles_of, clamp, free_of
+from master.estimator.observation_sources import Ground
 from master.estimator.problem import Belief, Rig, Search
 from master.estimator.settings import Settings
 from master.estimator.solve import palm_off
@@ -38,30 +38,35 @@ def _expected(
 ) -> None:
     """Write what is believed of the fingers before a triple; bring what was seen to the epoch, by their rates."""
     dt_s = (task.t_ns[0] - state.t_ns[0]) * 1e-9
-    fresh = task.continuous[0] > 0 and state.known[0] > 0 and 0.0 < dt_s <= settings.forget_s
+    measured_lately = task.continuous[0] > 0 and state.known[0] > 0 and 0.0 < dt_s <= settings.forget_s
     prior.light[0], prior.light2[0] = state.z[LIGHT], state.z_cov[LIGHT, LIGHT]
     for f in range(5):
         prior.twist[f], prior.twist2[f] = state.z[f], max(state.z_cov[f, f], 1e-8)
         told_s = (task.t_ns[0] - state.told_ns[f]) * 1e-9
-        recent = fresh and told_s <= settings.forget_s
-        prior.recent[f] = 1.0 if recent else 0.0
-        known = recent and state.level[f] > 0 and state.vague[f] == 0 and told_s <= settings.tracked_triple_s
+        had_previous = measured_lately and told_s <= settings.forget_s
+        prior.had_previous[f] = 1.0 if had_previous else 0.0
+        known = (
+            had_previous
+            and state.level[f] > 0
+            and state.vague[f] == 0
+            and told_s <= settings.tracked_triple_s
+        )
         state.searched[f] = state.searched[f] + 1 if known else 0
         known = known and state.searched[f] % settings.search_again != 0
         prior.near_rad[f] = settings.near_rad if known else 0.0
         for k in range(4 * f, 4 * f + 4):
             scan.angles[k] = settings.curled_rad  # somewhere
-            if recent:
+            if had_previous:
                 scan.angles[k] = state.angles[k]
         prior.last[f] = scan.angles[4 * f + 2]
-        prior.walked[f] = max(settings.walk_rad_s * told_s, settings.goes_on_rad)
+        prior.process_noise[f] = max(settings.process_noise_rad_s * told_s, settings.goes_on_rad)
         if sights.lit[f] == 0.0 and sights.shown[f] == 0.0:
             continue
         look(hand, device, prior.palm, prior.bend_axes, scan.angles, f, MOVES, scan.surface)
         J = scan.surface.J
         loosen(sights.laser_W[f], J, 0, state.z_cov)
         loosen(sights.tip_W[f], J, 2, state.z_cov)
-        if not recent:
+        if not had_previous:
             continue
         for k in range(4):
             rate = state.rates[4 * f + k]
@@ -87,7 +92,7 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
     hand, device, task, belief = model.hand[0], model.device[0], space.task, space.belief
     sights, scan, prior = belief.sights, space.scan, space.prior
     dt_s = 0.0 if state.z_ns[0] == NEVER_NS else (task.t_ns[0] - state.z_ns[0]) * 1e-9
-    predict_extras(settings, state, dt_s, task.walked_rad2[0], belief, space.extras)
+    predict_extras(settings, state, dt_s, task.process_noise_rad2[0], belief, space.extras)
     state.z_ns[0] = task.t_ns[0]
     for i in range(state.z.shape[0]):
         space.room.start_z[i] = state.z[i]
@@ -102,7 +107,7 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
     expect_coupling(settings, state, max(dt_s, 0.0), prior)
     for f in range(5):
         if sights.lit[f] == 0.0:
-            if prior.recent[f] == 0.0:
+            if prior.had_previous[f] == 0.0:
                 sights.shown[f] = 0.0
             continue
         scan_finger(hand, device, settings, sights, prior, f, sights.shown[f] > 0.0, scan)
@@ -207,13 +212,13 @@ def take_scanned(rig: Rig, ground: Ground, scan: Scan, found: Posterior, work: S
     hand, cov = rig.hand, found.cov
     angles_of(hand, found.x, work.angles, work.by)
     for f in range(5):
-        if scan.known[f] > 0.0 and ground.rests[f] == 0:
+        if scan.known[f] > 0.0 and ground.sources[f] == 0:
             for k in range(4):
                 work.angles[4 * f + k] = scan.out[f, k]
     clamp(hand, work.angles)
     free_of(hand, work.angles, found.x)
     for f in range(5):
-        if scan.known[f] == 0.0 or ground.rests[f] > 0:
+        if scan.known[f] == 0.0 or ground.sources[f] > 0:
             continue
         first, count = 6 + hand.first[f], hand.first[f + 1] - hand.first[f]
         pip, N = first + 2, cov.shape[0]

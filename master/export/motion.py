@@ -91,8 +91,8 @@ def complete(batches: Iterable[Poses], skeleton: Skeleton) -> Motion:
         position[:, joint] = np.where(good[:, None], position[:, joint], away)
         turned = times(orientation[:, parent], q)
         orientation[:, joint] = np.where(good[:, None], orientation[:, joint], turned)
-    usual_ns = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0.0
-    return Motion(t_ns, position, orientation, ~usable, int(max(GAP_S * 1e9, _GAP_POSES * usual_ns)))
+    typical_ns = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0.0
+    return Motion(t_ns, position, orientation, ~usable, int(max(GAP_S * 1e9, _GAP_POSES * typical_ns)))
 
 
 def _stacked(batches: Iterable[Poses]) -> tuple[Int, Float, Float, Bool]:

@@ -38,7 +38,7 @@ _LEAP_M_S, _LEAP_PX = 5.0, 5.0  # what is farther away a frame later is another 
 _SWAPPED = 3.0  # times nearer to the other track: the slave's names are contradicted
 # Frames show the same cap in the same light, behind the same finger: most of an error stays from frame to frame, and
 # no mean removes it. New in each is at most this part of the variance that the slave states, and this much.
-_FRESH, _FRESH_PX = 0.7, 0.1
+_INDEPENDENT_SHARE, _INDEPENDENT_PX = 0.7, 0.1
 _EVIDENCE = 0.5  # so they also say less of the motion than as many independent ones
 # An error in time lies along the motion. One number for both axes cannot say so: all of it covers too much (98-99 %),
 # half, which keeps the sum of the axes, too little where the motion is along the baseline (87 %); this 93-97 %.
@@ -49,7 +49,7 @@ _LEAST_SIGMA_PX = 0.01
 Reach = tuple[int, int, int, int]
 
 
-class Recent(NamedTuple):
+class TrackHistory(NamedTuple):
     """The last frames of C cameras; frame k is in slot k modulo HISTORY.
 
     Attributes:
@@ -71,7 +71,7 @@ class Recent(NamedTuple):
 
 @kernel
 def carry(
-    recent: Recent, t_ns: int, reach_ns: Reach, uv: Float, sigma: Float, area: Float, missing: Bool
+    history: TrackHistory, t_ns: int, reach_ns: Reach, uv: Float, sigma: Float, area: Float, missing: Bool
 ) -> tuple[int, bool]:
     """Write the markers and their rivals in C cameras at an instant.
 
@@ -94,15 +94,15 @@ def carry(
     known, L, z = np.empty((SIGHTINGS, 5)), np.empty((SIGHTINGS, SIGHTINGS)), np.empty((SIGHTINGS, 4))
     fit, mixed = np.empty(6 + SIGHTINGS), np.empty(6 + SIGHTINGS)
     ready_ns, rivals = NEVER, False
-    for c in range(len(recent.total)):
-        n = _around(recent, c, t_ns, reach_ns, used)
+    for c in range(len(history.total)):
+        n = _around(history, c, t_ns, reach_ns, used)
         missing[c] = n == 0
         for k in range(n):
-            ready_ns = max(ready_ns, recent.times_ns[c, used[k], 2])
-        scale, t_sigma_s = recent.scale_px_m[c], 1e-9 * recent.t_sigma_ns[c, used[0]] if n > 0 else 0.0
+            ready_ns = max(ready_ns, history.times_ns[c, used[k], 2])
+        scale, t_sigma_s = history.scale_px_m[c], 1e-9 * history.t_sigma_ns[c, used[0]] if n > 0 else 0.0
         for m in range(area.shape[1]):
-            area[c, m] = recent.marks[c, used[0], 5, m] if n > 0 else nan
-            rival = _read(recent, c, m, t_ns, used, n, track)
+            area[c, m] = history.marks[c, used[0], 5, m] if n > 0 else nan
+            rival = _read(history, c, m, t_ns, used, n, track)
             rivals |= rival
             if rival:
                 _sort(track, n, _LEAP_M_S * scale)
@@ -120,7 +120,7 @@ def carry(
 
 
 @inner
-def _around(recent: Recent, c: int, t_ns: int, reach_ns: Reach, used: Int) -> int:
+def _around(history: TrackHistory, c: int, t_ns: int, reach_ns: Reach, used: Int) -> int:
     """Write the slots of the frames around an instant, nearest first.
 
     Returns how many. None at all where even the nearest is too far: a track carried over two frames into the unknown
@@ -128,14 +128,14 @@ def _around(recent: Recent, c: int, t_ns: int, reach_ns: Reach, used: Int) -> in
     the first alone counts (two where there is none before), as if the others had not yet come: what comes out does not
     depend on how far a camera's messages ran ahead of another's.
     """
-    newest, oldest = recent.total[c], max(recent.total[c] - HISTORY, 0)
+    newest, oldest = history.total[c], max(history.total[c] - HISTORY, 0)
     after = newest
-    while after > oldest and recent.times_ns[c, (after - 1) % HISTORY, 0] >= t_ns:
+    while after > oldest and history.times_ns[c, (after - 1) % HISTORY, 0] >= t_ns:
         after -= 1
     before, end, n = after - 1, min(after + (1 if after > oldest else 2), newest), 0
     while n < SIGHTINGS and (before >= oldest or after < end):
-        back_ns = t_ns - recent.times_ns[c, before % HISTORY, 0] if before >= oldest else _FAR_NS
-        ahead_ns = recent.times_ns[c, after % HISTORY, 0] - t_ns if after < end else _FAR_NS
+        back_ns = t_ns - history.times_ns[c, before % HISTORY, 0] if before >= oldest else _FAR_NS
+        ahead_ns = history.times_ns[c, after % HISTORY, 0] - t_ns if after < end else _FAR_NS
         if min(back_ns, ahead_ns) > reach_ns[n]:
             break
         if back_ns <= ahead_ns:
@@ -149,7 +149,7 @@ def _around(recent: Recent, c: int, t_ns: int, reach_ns: Reach, used: Int) -> in
 
 
 @inner
-def _read(recent: Recent, c: int, m: int, t_ns: int, used: Int, n: int, track: Float) -> bool:
+def _read(history: TrackHistory, c: int, m: int, t_ns: int, used: Int, n: int, track: Float) -> bool:
     """Write the tracks of a marker and its rival; return whether it has one.
 
     `track`: (SIGHTINGS, 2, 4) u, v [px], time of the row from the instant [s], sigma [px].
@@ -158,10 +158,10 @@ def _read(recent: Recent, c: int, m: int, t_ns: int, used: Int, n: int, track: F
     for k in range(n):
         slot = used[k]
         for i in range(2):
-            v = recent.marks[c, slot, 2 * i + 1, m]
-            track[k, i, 0], track[k, i, 1] = recent.marks[c, slot, 2 * i, m], v
-            track[k, i, 2] = 1e-9 * (recent.times_ns[c, slot, 1] - t_ns + recent.row_time_ns[c] * v)
-            track[k, i, 3] = recent.marks[c, slot, 4, m]
+            v = history.marks[c, slot, 2 * i + 1, m]
+            track[k, i, 0], track[k, i, 1] = history.marks[c, slot, 2 * i, m], v
+            track[k, i, 2] = 1e-9 * (history.times_ns[c, slot, 1] - t_ns + history.row_time_ns[c] * v)
+            track[k, i, 3] = history.marks[c, slot, 4, m]
         rival |= isfinite(track[k, 1, 0])
     return rival
 
@@ -221,7 +221,9 @@ def _select(track: Float, n: int, i: int, scale: float, known: Float) -> int:
         leap = _LEAP_PX + _LEAP_M_S * scale * abs(track[k, i, 2] - track[0, i, 2])
         if u * u + v * v <= leap * leap:  # false for NaN
             known[count, 0], known[count, 1], known[count, 2], known[count, 3] = 1.0, u, v, track[k, i, 2]
-            known[count, 4] = min(_FRESH * _variance(track[k, i, 3]), _FRESH_PX * _FRESH_PX)
+            known[count, 4] = min(
+                _INDEPENDENT_SHARE * _variance(track[k, i, 3]), _INDEPENDENT_PX * _INDEPENDENT_PX
+            )
             count += 1
     return count
 

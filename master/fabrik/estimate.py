@@ -39,7 +39,7 @@ class SolvedHand:
         joints: Forward kinematics of the two.
         cov_m2: (26, 3, 3) [m^2] covariance of the joint positions.
         tilt_cov_rad2: (5, 3, 3) [rad^2] covariance of the directions of the last phalanges, by this instant alone.
-        tilt_walk_rad2_s2: (5,) [rad^2/s^2] by how much their trace is expected to grow, by the time squared.
+        tilt_process_noise_rad2_s2: (5,) [rad^2/s^2] by how much their trace is expected to grow, by the time squared.
     """
 
     T_rig_palm: Float
@@ -47,7 +47,7 @@ class SolvedHand:
     joints: HandJoints
     cov_m2: Float
     tilt_cov_rad2: Float
-    tilt_walk_rad2_s2: Float
+    tilt_process_noise_rad2_s2: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)

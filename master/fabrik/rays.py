@@ -72,7 +72,7 @@ class _Hand(NamedTuple):
     tilt_rad2: Float
     turned_rad2: float
     at: Float
-    walked: Float
+    process_noise: Float
 
 
 @inner
@@ -84,13 +84,13 @@ def _covariance(
     shared: float,
     rays: Rays,
     views: Views,
-    walked: float,
+    process_noise: float,
     cov: Float,
     own: Float,
 ) -> None:
     """Write the covariance (3, 3) of a refined point: all parts (see the module); and of them what rays do not show.
 
-    `walked`: as of `_Hand`.
+    `process_noise`: as of `_Hand`.
     """
     moved, gain = views.moved, views.gain
     step, both = views.step, views.both  # of the point by a common step; gain gain'
@@ -123,7 +123,7 @@ def _covariance(
             for t in range(1, count):
                 tilt += (moved[t, i] - moved[0, i]) * (moved[t, j] - moved[0, j]) / (count - 1)
             cov[i, j] = rays.cov[i, j] + shared * common + shape + tilt
-            own[i, j] = shape + (1.0 + walked) * tilt
+            own[i, j] = shape + (1.0 + process_noise) * tilt
 
 
 @inner
@@ -232,7 +232,7 @@ def locate(
     tilt_rad2: Float,
     turned_rad2: float,
     at: Float,
-    walked: Float,
+    process_noise: Float,
     observed: Float,
     rays: Rays,
     views: Views,
@@ -259,7 +259,7 @@ def locate(
         left_out: (C, M) written: outliers, without which they do.
         uv, variance, own: Written, as of `RayPositions`.
     """
-    hand = _Hand(known, as_seen, R, tilt_rad2, turned_rad2, at, walked)
+    hand = _Hand(known, as_seen, R, tilt_rad2, turned_rad2, at, process_noise)
     for m in range(observed.shape[1]):
         for c in range(observed.shape[0]):
             left_out[c, m] = False
@@ -280,7 +280,7 @@ def locate(
             for j in range(3):
                 own[m, i, j] = 0.0
         if meets:
-            much = float(walked[row]) if known and row >= 0 else 0.0
+            much = float(process_noise[row]) if known and row >= 0 else 0.0
             _covariance(cameras, caps, row, count, shared, rays, views, much, cov[m], own[m])
         elif seen == 1 and known and row >= 0:
             _lone(cameras, caps, hand, rays_px, observed, m, rays, views)
@@ -357,16 +357,16 @@ class RayTriangulator:
         observed = np.empty((cameras, count, 4))
         observed[..., :2], observed[..., 2], observed[..., 3] = uv, sigma_px, area_px2
         R = tilt = self._unknown
-        at, walked = self._unknown[:, 0], self._unknown[:, 0, 0]
+        at, process_noise = self._unknown[:, 0], self._unknown[:, 0, 0]
         if hand is not None:
             R, tilt = hand.joints.rotation[self._caps.joint], hand.tilt_cov_rad2[self._caps.finger]
             at = hand.joints.position_m[self._caps.joint]
             # A fit believes that fingers move as fast as its priors allow. Told of less than it believes itself, it
             # would follow its own error, and finger and cap would drag each other away.
             turned = 2.0 * (CAPS.turn_rad_s * age_s) ** 2
-            grown = hand.tilt_walk_rad2_s2[self._caps.finger] * age_s**2 - turned
+            grown = hand.tilt_process_noise_rad2_s2[self._caps.finger] * age_s**2 - turned
             ours = tilt[:, 0, 0] + tilt[:, 1, 1] + tilt[:, 2, 2] + turned
-            walked = np.maximum(grown, 0.0) / np.maximum(ours, 1e-12)
+            process_noise = np.maximum(grown, 0.0) / np.maximum(ours, 1e-12)
         points, cov = np.empty((count, 3)), np.empty((count, 3, 3))
         noise, apart = np.empty((count, 3, 3)), np.empty(count, np.bool_)
         left_out = np.empty((cameras, count), np.bool_)
@@ -383,7 +383,7 @@ class RayTriangulator:
             tilt,
             (CAPS.turn_rad_s * age_s) ** 2,
             np.ascontiguousarray(at),
-            np.ascontiguousarray(walked),
+            np.ascontiguousarray(process_noise),
             observed,
             self._rays,
             self._views,

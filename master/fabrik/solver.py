@@ -17,8 +17,8 @@ from common.hand_model import CHAINS, METACARPALS, PALM, TIPS, WRIST, HandModel
 from common.messages import MarkerDetections, Source
 from master.estimator.epoch import Epoch, Fitted
 from master.estimator.estimator import Estimator
-from master.estimator.ground import ON_MARKERS
 from master.estimator.hand_tables import Mounts
+from master.estimator.observation_sources import ON_MARKERS
 from master.estimator.state import PALM_PART
 from master.fabrik.estimate import HandEstimate, SolvedHand
 from master.fabrik.finger import Finger
@@ -186,7 +186,7 @@ class FabrikSolver:
         joints, _ = self._palm.pose(T, angles)
         off = joints.position_m - fit.joints.position_m
         joint_cov = fit.cov_m2 + off[:, :, None] * off[:, None, :]
-        hand = SolvedHand(T, angles, joints, joint_cov, fit.tilt_cov_rad2, fit.tilt_walk_rad2_s2)
+        hand = SolvedHand(T, angles, joints, joint_cov, fit.tilt_cov_rad2, fit.tilt_process_noise_rad2_s2)
         self._judge(out, palm, fit.surprise, placed)
         self._last, self._last_ns = hand, out.t_ns
         solved = bool(np.isfinite(out.residual_m).any() or out.tracked.any())
@@ -204,7 +204,7 @@ class FabrikSolver:
         out.valid[:] = True
         out.source[CHAINS[out.seen]] = Source.SOLVED
         out.source[TIPS[out.seen]] = Source.MEASURED
-        if palm.rests[PALM_PART] & ON_MARKERS:
+        if palm.sources[PALM_PART] & ON_MARKERS:
             out.tracked[_PALM_JOINTS], out.source[_PALM_JOINTS] = True, Source.SOLVED
             out.tracked[CHAINS[explained]] = True
         else:

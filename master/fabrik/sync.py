@@ -23,7 +23,7 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 from common.messages import MarkerDetections
-from master.fabrik.carry import HISTORY, NEVER, SIGHTINGS, Recent, carry
+from master.fabrik.carry import HISTORY, NEVER, SIGHTINGS, TrackHistory, carry
 
 SILENT_FRAMES = 12
 _SLOW, _SLOW_FRAMES = 2.2, 4  # times as many frames of others as the files say, between so many of its own
@@ -93,7 +93,7 @@ class FrameSync:
         self._reach_ns = near_ns, far_ns, far_ns, far_ns
         self._patience = SILENT_FRAMES * count
         self._slow_frames = [_SLOW * sum(rates) / rate for rate in rates]
-        self._recent = Recent(
+        self._history = TrackHistory(
             np.zeros(count, np.int64),
             np.full((count, HISTORY, 3), NEVER),
             np.zeros((count, HISTORY)),
@@ -149,13 +149,13 @@ class FrameSync:
         shape = len(self._came), self._markers
         uv, sigma = np.empty((2, *shape, 2)), np.empty((2, *shape))
         area, missing = np.empty(shape), np.empty(shape[0], np.bool_)
-        ready_t_ns, rivals = carry(self._recent, t_ns, self._reach_ns, uv, sigma, area, missing)
+        ready_t_ns, rivals = carry(self._history, t_ns, self._reach_ns, uv, sigma, area, missing)
         second = (uv[1], sigma[1]) if rivals else (None, None)
         return FrameSet(t_ns, uv[0], sigma[0], area, ready_t_ns, missing, *second)
 
     def _hold(self, c: int, centre_ns: int, message: MarkerDetections) -> None:
         """Copy a frame into its camera's ring."""
-        total, times_ns, t_sigma_ns, all_marks, _, _ = self._recent
+        total, times_ns, t_sigma_ns, all_marks, _, _ = self._history
         slot = int(total[c]) % HISTORY
         total[c] += 1
         times_ns[c, slot, 0], times_ns[c, slot, 1] = centre_ns, message.t_ns
@@ -217,7 +217,7 @@ class FrameSync:
         newest = self._newest_of[c]
         if newest >= t_ns:
             # At the very start one frame is not yet a track.
-            return self._continuous and self._recent.total[c] == 1 and not self._silent(c)
+            return self._continuous and self._history.total[c] == 1 and not self._silent(c)
         return newest + self._slack_ns[c] < t_ns and not self._silent(c)
 
     def _lonely(self, t_ns: int) -> bool:
@@ -228,5 +228,5 @@ class FrameSync:
         return any(
             not self._silent(c)
             and not any(-self._half_ns[c] <= s - t_ns <= self._outdated_ns for s in centres)
-            for c, centres in enumerate(self._recent.times_ns[:, :, 0].tolist())
+            for c, centres in enumerate(self._history.times_ns[:, :, 0].tolist())
         )

@@ -38,9 +38,9 @@ class Course:
         if not self._late:
             good = abs(wide_m) <= most_m
         else:
-            usual = median(wide for _, wide, _ in self._late)
+            typical = median(wide for _, wide, _ in self._late)
             lasts = self._since_ns is not None and (t_ns - self._since_ns) * 1e-9 > _LASTS_S
-            good = abs(wide_m) <= most_m and (lasts or abs(wide_m - usual) <= self._quick_m)
+            good = abs(wide_m) <= most_m and (lasts or abs(wide_m - typical) <= self._quick_m)
             if good and lasts:
                 self._late.clear()
         if good:
@@ -60,9 +60,9 @@ class Course:
         there was none."""
         if not self._late:
             return None
-        usual = median(wide for _, wide, _ in self._late)
+        typical = median(wide for _, wide, _ in self._late)
         firm = len(self._late)
-        while firm > 1 and abs(self._late[firm - 1][1] - usual) > _FIRM * self._quick_m:
+        while firm > 1 and abs(self._late[firm - 1][1] - typical) > _FIRM * self._quick_m:
             firm -= 1
         kept = list(self._late)[:firm]
         times = [(t - kept[-1][0]) * 1e-9 for t, _, _ in kept]

@@ -30,7 +30,7 @@ def lesson(
     clock: Clock,
     say: Callable[[str], None],
 ) -> list[Example]:
-    """Lead a person through `count` examples of the pose `name`.
+    """Blend a person through `count` examples of the pose `name`.
 
     Args:
         receive: The next pose of the hand, waiting at most so long [s].

@@ -238,11 +238,11 @@ class PoseRecogniser:
             self._coming, self._coming_ns = best, t_ns
         lasted_s = 1e-9 * (t_ns - self._coming_ns)
         enough = known >= _ENOUGH
-        rests = (
+        at_rest = (
             lasted_s >= (self._hold.begin_s if enough else self._hold.doubt_s)
             and speed <= self._hold.still_deg_s
         )
-        return best if rests or lasted_s >= self._hold.slow_s else None
+        return best if at_rest or lasted_s >= self._hold.slow_s else None
 
     def _begin(self, features: HandFeatures, pose: int, confidence: float) -> list[Gesture]:
         t_ns = features.t_ns

@@ -131,8 +131,8 @@ def _touches(distance: Float, sigma: Float, before: Bool) -> Bool:
     """(N,) what touches, by distances and standard deviations (N,) [m] and what touched before; NaN: not known."""
     sure = sigma < _SURE_M
     begins = distance < NEAR_M + _DOUBT * np.minimum(sigma, FAR_M)
-    stays = before & (distance < FAR_M + _DOUBT * np.minimum(sigma, FAR_M))
-    return sure & (begins | stays)
+    stay_near = before & (distance < FAR_M + _DOUBT * np.minimum(sigma, FAR_M))
+    return sure & (begins | stay_near)
 
 
 def _gaps(pose: HandPose, surface: Surface, placed: _Placed) -> tuple[Nearest, Float]:

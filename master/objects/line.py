@@ -33,8 +33,8 @@ from master.objects.fit import Fitted, PoseFit
 from master.objects.hidden import Hidden
 from master.objects.lone_tag import LoneTag
 from master.objects.motion import Motion
+from master.objects.pose_filter import PoseFilter
 from master.objects.start import poses_of_beads, poses_of_tags
-from master.objects.steady import Steady
 from master.objects.window import Window, Windows
 
 # What light does to a ball's centroid beyond what a slave says, and to a corner.
@@ -45,7 +45,7 @@ _LOST_M, _LOST_RAD = 0.05, np.radians(30.0)  # less sure than this is no pose
 _MOST = 0.5  # share of what is seen that must be in its place
 _START_MISFIT = 25.0  # chi square per number of what a pose from nothing rests on
 _TRACKED_M, _TRACKED_RAD = 15e-3, np.radians(10.0)  # less sure than this is led on rather than measured
-_FRESH_PERIODS = 2.25  # an observation older than this is not now
+_MAX_AGE_PERIODS = 2.25  # an observation older than this is not now
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ class ObjectLine:
         self._arrays = CameraArrays.of(self._cameras)
         self._hidden = Hidden(self._features, self._cameras)
         middle = self._features.points.mean(axis=0) if len(self._features.points) else np.zeros(3)
-        self._steady = Steady(middle, OneEuroParameters.of(rig.filter))
+        self._filter = PoseFilter(middle, OneEuroParameters.of(rig.filter))
         self._course = Course()
         self._lone = LoneTag(self._features, self._cameras, self._fit)
         self._lost_behind = False
@@ -114,7 +114,7 @@ class ObjectLine:
         seen = self._chosen(window, None if predicted is None else predicted.T)
         now = (
             seen is not None
-            and float(np.abs(seen.seen.tau_s).min()) <= _FRESH_PERIODS * window.period_ns * 1e-9
+            and float(np.abs(seen.seen.tau_s).min()) <= _MAX_AGE_PERIODS * window.period_ns * 1e-9
         )
         fitted = None
         if seen is not None and now:
@@ -126,9 +126,9 @@ class ObjectLine:
         tracked = fitted.alone or not fitted.poorer(_TRACKED_M, _TRACKED_RAD)
         shown = self._hidden.look(window, fitted.motion.T, seen.used(fitted))
         self._lost_behind = shown.occluded
-        T = self._steady.push(window.t_ns, fitted.motion.T, fitted.cov[:6, :6])
+        T = self._filter.push(window.t_ns, fitted.motion.T, fitted.cov[:6, :6])
         features = self._features.feature[seen.seen.point[fitted.used]]
-        near = fitted.used & (np.abs(seen.seen.tau_s) <= _FRESH_PERIODS * window.period_ns * 1e-9)
+        near = fitted.used & (np.abs(seen.seen.tau_s) <= _MAX_AGE_PERIODS * window.period_ns * 1e-9)
         return ObjectPose(
             object=self.name,
             t_ns=window.t_ns,
@@ -223,7 +223,7 @@ class ObjectLine:
             window, predicted.T, np.zeros((len(self._cameras), self._features.count), np.bool_)
         )
         self._lost_behind = shown.occluded
-        T = self._steady.held(window.t_ns, predicted.T)
+        T = self._filter.held(window.t_ns, predicted.T)
         return ObjectPose(
             object=self.name,
             t_ns=window.t_ns,
@@ -247,7 +247,7 @@ class ObjectLine:
 
     def _none(self, window: Window) -> ObjectPose:
         """No pose; what hid it when it was lost is taken to hide it still."""
-        self._steady.forget()
+        self._filter.forget()
         return ObjectPose(
             object=self.name,
             t_ns=window.t_ns,

@@ -99,12 +99,12 @@ class Surface:
     def nearest_to_cones(self, cones: Cones) -> Nearest:
         """Where the surface is nearest to each of N round cones, object frame."""
         rows: Int = np.arange(len(cones.start_m))
-        along, grows = cones.stop_m - cones.start_m, cones.stop_radius_m - cones.start_radius_m
+        along, scale_up = cones.stop_m - cones.start_m, cones.stop_radius_m - cones.start_radius_m
 
         def least(share: Float) -> tuple[Int, Float]:
             """Which of the balls at places (N, S) on the bones is the nearest, and how near (N,)."""
             middle = cones.start_m[:, None] + share[..., None] * along[:, None]
-            radius = cones.start_radius_m[:, None] + share * grows[:, None]
+            radius = cones.start_radius_m[:, None] + share * scale_up[:, None]
             gap = self.distances(middle.reshape(-1, 3)).reshape(share.shape) - radius
             best: Int = gap.argmin(axis=1)
             return best, gap[rows, best]

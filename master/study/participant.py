@@ -64,18 +64,20 @@ def participant(study_seed: int, number: int, rig: RigCalibration, hand: HandPro
     Fingers bend as the Digits paper says (preset D), up to how people stray from it.
     """
     rng = np.random.default_rng([study_seed, _STREAM, number])
-    usual = replace(hand, couplings="D", limits_rad="D")
+    typical = replace(hand, couplings="D", limits_rad="D")
     bones = 1.0 + rng.uniform(-BONE_SHARE, BONE_SHARE, (5, 3))
     palm = 1.0 + float(rng.uniform(-BONE_SHARE, BONE_SHARE))
     turn, shift = rng.uniform(-TURN_RAD, TURN_RAD, 3), rng.uniform(-SHIFT_M, SHIFT_M, 3)
     reflectance = 1.0 + float(rng.uniform(-REFLECTANCE_SHARE, REFLECTANCE_SHARE))
-    lengths = _lengths(usual)
+    lengths = _lengths(typical)
     wrong = _bone_errors(rng) / lengths
     return Participant(
         number=number,
         seed=1000 * study_seed + number,
-        hand=with_bones(usual, palm, bones),
-        measured=_measured(with_bones(usual, palm * (1.0 + PALM_SIGMA * float(rng.normal())), bones + wrong)),
+        hand=with_bones(typical, palm, bones),
+        measured=_measured(
+            with_bones(typical, palm * (1.0 + PALM_SIGMA * float(rng.normal())), bones + wrong)
+        ),
         rig=turned(rig, turn, shift),
         reflectance=reflectance,
     )

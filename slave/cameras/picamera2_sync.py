@@ -85,13 +85,13 @@ class SyncWatch:
             self.error_us = 0.0
         if not isinstance(duration, (int, float)):
             return
-        last, usual = self._durations
+        last, typical = self._durations
         if duration == last:
-            usual = float(duration)
-        off_us = usual - duration if usual else 0.0
+            typical = float(duration)
+        off_us = typical - duration if typical else 0.0
         if abs(off_us) >= LEAST_US:
             self.error_us, self._since_error = off_us, 0
-        self._durations = (float(duration), usual)
+        self._durations = (float(duration), typical)
 
     def _why(self, metadata: Mapping[str, object]) -> str:
         if not metadata.get("SyncReady"):

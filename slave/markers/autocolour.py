@@ -110,8 +110,8 @@ def calibrate_moving(
     things = [things_of(image, k, around) for k, image in enumerate(images)]
     paints = find_paints(things, len(names), around)
     for paint in paints:
-        rests = "" if paint.moved else "; it rests, skin around it tells that it is paint"
-        say(f"paint of hue {paint.hue:.0f}: in {len(paint.things)} of {len(images)} frames{rests}")
+        at_rest = "" if paint.moved else "; it rests, skin around it tells that it is paint"
+        say(f"paint of hue {paint.hue:.0f}: in {len(paint.things)} of {len(images)} frames{at_rest}")
     named = namer(paints, places(paints, len(images)))
     if sorted(named) != sorted(names):
         raise ValueError(f"the namer gave {named}, the rig has {names}")

@@ -284,7 +284,7 @@ class MarkerDetector:
             shape, x, y = Ellipse(before.xx, before.xy, before.yy), u - seen.left, v - seen.top
             whole = centre_of(seen.window, shape, x, y)
             if whole is not None and explained(before.hidden(seen.area), shape, whole.u - x, whole.v - y):
-                u, v, area = seen.left + whole.u, seen.top + whole.v, before.usual
+                u, v, area = seen.left + whole.u, seen.top + whole.v, before.typical
                 sigma = math.hypot(COVERED_PX, whole.rms)
         sigma = math.hypot(sigma, doubt)
         clarity = clarity_of(seen, track.whole)

@@ -93,10 +93,10 @@ def first_light(image: Image, table: ColourTable, reference: Float, expected: Fl
     if best.matched < PROOF or off_line(best.log_gains) > TINT:
         return best
     other = max((worth(e) for e in tried if different(e.log_gains, best.log_gains)), default=0.0)
-    usual = max((worth(e) for e in tried if not different(e.log_gains, expected)), default=0.0)
+    typical = max((worth(e) for e in tried if not different(e.log_gains, expected)), default=0.0)
     least = min(PROOF_ELSEWHERE, len(reference)) if different(best.log_gains, expected) else PROOF
     proven = best.matched >= least and worth(best) - other >= AHEAD
-    return replace(best, proven=proven, excluded=worth(best) - usual >= AHEAD)
+    return replace(best, proven=proven, excluded=worth(best) - typical >= AHEAD)
 
 
 def lights() -> Float:

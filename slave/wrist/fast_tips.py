@@ -245,13 +245,13 @@ def _postures(
     """Postures of index ... little that meet the laser where it is seen and are as bright as they should be."""
     length = table.laser.shape[3]
     off, share, beside, known = np.empty(length), np.empty(length), np.empty(length), np.empty(length)
-    sure, usual, per_m = limits.aside_m**-2, limits.abduction_sigma**-2, 1.0 / limits.aside_m
+    sure, typical, per_m = limits.aside_m**-2, limits.abduction_sigma**-2, 1.0 / limits.aside_m
     least = np.inf
     laser = table.laser[:, :, finger - 1]
     for k in range(length):
         x1, x2 = laser[1, 0, k], laser[2, 0, k]
         x, z = plane[finger, 0] - laser[0, 0, k], plane[finger, 1] - laser[0, 1, k]
-        known[k] = x1 * x1 * sure + usual
+        known[k] = x1 * x1 * sure + typical
         to = x1 * sure / known[k]
         by = x * to
         by = (x - x2 * by * by) * to

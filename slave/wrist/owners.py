@@ -76,9 +76,9 @@ def _room(of: Int, nearest: Int, moving: Bool) -> Bool:
 
     Then the finger is spread, or the palm is not quite where it should be.
     """
-    stays = np.zeros(6, np.bool_)
-    stays[of[~moving]] = True  # those of no finger come last
-    return stays[of] | ~stays[nearest]
+    unmoved = np.zeros(6, np.bool_)
+    unmoved[of[~moving]] = True  # those of no finger come last
+    return unmoved[of] | ~unmoved[nearest]
 
 
 def _at_creases(finger: Int, runs: Runs) -> Int:

@@ -26,7 +26,7 @@ from slave.wrist.view import WristView
 
 STEP_RAD = float(np.radians(4.0))
 _MOST_STEPS = np.array([8, 4])  # of flexion, deviation: 32 and 16 degrees
-_USUAL_RAD = np.radians((15.0, 8.0))  # standard deviations of the prior
+_TYPICAL_RAD = np.radians((15.0, 8.0))  # standard deviations of the prior
 _EVIDENCE = 14.0  # logarithm of probability per unit of E
 _TOP = 0.4  # contrast that an open gap exceeds: a deeper one says no more
 _DARK = np.float32(2.0)  # root of grey levels: noise
@@ -160,7 +160,7 @@ def _marks(view: WristView) -> _Marks:
     beside, shows = zip(*(_pixels(turned(view, bend), edge) for bend in bends), strict=True)
     return _Marks(
         bends,
-        (0.5 * ((bends / _USUAL_RAD) ** 2).sum(axis=1)).astype(np.float32),
+        (0.5 * ((bends / _TYPICAL_RAD) ** 2).sum(axis=1)).astype(np.float32),
         hardly,
         np.array(at),
         (gap_weight * np.array(inside)).astype(np.float32),

@@ -325,7 +325,7 @@ def spread_without_zero(profile: HandProfile) -> HandProfile:
     return msgspec.structs.replace(profile, limits_rad=msgspec.structs.replace(limits, ring=ring))
 
 
-def stray_without_ratio(profile: HandProfile) -> HandProfile:
+def spread_without_ratio(profile: HandProfile) -> HandProfile:
     return msgspec.structs.replace(profile, couplings=Couplings(dip_per_pip=None, dip_spread_rad=0.1))
 
 
@@ -347,7 +347,7 @@ BROKEN: dict[str, tuple[Callable[[HandProfile], HandProfile], tuple[str, ...]]] 
     ),
     "crossed limits": (crossed, ("limits_rad.ring.pip_rad",)),
     "narrowing away from zero": (spread_without_zero, ("limits_rad.ring.spread_at_full_flexion", "0.1")),
-    "straying from nothing": (stray_without_ratio, ("couplings.dip_spread_rad", "dip_per_pip")),
+    "straying from nothing": (spread_without_ratio, ("couplings.dip_spread_rad", "dip_per_pip")),
     "unknown mount": (mounted, ("markers.index.joint", "elbow")),
     "unknown radius": (lambda p: msgspec.structs.replace(p, radius_m={"elbow": 0.01}), ("radius_m", "elbow")),
 }

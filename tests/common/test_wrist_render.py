@@ -162,17 +162,17 @@ def test_another_camera_is_refused() -> None:
 
 
 def test_skin_that_gives_back_a_fifth_less_light_is_darker_by_that_and_lies_where_it_lay() -> None:
-    usual, dull = scene("poses@dark"), replace(scene("poses@dark"), reflectance=0.8)
-    bright = WristRenderer(usual, "wrist").render(2.0, LED).astype(np.float64)
+    typical, dull = scene("poses@dark"), replace(scene("poses@dark"), reflectance=0.8)
+    bright = WristRenderer(typical, "wrist").render(2.0, LED).astype(np.float64)
     dark = WristRenderer(dull, "wrist").render(2.0, LED).astype(np.float64)
     skin = (bright > 40.0) & (bright < 250.0)
     assert skin.sum() > 10_000
     assert np.median((dark[skin] - 2.0) / (bright[skin] - 2.0)) == pytest.approx(0.8, abs=0.01)
-    dim = [WristRenderer(one, "wrist").exposed(60.0, np.full(3, 0.01)) for one in (usual, dull)]
+    dim = [WristRenderer(one, "wrist").exposed(60.0, np.full(3, 0.01)) for one in (typical, dull)]
     line, duller = (one.render(2.0, LASER).astype(np.float64) - 2.0 for one in dim)
     lit = (line > 12.0) & (line < 250.0)
     assert np.median(duller[lit] / line[lit]) == pytest.approx(0.8, abs=0.05)
-    np.testing.assert_array_equal(dull.truth(2.0).laser_uv, usual.truth(2.0).laser_uv)
+    np.testing.assert_array_equal(dull.truth(2.0).laser_uv, typical.truth(2.0).laser_uv)
 
 
 @pytest.mark.parametrize("reflectance", [0.0, -1.0, np.nan, np.inf])

@@ -67,8 +67,8 @@ def contact(row: int, distance_m: list[float], *, held: bool = False) -> Contact
 
 def gesture(row: int, kind: str, phase: str, **more: object) -> Gesture:
     name = {"pose": "open_palm", "pinch": "index", "tap": "5"}.get(kind, kind)
-    usual = {"hand": "test-hand", "name": name, "began_t_ns": START_NS, "confidence": 0.9}
-    return Gesture(t_ns=START_NS + row * STEP_NS, kind=kind, phase=phase, **(usual | more))  # type: ignore[arg-type]
+    typical = {"hand": "test-hand", "name": name, "began_t_ns": START_NS, "confidence": 0.9}
+    return Gesture(t_ns=START_NS + row * STEP_NS, kind=kind, phase=phase, **(typical | more))  # type: ignore[arg-type]
 
 
 def column(path: Path, entity: str, component: str) -> tuple[list[int], list[list[object]]]:

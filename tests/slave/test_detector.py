@@ -31,8 +31,8 @@ def test_six_markers_of_a_hand_are_found_whole_and_certain() -> None:
 def test_each_is_measured_as_it_would_be_in_its_own_window() -> None:
     image = render(hand())
     tracked = push_all([render(hand(295.0, 200.0)), image])[1]
-    afresh = push_all([image])[0]
-    np.testing.assert_array_equal(tracked.uv, afresh.uv)
+    reinitialise = push_all([image])[0]
+    np.testing.assert_array_equal(tracked.uv, reinitialise.uv)
 
 
 def test_a_missing_marker_is_nan_in_all_and_the_others_are_what_they_were() -> None:

@@ -31,9 +31,13 @@ def under(image: Image, gains: Float, seed: int = 0) -> Image:
 
 
 def grasping(seed: int) -> Scene:
-    usual = standard_scene(seed)
+    typical = standard_scene(seed)
     return Scene.of_motion(
-        usual.rig, usual.cameras, usual.model.profile, Grasp(usual.model, view_centre(usual.rig), seed), seed
+        typical.rig,
+        typical.cameras,
+        typical.model.profile,
+        Grasp(typical.model, view_centre(typical.rig), seed),
+        seed,
     )
 
 

@@ -134,10 +134,12 @@ def _robust(
 
 def _blurred(blur_px: Float) -> dict[int, str]:
     """Images that are blurred where the others are not: index -> reason."""
-    usual = float(np.median(blur_px))
+    typical = float(np.median(blur_px))
     return {
-        int(i): f"blurred: edges spread over {blur_px[i]:.1f} px (standard deviation), usually {usual:.1f} px"
-        for i in np.flatnonzero(blur_px > max(_BLURRED * usual, _BLURRED_PX))
+        int(
+            i
+        ): f"blurred: edges spread over {blur_px[i]:.1f} px (standard deviation), usually {typical:.1f} px"
+        for i in np.flatnonzero(blur_px > max(_BLURRED * typical, _BLURRED_PX))
     }
 
 

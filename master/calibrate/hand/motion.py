@@ -114,8 +114,8 @@ def _good(palm: Palm) -> Bool:
         return whole
     middle = np.median(lengths[whole], axis=0)
     spread = np.median(np.abs(lengths[whole] - middle), axis=0)
-    usual = np.abs(lengths - middle) < np.maximum(_OUTLIER * spread, _FLOOR_M)
-    return whole & np.asarray(usual.all(axis=(1, 2)), np.bool_)
+    typical = np.abs(lengths - middle) < np.maximum(_OUTLIER * spread, _FLOOR_M)
+    return whole & np.asarray(typical.all(axis=(1, 2)), np.bool_)
 
 
 def _metacarpals(shape_m: Float) -> dict[str, RestJoint]:

@@ -157,18 +157,18 @@ class HandRoutineProblem:
             off[:, c] = -change[:, c] * (x[1:, c] - x[:-1, c])
             jacobian[:, CHANNELS + c, 0, c] = level[:, c]
             off[:, CHANNELS + c] = level[:, c] * (mean[:, c] - x[:-1, c])
-        stray = x[:, dip] - shape.dip_ratio * x[:, pip] - shape.dip_bias_rad
+        outlier = x[:, dip] - shape.dip_ratio * x[:, pip] - shape.dip_bias_rad
         for f, (d, p) in enumerate(zip(dip, pip, strict=True)):
             ratio, own = shape.dip_ratio[f], PER_FINGER * f
             jacobian[:, d, 0, d], jacobian[:, d, 1, d] = -change[:, d], change[:, d]
             jacobian[:, d, 0, p], jacobian[:, d, 1, p] = ratio * change[:, d], -ratio * change[:, d]
             by_shape[:, d, own + RATIO] = -change[:, d] * (x[1:, p] - x[:-1, p])
-            off[:, d] = -change[:, d] * (stray[1:, f] - stray[:-1, f])
+            off[:, d] = -change[:, d] * (outlier[1:, f] - outlier[:-1, f])
             row = CHANNELS + d
             jacobian[:, row, 0, d], jacobian[:, row, 0, p] = level[:, d], -ratio * level[:, d]
             by_shape[:, row, own + RATIO] = -level[:, d] * x[:-1, p]
             by_shape[:, row, own + BIAS] = -level[:, d]
-            off[:, row] = -level[:, d] * stray[:-1, f]
+            off[:, row] = -level[:, d] * outlier[:-1, f]
         return jacobian, by_shape, off
 
     def _widths(self) -> tuple[Float, Float, Float]:

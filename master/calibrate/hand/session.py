@@ -53,10 +53,10 @@ class Track:
         return np.array(self.t_ns, np.int64), np.array(self.points_m), np.array(self.cov_m2)
 
 
-def lead(
+def guide(
     receive: Receive, tips: Sequence[int], names: Sequence[str], clock: Clock, say: Callable[[str], None]
 ) -> Track:
-    """Lead a person through the routine.
+    """Blend a person through the routine.
 
     Args:
         receive: The next pose of the running master, waiting at most so long [s].

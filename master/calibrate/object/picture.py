@@ -35,9 +35,11 @@ def draw_object(path: Path, found: Measurement, profile: ObjectProfile) -> None:
     for row, name in enumerate(found.names):
         colour = FINGER_COLOURS[row % len(FINGER_COLOURS)]
         size = 1e3 * np.linalg.norm(bundle.off_m[:, row], axis=1)
-        stray = bundle.stray[:, row]
-        time.plot(bundle.seen.t_s, np.where(stray, np.nan, size), ".", markersize=3, color=colour, label=name)
-        time.plot(bundle.seen.t_s[stray], size[stray], "x", markersize=4, color=GREY)
+        outlier = bundle.outlier[:, row]
+        time.plot(
+            bundle.seen.t_s, np.where(outlier, np.nan, size), ".", markersize=3, color=colour, label=name
+        )
+        time.plot(bundle.seen.t_s[outlier], size[outlier], "x", markersize=4, color=GREY)
     time.set(title="from the rigid body [mm]; crosses: strays", xlabel="time [s]")
     time.set_ylim(0.0, max(1.0, 1.2 * float(np.nanpercentile(1e3 * np.abs(bundle.off_m), 99.0)) * 1.7))
     time.legend(fontsize=8, markerscale=3)

@@ -19,7 +19,7 @@ _SHOWN = 200  # instants from which ways of turning are counted while it goes on
 Receive = Callable[[float], HandPose | None]
 
 
-def lead(
+def guide(
     receive: Receive,
     rig: RigCalibration,
     names: Sequence[str],
@@ -27,7 +27,7 @@ def lead(
     say: Callable[[str], None],
     longest_s: float,
 ) -> Seen:
-    """Lead a person through the motion until it is enough, or the time is over.
+    """Blend a person through the motion until it is enough, or the time is over.
 
     Args:
         receive: The next pose of the running master, waiting at most so long [s].

@@ -24,7 +24,7 @@ MOST = 900  # instants
 BLOCKS = 12
 TRACKER_M, TRACKER_RAD = 1e-3, np.radians(0.15)
 UNTOLD_M, UNTOLD_RAD = 3e-3, np.radians(1.5)  # of an object's pose without covariance
-STRAY = (
+OUTLIER = (
     4.1  # times sigma: 0.999 of chi with six degrees of freedom is within 4.7, at the scale of the good half
 )
 _HALF = 5.348  # median of chi square with six degrees of freedom
@@ -58,7 +58,7 @@ class Fit:
     R: Float
     p_m: Float
     off: Float
-    stray: Bool
+    outlier: Bool
     scale: float
     cov: Float
     left_out: Float
@@ -137,7 +137,7 @@ def fit_registration(seen: PoseTrack, tracker: PoseTrack, first: Placed) -> Fit:
         lines.R,
         lines.p_m,
         lines.off,
-        sizes > STRAY,
+        sizes > OUTLIER,
         scale,
         np.asarray(np.linalg.inv(normal), np.float64),
         np.array(left_out).reshape(-1, _UNKNOWNS),
@@ -194,7 +194,7 @@ def _sizes(weight: Float, off: Float) -> Float:
 
 def _counts(sizes: Float) -> Float:
     """(N,) how much an instant counts: Tukey's biweight, nothing where it strays by twice as much as strays do."""
-    return np.clip(1.0 - (sizes / (2.0 * STRAY)) ** 2, 0.0, 1.0) ** 2
+    return np.clip(1.0 - (sizes / (2.0 * OUTLIER)) ** 2, 0.0, 1.0) ** 2
 
 
 def _normal(weight: Float, lines: _Lines, counts: Float) -> Float:

@@ -28,8 +28,10 @@ def draw_registration(path: Path, found: Registration) -> None:
         (side, (2, 1), "from the side [mm]"),
     ):
         axes.plot(told[:, a], told[:, b], "-", color=GREY, linewidth=0.8, label="tracker")
-        axes.plot(seen[~fit.stray, a], seen[~fit.stray, b], ".", color=BLUE, markersize=3, label="cameras")
-        axes.plot(seen[fit.stray, a], seen[fit.stray, b], "x", color=ORANGE, markersize=4, label="stray")
+        axes.plot(
+            seen[~fit.outlier, a], seen[~fit.outlier, b], ".", color=BLUE, markersize=3, label="cameras"
+        )
+        axes.plot(seen[fit.outlier, a], seen[fit.outlier, b], "x", color=ORANGE, markersize=4, label="stray")
         axes.set(title=f"{title}: rig {'xyz'[a]}, {'xyz'[b]}")
         axes.set_aspect("equal", adjustable="datalim")
         axes.legend(fontsize=8)
@@ -38,7 +40,7 @@ def draw_registration(path: Path, found: Registration) -> None:
         (place, slice(0, 3), 1e3, "cameras against tracker: place [mm]"),
         (turn, slice(3, 6), np.degrees(1.0), "cameras against tracker: turn [deg]"),
     ):
-        left = unit * np.where(fit.stray[:, None], np.nan, fit.off[:, columns])
+        left = unit * np.where(fit.outlier[:, None], np.nan, fit.off[:, columns])
         for values, colour, name in zip(left.T, (BLUE, ORANGE, _GREEN), "xyz", strict=True):
             axes.plot(fit.t_s, values, ".", color=colour, markersize=3, label=name)
         axes.axhline(0.0, color=GREY, linewidth=0.8)

@@ -91,7 +91,7 @@ def figures_of(fit: Fit) -> dict[str, float]:
     `position_mm` and `turn_deg` are roots of the mean square of the whole offset; the sigmas are of an object's pose by
     the tracker, wherever it may be within the motion's reach, turned by up to 50 degrees, from the registration alone.
     """
-    left = fit.off[~fit.stray]
+    left = fit.off[~fit.outlier]
     place, turn = (np.sqrt((part**2).sum(axis=1).mean()) for part in (left[:, :3], left[:, 3:]))
     R, p = _reach(fit)
     place_sigma, turn_sigma = sigma_at(fit, R, p)
@@ -102,7 +102,7 @@ def figures_of(fit: Fit) -> dict[str, float]:
     return {
         "position_mm": 1e3 * float(place),
         "turn_deg": float(np.degrees(turn)),
-        "strays": float(fit.stray.mean()),
+        "strays": float(fit.outlier.mean()),
         "position_sigma_mm": 1e3 * float(place_sigma),
         "turn_sigma_deg": float(np.degrees(turn_sigma)),
         "late_sigma_ms": 1e3 * late_sigma_s(fit),

@@ -1,6 +1,6 @@
 """The guided motion with a person: what was seen so far is told every second, and what is still missing.
 
-The machine that counts is `Session`; `lead` gives it what comes and talks.
+The machine that counts is `Session`; `guide` gives it what comes and talks.
 """
 
 from collections.abc import Callable
@@ -64,8 +64,8 @@ class Session:
         return ""
 
 
-def lead(receive: Receive, clock: Clock, say: Callable[[str], None], longest_s: float) -> Session:
-    """Lead a person through the motion until it is enough, or the time is over.
+def guide(receive: Receive, clock: Clock, say: Callable[[str], None], longest_s: float) -> Session:
+    """Blend a person through the motion until it is enough, or the time is over.
 
     Args:
         receive: The next pose of object or device, waiting at most so long [s].

@@ -173,7 +173,7 @@ def wearing(model: HandModel, unknown: Unknown) -> HandProfile:
     names: tuple[Finger, ...] = get_args(Finger)[FINGERS]
     # Without radii the breadth of the knuckles tells the thickness, and they have moved.
     without = {name: scale for name, scale in plain.palmar_scale.items() if name not in names}
-    usual = Skin.of(HandModel.of(replace(plain, palmar_scale=without))).palmar_m[FINGERS]
-    scale = (thick / usual).mean(axis=1)
+    typical = Skin.of(HandModel.of(replace(plain, palmar_scale=without))).palmar_m[FINGERS]
+    scale = (thick / typical).mean(axis=1)
     told = {name: round(float(value), 4) for name, value in zip(names, scale, strict=True)}
     return replace(plain, palmar_scale=without | told)

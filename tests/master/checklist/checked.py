@@ -73,13 +73,13 @@ class Bench:
         lost = self.loss.get(name, 0.0)
         self._add(name, "received", dt_s * rate * (1.0 - lost))
         self._add(name, "lost", dt_s * rate * lost)
-        usual = {f"seen.{marker}": rate for marker in MARKERS} | {
+        typical = {f"seen.{marker}": rate for marker in MARKERS} | {
             f"beside.{marker}": 0.0 for marker in MARKERS
         }
         if name == "wrist":
-            usual = dict.fromkeys(("strobe.out_of_step", "strobe.unlit"), 0.0)
+            typical = dict.fromkeys(("strobe.out_of_step", "strobe.unlit"), 0.0)
         frames = {"frames": self.rate.get(name, 90.0) if name == "wrist" else rate}
-        for event, number in (frames | usual | self.per_s.get(name, {})).items():
+        for event, number in (frames | typical | self.per_s.get(name, {})).items():
             self._add(name, event, dt_s * number)
 
     def _health(self, name: str) -> Health:

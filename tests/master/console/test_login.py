@@ -337,7 +337,7 @@ def paths(routes: Iterable[BaseRoute], before: str = "") -> Iterator[tuple[str, 
 def open_to_strangers(app: ASGIApp, found: Iterable[tuple[str, str]]) -> set[str]:
     """Paths that answer somebody who did not log in with anything but a refusal or the way to the login."""
 
-    async def walk() -> set[str]:
+    async def process_noise() -> set[str]:
         wrong: set[str] = set()
         for kind, path in found:
             for method in ("GET", "POST") if kind == "http" else ("GET",):
@@ -347,7 +347,7 @@ def open_to_strangers(app: ASGIApp, found: Iterable[tuple[str, str]]) -> set[str
                     wrong.add(f"{method} {path} {status(told)}")
         return wrong
 
-    return asyncio.run(walk())
+    return asyncio.run(process_noise())
 
 
 @pytest.fixture(scope="module")

@@ -148,10 +148,17 @@ def cut_at(boxed_device: Any, f: int, boxed_work: Any) -> float:
 
 @kernel
 def predict_extras_at(
-    boxed_settings: Any, boxed_state: Any, dt_s: float, walked_rad2: float, boxed_belief: Any, boxed_room: Any
+    boxed_settings: Any,
+    boxed_state: Any,
+    dt_s: float,
+    process_noise_rad2: float,
+    boxed_belief: Any,
+    boxed_room: Any,
 ) -> None:
     """`master.estimator.extras.predict_extras`; records in their arrays."""
-    predict_extras(boxed_settings[0], boxed_state[0], dt_s, walked_rad2, boxed_belief[0], boxed_room[0])
+    predict_extras(
+        boxed_settings[0], boxed_state[0], dt_s, process_noise_rad2, boxed_belief[0], boxed_room[0]
+    )
 
 
 @kernel

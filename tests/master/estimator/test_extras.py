@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.records import boxed
-from master.estimator.extras import ExtrasRoom, usual_of
+from master.estimator.extras import ExtrasRoom, stationary_of
 from master.estimator.problem import Belief
 from master.estimator.settings import DEFAULT
 from master.estimator.state import HandState
@@ -27,8 +27,8 @@ class Extras:
 
     def __init__(self, *, loose: bool = True) -> None:
         self.state = HandState.unknown(N, EXTRAS)
-        self.state.usual[:] = usual_of(DEFAULT, loose=loose, tilt_rad=TILT_RAD)
-        self.state.z_cov[:] = np.diag(self.state.usual)
+        self.state.stationary[:] = stationary_of(DEFAULT, loose=loose, tilt_rad=TILT_RAD)
+        self.state.z_cov[:] = np.diag(self.state.stationary)
         self.belief, self.room = Belief.none(N, EXTRAS), ExtrasRoom.empty(EXTRAS)
 
     @property
@@ -43,10 +43,10 @@ class Extras:
         self.state.z[:], self.state.z_cov[:] = mean, cov
         return self
 
-    def after(self, dt_s: float, walked_rad2: float = 0.0) -> "Extras":
+    def after(self, dt_s: float, process_noise_rad2: float = 0.0) -> "Extras":
         """Step them, in place."""
         boxes = boxed(SETTINGS), boxed(self.state)
-        predict_extras_at(*boxes, dt_s, walked_rad2, boxed(self.belief), boxed(self.room))
+        predict_extras_at(*boxes, dt_s, process_noise_rad2, boxed(self.belief), boxed(self.room))
         return self
 
     def told(self, dt_s: float, information: Float, measured: Float, scale: float = 1.0) -> "Extras":
@@ -63,9 +63,11 @@ class Extras:
 def drawn(seed: int) -> tuple[Float, Float]:
     """A mean and a covariance, none more doubtful than usual."""
     rng = np.random.default_rng(seed)
-    usual = np.sqrt(Extras().state.usual)
+    stationary = np.sqrt(Extras().state.stationary)
     root = rng.normal(size=(EXTRAS, EXTRAS)) * 0.2
-    return usual * rng.normal(size=EXTRAS), usual[:, None] * (root @ root.T + 1e-4 * np.eye(EXTRAS)) * usual
+    return stationary * rng.normal(size=EXTRAS), stationary[:, None] * (
+        root @ root.T + 1e-4 * np.eye(EXTRAS)
+    ) * stationary
 
 
 @given(st.floats(1e-3, 3.0))
@@ -104,7 +106,9 @@ def test_doubt_ends_at_what_is_usual_and_the_heading_walks_on() -> None:
     for _ in range(100):
         far.after(1e3, 1e-3)
     quick = [*range(BEND, HEADING)]
-    np.testing.assert_allclose(far.cov[quick][:, quick], np.diag(far.state.usual)[quick][:, quick], atol=1e-9)
+    np.testing.assert_allclose(
+        far.cov[quick][:, quick], np.diag(far.state.stationary)[quick][:, quick], atol=1e-9
+    )
     np.testing.assert_allclose(far.mean[quick], 0.0, atol=1e-9)
     assert far.mean[HEADING] == pytest.approx(mean[HEADING])
     assert far.cov[HEADING, HEADING] == pytest.approx(cov[HEADING, HEADING] + 0.1)
@@ -193,12 +197,12 @@ def test_it_stays_a_covariance_whatever_comes(seed: int) -> None:
         assert (size > 0.0).all()
         assert np.linalg.eigvalsh(cov / np.outer(size, size)).min() > -1e-7
         assert (
-            size[[*range(HEADING), LIGHT]] < 1.01 * np.sqrt(extras.state.usual[[*range(HEADING), LIGHT]])
+            size[[*range(HEADING), LIGHT]] < 1.01 * np.sqrt(extras.state.stationary[[*range(HEADING), LIGHT]])
         ).all()
 
 
 def test_a_palm_that_was_calibrated_does_not_bend_and_a_tilt_is_at_least_of_a_milliradian() -> None:
-    worn, loose = (usual_of(DEFAULT, loose=loose, tilt_rad=0.0) for loose in (False, True))
+    worn, loose = (stationary_of(DEFAULT, loose=loose, tilt_rad=0.0) for loose in (False, True))
     np.testing.assert_allclose(np.sqrt(worn[BEND : BEND + 2]), DEFAULT.worn_rad)
     np.testing.assert_allclose(np.sqrt(loose[BEND : BEND + 2]), [DEFAULT.flexion_rad, DEFAULT.deviation_rad])
     np.testing.assert_allclose(np.sqrt(loose[TILT : TILT + 2]), 1e-3)

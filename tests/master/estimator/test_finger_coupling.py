@@ -58,12 +58,12 @@ def test_a_hand_that_follows_no_share_is_not_taken_to(worn: Worn) -> None:
 
 def test_a_hand_that_keeps_to_its_share_is_tracked_by_the_laser_alone(worn: Worn) -> None:
     """As long as nothing is learnt it is vague, and vaguer where the hand defies habit."""
-    fresh, usual = laser_alone(worn, pipeline(worn, continuous=True))
+    fresh, stationary = laser_alone(worn, pipeline(worn, continuous=True))
     pose, close = laser_alone(worn, learnt(worn, 0.54))
     other, wide = laser_alone(worn, learnt(worn, 0.54, 30.0))
     np.testing.assert_allclose(np.degrees(pose.angles_rad[1:, PIP]), SHOWN_PIP_DEG, atol=6.0)
-    assert (close < 0.9 * usual).all()
-    assert (usual < 0.9 * wide).all()
+    assert (close < 0.9 * stationary).all()
+    assert (stationary < 0.9 * wide).all()
     tips = CHAINS[1:, PIP]
     assert pose.tracked[tips].sum() > fresh.tracked[tips].sum()
     assert not other.tracked[tips].any()

@@ -166,12 +166,12 @@ def test_the_dip_follows_exactly_loosely_or_not_at_all(spread_deg: float, free: 
     machine = forgetful(model)
     sure = turned(palm()[:3, :3], 1e-6 * np.eye(3))
     hand = found(fit(places(palm(), truth, model), small_cov(), by=machine, turn=sure))
-    strayed = np.degrees(hand.angles_rad[1:, 3] - hand.angles_rad[1:, 2] * 2 / 3)
+    growth = np.degrees(hand.angles_rad[1:, 3] - hand.angles_rad[1:, 2] * 2 / 3)
     if spread_deg == 0.0 and not free:
-        np.testing.assert_allclose(strayed, 0.0, atol=1e-9)
+        np.testing.assert_allclose(growth, 0.0, atol=1e-9)
     else:
-        assert strayed[1] > 0.1
-        assert strayed[1] > np.abs(strayed[[0, 2, 3]]).max()
+        assert growth[1] > 0.1
+        assert growth[1] > np.abs(growth[[0, 2, 3]]).max()
 
 
 def test_neighbours_can_be_strangers() -> None:

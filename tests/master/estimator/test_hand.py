@@ -306,8 +306,12 @@ def test_covariances_of_joints_and_directions_are_those_of_numpy() -> None:
     expected = turn @ hand.alone @ turn.swapaxes(1, 2)
     np.testing.assert_allclose(hand.tilt_cov_rad2, expected, atol=1e-5 * np.abs(expected).max())
     # A bending joint turns the end of its finger as fast as it bends itself: MCP, PIP and DIP = 2/3 PIP together.
-    rate = np.concatenate([np.full(6, DEFAULT.palm_walk_rad_s), np.full(FREE, DEFAULT.walk_rad_s)])
-    np.testing.assert_allclose(hand.tilt_walk_rad2_s2, ((turn * rate) ** 2).sum(axis=(1, 2)), rtol=1e-4)
+    rate = np.concatenate(
+        [np.full(6, DEFAULT.palm_process_noise_rad_s), np.full(FREE, DEFAULT.process_noise_rad_s)]
+    )
+    np.testing.assert_allclose(
+        hand.tilt_process_noise_rad2_s2, ((turn * rate) ** 2).sum(axis=(1, 2)), rtol=1e-4
+    )
 
 
 # -- where the search begins ------------------------------------------------------------------------------------
@@ -324,9 +328,9 @@ def test_where_a_search_begins_does_not_tell_where_it_ends(turned_deg: float, se
     turn = rotation_vector_to_matrix(np.radians(turned_deg) * np.array([0.6, 0.8, 0.0]))
     there = rigid(turn @ T[:3, :3], T[:3, 3] + 0.02)
     other = found(fit(places(there, natural_angles(rng)), cov, facing=there[:3, 1]))
-    near, afresh = (found(fit(points, cov, start=start)) for start in (other, None))
-    assert near.surprise.sum() < afresh.surprise.sum() + 1.0
-    assert residual_m(near, points).max() < residual_m(afresh, points).max() + 1e-3
+    near, reinitialise = (found(fit(points, cov, start=start)) for start in (other, None))
+    assert near.surprise.sum() < reinitialise.surprise.sum() + 1.0
+    assert residual_m(near, points).max() < residual_m(reinitialise, points).max() + 1e-3
 
 
 @pytest.mark.parametrize("posture_deg", [5.0, 40.0, 80.0])
@@ -343,15 +347,15 @@ def test_a_first_frame_is_found_from_several_starts_open_to_closed(posture_deg: 
         assert residual_m(found(hand.solution), points).max() < 4e-3
         assert palm_deg(hand.solution, T) < 25.0
         assert joint_mm(hand.solution, RIGHT.forward(T, angles).position_m)[1:].mean() < 15.0
-        assert not hand.anew
+        assert not hand.reinitialised
 
 
 def test_a_first_frame_begins_from_the_line_s_hand_where_that_explains_it() -> None:
     points = places(palm(), natural_angles(np.random.default_rng(7)))
-    afresh = found(fit(points, small_cov()))
-    begun = found(fit(points, small_cov(), start=afresh))
-    np.testing.assert_allclose(begun.joints.position_m, afresh.joints.position_m, atol=1e-3)
-    assert begun.steps <= afresh.steps
+    reinitialise = found(fit(points, small_cov()))
+    begun = found(fit(points, small_cov(), start=reinitialise))
+    np.testing.assert_allclose(begun.joints.position_m, reinitialise.joints.position_m, atol=1e-3)
+    assert begun.steps <= reinitialise.steps
 
 
 def test_free_angles_are_those_of_the_parameters() -> None:

@@ -125,7 +125,7 @@ def test_uncertainty_grows_with_time_and_less_between_neighbours_that_show() -> 
     assert (np.diff(alone) > 0.0).all()
     assert (np.diff(between) > 0.0).all()
     assert (between < alone).all()
-    assert alone[-1] < 1.01 * DEFAULT.stray_rad
+    assert alone[-1] < 1.01 * DEFAULT.growth_rad
     # what is seen of the other three halves the variance, and more
     assert between[60] ** 2 < 0.5 * alone[60] ** 2
 

@@ -46,7 +46,7 @@ def test_too_few_markers_and_none_are_no_palm_and_a_known_one_goes_on_by_one() -
         push(machine, 0, points)
         hand = push(machine, STEP_NS, few)
         assert hand.solution is not None
-        assert (hand.rests > 0).any() == (kept > 0)
+        assert (hand.sources > 0).any() == (kept > 0)
 
 
 def test_the_pose_is_that_of_the_model_and_markers_are_where_it_mounts_them() -> None:

@@ -246,7 +246,7 @@ def test_a_marker_without_covariance_does_not_count_as_seen() -> None:
     cov[MARKER_INDEX] = np.nan
     hand = push(machine, 5 * STEP_NS, bent_points(bent(5 / 60)), cov)
     assert (hand.source[CHAINS[INDEX]] == Source.HELD).all()
-    assert not hand.rests[INDEX]
+    assert not hand.sources[INDEX]
 
 
 def test_the_message_holds_the_solution() -> None:
@@ -329,7 +329,7 @@ def test_an_orientation_without_heading_does_not_tell_the_palm_by_one_finger(
     said = turned(palm()[:3, :3], cov, sure=told)
     hand = [push(machine, k * STEP_NS, points, turn=said) for k in range(5, 10)][-1]
     assert region_m(hand)[TIPS[INDEX]] < DEFAULT.tracked_m
-    assert (hand.rests[5] > 0) == told
+    assert (hand.sources[5] > 0) == told
     assert hand.source[PALM] == (Source.SOLVED if told else Source.HELD)
     assert hand.tracked[PALM] == (told and sure(hand)[PALM])
 
@@ -396,7 +396,7 @@ def test_a_state_that_is_wrong_is_left_at_once_for_the_hand_of_the_line() -> Non
             push(machine, k * STEP_NS, places(shifted, angles))
         hand = push(machine, 5 * STEP_NS, points, start=line if helped else None)
         assert hand.solution is not None
-        assert hand.anew is helped
+        assert hand.reinitialised is helped
         truth = RIGHT.forward(palm(), angles).position_m
         errors[helped] = float(np.linalg.norm(hand.solution.joints.position_m - truth, axis=1).mean())
     assert errors[True] < 8e-3
@@ -408,7 +408,7 @@ def test_a_hand_that_moves_on_is_not_begun_anew() -> None:
     for k in range(40):
         points = bent_points(bent(k / 60.0))
         line = push(estimator(), 0, points).solution
-        assert not push(machine, k * STEP_NS, points, start=line).anew
+        assert not push(machine, k * STEP_NS, points, start=line).reinitialised
 
 
 def test_a_hand_of_habits_begins_anew_by_itself_where_the_last_does_not_explain_a_leap() -> None:
@@ -445,4 +445,4 @@ def test_a_copied_state_goes_on_with_the_same_bytes() -> None:
         for name in ("T_rig_palm", "angles_rad", "cov_m2", "tilt_cov_rad2", "alone", "surprise"):
             np.testing.assert_array_equal(getattr(one.solution, name), getattr(same.solution, name))
         np.testing.assert_array_equal(one.tracked, same.tracked)
-        np.testing.assert_array_equal(one.rests, same.rests)
+        np.testing.assert_array_equal(one.sources, same.sources)

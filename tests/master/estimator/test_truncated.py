@@ -19,11 +19,11 @@ SIZE = PALM + FREE
 
 
 def mean_within(
-    normal: Float, gradient: Float, x: Float, low: Float, high: Float, rests: bool = False
+    normal: Float, gradient: Float, x: Float, low: Float, high: Float, at_low_limit: bool = False
 ) -> Float:
-    """The step (22,) to the mean of a hand with those limits; `rests`: its fingers rest at their low ones."""
+    """The step (22,) to the mean of a hand with those limits; `at_low_limit`: its fingers rest at their low ones."""
     tables, mean = HandTables.of(RIGHT, PARAMETERS), np.empty(SIZE)
-    tables.low[:], tables.high[:], tables.rests[:] = low, high, rests
+    tables.low[:], tables.high[:], tables.at_low_limit[:] = low, high, at_low_limit
     mean_within_at(boxed(tables), normal, gradient, x, boxed(Cut.empty(FREE, SIZE)), mean)
     return mean
 
@@ -51,7 +51,7 @@ def test_nothing_piles_up_where_a_straight_finger_rests() -> None:
     """At the low limit of a finger that rests there: it does not move up, however poorly it is known."""
     normal, x = np.diag([1.0] * PALM + [16.0] * FREE), np.zeros(FREE)
     zero, far = np.zeros(SIZE), np.full(FREE, 50.0)
-    assert np.abs(mean_within(normal, zero, x, x, far, rests=True)).max() < 1e-9
+    assert np.abs(mean_within(normal, zero, x, x, far, at_low_limit=True)).max() < 1e-9
     assert mean_within(normal, zero, x, x, far)[PALM:].min() > 0.15
 
 

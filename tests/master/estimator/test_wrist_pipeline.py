@@ -524,9 +524,9 @@ def test_a_rendered_curl_from_exact_points(datasets: Path) -> None:
     found = np.degrees([pose.angles_rad[1:, PIP] for pose in poses])
     tracked = np.array([pose.tracked[CHAINS[1:, 1]] for pose in poses])
     # At 80 and 85 degrees the last phalanx hides most of the little finger's line from the camera.
-    usual = (pip < 85.1) & tracked & (truth["laser_len_vis"][:, 2:6] > 0.015)
-    rms = [float(np.sqrt(np.mean((found - pip)[usual[:, f], f] ** 2))) for f in range(4)]
-    assert usual.sum() > 30
+    stationary = (pip < 85.1) & tracked & (truth["laser_len_vis"][:, 2:6] > 0.015)
+    rms = [float(np.sqrt(np.mean((found - pip)[stationary[:, f], f] ** 2))) for f in range(4)]
+    assert stationary.sum() > 30
     assert max(rms) < 2.0, dict(zip(FINGERS[1:], rms, strict=True))
     seen = (pip < 85.1) & (truth["laser_len_vis"][:, 2:6] > 0.015)
     every = [float(np.sqrt(np.mean((found - pip)[seen[:, f], f] ** 2))) for f in range(4)]

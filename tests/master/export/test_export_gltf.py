@@ -55,17 +55,17 @@ class Model:
             nodes[target["node"]][target["path"]] = self.values(sampler["output"])[key]
         out: dict[str, Float] = {}
 
-        def walk(number: int, above: Float) -> None:
+        def process_noise(number: int, above: Float) -> None:
             node = nodes[number]
             own = np.eye(4)
             own[:3, :3] = Rotation.from_quat(node.get("rotation", [0, 0, 0, 1])).as_matrix()
             own[:3, 3] = node.get("translation", [0, 0, 0])
             out[node["name"]] = above @ own
             for child in node.get("children", ()):
-                walk(child, out[node["name"]])
+                process_noise(child, out[node["name"]])
 
         for number in self.json["scenes"][self.json["scene"]]["nodes"]:
-            walk(number, np.eye(4))
+            process_noise(number, np.eye(4))
         return out
 
 

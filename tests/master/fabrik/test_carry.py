@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.arrays import Float
-from master.fabrik.carry import HISTORY, NEVER, SIGHTINGS, Reach, Recent, carry
+from master.fabrik.carry import HISTORY, NEVER, SIGHTINGS, Reach, TrackHistory, carry
 from master.fabrik.sync import FrameSet
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -44,7 +44,7 @@ class Frame:
     t_sigma_ms: float = 0.0
 
 
-def recent(views: list[list[Frame]], scale: Float, row_time_ns: float = 0.0) -> Recent:
+def history(views: list[list[Frame]], scale: Float, row_time_ns: float = 0.0) -> TrackHistory:
     """As `FrameSync` holds them, in any order."""
     shape, markers = (len(views), HISTORY), max(len(one.uv) for view in views for one in view)
     times, marks, t_sigma = (
@@ -59,10 +59,10 @@ def recent(views: list[list[Frame]], scale: Float, row_time_ns: float = 0.0) -> 
             if one.rivals is not None:
                 marks[c, k, 2:4] = one.rivals.T
     count = np.array([len(view) for view in views], np.int64)
-    return Recent(count, times, t_sigma, marks, np.full(len(views), row_time_ns), scale)
+    return TrackHistory(count, times, t_sigma, marks, np.full(len(views), row_time_ns), scale)
 
 
-def carried(held: Recent, t_ns: int = 0, reach_ns: Reach = REACH_NS) -> FrameSet:
+def carried(held: TrackHistory, t_ns: int = 0, reach_ns: Reach = REACH_NS) -> FrameSet:
     shape = (len(held.total), held.marks.shape[3])
     uv, sigma, area = np.empty((2, *shape, 2)), np.empty((2, *shape)), np.empty(shape)
     missing = np.empty(shape[0], np.bool_)
@@ -74,7 +74,7 @@ def carried(held: Recent, t_ns: int = 0, reach_ns: Reach = REACH_NS) -> FrameSet
 
 def carry_one(frames: list[Frame]) -> FrameSet:
     """To time 0, of one camera, whose axis is then taken off."""
-    found = carried(recent([frames], np.array([PX_M])))
+    found = carried(history([frames], np.array([PX_M])))
     named = [None if x is None else x[0] for x in (found.rival_uv, found.rival_sigma_px)]
     return FrameSet(0, found.uv[0], found.sigma_px[0], found.area[0], found.ready_t_ns, found.missing, *named)
 
@@ -214,7 +214,7 @@ def test_a_shifted_picture_or_a_clock_that_began_elsewhere_changes_nothing(
     np.testing.assert_allclose(shifted.uv, plain.uv + shift, atol=1e-8)
     np.testing.assert_allclose(shifted.sigma_px, plain.sigma_px)
     later_ms = tuple(t + late_ms for t in PAST)
-    later = carried(recent([seen(later_ms, places)], np.array([PX_M])), round(late_ms * MS))
+    later = carried(history([seen(later_ms, places)], np.array([PX_M])), round(late_ms * MS))
     np.testing.assert_allclose(later.uv[0], plain.uv, atol=1e-6)
 
 
@@ -257,9 +257,9 @@ def test_cameras_are_carried_each_by_itself() -> None:
     places = 300.0 + rng.normal(0.0, 2.0, (2, SIGHTINGS, 3, 2))
     views = [seen(PAST, places[0]), seen(AHEAD[:2], places[1][:2]), []]
     scale = np.array([1000.0, 700.0, 900.0])
-    together = carried(recent(views, scale))
+    together = carried(history(views, scale))
     for c in range(2):
-        alone = carried(recent([views[c]], scale[c : c + 1]))
+        alone = carried(history([views[c]], scale[c : c + 1]))
         np.testing.assert_allclose(together.uv[c], alone.uv[0])
         np.testing.assert_allclose(together.sigma_px[c], alone.sigma_px[0])
     assert np.isnan(together.uv[2]).all()
@@ -307,7 +307,7 @@ def test_place_and_variance_are_those_of_the_formula(seed: int, count: int, time
 def test_frames_seldom_taken_give_a_finite_place_with_a_wide_sigma(period_s: float) -> None:
     """S is then singular to rounding: the motion's variance exceeds the noise's by 10^15 and more."""
     times = tuple(1e3 * period_s * t for t in (-0.3, -1.3, -2.3, -3.3))
-    held = recent([seen(times, np.random.default_rng(1).uniform(100.0, 400.0, (4, 3, 2)))], np.array([PX_M]))
+    held = history([seen(times, np.random.default_rng(1).uniform(100.0, 400.0, (4, 3, 2)))], np.array([PX_M]))
     found = carried(held, 0, (2**60, 2**60, 2**60, 2**60))
     assert ((found.uv > 0.0) & (found.uv < 1000.0)).all()
     assert (found.sigma_px > 1.0).all()
@@ -329,7 +329,7 @@ def examples() -> list[list[float]]:
             rivals[(rng.uniform(size=places.shape[:2]) < 0.4) | np.isnan(places[..., 0])] = np.nan
             steps = zip(times.tolist(), places, rivals, strict=True)
             views.append([Frame(t, uv, r, float(rng.uniform(0.05, 0.6)), 0.2) for t, uv, r in steps])
-        one = carried(recent(views, np.array([1000.0, 800.0, 1200.0]), 20_600.0))
+        one = carried(history(views, np.array([1000.0, 800.0, 1200.0]), 20_600.0))
         for array in (one.uv, one.sigma_px, one.rival_uv, one.rival_sigma_px):
             found.append([] if array is None else array.ravel().tolist())
     return found

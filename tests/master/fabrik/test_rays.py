@@ -46,8 +46,8 @@ def hand(tilt_rad: float, joints: HandJoints | None = None) -> SolvedHand:
     ends = joints.rotation[TIPS]
     tilt = tilt_rad**2 * (np.eye(3) - ends[:, :, 2:] @ ends[:, :, 2:].swapaxes(1, 2))
     nothing = np.zeros((26, 3, 3))
-    walk = 100.0 * np.trace(tilt, axis1=1, axis2=2)
-    return SolvedHand(palm(), np.zeros((5, 4)), joints, nothing, tilt, walk)
+    process_noise = 100.0 * np.trace(tilt, axis1=1, axis2=2)
+    return SolvedHand(palm(), np.zeros((5, 4)), joints, nothing, tilt, process_noise)
 
 
 def locate(

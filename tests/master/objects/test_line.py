@@ -275,7 +275,7 @@ def test_far_away_the_doubt_of_a_single_tag_reaches_its_other_pose() -> None:
     one = msgspec.structs.replace(CUBE.profile, tags=msgspec.structs.replace(tags, tags=tags.tags[4:]))
     setup = Setup(one, CUBE.rig, CUBE.models)
     at = rigid(axis_rotation(1, np.radians(160.0)), np.array([0.0, 0.0, 0.7]))
-    noise = Noise(stays_px=0.5, fresh_px=0.2)
+    noise = Noise(correlated_px=0.5, independent_px=0.2)
     messages = [m for m in setup.messages(lambda t_s: at, 0.4, 3, noise=noise) if m.camera == "left"]
     poses = [p for p in run(setup.line(), iter(messages)) if np.isfinite(p.position_m).all()]
     assert poses

@@ -17,7 +17,7 @@ from common.object_profile import ObjectProfile
 from common.sim.record import record_scene
 from common.sim.scenes import scene_by_name
 from master.__main__ import main
-from master.calibrate.object.session import lead, progress
+from master.calibrate.object.session import guide, progress
 from master.objects.line import ObjectLine
 from master.recorded import recorded_detections
 from master.rig import load_setup
@@ -162,7 +162,7 @@ class Clock:
 def test_a_person_is_told_that_nothing_comes() -> None:
     said: list[str] = []
     with pytest.raises(Exception, match="no pose came"):
-        lead(lambda wait_s: None, RIG, BEADS, Clock(), said.append, 3.0)
+        guide(lambda wait_s: None, RIG, BEADS, Clock(), said.append, 3.0)
     assert any("phalanx-master run" in line for line in said[1:])
 
 
@@ -181,7 +181,7 @@ def test_markers_of_poses_are_what_is_measured() -> None:
     """A session of poses as a master publishes them is what was placed from the detections."""
     motion = seen(5, 1.5)
     poses = iter([*map(_pose, range(len(motion.t_s)), motion.t_s, motion.points_m, motion.cov_m2)])
-    found = lead(lambda wait_s: next(poses, None), RIG, BEADS, Clock(), lambda line: None, 4.0)
+    found = guide(lambda wait_s: next(poses, None), RIG, BEADS, Clock(), lambda line: None, 4.0)
     np.testing.assert_array_equal(found.points_m, motion.points_m)
 
 

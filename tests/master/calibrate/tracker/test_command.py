@@ -19,7 +19,7 @@ from common.object_profile import ObjectProfile
 from master.__main__ import main
 from master.calibrate.tracker.coverage import coverage_of
 from master.calibrate.tracker.save import read_motion, write_motion
-from master.calibrate.tracker.session import lead
+from master.calibrate.tracker.session import guide
 from master.calibrate.tracker.tracks import object_track, tracker_track
 from master.objects.tracker import TrackerLine
 from master.outputs.devices import DevicePoses
@@ -209,7 +209,7 @@ def played(
 def test_the_guided_motion_ends_by_itself_and_says_what_is_missing_until_then() -> None:
     motion, clock, said = Motion(9, seconds=40.0), Clock(), list[str]()
     held = replace(motion.objects()[0], tracked=False, source=ObjectSource.HELD)
-    session = lead(played([held, *motion.objects(), *motion.tracked()], clock), clock, said.append, 60.0)
+    session = guide(played([held, *motion.objects(), *motion.tracked()], clock), clock, said.append, 60.0)
     assert 15.0 < 1e-9 * (clock.t_ns - ZERO_NS) < 30.0
     assert "as well" in " ".join(said[1:4])
     assert said[-1].startswith("100 %")
@@ -233,7 +233,7 @@ def test_who_is_silent_is_said(left_out: str, text: str) -> None:
     messages: list[ObjectPose | TrackerPose] = [] if left_out in ("object", "both") else [*motion.objects()]
     messages += {"tracker": [], "both": [], "place": nowhere}.get(left_out, motion.tracked())
     try:
-        lead(played(messages, clock), clock, said.append, 7.0)
+        guide(played(messages, clock), clock, said.append, 7.0)
     except FitError as error:
         said.append(str(error))
     assert any(text in line for line in said)

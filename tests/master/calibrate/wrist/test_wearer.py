@@ -204,13 +204,13 @@ def test_what_tells_nothing_or_a_lie_is_refused(
 def test_a_hand_file_says_how_thick_its_fingers_are(people: dict[int, Person]) -> None:
     hand = people[40].hand
     for plain in (hand, replace(hand, radius_m=None)):
-        usual, thick = (
+        typical, thick = (
             Skin.of(HandModel.of(one)) for one in (plain, replace(plain, palmar_scale={"ring": 1.2}))
         )
-        ratio = thick.palmar_m / usual.palmar_m
+        ratio = thick.palmar_m / typical.palmar_m
         np.testing.assert_allclose(ratio[3], 1.2)
         np.testing.assert_allclose(np.delete(ratio, 3, axis=0), 1.0)
-        np.testing.assert_allclose(thick.radius_m / usual.radius_m, ratio)
+        np.testing.assert_allclose(thick.radius_m / typical.radius_m, ratio)
 
 
 @pytest.mark.parametrize(("key", "value"), [("ringfinger", "1.1"), ("ring", "0.1"), ("ring", '"thick"')])

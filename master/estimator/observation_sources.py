@@ -28,7 +28,7 @@ class Ground:
     """
 
     shown: Bool
-    rests: Int
+    sources: Int
     seen: Int
     most: Int
     numbers: Float
@@ -41,7 +41,7 @@ class Ground:
         return record(
             cls,
             shown=("u1", 5),
-            rests=("i8", 6),
+            sources=("i8", 6),
             seen=("i8", 1),
             most=("i8", 1),
             numbers=1,
@@ -62,7 +62,7 @@ def count_rows(mounts: Mounts, observed: Observations, boxed_out: Any) -> None:
     out = boxed_out[0]
     out.seen[0], out.most[0], out.numbers[0], out.back[0] = 0, 0, 0.0, False
     for p in range(6):
-        out.rests[p] = 0
+        out.sources[p] = 0
     for m in range(mounts.finger.shape[0]):
         if not observed.seen[m]:
             continue
@@ -72,11 +72,11 @@ def count_rows(mounts: Mounts, observed: Observations, boxed_out: Any) -> None:
         out.numbers[0] += 3.0 if rays > 1 else 2.0
         out.back[0] = out.back[0] or mounts.on_back[m]
         if f >= 0:
-            out.rests[f] |= ON_MARKERS | (BY_MARKERS if rays > 1 else 0)
-        out.rests[5] |= 1 << (_FIRST_MARKER + m)
+            out.sources[f] |= ON_MARKERS | (BY_MARKERS if rays > 1 else 0)
+        out.sources[5] |= 1 << (_FIRST_MARKER + m)
     for f in range(5):
-        out.shown[f] = out.rests[f] > 0
+        out.shown[f] = out.sources[f] > 0
     out.numbers[0] += _BACK_NUMBERS if out.back[0] else 0.0
     out.by_markers[0] = out.seen[0] >= _PALM_BY or (out.seen[0] == _PALM_BY - 1 and out.back[0] > 0)
     if out.by_markers[0]:
-        out.rests[5] |= ON_MARKERS | BY_MARKERS
+        out.sources[5] |= ON_MARKERS | BY_MARKERS

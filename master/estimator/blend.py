@@ -13,7 +13,7 @@ from math import exp
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from master.estimator.ground import BY_MARKERS
+from master.estimator.observation_sources import BY_MARKERS
 
 PLACE, TURN, ANGLES = slice(0, 3), slice(3, 6), slice(6, 26)
 PARTS: Int = np.repeat([5, 0, 1, 2, 3, 4], [6, 4, 4, 4, 4, 4])  # signal -> finger, or 5: the palm
@@ -26,17 +26,17 @@ _EASE_S = 0.04  # in which the last of what is led fades
 _LITTLE_M, _NOTHING_M = 1e-3, 1e-5  # a part that is led by more is not yet where its markers are
 
 
-class Lead:
+class Blend:
     """Push machine. Holds what is left of leaps, what the hand rested on, its markers and its speed."""
 
-    def __init__(self, lead_m_s: float, on_palm: Bool) -> None:
-        """Lead each part no faster than a speed [m/s]; `on_palm` (M,) says which markers sit on the back."""
-        self._lead_m_s, self._on_palm = lead_m_s, on_palm
+    def __init__(self, blend_m_s: float, on_palm: Bool) -> None:
+        """Blend each part no faster than a speed [m/s]; `on_palm` (M,) says which markers sit on the back."""
+        self._blend_m_s, self._on_palm = blend_m_s, on_palm
         self._offset, self._speed = np.zeros(26), np.zeros(26)
-        self._rests = np.zeros(6, np.int64)
+        self._sources = np.zeros(6, np.int64)
         self._points_m = np.full((len(on_palm), 3), np.nan)
 
-    def push(self, gap_s: float, rests: Int, shown: Float, solved: Float, points_m: Float) -> Float:
+    def push(self, gap_s: float, sources: Int, shown: Float, solved: Float, points_m: Float) -> Float:
         """What is to be added to the solved signals (26,) [m] (`master.estimator.smooth`).
 
         Args:
@@ -52,14 +52,14 @@ class Lead:
             if len(went) and gap_s <= _STALE_S:
                 goes_on[PLACE] = shown[PLACE] + went.mean(axis=0)
             off = np.sqrt(np.bincount(PARTS, np.square(goes_on - solved - self._offset)))
-            placed = (rests & self._rests & BY_MARKERS) > 0
+            placed = (sources & self._sources & BY_MARKERS) > 0
             led = np.bincount(PARTS, np.abs(self._offset)) > _LITTLE_M
-            leaps = ((rests != self._rests) | ~placed | led) & (off > _SUDDEN_M)
+            leaps = ((sources != self._sources) | ~placed | led) & (off > _SUDDEN_M)
             self._offset = np.where(leaps[PARTS], goes_on - solved, self._offset)
             size_m = np.maximum(np.bincount(PARTS, np.abs(self._offset)), _NOTHING_M)
-            left = 1.0 - min(self._lead_m_s * gap_s, _STEP_M) / size_m
+            left = 1.0 - min(self._blend_m_s * gap_s, _STEP_M) / size_m
             self._offset = self._offset * np.maximum(left, exp(-gap_s / _EASE_S))[PARTS]
-        self._rests, self._points_m = rests, points_m
+        self._sources, self._points_m = sources, points_m
         return self._offset
 
     def moved(self, gap_s: float, step: Float) -> None:

@@ -44,7 +44,7 @@ class HabitTables:
         return self._tables[fingers]
 
 
-class Afresh:
+class Reinitialiser:
     """Fits without the state. What it holds was prepared by the constructor."""
 
     def __init__(
