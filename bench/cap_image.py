@@ -199,9 +199,9 @@ def _exposed(
     canvas = _paint(cap, x.astype(np.float32)[None, :], y.astype(np.float32)[:, None], to_light, fine)
     if steps > 1:
         # Instants symmetric about the middle, rounded symmetrically: their mean place is exactly the cap's.
-        instants = (np.arange(steps) + 0.5) / steps - 0.5
+        epochs = (np.arange(steps) + 0.5) / steps - 0.5
         mean = np.zeros((height * fine, width * fine, 4), np.float32)
-        for dx, dy in np.rint(fine * instants[:, None] * np.array(motion)).astype(int).tolist():
+        for dx, dy in np.rint(fine * epochs[:, None] * np.array(motion)).astype(int).tolist():
             mean += canvas[
                 pad * fine - dy : (pad + height) * fine - dy, pad * fine - dx : (pad + width) * fine - dx
             ]

@@ -65,7 +65,7 @@ def _course(axes: Axes, found: Outcome) -> None:
         mean = np.where(known.any(axis=1), mean, np.nan)
         axes.plot(one.t_s[early], mean, color=_COLOURS[kind], linewidth=1.4, label=_NAMES[kind])
     t_s: Float = np.arange(0.0, until_s, 0.02)
-    hidden = (found.shown.sight.cameras_of(t_s, ABOUT_S)[:, 1:5] < 2).mean(axis=1)
+    hidden = (found.shown.line_of_sight.cameras_of(t_s, ABOUT_S)[:, 1:5] < 2).mean(axis=1)
     shade = axes.twinx()
     shade.fill_between(t_s, hidden, step="mid", color="#bbbbbb", alpha=0.4, linewidth=0.0)
     shade.set_ylim(0.0, 1.0)

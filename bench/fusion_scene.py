@@ -130,7 +130,7 @@ class Shown:
     both: Both
     seconds: float
     messages: list[Observed]
-    sight: Sight
+    line_of_sight: Sight
 
 
 def in_order(messages: list[Observed]) -> list[Observed]:

@@ -49,8 +49,8 @@ class Sighted:
         if away is not None:
             before = away.at(t_s - ABOUT_S)
             gone = (gone[0] & before[0], gone[1] & before[1])
-        cameras = shown.sight.cameras_of(t_s, ABOUT_S, gone[0] | (not solved.markers))
-        worn = shown.sight.worn(t_s, ABOUT_S, gone[1] | (not solved.wrist))
+        cameras = shown.line_of_sight.cameras_of(t_s, ABOUT_S, gone[0] | (not solved.markers))
+        worn = shown.line_of_sight.worn(t_s, ABOUT_S, gone[1] | (not solved.wrist))
         oriented = ~gone[1] & solved.wrist
         by = np.concatenate([cameras[:, :_FINGERS] >= 2, worn], axis=1)
         changed = np.zeros(by.shape, np.int64)
@@ -58,7 +58,7 @@ class Sighted:
         total = np.concatenate([np.zeros((1, by.shape[1]), np.int64), np.cumsum(changed, axis=0)])
         first, last = (np.searchsorted(t_s, t_s + way * HAND_OVER_S) for way in (-1.0, 1.0))
         near = total[last] > total[first]
-        hidden = shown.sight.cameras_of(t_s, ABOUT_S)[:, :_FINGERS] < 2
+        hidden = shown.line_of_sight.cameras_of(t_s, ABOUT_S)[:, :_FINGERS] < 2
         return cls(
             cameras, worn, hidden, oriented, not solved.markers, near[:, :_FINGERS] | near[:, _FINGERS:]
         )

@@ -58,12 +58,12 @@ class Outcome:
     """What became of the markers under one course of the light.
 
     Attributes:
-        visible: Sightings to be had: markers at least half visible, over all frames.
+        visible: ImageObservations to be had: markers at least half visible, over all frames.
         found: How many were found.
         swaps: Reports of a marker on the place of another one.
         wrong: All reports that are on no visible part of their marker, swaps included.
         swaps_unwarned: Swaps before the first warning.
-        missed_unwarned: Sightings missed before the first warning.
+        missed_unwarned: ImageObservations missed before the first warning.
         apart: Largest error of the estimated light in log gains of red or blue against green, after the first second.
         refused: Frames in which nothing was reported.
     """

@@ -62,7 +62,7 @@ def rendered(rate_hz: float, offset_s: float, treatment: Treatment) -> Float:
     setup, scene = _scene(rate_hz)
     watched = _watched(rate_hz, offset_s)
     if treatment == "predict":
-        setup = replace(setup, rig=msgspec.structs.replace(setup.rig, pairing="predict"))
+        setup = replace(setup, rig=msgspec.structs.replace(setup.rig, frame_sync="predict"))
     if treatment == "uncorrected":
         watched = tuple(_by_number(one, rate_hz) for one in watched)
         models: dict[str, CameraModel] = {n: replace(m, row_time_ns=0.0) for n, m in setup.models.items()}

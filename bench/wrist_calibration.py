@@ -27,12 +27,12 @@ from common.hand_model import HandModel
 from common.sim.wrist_board import LED_LOBE, LENS_POWER, WristBoardRenderer, WristBoardScene, board_poses
 from common.wrist_calibration import LaserPlane
 from master.calibrate.cameras.boards import Checkerboard, board_corners
+from master.calibrate.wrist.board_pose import place_corners
 from master.calibrate.wrist.flat_command import white_of
 from master.calibrate.wrist.flat_field import fit_flat_field
 from master.calibrate.wrist.laser_command import LinesSeen, lines_of
 from master.calibrate.wrist.lit_views import LitView
 from master.calibrate.wrist.palm_board import Mounting, palm_from_board
-from master.calibrate.wrist.placed import place_corners
 from master.calibrate.wrist.plane import PlaneFit, ViewLine, fit_plane
 from master.calibrate.wrist.wearer import Wearer, calibrate_wearer
 from master.estimator.wrist_pipeline import WristPipeline

@@ -14,7 +14,7 @@ from common.keys import Identity
 
 _PATIENCE_S = 0.5
 _ALONE_S = 2.0  # without anybody for so long, a process says why
-_LOOK_S = 0.25
+_POLL_S = 0.25
 _NOT_YET_VALID, _EXPIRED = 9, 10  # X509_V_ERR_CERT_NOT_YET_VALID, X509_V_ERR_CERT_HAS_EXPIRED of OpenSSL
 _LOG = logging.getLogger(__name__)
 
@@ -127,7 +127,7 @@ def say_why_alone(
 
     def watch() -> None:
         said, since = "", time.monotonic()
-        while not closing.wait(_LOOK_S):
+        while not closing.wait(_POLL_S):
             now = time.monotonic()
             if peers():
                 said, since = "", now

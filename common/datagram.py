@@ -80,7 +80,7 @@ class Refusal(StrEnum):
     )
     IMPOSTOR = "impostor"  # speaks for a camera that it is not
     UNKNOWN = "unknown_camera"  # a slave that this rig does not have
-    RIVAL = "rival"  # a beacon of another master while ours is well
+    OTHER_MASTER = "other_master"  # a beacon of another master while ours is well
     TWIN = "twin"  # a hello of a second process under a name whose first one is well; a beacon that lists it
 
 

@@ -138,12 +138,12 @@ class Backlog(Message, frozen=True, eq=False, tag=True):
     Attributes:
         source: Process name: "master".
         t_ns: When that message was there [ns], master's clock.
-        leave_out: How many instants of each hand are left out, at most, between two that are solved; 0: none.
+        reject: How many instants of each hand are left out, at most, between two that are solved; 0: none.
     """
 
     source: Name
     t_ns: TimeNs
-    leave_out: Annotated[int, Meta(ge=0, le=64)]
+    reject: Annotated[int, Meta(ge=0, le=64)]
 
 
 class Preview(Message, frozen=True, eq=False, tag=True):

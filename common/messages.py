@@ -158,9 +158,9 @@ _DECODER = msgspec.msgpack.Decoder(AnyMessage, dec_hook=_from_bytes)
 
 def encode(message: Message) -> bytes:
     """Return the message as msgpack bytes."""
-    if isinstance(message, MarkerDetections) and not message.has_rivals:
+    if isinstance(message, MarkerDetections) and not message.has_alternatives:
         message = copy(message)
-        msgspec.structs.force_setattr(message, "rival_uv", _NONE)
+        msgspec.structs.force_setattr(message, "alternative_uv", _NONE)
     return _ENCODER.encode(message)
 
 

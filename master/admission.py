@@ -96,8 +96,8 @@ def limits_of(setups: Iterable[RigSetup]) -> dict[str, SenderLimits]:
 def _points(message: Detections | TagDetections) -> tuple[Float, ...]:
     if isinstance(message, WristDetections):
         return message.laser_uv, message.tip_uv
-    if isinstance(message, MarkerDetections) and message.has_rivals:
-        return message.uv, message.rival_uv
+    if isinstance(message, MarkerDetections) and message.has_alternatives:
+        return message.uv, message.alternative_uv
     return (message.uv,)
 
 

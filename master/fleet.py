@@ -19,7 +19,7 @@ from master.master_bus import join_bus
 from master.options import HERE_BUS, BusEnd
 from master.stopping import stop_on_signals
 
-_LOOK_S = 0.1
+_POLL_S = 0.1
 _SILENT_S = 3.0  # three reports
 
 
@@ -160,7 +160,7 @@ def _listen(bus: Bus, roll: Roll, period_s: float, watch: bool, stop: threading.
     inbox = bus.subscribe("health", depth=256)
     told = time.monotonic() + period_s
     while not stop.is_set():
-        health = inbox.get(_LOOK_S)
+        health = inbox.get(_POLL_S)
         if isinstance(health, Health):
             roll.push(health, time.monotonic())
         if time.monotonic() >= told:

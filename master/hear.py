@@ -41,7 +41,7 @@ from master.options import (
 from master.stopping import stop_on_signals
 
 _APPEAR_S = 1.5  # whoever has just connected is not known everywhere yet
-_LOOK_S = 0.1
+_POLL_S = 0.1
 _START_S = 1.0
 _RATE_S = 1.0  # how long datagrams are counted after the first of each
 Heard = dict[str, float]
@@ -100,7 +100,7 @@ def at_master(bus: Bus, names: Sequence[str], seconds: float, stop: threading.Ev
     heard: Heard = {}
     end = time.monotonic() + seconds
     while len(heard) < len(set(names)) and time.monotonic() < end and not stop.is_set():
-        health = inbox.get(_LOOK_S)
+        health = inbox.get(_POLL_S)
         if not isinstance(health, Health):
             continue
         for name in names:
@@ -154,7 +154,7 @@ def _counted(ingest: Ingest, names: Sequence[str], seconds: float, stop: threadi
     first: dict[str, float] = {}
     heard: Heard = {}
     while time.monotonic() - began < seconds and len(heard) < len(set(names)) and not stop.is_set():
-        ingest.get(_LOOK_S)
+        ingest.get(_POLL_S)
         while ingest.get(0.0) is not None:
             pass  # that it came is enough
         now = time.monotonic()
@@ -162,7 +162,7 @@ def _counted(ingest: Ingest, names: Sequence[str], seconds: float, stop: threadi
             count = ingest.counts_of(name).received
             if count:
                 passed_s = now - first.setdefault(name, now)
-                if passed_s >= _RATE_S or now - began > seconds - _LOOK_S:
+                if passed_s >= _RATE_S or now - began > seconds - _POLL_S:
                     heard[name] = count / max(passed_s, _RATE_S)
     return heard
 
@@ -179,7 +179,7 @@ def _running(endpoint: str) -> ZenohBus | None:
     while time.monotonic() < end:
         if MASTER in bus.alive():
             return bus
-        time.sleep(_LOOK_S)
+        time.sleep(_POLL_S)
     bus.close()
     return None
 

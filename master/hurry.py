@@ -7,7 +7,7 @@ queue, and every other camera has one there that is not older. So what is left o
 what is solved in its place: datagrams that come together, and jitter of less than half a period, leave nothing out
 while the solver takes less than a period (waiting is then never longer than the jitter: Lindley's recursion).
 
-How much waits is looked at once for each message that is taken, and nothing but `Hurry.leave_out` comes of it: with the
+How much waits is looked at once for each message that is taken, and nothing but `Hurry.reject` comes of it: with the
 messages and that number, what is solved can be solved again bit for bit (`master.recording`).
 """
 
@@ -72,13 +72,13 @@ class Hurry:
 
     Attributes:
         waiting: Camera -> when its frames are that have come and were not taken yet [ns].
-        leave_out: How many instants are left out between two that are solved, of each hand; 0: none.
+        reject: How many instants are left out between two that are solved, of each hand; 0: none.
     """
 
     def __init__(self, setups: Sequence[RigSetup] = ()) -> None:
         """Of a master of these hands that is not behind; without hands it is as far behind as it is told."""
         self.waiting: Callable[[], Mapping[str, Span]] = dict[str, Span]
-        self.leave_out = 0
+        self.reject = 0
         self._newest_ns: dict[str, int] = {}
         self._cameras: dict[str, list[Cameras]] = {}
         for setup in setups:
@@ -97,7 +97,7 @@ class Hurry:
         behind = bool(waiting and watched) and all(
             cameras.newer_waits(waiting, self._newest_ns, message.t_ns) for cameras in watched or ()
         )
-        self.leave_out = MOST if behind else 0
+        self.reject = MOST if behind else 0
 
 
 class Shedding:
@@ -110,5 +110,5 @@ class Shedding:
 
     def __call__(self) -> bool:
         """Whether the next instant is left out."""
-        self._in_a_row = self._in_a_row + 1 if self._in_a_row < self._hurry.leave_out else 0
+        self._in_a_row = self._in_a_row + 1 if self._in_a_row < self._hurry.reject else 0
         return self._in_a_row > 0

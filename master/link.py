@@ -259,7 +259,7 @@ class MasterLink:
             self.turned_away.twin(hello.name, address[0], WIRE_VERSION, t_ns)
         if rule.reply is Kind.UNPROVEN:
             self.turned_away.unproven(hello.name, address[0], WIRE_VERSION, t_ns)
-            unproven = Unproven(self._nonce, hello.slave_nonce, self._keys.apart)
+            unproven = Unproven(self._nonce, hello.slave_nonce, self._keys.has_secrets)
             self._outbox.append((seal(self._sealer, unproven), address))
         if rule.reply is Kind.WELCOME:
             session = self._of_nonce(sender, hello.slave_nonce)  # its welcome was lost

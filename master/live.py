@@ -22,7 +22,7 @@ from master.hurry import Hurry, Shedding
 from master.ingest import Ingest
 from master.live_report import Reporter, cameras_line, unplaced_line
 from master.loop_watch import WatchedLoop
-from master.master_bus import carry_bus
+from master.master_bus import host_bus
 from master.odd_watch import OddWatch
 from master.outputs.bus import BusSink
 from master.outputs.devices import DevicePoses
@@ -104,7 +104,7 @@ def run_live(
     world = World(setups, pipelines, stages)
     tuning = None if settings.files is None else RigTuning(settings.files, setups, pipelines, say, world)
     with ExitStack() as stack:
-        bus = carry_bus(settings.bus, devices_of(setups))
+        bus = host_bus(settings.bus, devices_of(setups))
         stack.callback(bus.close)
         tap = Tap(bus, clock, always=settings.record is not None)
         stack.callback(tap.close)
@@ -119,7 +119,7 @@ def run_live(
         for sink in sinks:
             stack.callback(sink.close)
         watch = TimeWatch(setups)
-        odd = [OddWatch(setup.rig.cameras) for setup in setups]
+        extrinsics = [OddWatch(setup.rig.cameras) for setup in setups]
         reporter = Reporter(
             cameras_of(setups),
             trackers_of(setups),
@@ -127,7 +127,7 @@ def run_live(
             bus,
             ingest,
             world,
-            list(zip(odd, pipelines, strict=True)),
+            list(zip(extrinsics, pipelines, strict=True)),
             tuning,
             watch,
             figures,

@@ -36,7 +36,7 @@ class Reporter:
         bus: ZenohBus,
         ingest: Ingest,
         world: World,
-        odd: Sequence[tuple[OddWatch, LivePipeline]],
+        extrinsics: Sequence[tuple[OddWatch, LivePipeline]],
         tuning: RigTuning | None,
         watch: TimeWatch,
         figures: RunFigures,
@@ -48,7 +48,7 @@ class Reporter:
         self.session = secrets.randbits(63)
         self._cameras, self._trackers, self._clock, self._bus = cameras, trackers, clock, bus
         self._ingest, self._world, self._figures = ingest, world, figures
-        self._tuning, self._watch, self._odd = tuning, watch, odd
+        self._tuning, self._watch, self._extrinsics = tuning, watch, extrinsics
         self._tap, self._stop, self._say = tap, stop, say
         self._mismatched: frozenset[str] = frozenset()
         bus.announce(MASTER)
@@ -121,7 +121,9 @@ class Reporter:
                 self._watch.follow(self._tuning.setups)
                 self._ingest.limit(limits_of(self._tuning.setups))
             lines = self._watch.look()
-            lines += [line for odd, pipeline in self._odd for line in odd.look(pipeline.counts)]
+            lines += [
+                line for extrinsics, pipeline in self._extrinsics for line in extrinsics.look(pipeline.counts)
+            ]
         except Exception as error:  # noqa: BLE001
             self._ingest.quarantine.note(MASTER, error)
             lines = []

@@ -21,7 +21,7 @@ def join_bus(endpoint: str, site: str | None = None) -> ZenohBus:
     return ZenohBus(None, endpoint, access_of(os.environ, OPERATOR), beyond=True, namespace=site)
 
 
-def carry_bus(endpoint: str, devices: Iterable[str] = ()) -> ZenohBus:
+def host_bus(endpoint: str, devices: Iterable[str] = ()) -> ZenohBus:
     """The bus of a master, which listens at `endpoint`.
 
     Args:

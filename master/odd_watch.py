@@ -11,7 +11,7 @@ class OddWatch:
 
     def __init__(self, cameras: tuple[str, ...]) -> None:
         """Watch the cameras of a rig."""
-        self._left_out = dict.fromkeys(cameras, 0)
+        self._rejected = dict.fromkeys(cameras, 0)
         self._looks = dict.fromkeys(cameras, 0)
         self._poses = 0
 
@@ -24,10 +24,10 @@ class OddWatch:
         lines: list[str] = []
         poses = counts.get("poses", 0) - self._poses
         self._poses += poses
-        for name, before in self._left_out.items():
+        for name, before in self._rejected.items():
             now = counts.get(f"mostly_left_out.{name}"[:_NAME], 0)
             mostly = poses > 0 and now - before > 0.5 * poses
-            self._left_out[name] = now
+            self._rejected[name] = now
             self._looks[name] = self._looks[name] + 1 if mostly else 0
             if self._looks[name] == _LOOKS:
                 lines.append(

@@ -18,7 +18,7 @@ from common.geometry import matrix_to_quaternion, quaternion_to_matrix, transfor
 from common.hand_model import HandModel
 from common.rig_calibration import check_places
 
-_ALIKE = ("markers", "free_markers", "pairing", "filter", "solver")
+_ALIKE = ("markers", "free_markers", "frame_sync", "filter", "solver")
 _UNTURNED = 1e-9  # of a rotation matrix that turns nothing
 
 

@@ -146,7 +146,7 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
         setup.hand,
         rig.markers,
         setup.hand_markers,
-        sync=FrameSync(setup.models, rates, len(rig.markers), policy=rig.pairing, continuous=continuous),
+        sync=FrameSync(setup.models, rates, len(rig.markers), policy=rig.frame_sync, continuous=continuous),
         triangulate=triangulate,
         one_euro=_point_filter(setup) if continuous else None,
         palm=_estimator(setup, continuous=continuous, natural=True),

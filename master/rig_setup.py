@@ -100,7 +100,7 @@ class RigSetup:
             area=message.area[chosen],
             quality=message.quality[chosen],
             sigma_px=message.sigma_px[chosen],
-            rival_uv=message.rival_uv[chosen],
+            alternative_uv=message.alternative_uv[chosen],
         )
 
     @classmethod

@@ -15,7 +15,7 @@ from master.options import HERE_BUS, BusEnd, site_name
 from master.relay import Relay
 from master.stopping import stop_on_signals
 
-_LOOK_S = 0.5
+_POLL_S = 0.5
 
 
 def router(
@@ -43,7 +43,7 @@ def router(
     try:
         _say("router", f"listening on {listen}" + "".join(f", joined with {one}" for one in connect or []))
         joined = 0
-        while not stop.wait(_LOOK_S):
+        while not stop.wait(_POLL_S):
             if bus.peers != joined:
                 joined = bus.peers
                 _say("router", f"joined with {joined} of other routers")

@@ -14,7 +14,7 @@ from common.datagram import HEADER, MAGIC, Header, Kind
 from common.session import RigKeys
 
 LATELY_NS = 1_500_000_000  # both say hello again within a second
-_LOOK_NS = 100_000_000  # a flood of hellos of another version costs one unsealing in so long
+_POLL_NS = 100_000_000  # a flood of hellos of another version costs one unsealing in so long
 
 
 SeenT = TypeVar("SeenT")
@@ -68,7 +68,7 @@ class TurnedAway:
         magic, version, kind, _, rig, key_id, counter = HEADER.unpack_from(datagram)
         if magic != MAGIC or kind != Kind.HELLO or rig != self._keys.rig_tag:
             return
-        self._next_ns = t_ns + _LOOK_NS
+        self._next_ns = t_ns + _POLL_NS
         name = self._keys.name_in(Header(Kind.HELLO, key_id, counter), datagram)
         if name in self._names:
             self._versions[name] = t_ns, Away(host, version)

@@ -325,8 +325,8 @@ class SlaveLink:
         ours = self._offer is not None and unproven.slave_nonce == self._offer.slave_nonce
         if ours:
             why = _SECRET
-            if unproven.apart != self._keys.apart:
-                why = _NO_SECRET if unproven.apart else _MASTER_HAS_NONE
+            if unproven.has_secrets != self._keys.has_secrets:
+                why = _NO_SECRET if unproven.has_secrets else _MASTER_HAS_NONE
             self._wrong = t_ns, why.format(self._name, address[0])
         return self._rule(Event.UNPROVEN if ours else Event.UNPROVEN_UNASKED, t_ns).refusal
 

@@ -17,12 +17,12 @@ from slave.app import run, run_wrist, wait_for_start
 from slave.cameras.source import FrameSource
 from slave.light_report import LightReport
 from slave.markers.beside import told_frames, told_places
-from slave.markers.blind import BlindDetector
 from slave.markers.changing import Changeable, ChangingDetector, marker_changes
 from slave.markers.detector import MarkerDetector
 from slave.markers.engine import Engine
 from slave.markers.following import can_follow, detector_for
 from slave.markers.known import KnownDetector
+from slave.markers.null_detector import NullDetector
 from slave.markers.scan_choice import Scan, ScanChoice
 from slave.overlay import MarkerOverlay, WristOverlay
 from slave.picker import LivePicker
@@ -34,10 +34,10 @@ from slave.tags.live import LiveTags, finder_of
 from slave.tally import Tally
 from slave.tuning import CameraFiles, CameraTuning, Prepare
 from slave.uplink import Uplink
-from slave.wrist.blind import BlindWrist
 from slave.wrist.changing import view_of, wrist_changes
 from slave.wrist.detector import WristDetector
 from slave.wrist.engine import Engine as WristEngine
+from slave.wrist.null_detector import NullWristDetector
 
 Colours = Literal["follow", "fixed", "none"]
 NO_REFERENCE = (
@@ -161,10 +161,10 @@ def _marker_line(
     rig, alive = files.rig, service.working
     tags = LiveTags(files.camera, files.objects)
     if colours == "none":
-        blind, tally = BlindDetector(len(rig.markers)), Tally(rig.markers, tags.counts)
+        null_detector, tally = NullDetector(len(rig.markers)), Tally(rig.markers, tags.counts)
         plain = Previews(name, clock)
         return _Line(
-            lambda: run(source, blind, uplink, name, tally, stop, plain.offer, alive=alive),
+            lambda: run(source, null_detector, uplink, name, tally, stop, plain.offer, alive=alive),
             tally,
             plain,
             None,
@@ -240,7 +240,7 @@ def _wrist_line(
     if colours == "none":
         tally, plain = Tally(()), Previews(name, clock)
         return _Line(
-            lambda: run_wrist(source, BlindWrist(), uplink, name, tally, stop, plain.offer, alive),
+            lambda: run_wrist(source, NullWristDetector(), uplink, name, tally, stop, plain.offer, alive),
             tally,
             plain,
             None,

@@ -130,8 +130,8 @@ def _debian(architecture: str, packages: tuple[str, ...], say: Callable[[str], N
         what = [f"--arch={architecture}", f"--include={','.join(packages)}"]
         _run(["mmdebstrap", "--quiet", *modes, *what, SUITE, str(archive), MIRROR])
         # A /tmp in here would hide the real one from what is emulated, a /dev the real devices.
-        leave_out = [f"--exclude=./{name}" for name in ("dev", "tmp", "proc", "sys", "run")]
-        _run(["tar", "-x", "--no-same-owner", *leave_out, "-f", str(archive), "-C", str(folder)])
+        reject = [f"--exclude=./{name}" for name in ("dev", "tmp", "proc", "sys", "run")]
+        _run(["tar", "-x", "--no-same-owner", *reject, "-f", str(archive), "-C", str(folder)])
 
     return _made(f"{SUITE}-{architecture}-{packages[0]}", f"{packages} {MIRROR}", unpack, say)
 

@@ -76,7 +76,7 @@ def _slave() -> dict[Key, Rule]:
     rules: dict[tuple[State, Event], Rule] = {
         (State.IDLE, Event.BEACON_OTHER): Rule(State.OFFERED, Kind.HELLO),
         (State.OFFERED, Event.BEACON_OTHER): Rule(State.OFFERED, Kind.HELLO),
-        (State.LIVE, Event.BEACON_OTHER): Rule(State.LIVE, refusal=Refusal.RIVAL),
+        (State.LIVE, Event.BEACON_OTHER): Rule(State.LIVE, refusal=Refusal.OTHER_MASTER),
         (State.SILENT, Event.BEACON_OTHER): Rule(State.SILENT, Kind.HELLO),
         (State.OFFERED, Event.WELCOME): Rule(State.LIVE),
         (State.LIVE, Event.SILENCE): Rule(State.SILENT),

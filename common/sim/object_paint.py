@@ -15,7 +15,7 @@ from common.sim import light, raster
 from common.sim.before import NO_PHALANX, REACH_PX, Places, hand_before, things_before
 from common.sim.objects_seen import SeenBead, SeenPart, SeenSheet
 from common.sim.raster import Coverage, Shape
-from common.sim.tag_paint import sheet_look
+from common.sim.tag_paint import sheet_appearance
 from common.sim.view import Snapshot, View
 
 Float32 = npt.NDArray[np.float32]
@@ -106,21 +106,23 @@ class ObjectPainter:
         covers = raster.cover(markers, self._view.exposure_s, self._size)
         return [PaintedFeature(feature, cover) for (feature, _), cover in zip(features, covers, strict=True)]
 
-    def look(self, item: PaintedFeature, box: Box) -> Float32:
+    def appearance(self, item: PaintedFeature, box: Box) -> Float32:
         """Linear light (h, w, 3) of its surface over pixels x0, y0, x1, y1, as if it filled them."""
         if isinstance(item.feature, SeenSheet):
-            return sheet_look(item.feature, raster.moments(item.feature.shape, self._view.exposure_s), box)
+            return sheet_appearance(
+                item.feature, raster.moments(item.feature.shape, self._view.exposure_s), box
+            )
         x0, y0, x1, y1 = box
         bead, corner = item.feature, np.array([x0, y0])
         assert bead.bead.marker is not None
         shades = self._shades[bead.bead.marker]
-        look = np.empty((y1 - y0, x1 - x0, 3), dtype=np.uint8)
-        look[:] = shades[0]
+        appearance = np.empty((y1 - y0, x1 - x0, 3), dtype=np.uint8)
+        appearance[:] = shades[0]
         for band, shade in zip(bead.bands[1:], shades[1:], strict=True):
-            raster.fill(look, raster.fixed(band - corner), shade)
+            raster.fill(appearance, raster.fixed(band - corner), shade)
         spot = bead.shine_uv - corner + SHINE_SHARE * bead.shine_px * self._view.circle
-        raster.fill(look, raster.fixed(spot), self._shine[bead.bead.marker])
-        return self._tables.decode(look)
+        raster.fill(appearance, raster.fixed(spot), self._shine[bead.bead.marker])
+        return self._tables.decode(appearance)
 
     def truth(self, snapshot: Snapshot, painted: Sequence[PaintedFeature]) -> Mapping[str, ObjectView]:
         """What is visible of every tracked object of the scene."""

@@ -166,36 +166,36 @@ class Painter:
             alpha = cover.alpha[cy0 - cover.y : cy1 - cover.y, cx0 - cover.x : cx1 - cover.x, None]
             box = cx0, cy0, cx1, cy1
             if isinstance(item, Painted):
-                look = self._tables.decode(self._look(item, snapshot, box))
+                appearance = self._tables.decode(self._appearance(item, snapshot, box))
             else:
-                look = self._objects.look(item, box)
+                appearance = self._objects.appearance(item, box)
             part = window[cy0 - y0 : cy1 - y0, cx0 - x0 : cx1 - x0]
-            part += (look - part) * alpha
+            part += (appearance - part) * alpha
         window = cv2.GaussianBlur(window, (3, 3), LENS_SIGMA_PX)
         left, top = int(x0 > 0), int(y0 > 0)
         inner = window[top : -1 if y1 < height else None, left : -1 if x1 < width else None]
         return x0 + left, y0 + top, self._tables.encode(np.asarray(inner, dtype=np.float32))
 
-    def _look(self, item: Painted, snapshot: Snapshot, box: Window) -> Image:
+    def _appearance(self, item: Painted, snapshot: Snapshot, box: Window) -> Image:
         """Colours of one marker's surface over a pixel box, as if it filled it."""
         x0, y0, x1, y1 = box
-        look = np.empty((y1 - y0, x1 - x0, 3), dtype=np.uint8)
+        appearance = np.empty((y1 - y0, x1 - x0, 3), dtype=np.uint8)
         cap = self._caps.get(item.marker)
         if cap is not None:
             base, *bands = self._shades[item.marker]
-            cv2.rectangle(look, (0, 0), (x1 - x0, y1 - y0), base, cv2.FILLED)
+            cv2.rectangle(appearance, (0, 0), (x1 - x0, y1 - y0), base, cv2.FILLED)
             corners = snapshot.bands[cap] - raster.fixed(np.array([x0, y0]))
             for outline, colour in zip(corners, bands, strict=True):
-                raster.fill(look, outline, colour)
-            return look
+                raster.fill(appearance, outline, colour)
+            return appearance
         side = self._boxes[item.marker]
-        cv2.rectangle(look, (0, 0), (x1 - x0, y1 - y0), self._sides[item.marker], cv2.FILLED)
+        cv2.rectangle(appearance, (0, 0), (x1 - x0, y1 - y0), self._sides[item.marker], cv2.FILLED)
         top = snapshot.points[side][:4]
         normal = unit(cross(top[1] - top[0], top[3] - top[0]))
         facing = float(normal @ self._view.to_light) * (-1.0 if float(normal @ top[0]) > 0.0 else 1.0)
         corners = raster.fixed(snapshot.uv[side][:4] - (x0, y0))
-        raster.fill(look, corners, light.face_shade(self._paint[item.marker], facing))
-        return look
+        raster.fill(appearance, corners, light.face_shade(self._paint[item.marker], facing))
+        return appearance
 
     def clusters(self, painted: Covered) -> list[list[AnyPainted]]:
         """Markers whose windows touch, together; markers outside the image or hidden left out."""

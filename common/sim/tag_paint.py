@@ -29,7 +29,7 @@ def printed(family: TagFamily, number: int) -> Image:
     return np.pad(np.rint(255.0 * ink), _BLEED, mode="edge").astype(np.uint8)
 
 
-def sheet_look(seen: SeenSheet, moments_s: Float, box: tuple[int, int, int, int]) -> Float32:
+def sheet_appearance(seen: SeenSheet, moments_s: Float, box: tuple[int, int, int, int]) -> Float32:
     """Linear light (h, w, 3), blue first, of a tag over a box of pixels x0, y0, x1, y1, as if it filled it.
 
     Args:

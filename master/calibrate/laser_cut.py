@@ -88,8 +88,8 @@ class LaserCut:
         lit = np.isfinite(far) & ((body >= ROOT - 1) | ~thumb)
         points = laser + np.where(lit, far, 1.0) * rays
         distance = np.sqrt((points * points).sum(axis=0))
-        sights, from_camera = points / distance, _known(chain, np.zeros(3))
-        before = _hits(from_camera, sights)
+        lines_of_sight, from_camera = points / distance, _known(chain, np.zeros(3))
+        before = _hits(from_camera, lines_of_sight)
         seen_at = before.min(axis=0)
         # How clearly it is seen [m]: at most _SEEN_M, and not at all below 0.
         clear = np.where(lit, np.minimum(seen_at - distance, 0.0) + _SEEN_M, -np.inf)
@@ -98,7 +98,7 @@ class LaserCut:
         whole &= (step * step).sum(axis=0) < (_STRETCH * broad) ** 2
         first, last = _seen_part(clear[:-1], clear[1:])
         cut = np.nonzero(whole & ((clear[1:] > 0.0) != (clear[:-1] > 0.0)))
-        _at_edge(first, last, cut, clear, sights, before, from_camera)
+        _at_edge(first, last, cut, clear, lines_of_sight, before, from_camera)
         image = points[:2] / points[2]
         step = image[:, 1:] - image[:, :-1]
         weight = np.where(whole, np.sqrt((step * step).sum(axis=0)) * (last - first), 0.0)
@@ -180,7 +180,7 @@ def _at_edge(
     last: Float,
     cut: tuple[Int, ...],
     clear: Float,
-    sights: Float,
+    lines_of_sight: Float,
     before: Float,
     from_camera: Float,
 ) -> None:
@@ -201,8 +201,8 @@ def _at_edge(
     hidden, seen = np.where(rises, chord, chord + 1), np.where(rises, chord + 1, chord)
     body = before[:, hidden, pose].argmin(axis=0)
     known = from_camera[:, body, pose]
-    inside, foot = _depths(known, sights[:, hidden, pose])
-    outside, _ = _depths(known, sights[:, seen, pose])
+    inside, foot = _depths(known, lines_of_sight[:, hidden, pose])
+    outside, _ = _depths(known, lines_of_sight[:, seen, pose])
     crossed = (inside > 0.0) & (outside < 0.0)
     crossed[2] &= (foot > 0.0) & (foot < known[6])
     share = np.where(crossed, outside / np.where(crossed, outside - inside, 1.0), np.inf).min(axis=0)

@@ -21,7 +21,7 @@ from master.rig_setup import RigSetup
 from master.sequence import CameraCounts
 from master.turned_away import Away, MarkerCounts
 
-LOOK_S = 0.2
+POLL_S = 0.2
 EVERY_NS = 1_000_000_000  # and at once where it changes
 DEPTH = 64  # reports of slaves that may wait for a look: 32 senders, twice a second
 
@@ -114,7 +114,7 @@ class ChecklistFeed:
 
     def work(self, stop: threading.Event, setups: Callable[[], Sequence[RigSetup]] | None) -> None:
         """Look again and again until the stop; `setups` says which are in use."""
-        while not stop.wait(LOOK_S):
+        while not stop.wait(POLL_S):
             try:
                 self.look(None if setups is None else setups())
             except BusError:

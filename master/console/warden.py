@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterable
 
 ENDS_S = 4.0
-_LOOK_S = 0.05
+_POLL_S = 0.05
 
 
 def watch(lines: Iterable[str]) -> set[int]:
@@ -31,7 +31,7 @@ def end_groups(groups: set[int], ends_s: float = ENDS_S) -> None:
     left = {group for group in groups if _send(group, signal.SIGTERM)}
     deadline = time.monotonic() + ends_s
     while left and time.monotonic() < deadline:
-        time.sleep(_LOOK_S)
+        time.sleep(_POLL_S)
         left = {group for group in left if _send(group, 0)}
     for group in left:
         _send(group, signal.SIGKILL)

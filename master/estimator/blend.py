@@ -52,9 +52,9 @@ class Blend:
             if len(went) and gap_s <= _STALE_S:
                 goes_on[PLACE] = shown[PLACE] + went.mean(axis=0)
             off = np.sqrt(np.bincount(PARTS, np.square(goes_on - solved - self._offset)))
-            placed = (sources & self._sources & BY_MARKERS) > 0
+            triangulated = (sources & self._sources & BY_MARKERS) > 0
             led = np.bincount(PARTS, np.abs(self._offset)) > _LITTLE_M
-            leaps = ((sources != self._sources) | ~placed | led) & (off > _SUDDEN_M)
+            leaps = ((sources != self._sources) | ~triangulated | led) & (off > _SUDDEN_M)
             self._offset = np.where(leaps[PARTS], goes_on - solved, self._offset)
             size_m = np.maximum(np.bincount(PARTS, np.abs(self._offset)), _NOTHING_M)
             left = 1.0 - min(self._blend_m_s * gap_s, _STEP_M) / size_m

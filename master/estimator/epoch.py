@@ -121,7 +121,7 @@ class Fitted:
         anew: The hand of a moment ago was wrong: nothing of it is in this one.
         level: (5,) `Level` codes of what a wrist device tells the fingers from, now.
         ambiguous: (5,) whether another pose of the finger explains that as well.
-        turn_left_out: Whether the palm by markers contradicts how other sensors have it turned, which was left out.
+        rotation_rejected: Whether the palm by markers contradicts how other sensors have it turned, which was left out.
         refused, off: (5,) fingertips and laser points that no pose explains.
     """
 
@@ -133,6 +133,6 @@ class Fitted:
     reinitialised: bool = False
     level: Code = field(default_factory=lambda: np.zeros(5, np.uint8))
     ambiguous: Bool = field(default_factory=lambda: np.zeros(5, np.bool_))
-    turn_left_out: bool = False
+    rotation_rejected: bool = False
     refused: Bool = field(default_factory=lambda: np.zeros(5, np.bool_))
     off: Bool = field(default_factory=lambda: np.zeros(5, np.bool_))

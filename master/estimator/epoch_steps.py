@@ -68,14 +68,14 @@ class EpochSteps:
         self._rig = Rig(HandTables.of(model, parameters), mounts, CameraArrays.of(cameras), device)
         n = len(parameters.free)
         self.observed = observed = Observations.empty(len(cameras), count)
-        self.placed: Bool = np.zeros(count, np.bool_)
+        self.triangulated: Bool = np.zeros(count, np.bool_)
         self._blank = Blank.of(n, extras, len(cameras), count)
         # Records are used by their fields here, and handed to kernels in the arrays that they lie in.
         self.state = state = HandState.unknown(n, extras)
         space = Workspace.empty(n, extras, _capacity(count))
         self.now, self.at = fields(state), fields(space)
         self._state, self._space, self._work = boxed(state), boxed(space), boxed(Scratch.empty())
-        self._ground, self._sights = self._space["ground"], self._space["belief"]["sights"]
+        self._ground, self._lines_of_sight = self._space["ground"], self._space["belief"]["sights"]
         hand, device = boxed(self._rig.hand), boxed(device)
         self._model = Model(hand, boxed(settings.record()), mounts, self._rig.cameras, device)
         self.at.room.search.bend_share[0] = settings.bend_share
@@ -89,7 +89,7 @@ class EpochSteps:
         self._points = bound(observe_points, room[2], own[self.on_hand], 0.0, observed)
         self._count = bound(count_rows, mounts, observed, self._ground)
         self._triple = bound(
-            observe_wrist, device, none, each, each, none, each, each, 0.0, 0.0, 0.0, self._sights
+            observe_wrist, device, none, each, each, none, each, each, 0.0, 0.0, 0.0, self._lines_of_sight
         )
         self._pose = bound(pose, hand, mounts, _AT_ORIGIN, np.zeros(20), self._work, *room)
         rig, state, space = self._model, self._state, self._space
@@ -110,12 +110,12 @@ class EpochSteps:
 
     def observe(self, at: Epoch, *, continuous: bool) -> None:
         """Write the rows of an epoch, and count them."""
-        task, sights = self.at.task, self.at.belief.sights
+        task, lines_of_sight = self.at.task, self.at.belief.lines_of_sight
         task.t_ns[0], task.second_order[0], task.continuous[0] = at.t_ns, at.second_order, continuous
         task.process_noise_rad2[0] = 0.0 if at.turn is None else at.turn.process_noise_rad2
         if at.wrist is None:
-            sights.rows[0] = 0.0
-            sights.lit[:] = sights.shown[:] = 0.0
+            lines_of_sight.rows[0] = 0.0
+            lines_of_sight.lit[:] = lines_of_sight.shown[:] = 0.0
         else:
             self.at.prior.law[:] = at.wrist.law
             self._triple(
@@ -129,7 +129,7 @@ class EpochSteps:
                 self._settings.light_rad,
                 at.wrist.laser_s,
                 at.wrist.tip_s,
-                self._sights,
+                self._lines_of_sight,
             )
         if at.uv is None and at.cov_m2 is None:
             self.observed.seen[:] = False
@@ -145,7 +145,9 @@ class EpochSteps:
             uv, variance = np.ascontiguousarray(at.uv), np.ascontiguousarray(at.variance_px2)
             self._rays(uv, variance, own, self.on_hand, self.observed)
         measured = at.cov_m2 is not None
-        self.placed = self.observed.placed if measured else np.isfinite(at.points_m[self.on_hand].sum(axis=1))
+        self.triangulated = (
+            self.observed.triangulated if measured else np.isfinite(at.points_m[self.on_hand].sum(axis=1))
+        )
         self._count(self._model.mounts, self.observed, self._ground)
 
     def prepare(self) -> None:
@@ -160,8 +162,8 @@ class EpochSteps:
         belief.depth_w2[0] = 0.0
         if known and ground.most[0] == 1:
             alone = self._rig.cameras.centre[(self.observed.weight > 0.0).sum(axis=1).argmax()]
-            sight = self.now.palm[:3, 3] - alone
-            belief.sight[:] = sight / np.sqrt(sight @ sight)
+            line_of_sight = self.now.palm[:3, 3] - alone
+            belief.line_of_sight[:] = line_of_sight / np.sqrt(line_of_sight @ line_of_sight)
             belief.depth_w2[0] = self._settings.held_depth_m**-2.0
         belief.turned[0] = turn is not None
         if turn is not None:
@@ -203,7 +205,7 @@ class EpochSteps:
         """
         if at.place is not None:
             return True
-        points = at.points_m[self.on_hand][self.placed]
+        points = at.points_m[self.on_hand][self.triangulated]
         if at.turn is not None and at.turn.sure:
             return len(points) > 0
         if len(points) < 2:

@@ -121,7 +121,7 @@ class Estimator:
         known = self.has_previous(at.t_ns)
         steps.believe(at, known=known)
         doubtful = self.wrist and at.turn is not None and bool(ground.by_markers[0])
-        before, left_out = steps.kept() if doubtful else None, False
+        before, rejected = steps.kept() if doubtful else None, False
         out, reinitialised = self._solve(at, known=known)
         if out is not None and before is not None and self._at.found.contrary[0] > self.settings.contrary:
             # What the IMU says is left out: it began anew, or the wrist was flicked. But not where it alone tells.
@@ -129,8 +129,8 @@ class Estimator:
                 steps.put_back(before)
                 steps.believe(replace(at, turn=turn), known=known)
                 out, reinitialised = self._solve(replace(at, turn=turn), known=known)
-                left_out = turn is None
-                if left_out and np.trace(self._at.found.cov[:3, :3]) < _SURE_RAD2:
+                rejected = turn is None
+                if rejected and np.trace(self._at.found.cov[:3, :3]) < _SURE_RAD2:
                     break
         told = self.wrist and bool(task.level.any())
         if ground.seen[0] > 0 or (told and (at.place is not None or self._knows_place())):
@@ -139,7 +139,7 @@ class Estimator:
         return (
             _unknown(sources)
             if out is None
-            else self._fitted(at, out, sources, reinitialised=reinitialised, left_out=left_out)
+            else self._fitted(at, out, sources, reinitialised=reinitialised, rejected=rejected)
         )
 
     def _solve(self, at: Epoch, *, known: bool) -> tuple[Estimate | None, bool]:
@@ -205,7 +205,7 @@ class Estimator:
         return np.array(sources)
 
     def _fitted(
-        self, at: Epoch, out: Estimate, sources: Int, *, reinitialised: bool, left_out: bool
+        self, at: Epoch, out: Estimate, sources: Int, *, reinitialised: bool, rejected: bool
     ) -> Fitted:
         found, task = self._at.found, self._at.task
         has_previous = (at.t_ns - int(self._now.seen_ns[0])) * 1e-9 <= self.settings.forget_s
@@ -234,7 +234,7 @@ class Estimator:
             reinitialised,
             level=task.level.copy(),
             ambiguous=task.ambiguous.astype(np.bool_),
-            turn_left_out=left_out,
+            rotation_rejected=rejected,
             refused=task.refused.astype(np.bool_),
             off=task.off.astype(np.bool_),
         )

@@ -111,7 +111,7 @@ class WristSide:
         self._count("ambiguous", hand.ambiguous)
         if self.forearm is None or hand.solution is None or not hand.sources[5] & ON_MARKERS:
             return
-        if turned and self.forearm.contradicted(t_ns, by_palm=hand.turn_left_out):
+        if turned and self.forearm.contradicted(t_ns, by_palm=hand.rotation_rejected):
             estimator.forget_heading()
             turned = False
         if turned:
@@ -172,7 +172,7 @@ class FusedPipeline:
         t_ns = self._side.push(message)
         if t_ns is None or (self._last_ns is not None and t_ns - self._last_ns <= self._silent_ns):
             return []
-        solved = self._markers.blind(t_ns, message.ready_t_ns)
+        solved = self._markers.no_observation(t_ns, message.ready_t_ns)
         self.counts["poses_by_wrist"] += 1
         return [] if solved is None else [solved]
 

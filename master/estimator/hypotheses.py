@@ -92,7 +92,7 @@ class Hypothesis:
     surprise: Float
     information: Float
     cost: Float
-    apart: Float
+    outliers: Float
     share: Float
     step: Float
     off: Float
@@ -111,7 +111,7 @@ class Hypothesis:
             surprise=markers,
             information=(markers, 3, 3),
             cost=1,
-            apart=1,
+            outliers=1,
             share=1,
             step=N,
             off=N,

@@ -132,13 +132,13 @@ class MarkerPipeline:
         """Take one camera's detections; return the poses they complete, oldest first."""
         if late_ns := self._late_ns.get(message.camera):
             message = restamped(message, t_ns=message.t_ns + late_ns)
-        with self._stage("pairing"):
+        with self._stage("frame_sync"):
             sets = self._line.sync.push(message)
         if self._line.sync.outdated:
             self.counts["instants_outdated"] = self._line.sync.outdated
         return self._solved(sets)
 
-    def blind(self, t_ns: int, ready_t_ns: int) -> SolvedPose | None:
+    def no_observation(self, t_ns: int, ready_t_ns: int) -> SolvedPose | None:
         """The pose at an epoch at which no camera saw anything, by what else watches the hand; None: it is past."""
         shape = (len(self._names), len(self.markers))
         unseen, nothing = np.full(shape, np.nan), np.full((*shape, 2), np.nan)
@@ -178,15 +178,15 @@ class MarkerPipeline:
         with self._stage("triangulate"):
             if self._lens_shift.any:
                 frames = replace(frames, uv=self._lens_shift.centres(frames.uv, frames.area))
-            if frames.rival_uv is not None:
+            if frames.alternative_uv is not None:
                 frames = self._associated(frames)
         line = self._line.solve(frames, last, age_s)
         hand: HandEstimate | Fitted = line
         found = line.markers
         if self._estimator is not None:
-            found = self._placed(frames, line, last, age_s)
+            found = self._triangulated(frames, line, last, age_s)
             hand = self._fitted(self._estimator, frames, line, found)
-        if found.apart.any() or found.left_out.any():
+        if found.outliers.any() or found.rejected.any():
             self._count_outliers(found, frames)
         pose = pose_of(hand, self.model, t_ns, line.smooth_m, line.markers, self._volume)
         if self._side is not None and self._estimator is not None:
@@ -205,15 +205,17 @@ class MarkerPipeline:
             return None
         return self._last.solution
 
-    def _placed(
+    def _triangulated(
         self, frames: FrameSet, line: HandEstimate, last: SolvedHand | None, age_s: float
     ) -> MarkerPositions:
         """The markers by the rays of all cameras; the line's own where it goes by these."""
         if self._rays is None or isinstance(line.markers, RayPositions):
             return line.markers
         with self._stage("triangulate"):
-            near = last or line.solution
-            return self._rays(frames.uv, frames.sigma_px, frames.area, near, age_s, as_seen=near is None)
+            warm_start = last or line.solution
+            return self._rays(
+                frames.uv, frames.sigma_px, frames.area, warm_start, age_s, as_seen=warm_start is None
+            )
 
     def _fitted(
         self, estimator: Estimator, frames: FrameSet, line: HandEstimate, found: MarkerPositions
@@ -257,25 +259,31 @@ class MarkerPipeline:
 
     def _associated(self, frames: FrameSet) -> FrameSet:
         """The epoch with one place for each marker."""
-        assert frames.rival_uv is not None
-        assert frames.rival_sigma_px is not None
-        in_doubt = np.isfinite(frames.rival_uv[..., 0]).any(axis=0)
+        assert frames.alternative_uv is not None
+        assert frames.alternative_sigma_px is not None
+        in_doubt = np.isfinite(frames.alternative_uv[..., 0]).any(axis=0)
         if not in_doubt.any():  # an alternative was named in a frame nearby, and is not carried to this epoch
-            return replace(frames, rival_uv=None)
+            return replace(frames, alternative_uv=None)
         first = triangulate(self._cameras, frames.uv, frames.sigma_px, self._rays_px)
-        clear = np.where((in_doubt | first.apart)[:, None], np.nan, first.points_m)
+        clear = np.where((in_doubt | first.outliers)[:, None], np.nan, first.points_m)
         others = self._line.solve_once(clear, first.cov_m2, frames.area)
-        chosen = associate(
+        associated = associate(
             self._cameras,
             (frames.uv, frames.sigma_px, frames.area),
-            (frames.rival_uv, frames.rival_sigma_px),
+            (frames.alternative_uv, frames.alternative_sigma_px),
             among(clear, self._on_hand) if others is None else self._expected(others),
             (self._was_m, np.asarray((frames.t_ns - self._was_ns) * 1e-9, np.float64)),
             self._rays_px,
         )
-        self._count("rival", chosen.taken)
-        self._count("unclear", chosen.dropped)
-        return replace(frames, uv=chosen.uv, sigma_px=chosen.sigma_px, area=chosen.area_px2, rival_uv=None)
+        self._count("alternative", associated.taken)
+        self._count("unclear", associated.dropped)
+        return replace(
+            frames,
+            uv=associated.uv,
+            sigma_px=associated.sigma_px,
+            area=associated.area_px2,
+            alternative_uv=None,
+        )
 
     def _expected(self, hand: SolvedHand) -> Prior:
         """Where a hand has the markers."""
@@ -292,12 +300,12 @@ class MarkerPipeline:
 
     def _count_outliers(self, found: MarkerPositions, frames: FrameSet) -> None:
         """Count markers whose rays do not meet, and what is left out of each camera."""
-        if found.apart.any():
-            self._count("apart", found.apart)
-            self.counts["epipolar_misfits"] += int(found.apart.sum())
+        if found.outliers.any():
+            self._count("apart", found.outliers)
+            self.counts["epipolar_misfits"] += int(found.outliers.sum())
         sees = np.isfinite(frames.uv[..., 0]) & np.isfinite(found.points_m[:, 0])
-        mostly = found.left_out.sum(axis=1) > 0.5 * sees.sum(axis=1)
-        for c in np.flatnonzero(found.left_out.any(axis=1)):
-            self.counts[f"left_out.{self._names[c]}"[:_NAME]] += int(found.left_out[c].sum())
+        mostly = found.rejected.sum(axis=1) > 0.5 * sees.sum(axis=1)
+        for c in np.flatnonzero(found.rejected.any(axis=1)):
+            self.counts[f"rejected.{self._names[c]}"[:_NAME]] += int(found.rejected[c].sum())
             if mostly[c]:
                 self.counts[f"mostly_left_out.{self._names[c]}"[:_NAME]] += 1

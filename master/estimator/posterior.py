@@ -79,7 +79,7 @@ def _solve_each(
         one.cost[0] = linearise(
             rig, habits, belief, observed, h, one.palm, one.x, one.z, one.gradient, one.normal, room.search
         )
-        one.apart[0] = room.search.apart[0]
+        one.outliers[0] = room.search.outliers[0]
         for m in range(rig.mounts.finger.shape[0]):
             one.surprise[m] = room.search.surprise[m]
             for i in range(3):
@@ -143,7 +143,7 @@ def _covariance(
             A[6 + i, 6 + i] -= rig.hand.beyond_w2[i]
     for i in range(3):
         for j in range(i + 1):
-            A[3 + i, 3 + j] -= belief.depth_w2[0] * belief.sight[i] * belief.sight[j]
+            A[3 + i, 3 + j] -= belief.depth_w2[0] * belief.line_of_sight[i] * belief.line_of_sight[j]
     if not cholesky(A, N, room.L):  # by rounding: nothing is known but limits
         known = rig.hand.anywhere.shape[0]
         for i in range(N):
@@ -154,7 +154,7 @@ def _covariance(
         return 1.0
     inverse(room.L, N, room.work, room.cov)
     past = past_cost(belief, one.palm, one.x, room.search.off)
-    chi2 = 2.0 * (one.cost[0] - past - one.apart[0] - _least(habits, belief, h, room))
+    chi2 = 2.0 * (one.cost[0] - past - one.outliers[0] - _least(habits, belief, h, room))
     free = max(numbers - 6.0, 0.0)
     scale = max((settings.claimed + max(chi2, 0.0)) / (settings.claimed + free), 1.0)
     for i in range(N):
@@ -252,7 +252,7 @@ def _onto(
     """
     n, N, between, likely = out.x.shape[0], room.middle.shape[0], blank.between, room.each[best]
     for m in range(rig.mounts.finger.shape[0]):
-        between.seen[m] = between.placed[m] = observed.seen[m]
+        between.seen[m] = between.triangulated[m] = observed.seen[m]
         for i in range(3):
             between.point[m, i] = 0.0
             for j in range(3):

@@ -8,7 +8,7 @@ from master.estimator.cameras import CameraArrays
 from master.estimator.finger_surface import Surface
 from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.kinematics import Scratch
-from master.estimator.wrist_device import Device, Sights
+from master.estimator.wrist_device import Device, LinesOfSight
 
 
 class Rig(NamedTuple):
@@ -45,7 +45,7 @@ class Belief:
     past: Float
     palm: Float
     palm_w2: Float
-    sight: Float
+    line_of_sight: Float
     depth_w2: Float
     facing: Float
     facing_w2: Float
@@ -58,7 +58,7 @@ class Belief:
     axes: Float
     place: Float
     place_w2: Float
-    sights: Sights
+    lines_of_sight: LinesOfSight
 
     @classmethod
     def none(cls, n: int, extras: int) -> "Belief":
@@ -71,7 +71,7 @@ class Belief:
             past=n,
             palm=(4, 4),
             palm_w2=6,
-            sight=3,
+            line_of_sight=3,
             depth_w2=1,
             facing=3,
             facing_w2=1,
@@ -84,7 +84,7 @@ class Belief:
             axes=(3, 3),
             place=3,
             place_w2=1,
-            sights=Sights.empty(),
+            lines_of_sight=LinesOfSight.empty(),
         )
 
 
@@ -119,7 +119,7 @@ class Search:
     held: Bool  # (N,)
     surprise: Float  # (M,)
     information: Float  # (M, 3, 3)
-    apart: Float  # (1,)
+    outliers: Float  # (1,)
     rows: Scratch
 
     @classmethod
@@ -156,7 +156,7 @@ class Search:
             held=("u1", N),
             surprise=markers,
             information=(markers, 3, 3),
-            apart=1,
+            outliers=1,
             rows=Scratch.empty(),
         )
         room.bend_share[0] = 1.0

@@ -74,13 +74,13 @@ class Reinitialiser:
 
     def _begin_with(self, at: Epoch, shown: frozenset[int], like: frozenset[int]) -> float:
         """As `begin`, while the hidden fingers of `like` are bent as their neighbours."""
-        steps, apart, start = self._steps, frozenset(range(5)) - shown - like, at.start
+        steps, outliers, start = self._steps, frozenset(range(5)) - shown - like, at.start
         task, belief, room = steps.at.task, steps.at.belief, steps.at.room
         belief.past_w2[:], belief.past[:], belief.palm_w2[:], belief.depth_w2[:] = 0.0, 0.0, 0.0, 0.0
-        fingers = np.isin(np.arange(5), list(apart))
+        fingers = np.isin(np.arange(5), list(outliers))
         belief.own_w2[:], belief.own[:] = curled(self._parameters, self._settings, fingers)
         task.natural[0], task.counts[0] = _EVEN, 0.0
-        habits = self._habits.unlike(apart)
+        habits = self._habits.unlike(outliers)
         try:
             if start is not None:
                 shows = steps.at.ground.shown[self._finger_of_free] > 0
@@ -109,13 +109,13 @@ class Reinitialiser:
             T = np.eye(4)
             T[:3, :3], T[:3, 3] = turned, epoch.place
             return [(T, self._as_told(self._natural.copy()))]
-        placed = steps.placed
-        weight = np.where(steps.finger[placed] >= 0, 1.0, _PALM_WEIGHT)
-        observed = epoch.points_m[steps.on_hand][placed]
+        triangulated = steps.triangulated
+        weight = np.where(steps.finger[triangulated] >= 0, 1.0, _PALM_WEIGHT)
+        observed = epoch.points_m[steps.on_hand][triangulated]
         starts: list[tuple[Float, Float]] = []
         for posture in self._postures:
             x = self._as_told(posture.copy())
-            expected = steps.pose(_AT_ORIGIN, self._parameters.angles(x))[1][placed]
+            expected = steps.pose(_AT_ORIGIN, self._parameters.angles(x))[1][triangulated]
             if turned is not None and epoch.turn is not None and epoch.turn.sure:
                 T = np.eye(4)
                 T[:3, :3] = turned

@@ -56,7 +56,7 @@ def past_cost(belief: Belief, T: Float, x: Float, off: Float) -> float:
     for i in range(6):
         cost += 0.5 * belief.palm_w2[i] * off[i] * off[i]
     for i in range(3):
-        depth += belief.sight[i] * off[3 + i]
+        depth += belief.line_of_sight[i] * off[3 + i]
     cost += 0.5 * belief.depth_w2[0] * depth * depth
     for i in range(x.shape[0]):
         cost += 0.5 * belief.past_w2[i] * (x[i] - belief.past[i]) ** 2
@@ -97,14 +97,14 @@ def _believed(
     cost = past_cost(belief, T, x, search.off) + own_cost(habits, belief, h, x)
     depth = 0.0
     for i in range(3):
-        depth += belief.sight[i] * search.off[3 + i]
+        depth += belief.line_of_sight[i] * search.off[3 + i]
     for i in range(6):
         gradient[i] = belief.palm_w2[i] * search.off[i]
         normal[i, i] = belief.palm_w2[i]
     for i in range(3):
-        gradient[3 + i] += belief.depth_w2[0] * depth * belief.sight[i]
+        gradient[3 + i] += belief.depth_w2[0] * depth * belief.line_of_sight[i]
         for j in range(3):
-            normal[3 + i, 3 + j] += belief.depth_w2[0] * belief.sight[i] * belief.sight[j]
+            normal[3 + i, 3 + j] += belief.depth_w2[0] * belief.line_of_sight[i] * belief.line_of_sight[j]
     for i in range(n):
         total = 0.0
         for j in range(n):
@@ -198,12 +198,12 @@ def linearise(
         for f in range(5):
             search.twist[f] = z[f]
         twist_hand(hand, search.twist)
-        if belief.sights.rows[0] > 0.0:
+        if belief.lines_of_sight.rows[0] > 0.0:
             bent_palm(rig.device.palm, z[BEND], z[BEND + 1], search.palm_camera, search.bend_axes)
             for f in range(5):
                 cost += finger_rows(rig, belief, f, z, x.shape[0], gradient, normal, search)
     chains(hand, T, work.angles, work.R, work.P)
-    search.apart[0] = 0.0
+    search.outliers[0] = 0.0
     for m in range(mounts.finger.shape[0]):
         search.surprise[m] = 0.0
         if not observed.seen[m]:
@@ -221,7 +221,7 @@ def _marker(
     f = mounts.finger[m]
     marker_point(mounts, m, T, work.R, work.P, work.point)
     cost, search.surprise[m] = marker_rows(rig.cameras, observed, m, work.point, work)
-    search.apart[0] += cost - 0.5 * search.surprise[m]
+    search.outliers[0] += cost - 0.5 * search.surprise[m]
     for i in range(3):
         work.arm[i] = work.point[i] - T[i, 3]
         for j in range(3):

@@ -39,7 +39,7 @@ class HandState:
         t_ns: (1,) when.
         known: (1,) whether there is a hand.
         seen_ns: (1,) when anything of it was measured last.
-        placed_ns: (1,) when two cameras, or a depth law, placed a marker of it last.
+        triangulated_ns: (1,) when two cameras, or a depth law, placed a marker of it last.
         told_ns: (6,) when each finger, and the palm, was measured last.
         palm, x, angles: (4, 4) palm, (n,) free and (20,) all angles [rad].
         rates: (20,) [rad/s].
@@ -62,7 +62,7 @@ class HandState:
     t_ns: Int
     known: Bool
     seen_ns: Int
-    placed_ns: Int
+    triangulated_ns: Int
     told_ns: Int
     palm: Float
     x: Float
@@ -97,7 +97,7 @@ class HandState:
             t_ns=("i8", 1),
             known=("u1", 1),
             seen_ns=("i8", 1),
-            placed_ns=("i8", 1),
+            triangulated_ns=("i8", 1),
             told_ns=("i8", 6),
             palm=(4, 4),
             x=n,
@@ -123,7 +123,14 @@ class HandState:
             turn=(3, 3),
             turn_known=("u1", 1),
         )
-        for never in (state.t_ns, state.z_ns, state.seen_ns, state.placed_ns, state.told_ns, state.hidden_ns):
+        for never in (
+            state.t_ns,
+            state.z_ns,
+            state.seen_ns,
+            state.triangulated_ns,
+            state.told_ns,
+            state.hidden_ns,
+        ):
             never[:] = NEVER_NS
         state.z_cov[:] = np.eye(extras)
         return state

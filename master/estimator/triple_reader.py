@@ -30,8 +30,8 @@ class TripleReader:
         """The rows of a triple for an epoch, and its laser points (5, 3) [m], camera frame; NaN: not seen."""
         setup, level = self._setup, self._setup.level
         uv = np.concatenate([message.laser_uv, message.tip_uv])
-        self._leave_out("outside", uv[:5], message.laser_sigma_px)
-        self._leave_out("tip_outside", uv[5:], message.tip_sigma_px)
+        self._reject("outside", uv[:5], message.laser_sigma_px)
+        self._reject("tip_outside", uv[5:], message.tip_sigma_px)
         xy1 = np.ones((10, 3))
         xy1[:, :2] = setup.optics.undistort(uv)
         away = setup.offset_m / (xy1[:5] @ setup.normal)
@@ -61,7 +61,7 @@ class TripleReader:
         )
         return rows, points_m
 
-    def _leave_out(self, event: str, uv: Float, sigma_px: Float) -> None:
+    def _reject(self, event: str, uv: Float, sigma_px: Float) -> None:
         """Write NaN to points (5, 2) outside the picture, and to those that may be anywhere in it; count them."""
         optics = self._setup.optics
         right, low = optics.width_px - 0.5, optics.height_px - 0.5

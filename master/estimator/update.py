@@ -84,7 +84,7 @@ def chi_square(
         if not observed.seen[m]:
             continue
         kept = search.J
-        own = observed.information[m] if observed.placed[m] else observed.own[m]
+        own = observed.information[m] if observed.triangulated[m] else observed.own[m]
         marker_point(mounts, m, T, work.R, work.P, work.point)
         for i in range(3):
             for j in range(3):
@@ -143,16 +143,16 @@ def _drift(
 
     Perspective tells the depth of a hand to centimetres only, and the fit is as sure of it as of the last epoch's.
     """
-    placed, seen = ground.most[0] > 1, ground.seen[0] > 0
-    if placed or state.placed_ns[0] == NEVER_NS:
-        state.placed_ns[0] = t_ns
-    if placed or not seen:
+    triangulated, seen = ground.most[0] > 1, ground.seen[0] > 0
+    if triangulated or state.triangulated_ns[0] == NEVER_NS:
+        state.triangulated_ns[0] = t_ns
+    if triangulated or not seen:
         return
-    sigma_m = min(settings.drift_m_s * (t_ns - state.placed_ns[0]) * 1e-9, settings.drift_most_m)
+    sigma_m = min(settings.drift_m_s * (t_ns - state.triangulated_ns[0]) * 1e-9, settings.drift_most_m)
     for joint in range(26):
         for i in range(3):
             for j in range(3):
-                out.cov[joint, i, j] += sigma_m * sigma_m * belief.sight[i] * belief.sight[j]
+                out.cov[joint, i, j] += sigma_m * sigma_m * belief.line_of_sight[i] * belief.line_of_sight[j]
 
 
 @kernel
@@ -271,7 +271,7 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
     )
     if found.z.shape[0] == EXTRAS:
         extras_alone(belief, found, search)
-    if belief.sights.rows[0] > 0.0:
+    if belief.lines_of_sight.rows[0] > 0.0:
         take_scanned(rig, space.ground, space.scan, found, search.rows)
     found.contrary[0] = contrary(belief, found.palm, found.z, search) if belief.turned[0] > 0.0 else 0.0
     return chi_square(rig, observed, found.palm, found.x, 0.0, search)

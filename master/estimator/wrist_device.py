@@ -118,7 +118,7 @@ class Device:
         )
 
 
-class Sights:
+class LinesOfSight:
     """What one triple shows of five fingers, as rows; x, y are those of undistorted rays (x, y, 1).
 
     Attributes:
@@ -149,7 +149,7 @@ class Sights:
     rows: Float
 
     @classmethod
-    def empty(cls) -> "Sights":
+    def empty(cls) -> "LinesOfSight":
         """Nothing is seen."""
         return record(
             cls,
@@ -198,11 +198,13 @@ def loosen(W: Float, J: Float, row: int, cov: Float) -> None:
 
 
 @inner
-def loosen_short(device: Any, sights: Sights, f: int, length_px: float, point: Float, A: Float) -> bool:
+def loosen_short(
+    device: Any, lines_of_sight: LinesOfSight, f: int, length_px: float, point: Float, A: Float
+) -> bool:
     """Take from the information of a laser point what it does not say of a line that is hidden in part.
 
     Args:
-        device, sights: `Sights.laser_W` is changed.
+        device, sights: `LinesOfSight.laser_W` is changed.
         f: Finger.
         length_px: The line's, were all of it seen.
         point, A: (3,), (2, 2) room.
@@ -210,11 +212,11 @@ def loosen_short(device: Any, sights: Sights, f: int, length_px: float, point: F
     Returns:
         Whether the line is that short.
     """
-    seen_px = sights.laser_px[f]
-    x, y = sights.laser[f, 0], sights.laser[f, 1]
+    seen_px = lines_of_sight.laser_px[f]
+    x, y = lines_of_sight.laser[f, 0], lines_of_sight.laser[f, 1]
     if seen_px == 0.0 or seen_px > _WHOLE * length_px or not on_plane(device, x, y, point, A):
         return False
-    W = sights.laser_W[f]
+    W = lines_of_sight.laser_W[f]
     det = W[0, 0] * W[1, 1] - W[0, 1] * W[1, 0]
     a, b, c = W[1, 1] / det, -W[0, 1] / det, W[0, 0] / det
     off = 0.5 * (length_px - seen_px) / device.focal[0]
@@ -265,7 +267,7 @@ def observe_wrist(
         tip_depth: (5,) distances of the tips by light.
         depth_sigma: Standard deviation of their logarithms; 0: they are not used.
         laser_s, tip_s: How much later than the epoch laser points and tips were seen.
-        boxed_out: (1,) `Sights`, written.
+        boxed_out: (1,) `LinesOfSight`, written.
     """
     device, out = boxed_device[0], boxed_out[0]
     point, A = np.zeros(3), np.zeros((2, 2))

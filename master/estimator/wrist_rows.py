@@ -143,7 +143,7 @@ def finger_rows(
 
     `search.palm_camera` and `search.bend_axes` are those of the bend.
     """
-    hand, sights, work, surface = rig.hand, belief.sights, search.rows, search.surface
+    hand, lines_of_sight, work, surface = rig.hand, belief.lines_of_sight, search.rows, search.surface
     start = hand.first[f]
     count, base = hand.first[f + 1] - start, 6 + n
     J, r, w, at = search.local_J, search.local_r, search.local_w, search.at
@@ -156,23 +156,26 @@ def finger_rows(
         base + LIGHT,
     )
     size, cost = count + 4, 0.0
-    if sights.lit[f] == 0.0 and sights.shown[f] == 0.0:
+    if lines_of_sight.lit[f] == 0.0 and lines_of_sight.shown[f] == 0.0:
         return 0.0
     look(hand, rig.device, search.palm_camera, search.bend_axes, work.angles, f, MOVES, surface)
     for what in range(2):
-        if (what == 0 and sights.lit[f] == 0.0) or (what == 1 and sights.shown[f] == 0.0):
+        if (what == 0 and lines_of_sight.lit[f] == 0.0) or (what == 1 and lines_of_sight.shown[f] == 0.0):
             continue
         rows, first = 2, 0
         if what == 0:
-            W = sights.laser_W[f]
-            r[0] = surface.seen[0] + sights.lack[f, 0] - sights.laser[f, 0]
-            r[1] = surface.seen[1] + sights.lack[f, 1] - sights.laser[f, 1]
+            W = lines_of_sight.laser_W[f]
+            r[0] = surface.seen[0] + lines_of_sight.lack[f, 0] - lines_of_sight.laser[f, 0]
+            r[1] = surface.seen[1] + lines_of_sight.lack[f, 1] - lines_of_sight.laser[f, 1]
         else:
-            W, first = sights.tip_W[f], 2
-            r[0], r[1] = surface.seen[2] - sights.tip[f, 0], surface.seen[3] - sights.tip[f, 1]
-            if sights.depth_w2[f] > 0.0:
+            W, first = lines_of_sight.tip_W[f], 2
+            r[0], r[1] = (
+                surface.seen[2] - lines_of_sight.tip[f, 0],
+                surface.seen[3] - lines_of_sight.tip[f, 1],
+            )
+            if lines_of_sight.depth_w2[f] > 0.0:
                 rows = 3
-                r[2] = surface.seen[4] + z[LIGHT] - sights.depth[f]
+                r[2] = surface.seen[4] + z[LIGHT] - lines_of_sight.depth[f]
         for i in range(rows):
             for c in range(count):
                 J[i, c] = 0.0
@@ -180,11 +183,11 @@ def finger_rows(
                     J[i, c] += surface.J[first + i, k] * work.by[4 * f + k, c]
             for c in range(3):
                 J[i, count + c] = surface.J[first + i, 4 + c]
-            J[i, count] *= sights.teaches[f]
+            J[i, count] *= lines_of_sight.teaches[f]
             J[i, count + 3] = 1.0 if i == 2 else 0.0
         for i in range(rows):
             if i == 2:
-                w[2] = sights.depth_w2[f] * r[2]
+                w[2] = lines_of_sight.depth_w2[f] * r[2]
             else:
                 w[i] = W[i, 0] * r[0] + W[i, 1] * r[1]
             cost += 0.5 * w[i] * r[i]
@@ -196,7 +199,7 @@ def finger_rows(
                 gradient[at[a]] += share * J[i, a] * w[i]
             p0 = W[0, 0] * J[0, a] + W[0, 1] * J[1, a]
             p1 = W[1, 0] * J[0, a] + W[1, 1] * J[1, a]
-            p2 = sights.depth_w2[f] * J[2, a] if rows == 3 else 0.0
+            p2 = lines_of_sight.depth_w2[f] * J[2, a] if rows == 3 else 0.0
             for b in range(size):
                 total = p0 * J[0, b] + p1 * J[1, b]
                 if rows == 3:

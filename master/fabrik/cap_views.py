@@ -78,16 +78,16 @@ def seen_shift(caps: CapTables, row: int, ahead: Float, back: Float, out: Float)
         out[0] = out[1] = out[2] = np.nan
         return np.nan
     cosine = min(max(cosine, -1.0), 1.0)
-    last = caps.looks.shape[1] - 1
+    last = caps.appearances.shape[1] - 1
     place = acos(cosine) * (last / np.pi)
     low = min(max(int(place), 0), last - 1)
     part = place - low
-    along = (1.0 - part) * caps.looks[row, low, 0] + part * caps.looks[row, low + 1, 0]
-    towards = (1.0 - part) * caps.looks[row, low, 1] + part * caps.looks[row, low + 1, 1]
+    along = (1.0 - part) * caps.appearances[row, low, 0] + part * caps.appearances[row, low + 1, 0]
+    towards = (1.0 - part) * caps.appearances[row, low, 1] + part * caps.appearances[row, low + 1, 1]
     towards /= max(sqrt(1.0 - cosine * cosine), 1e-9)
     for i in range(3):
         out[i] = along * ahead[i] + towards * (back[i] - cosine * ahead[i])
-    return (1.0 - part) * caps.looks[row, low, 2] + part * caps.looks[row, low + 1, 2]
+    return (1.0 - part) * caps.appearances[row, low, 2] + part * caps.appearances[row, low + 1, 2]
 
 
 @kernel

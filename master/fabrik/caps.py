@@ -59,7 +59,7 @@ class CapTables(NamedTuple):
     """How the M markers of a rig look from all sides; K of them are caps.
 
     Attributes:
-        row: (M,) row of `looks`; -1: flat, its centroid is what is seen.
+        row: (M,) row of `appearances`; -1: flat, its centroid is what is seen.
         looks: (K, A + 1, 3) over the angle between finger and sight, 0 to pi: shift of the seen centroid along the
             finger and towards the eye [m], and the area seen [m^2].
         radius_m: (K,).
@@ -68,7 +68,7 @@ class CapTables(NamedTuple):
     """
 
     row: Int
-    looks: Float
+    appearances: Float
     radius_m: Float
     joint: Int
     finger: Int
@@ -85,8 +85,8 @@ class CapTables(NamedTuple):
     def flat(cls, count: int) -> "CapTables":
         """Tables of markers that are all flat."""
         nothing = np.zeros(0, np.int64)
-        looks = np.zeros((0, _ANGLES + 1, 3))
-        return cls(np.full(count, -1, np.int64), looks, np.zeros(0), nothing, nothing)
+        appearances = np.zeros((0, _ANGLES + 1, 3))
+        return cls(np.full(count, -1, np.int64), appearances, np.zeros(0), nothing, nothing)
 
     def pointing(self, hand: SolvedHand, age_s: float) -> tuple[Float, Float]:
         """Directions of the caps of a hand of `age_s` [s] ago.
@@ -105,7 +105,7 @@ class CapTables(NamedTuple):
 @lru_cache(maxsize=64)
 def _tables(model: HandModel, markers: tuple[str, ...]) -> CapTables:
     out = CapTables.flat(len(markers))
-    joints, fingers, looks = list[int](), list[int](), list[Float]()
+    joints, fingers, appearances = list[int](), list[int](), list[Float]()
     for m, name in enumerate(markers):
         mount = model.mount(name) if name in model.mounts else None
         if mount is None or mount.joint is None or mount.finger is None:
@@ -113,22 +113,22 @@ def _tables(model: HandModel, markers: tuple[str, ...]) -> CapTables:
         points, normals, areas = cap_surface(float(model.radius_m[mount.joint]), float(-mount.offset_m[2]))
         # The sampled cap is placed so that its centroid is exactly the profile's point.
         points -= np.average(points, axis=0, weights=areas)
-        out.row[m] = len(looks)
-        looks.append(_looks(points, normals, areas))
+        out.row[m] = len(appearances)
+        appearances.append(_appearances(points, normals, areas))
         joints.append(mount.joint)
         fingers.append(mount.finger)
-    if not looks:
+    if not appearances:
         return out
     radii = np.array([model.radius_m[joint] for joint in joints])
     return out._replace(
-        looks=np.array(looks),
+        appearances=np.array(appearances),
         radius_m=radii,
         joint=np.array(joints, np.int64),
         finger=np.array(fingers, np.int64),
     )
 
 
-def _looks(points: Float, normals: Float, areas: Float) -> Float:
+def _appearances(points: Float, normals: Float, areas: Float) -> Float:
     """Tabulate a cap whose finger points 0..180 degrees away from the eye.
 
     Returns:

@@ -59,7 +59,13 @@ _FIRST_STEPS, _MOST_STEPS = constant(8), constant(60)
 
 @kernel
 def closed_form(
-    chain: ChainArrays, edges: Float, ratio: float, goal: Vector, near: Float, angles: Float, seeds: Float
+    chain: ChainArrays,
+    edges: Float,
+    ratio: float,
+    goal: Vector,
+    warm_start: Float,
+    angles: Float,
+    seeds: Float,
 ) -> float:
     """The legal pose that hits the target.
 
@@ -88,7 +94,7 @@ def closed_form(
             if cut <= _SLACK_RAD and off <= _EDGE_M2:
                 # bones out of plane cannot point exactly at the pole: legal angles may still miss
                 miss = length(minus(end_of(chain, trial), goal))
-                rank = _rank(trial, near, branches - 1 - b)
+                rank = _rank(trial, warm_start, branches - 1 - b)
                 if miss < REACHED_M and rank < best:
                     best, residual = rank, miss
                     _copy(trial, angles)
@@ -182,13 +188,13 @@ def _known(angles: Float) -> bool:
 
 
 @inner
-def _rank(angles: Float, near: Float, branch: int) -> float:
+def _rank(angles: Float, warm_start: Float, branch: int) -> float:
     """Rank of a pose that hits, least first: change [rad], or branch and abduction."""
-    if not _known(near):
+    if not _known(warm_start):
         return branch * _PER_BRANCH + abs(angles[0])
     rank = 0.0
     for i in range(4):
-        rank += abs(angles[i] - near[i])
+        rank += abs(angles[i] - warm_start[i])
     return rank
 
 
@@ -241,7 +247,7 @@ def _in_plane(chain: ChainArrays, edges: Float, ratio: float, local: Vector, see
 
 
 @kernel
-def nearest_pose(chain: ChainArrays, goal: Vector, near: Float, seeds: Float, angles: Float) -> float:
+def nearest_pose(chain: ChainArrays, goal: Vector, warm_start: Float, seeds: Float, angles: Float) -> float:
     """The legal pose nearest to the target, where none hits it in closed form.
 
     Args:
@@ -258,7 +264,7 @@ def nearest_pose(chain: ChainArrays, goal: Vector, near: Float, seeds: Float, an
     for start in range(starts + 1):
         steps = _FIRST_STEPS
         if start < starts:
-            _start(chain, local, near, seeds, start, trial)
+            _start(chain, local, warm_start, seeds, start, trial)
         else:
             steps = _MOST_STEPS
             _copy(angles, trial)
@@ -272,15 +278,17 @@ def nearest_pose(chain: ChainArrays, goal: Vector, near: Float, seeds: Float, an
 
 
 @inner
-def _start(chain: ChainArrays, local: Vector, near: Float, seeds: Float, start: int, angles: Float) -> None:
+def _start(
+    chain: ChainArrays, local: Vector, warm_start: Float, seeds: Float, start: int, angles: Float
+) -> None:
     """Write start (4,): a seed; for a free DIP also the last pose, and pairs."""
     pair = start - len(seeds) - 1
     if start < len(seeds):
         _copy_row(seeds, start, angles)
     elif pair < 0:
         _copy_row(seeds, _FIRST, angles)
-        if _known(near):
-            _copy(near, angles)
+        if _known(warm_start):
+            _copy(warm_start, angles)
     else:
         pip_share, dip_share = _SPREAD_OF_STARTS[pair // 2]
         pip = chain.spans[2, 0] + pip_share * (chain.spans[2, 1] - chain.spans[2, 0])

@@ -19,14 +19,14 @@ class MarkerPositions:
         cov_m2: (M, 3, 3) [m^2].
         noise_m2: (M, 3, 3) [m^2] the part of it that may differ from one instant to the next.
         apart: (M,) what two cameras see is not one thing.
-        left_out: (C, M) outliers of single cameras, without which the rays of three or more meet.
+        rejected: (C, M) outliers of single cameras, without which the rays of three or more meet.
     """
 
     points_m: Float
     cov_m2: Float
     noise_m2: Float
-    apart: Bool
-    left_out: Bool
+    outliers: Bool
+    rejected: Bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)

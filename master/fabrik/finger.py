@@ -113,7 +113,7 @@ class FingerSolver:
         """Low and high of the four angles [rad]; as of `Chain.spans`."""
         return self.chain.spans
 
-    def solve(self, target: Vector, near: Four | None = None) -> FingerSolution:
+    def solve(self, target: Vector, warm_start: Four | None = None) -> FingerSolution:
         """Angles that bring the point to `target`, or as near to it as the limits allow.
 
         Args:
@@ -127,7 +127,7 @@ class FingerSolver:
         goal = minus(target, self.root)
         if not isfinite(length(goal)):
             return NOT_SEEN
-        before, angles = np.array(_UNKNOWN if near is None else near), np.empty(4)
+        before, angles = np.array(_UNKNOWN if warm_start is None else warm_start), np.empty(4)
         left = self.start(self.chain.arrays, self.edges, self.ratio, goal, before, angles)
         a, f, pip, dip = angles.tolist()
         return FingerSolution(a, f, pip, dip, left, left < REACHED_M)
@@ -207,7 +207,7 @@ class Finger:
 
 @kernel
 def start_of(
-    chain: ChainArrays, edges: Float, ratio: float, goal: Vector, near: Float, angles: Float
+    chain: ChainArrays, edges: Float, ratio: float, goal: Vector, warm_start: Float, angles: Float
 ) -> float:
     """The pose from which FABRIK begins: the closed form, or the legal pose nearest to the target.
 
@@ -219,8 +219,8 @@ def start_of(
         Distance of the point to the target [m].
     """
     seeds = np.empty((3, 4))
-    left = closed_form(chain, edges, ratio, goal, near, angles, seeds)
-    return left if left < inf else nearest_pose(chain, goal, near, seeds, angles)
+    left = closed_form(chain, edges, ratio, goal, warm_start, angles, seeds)
+    return left if left < inf else nearest_pose(chain, goal, warm_start, seeds, angles)
 
 
 @kernel
@@ -238,12 +238,12 @@ def bring_onto(
     goal = minus((target[0], target[1], target[2]), root)
     if not isfinite(length(goal)):
         return nan, 0
-    near, before = angles.copy(), 0
-    if chain.follower < 0 and isfinite(near.sum()):
+    warm_start, before = angles.copy(), 0
+    if chain.follower < 0 and isfinite(warm_start.sum()):
         residual, before = solve_chain(chain, goal, tolerance_m, max_iterations, _NO_RESTARTS, angles)
         if residual <= tolerance_m:
             return residual, before
-    start_of(chain, edges, ratio, goal, near, angles)
+    start_of(chain, edges, ratio, goal, warm_start, angles)
     residual, iterations = solve_chain(chain, goal, tolerance_m, max_iterations, _NO_RESTARTS, angles)
     return residual, before + iterations
 

@@ -173,7 +173,7 @@ def _place(
     hand: _Hand,
     rays_px: float,
     observed: Float,
-    left_out: Bool,
+    rejected: Bool,
     m: int,
     rays: Rays,
     views: Views,
@@ -183,7 +183,7 @@ def _place(
     Returns:
         How many see it; whether its point is determined; and as `_correct`.
     """
-    seen = observe(cameras, observed, left_out, rays_px, m, rays)
+    seen = observe(cameras, observed, rejected, rays_px, m, rays)
     if seen < 2 or not linear(cameras, rays):
         return seen, False, 1, 0.0
     for c in range(observed.shape[0]):
@@ -193,7 +193,7 @@ def _place(
 
 
 @inner
-def _lone(
+def _monocular(
     cameras: CameraArrays,
     caps: CapTables,
     hand: _Hand,
@@ -221,7 +221,7 @@ def _lone(
 
 
 @kernel
-def locate(
+def correct_centres(
     cameras: CameraArrays,
     caps: CapTables,
     rays_px: float,
@@ -239,8 +239,8 @@ def locate(
     points: Float,
     cov: Float,
     noise: Float,
-    apart: Bool,
-    left_out: Bool,
+    outliers: Bool,
+    rejected: Bool,
     uv: Float,
     variance: Float,
     own: Float,
@@ -256,25 +256,27 @@ def locate(
         rays, views: Room.
         points, cov, noise: (M, 3), (M, 3, 3), (M, 3, 3) written as of `MarkerPositions`.
         apart: (M,) written: two cameras or more see it, but their rays do not meet.
-        left_out: (C, M) written: outliers, without which they do.
+        rejected: (C, M) written: outliers, without which they do.
         uv, variance, own: Written, as of `RayPositions`.
     """
     hand = _Hand(known, as_seen, R, tilt_rad2, turned_rad2, at, process_noise)
     for m in range(observed.shape[1]):
         for c in range(observed.shape[0]):
-            left_out[c, m] = False
-        seen, placed, count, shared = _place(cameras, caps, hand, rays_px, observed, left_out, m, rays, views)
-        meets = placed and chi_square(rays) <= limits[seen]
+            rejected[c, m] = False
+        seen, triangulated, count, shared = _place(
+            cameras, caps, hand, rays_px, observed, rejected, m, rays, views
+        )
+        meets = triangulated and chi_square(rays) <= limits[seen]
         if seen >= _FEWEST and not meets:
-            odd = outlier(cameras, limits[seen - 1], rays)
-            if odd >= 0:
-                left_out[odd, m] = True
-                seen, placed, count, shared = _place(
-                    cameras, caps, hand, rays_px, observed, left_out, m, rays, views
+            outlying = outlier(cameras, limits[seen - 1], rays)
+            if outlying >= 0:
+                rejected[outlying, m] = True
+                seen, triangulated, count, shared = _place(
+                    cameras, caps, hand, rays_px, observed, rejected, m, rays, views
                 )
-                meets = placed and chi_square(rays) <= limits[seen]
-                left_out[odd, m] = meets
-        apart[m] = seen >= 2 and not meets
+                meets = triangulated and chi_square(rays) <= limits[seen]
+                rejected[outlying, m] = meets
+        outliers[m] = seen >= 2 and not meets
         row = caps.row[m]
         for i in range(3):
             for j in range(3):
@@ -283,10 +285,10 @@ def locate(
             much = float(process_noise[row]) if known and row >= 0 else 0.0
             _covariance(cameras, caps, row, count, shared, rays, views, much, cov[m], own[m])
         elif seen == 1 and known and row >= 0:
-            _lone(cameras, caps, hand, rays_px, observed, m, rays, views)
+            _monocular(cameras, caps, hand, rays_px, observed, m, rays, views)
         common = 0.0
         for c in range(observed.shape[0]):
-            used = rays.weight[c] > 0.0 and not apart[m]
+            used = rays.weight[c] > 0.0 and not outliers[m]
             alone = rays.variance[c] + rays_px * rays_px - (shared if meets else 0.0)
             variance[c, m] = alone if used else np.nan
             uv[c, m, 0], uv[c, m, 1] = rays.uv[c, 0], rays.uv[c, 1]
@@ -340,7 +342,7 @@ class RayTriangulator:
         self._limits = limits_of(len(cameras))
         self._rays, self._views = Rays.empty(len(cameras)), Views.empty(len(cameras))
         self._unknown = np.zeros((len(caps.radius_m), 3, 3))
-        self._locate: Callable[..., None] | None = None
+        self._correct_centres: Callable[..., None] | None = None
 
     def __call__(
         self,
@@ -368,8 +370,8 @@ class RayTriangulator:
             ours = tilt[:, 0, 0] + tilt[:, 1, 1] + tilt[:, 2, 2] + turned
             process_noise = np.maximum(grown, 0.0) / np.maximum(ours, 1e-12)
         points, cov = np.empty((count, 3)), np.empty((count, 3, 3))
-        noise, apart = np.empty((count, 3, 3)), np.empty(count, np.bool_)
-        left_out = np.empty((cameras, count), np.bool_)
+        noise, outliers = np.empty((count, 3, 3)), np.empty(count, np.bool_)
+        rejected = np.empty((cameras, count), np.bool_)
         seen, variance = np.empty((cameras, count, 2)), np.empty((cameras, count))
         own = np.empty((count, 3, 3))
         arguments = (
@@ -390,16 +392,16 @@ class RayTriangulator:
             points,
             cov,
             noise,
-            apart,
-            left_out,
+            outliers,
+            rejected,
             seen,
             variance,
             own,
         )
-        if self._locate is None:
-            self._locate = bound(locate, *arguments)
-        self._locate(*arguments)
-        return RayPositions(points, cov, noise, apart, left_out, seen, variance, own)
+        if self._correct_centres is None:
+            self._correct_centres = bound(correct_centres, *arguments)
+        self._correct_centres(*arguments)
+        return RayPositions(points, cov, noise, outliers, rejected, seen, variance, own)
 
     def triangulate(self, uv: Float, sigma_px: float | Float = 0.1) -> Triangulation:
         """Triangulate markers as they are seen (`master.fabrik.intersection`)."""

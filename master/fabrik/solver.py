@@ -95,7 +95,7 @@ class FabrikSolver:
         return [self.solve(frames) for frames in self.sync.flush()]
 
     def solve(
-        self, frames: FrameSet, near: SolvedHand | None = None, near_age_s: float = 0.0
+        self, frames: FrameSet, warm_start: SolvedHand | None = None, warm_start_age_s: float = 0.0
     ) -> HandEstimate:
         """Solve one instant.
 
@@ -103,10 +103,10 @@ class FabrikSolver:
             frames: What the cameras see of it.
             near: A hand that is surer than this line's last one, for the side of the caps that the cameras see; this
                 line's then has its covariance to first order.
-            near_age_s: How long ago that held [s].
+            warm_start_age_s: How long ago that held [s].
         """
         last, age_s = self._recent(frames.t_ns)
-        seen_as, seen_age_s = (last, age_s) if near is None else (near, near_age_s)
+        seen_as, seen_age_s = (last, age_s) if warm_start is None else (warm_start, warm_start_age_s)
         pixels = frames.uv, frames.sigma_px, frames.area
         with self._stage("triangulate"):
             markers = self.triangulate(*pixels, seen_as, seen_age_s)
@@ -121,7 +121,7 @@ class FabrikSolver:
             facing = self.towards(smooth[self.on_hand], frames.area)
             out = HandEstimate.unseen(frames.t_ns, markers, smooth, facing)
             palm = self._palm.push(
-                Epoch(frames.t_ns, smooth, facing, cov_m2=markers.cov_m2, second_order=near is None)
+                Epoch(frames.t_ns, smooth, facing, cov_m2=markers.cov_m2, second_order=warm_start is None)
             )
             return self._estimate(out, smooth[self.on_hand], markers.cov_m2[self.on_hand], palm)
 
@@ -172,8 +172,8 @@ class FabrikSolver:
     def _estimate(self, out: HandEstimate, points: Float, cov: Float, palm: Fitted) -> HandEstimate:
         """Bring a palm's fingers onto their markers; without a palm hold the last hand."""
         last, age_s = self._recent(out.t_ns)
-        fit, placed = palm.solution, np.isfinite(points[:, 0])
-        if fit is None or not placed.any():
+        fit, triangulated = palm.solution, np.isfinite(points[:, 0])
+        if fit is None or not triangulated.any():
             out.valid[:] = last is not None
             return out if last is None else replace(out, solution=_drifted(last, age_s))
         T, angles = fit.T_rig_palm, fit.angles_rad.copy()
@@ -187,17 +187,17 @@ class FabrikSolver:
         off = joints.position_m - fit.joints.position_m
         joint_cov = fit.cov_m2 + off[:, :, None] * off[:, None, :]
         hand = SolvedHand(T, angles, joints, joint_cov, fit.tilt_cov_rad2, fit.tilt_process_noise_rad2_s2)
-        self._judge(out, palm, fit.surprise, placed)
+        self._judge(out, palm, fit.surprise, triangulated)
         self._last, self._last_ns = hand, out.t_ns
         solved = bool(np.isfinite(out.residual_m).any() or out.tracked.any())
         return replace(out, solution=hand, solved=solved)
 
-    def _judge(self, out: HandEstimate, palm: Fitted, surprise: Float, placed: Bool) -> None:
-        """Write the bits of a solved hand; `placed`: (H,) which markers are.
+    def _judge(self, out: HandEstimate, palm: Fitted, surprise: Float, triangulated: Bool) -> None:
+        """Write the bits of a solved hand; `triangulated`: (H,) which markers are.
 
         What they explain is tracked.
         """
-        out.seen[self._finger_of[placed & self._on_finger]] = True
+        out.seen[self._finger_of[triangulated & self._on_finger]] = True
         explained = out.seen.copy()
         wrong = surprise >= self._palm.settings.explained
         explained[self._finger_of[wrong & self._on_finger]] = False

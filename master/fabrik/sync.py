@@ -10,7 +10,7 @@ is the newest capture time seen: no clock is read here, so a replay synchronises
 that still waited for a camera when all fell silent, for as long as makes one silent, is *outdated* and left out.
 
 Each marker has its own capture time, t_row0 + row_time v: a rolling shutter sees the finger tips earlier than the back
-of the hand. `master.fabrik.carry` carries each to the instant; a sideways error Dt v would turn into a depth error
+of the hand. `master.fabrik.propagate` carries each to the instant; a sideways error Dt v would turn into a depth error
 D v Dt / B, the largest of an unsynchronised rig.
 """
 
@@ -23,7 +23,7 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 from common.messages import MarkerDetections
-from master.fabrik.carry import HISTORY, NEVER, SIGHTINGS, TrackHistory, carry
+from master.fabrik.propagate import HISTORY, NEVER, OBSERVATIONS, TrackHistory, propagate
 
 SILENT_FRAMES = 12
 _SLOW, _SLOW_FRAMES = 2.2, 4  # times as many frames of others as the files say, between so many of its own
@@ -41,7 +41,7 @@ class FrameSet:
         area: (C, M) [px^2] of the nearest frame.
         ready_t_ns: When the last contributing frame was handed to its slave.
         missing: (C,) cameras that had no frame in time.
-        rival_uv, rival_sigma_px: As `uv` and `sigma_px` of the second places that slaves named; None: none at all.
+        alternative_uv, alternative_sigma_px: As `uv` and `sigma_px` of the second places that slaves named; None: none at all.
     """
 
     t_ns: int
@@ -50,8 +50,8 @@ class FrameSet:
     area: Float
     ready_t_ns: int
     missing: Bool
-    rival_uv: Float | None = None
-    rival_sigma_px: Float | None = None
+    alternative_uv: Float | None = None
+    alternative_sigma_px: Float | None = None
 
 
 class FrameSync:
@@ -88,7 +88,7 @@ class FrameSync:
         self._deadline_ns, self._outdated_ns = int(1.25 * period_ns), SILENT_FRAMES * period_ns
         self._half_ns = [int(0.5e9 / rate) for rate in rates]
         self._slack_ns = self._half_ns if policy == "predict" else [0] * count
-        far_ns = int((SIGHTINGS + 0.25) * period_ns) if continuous else -1
+        far_ns = int((OBSERVATIONS + 0.25) * period_ns) if continuous else -1
         near_ns = self._deadline_ns if continuous else self._deadline_ns // 2
         self._reach_ns = near_ns, far_ns, far_ns, far_ns
         self._patience = SILENT_FRAMES * count
@@ -149,8 +149,8 @@ class FrameSync:
         shape = len(self._came), self._markers
         uv, sigma = np.empty((2, *shape, 2)), np.empty((2, *shape))
         area, missing = np.empty(shape), np.empty(shape[0], np.bool_)
-        ready_t_ns, rivals = carry(self._history, t_ns, self._reach_ns, uv, sigma, area, missing)
-        second = (uv[1], sigma[1]) if rivals else (None, None)
+        ready_t_ns, alternatives = propagate(self._history, t_ns, self._reach_ns, uv, sigma, area, missing)
+        second = (uv[1], sigma[1]) if alternatives else (None, None)
         return FrameSet(t_ns, uv[0], sigma[0], area, ready_t_ns, missing, *second)
 
     def _hold(self, c: int, centre_ns: int, message: MarkerDetections) -> None:
@@ -161,7 +161,7 @@ class FrameSync:
         times_ns[c, slot, 0], times_ns[c, slot, 1] = centre_ns, message.t_ns
         times_ns[c, slot, 2], t_sigma_ns[c, slot] = message.ready_t_ns, message.t_sigma_ns
         marks = all_marks[c, slot]
-        marks[:2], marks[2:4] = message.uv.T, message.rival_uv.T
+        marks[:2], marks[2:4] = message.uv.T, message.alternative_uv.T
         marks[4], marks[5] = message.sigma_px, message.area
 
     def _leader(self) -> int:

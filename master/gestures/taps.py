@@ -34,7 +34,7 @@ _DOWN_M = 0.001  # a thumb whose gap is larger than the least by less is down
 _NEVER_NS = -(2**61)
 
 
-class _Instant(NamedTuple):
+class _Epoch(NamedTuple):
     """The thumb at an instant of a touch.
 
     Attributes:
@@ -58,7 +58,7 @@ class _Touch:
     began_ns: int
     bend_rad: float
     least_m: float
-    instants: list[_Instant]
+    epochs: list[_Epoch]
 
 
 class TapWatch:
@@ -86,7 +86,7 @@ class TapWatch:
         sigma = float(touch.key_sigma_m[finger, segment])
         # Of the finger its PIP must be known, too, along its worst axis.
         known = sigma <= own.sigma_most_m and _worst_m(seen, CHAINS[finger + 1, 1]) <= own.place_sigma_m
-        now = _Instant(gaps, sigma, float(seen.sigma_m[0]), seen.joints_m)
+        now = _Epoch(gaps, sigma, float(seen.sigma_m[0]), seen.joints_m)
         if self._touch is not None:
             return self._go_on(self._touch, seen, now, known=known)
         if not known:
@@ -102,7 +102,7 @@ class TapWatch:
         """Forget the touch: the hand is gone, or does something else."""
         self._touch, self._clear_ns = None, _NEVER_NS
 
-    def _go_on(self, going: _Touch, seen: HandFeatures, now: _Instant, *, known: bool) -> list[Gesture]:
+    def _go_on(self, going: _Touch, seen: HandFeatures, now: _Epoch, *, known: bool) -> list[Gesture]:
         """A touch goes on, ends as a tap, or was none."""
         own, gap = self._settings, min(now.gap_m)
         lasted = (seen.t_ns - going.began_ns) * 1e-9
@@ -112,7 +112,7 @@ class TapWatch:
             return []
         if not known:
             return []
-        going.instants.append(now)
+        going.epochs.append(now)
         going.least_m = min(going.least_m, gap)
         if gap < min(own.leave_gap_m, max(going.least_m + own.rise_m, own.touch_gap_m)):
             return []
@@ -128,9 +128,9 @@ class TapWatch:
 
     def _tapped(self, gone: _Touch, seen: HandFeatures) -> list[Gesture]:
         """The tap of a touch that is over; nothing where two fingers may have been touched."""
-        least = [min(one.gap_m) for one in gone.instants]
+        least = [min(one.gap_m) for one in gone.epochs]
         down = next(k for k, gap in enumerate(least) if gap <= gone.least_m + _DOWN_M)
-        course, nearest = gone.instants[down:], gone.instants[int(np.argmin(least))]
+        course, nearest = gone.epochs[down:], gone.epochs[int(np.argmin(least))]
         weight = np.array([1.0 / max(one.thumb_sigma_m, 1e-4) ** 2 for one in course])
         weight = weight / weight.sum()
         gap = weight @ np.array([one.gap_m for one in course])

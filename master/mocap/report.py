@@ -39,9 +39,9 @@ def alignment_lines(alignment: Alignment) -> list[str]:
             "the file's hand is the mirror image of ours and was turned over: left-handed axes (Unity, Unreal), or the"
             " other hand"
         )
-    if np.isfinite(alignment.rival_s):
+    if np.isfinite(alignment.alternative_s):
         lines.append(
-            f"an offset {alignment.rival_s:+.2f} s from there fits nearly as well: a movement that repeats;"
+            f"an offset {alignment.alternative_s:+.2f} s from there fits nearly as well: a movement that repeats;"
             " make one that does not"
         )
     return lines
@@ -71,7 +71,7 @@ def alignment_json(alignment: Alignment | None) -> dict[str, object]:
     """The same for programs; None: frame and clock were said to be ours."""
     if alignment is None:
         return {"aligned": True}
-    rival = alignment.rival_s
+    alternative = alignment.alternative_s
     return {
         "aligned": False,
         "T_rig_file": [[round(float(value), 9) for value in row] for row in alignment.T_rig_file],
@@ -82,7 +82,7 @@ def alignment_json(alignment: Alignment | None) -> dict[str, object]:
         "shift_sigma_mm": 1e3 * alignment.shift_sigma_m,
         "residual_mm": 1e3 * alignment.residual_m,
         "speed_correlation": alignment.correlation,
-        "rival_offset_s": rival if np.isfinite(rival) else None,
+        "rival_offset_s": alternative if np.isfinite(alternative) else None,
         "mirrored": alignment.mirrored,
     }
 

@@ -56,7 +56,7 @@ _FREE = 2.5  # standard deviations of a distance beyond which a finger surely do
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Placed:
+class _PointEstimate:
     """An object at an instant: `T_rig_object` (4, 4) and covariance (6, 6)."""
 
     T: Float
@@ -135,7 +135,7 @@ def _touches(distance: Float, sigma: Float, before: Bool) -> Bool:
     return sure & (begins | stay_near)
 
 
-def _gaps(pose: HandPose, surface: Surface, placed: _Placed) -> tuple[Nearest, Float]:
+def _gaps(pose: HandPose, surface: Surface, placed: _PointEstimate) -> tuple[Nearest, Float]:
     """Distances of all bones (19,), object frame, and their standard deviations; NaN where a joint is not valid."""
     points = transform(invert(placed.T), np.nan_to_num(pose.position_m))
     start, stop = _BONES.T
@@ -159,14 +159,14 @@ def _gaps(pose: HandPose, surface: Surface, placed: _Placed) -> tuple[Nearest, F
     return Nearest(found.distance_m + nan, found.point_m + nan[:, None], found.along), sigma + nan
 
 
-def _at(poses: Sequence[ObjectPose], t_ns: int) -> _Placed | None:
+def _at(poses: Sequence[ObjectPose], t_ns: int) -> _PointEstimate | None:
     """Where an object was at an instant, by its last poses; None: nobody knows."""
     if not poses or t_ns - poses[-1].t_ns > LED_S * 1e9 or poses[0].t_ns - t_ns > LED_S * 1e9:
         return None
     if len(poses) == 1:
         one = poses[0]
         dt = (t_ns - one.t_ns) * 1e-9
-        return _Placed(_pose_of(one), one.cov + _led(dt))
+        return _PointEstimate(_pose_of(one), one.cov + _led(dt))
     after = next((k for k, one in enumerate(poses) if one.t_ns >= t_ns), len(poses) - 1)
     a, b = poses[max(after, 1) - 1], poses[max(after, 1)]
     share = (t_ns - a.t_ns) / (b.t_ns - a.t_ns)
@@ -176,7 +176,7 @@ def _at(poses: Sequence[ObjectPose], t_ns: int) -> _Placed | None:
     T = rigid(R, T_a[:3, 3] + share * (T_b[:3, 3] - T_a[:3, 3]))
     near = b if share > 0.5 else a
     beyond_s = max(t_ns - b.t_ns, a.t_ns - t_ns, 0) * 1e-9
-    return _Placed(T, near.cov + _led(beyond_s))
+    return _PointEstimate(T, near.cov + _led(beyond_s))
 
 
 def _led(dt_s: float) -> Float:

@@ -105,7 +105,7 @@ def unheeded(fitted: Fitted, alone: Fitted, since_s: float, poor_m: float) -> Fi
         poor_m: What is less sure than this is not told [m].
     """
     size, axes = np.linalg.eigh(alone.cov[:6, :6] * np.outer(_SCALE, _SCALE))
-    blind = axes[:, size > poor_m**2] / _SCALE[:, None]
+    unobserved = axes[:, size > poor_m**2] / _SCALE[:, None]
     cov = fitted.cov.copy()
-    cov[:6, :6] += (0.5 * _UNSEEN_M_S2 * min(since_s, HELD_S) ** 2) ** 2 * (blind @ blind.T)
+    cov[:6, :6] += (0.5 * _UNSEEN_M_S2 * min(since_s, HELD_S) ** 2) ** 2 * (unobserved @ unobserved.T)
     return replace(fitted, cov=cov, alone=False)

@@ -3,7 +3,7 @@
 Each observation (a bead, a corner of a tag) has its own time, that of its row, and a place in the distorted image. The
 object's motion about the instant is a Taylor series of its place and of its turn (`master.objects.motion`), to the
 fourth order, whose speed, acceleration, jerk and snap are drawn at random with the sizes of what hands do (as
-`master.fabrik.carry` has it for single markers; Rasmussen, Williams 2006, 2.7).
+`master.fabrik.propagate` has it for single markers; Rasmussen, Williams 2006, 2.7).
 
 Minimised is the reprojection error in units of its noise plus these priors, by Gauss-Newton from a start. Everything is
 one linear problem of 30 unknowns per round, whatever the number of cameras and features: cameras need not be in step,

@@ -116,9 +116,9 @@ def _homography(plane: Float, xy: Float) -> Float | None:
         return None
 
 
-def _turn_to(sight: Float) -> Float:
+def _turn_to(line_of_sight: Float) -> Float:
     """The least rotation (3, 3) that takes the z axis to the direction of a vector (3,) before the camera."""
-    x, y, z = sight / np.linalg.norm(sight)
+    x, y, z = line_of_sight / np.linalg.norm(line_of_sight)
     cross = np.array([[0.0, 0.0, x], [0.0, 0.0, y], [-x, -y, 0.0]])
     return np.eye(3) + cross + cross @ cross / (1.0 + z)
 
@@ -143,8 +143,8 @@ def poses_of_beads(sighted: Sequence[Sighted], features: Features, cameras: Came
         if np.linalg.norm(np.cross(own[1] - own[0], own[2] - own[0])) < 1e-4:  # [m^2]: nearly in one line
             continue
         wanted = _sides(own)
-        for chosen in list(product(*(range(len(places[bead])) for bead in triple)))[:_COMBINATIONS]:
-            points = np.array([places[bead][k] for bead, k in zip(triple, chosen, strict=True)])
+        for associated in list(product(*(range(len(places[bead])) for bead in triple)))[:_COMBINATIONS]:
+            points = np.array([places[bead][k] for bead, k in zip(triple, associated, strict=True)])
             off = np.abs(_sides(points) - wanted)
             if (off < _DISTANCE_M + _DISTANCE_SHARE * wanted).all():
                 poses.append((float(off.sum()), fit_rigid(points, own)))
@@ -159,8 +159,8 @@ def _points(sighted: Sequence[Sighted], bead: int, cameras: CameraArrays) -> Flo
         return np.empty((0, 3))
     choices = list(product(*(range(len(seen.uv)) for seen in views)))[:_COMBINATIONS]
     uv = np.full((len(cameras.scale), len(choices), 2), np.nan)
-    for seen, chosen in zip(views, np.array(choices, np.int64).T, strict=True):
-        uv[seen.camera] = seen.uv[chosen, 0]
+    for seen, associated in zip(views, np.array(choices, np.int64).T, strict=True):
+        uv[seen.camera] = seen.uv[associated, 0]
     found = triangulate(cameras, uv, _SIGMA_PX)
     return found.points_m[found.residual_px < _MISS_PX]
 

@@ -15,7 +15,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from master.fabrik.intersection import RAYS
 
-_INDEPENDENT_SHARE, _INDEPENDENT_PX = 0.7, 0.1  # as in `master.fabrik.carry`
+_INDEPENDENT_SHARE, _INDEPENDENT_PX = 0.7, 0.1  # as in `master.fabrik.propagate`
 _SOFT_2 = 9.0  # square of the deviation in sigmas at which a feature counts half ... a quarter
 
 
@@ -39,15 +39,15 @@ class Observations:
     sigma_px: Float
     t_sigma_s: Float
 
-    def some(self, chosen: Bool) -> "Observations":
+    def some(self, associated: Bool) -> "Observations":
         """Those of a mask (n,)."""
         return Observations(
-            self.camera[chosen],
-            self.point[chosen],
-            self.tau_s[chosen],
-            self.uv[chosen],
-            self.sigma_px[chosen],
-            self.t_sigma_s[chosen],
+            self.camera[associated],
+            self.point[associated],
+            self.tau_s[associated],
+            self.uv[associated],
+            self.sigma_px[associated],
+            self.t_sigma_s[associated],
         )
 
 

@@ -38,7 +38,7 @@ class Nearest:
     along: Float
 
 
-class _Placed:
+class _PosedSurface:
     """All parts of one kind, each where it is on the object."""
 
     def __init__(self, shapes: Sequence[Shape], parts: Parts) -> None:
@@ -70,7 +70,7 @@ class Surface:
 
     def __init__(self, parts: Sequence[Shape]) -> None:
         """Take the parts of its shape; none: it has no surface."""
-        self._kinds = [_Placed(shapes, kind) for shapes, kind in by_kind(parts)]
+        self._kinds = [_PosedSurface(shapes, kind) for shapes, kind in by_kind(parts)]
 
     def __bool__(self) -> bool:
         """Whether there is any."""
@@ -113,8 +113,8 @@ class Surface:
         low, high = _GRID[np.maximum(best - 1, 0)], _GRID[np.minimum(best + 1, _STEPS - 1)]
         share = low[:, None] + (high - low)[:, None] * _GRID
         best, gap = least(share)
-        chosen = share[rows, best]
-        return Nearest(gap, self.nearest(cones.start_m + chosen[:, None] * along)[1], chosen)
+        associated = share[rows, best]
+        return Nearest(gap, self.nearest(cones.start_m + associated[:, None] * along)[1], associated)
 
     def hides(self, eye: Float, points: Float) -> Bool:
         """(...) whether the object itself is between an eye (3,) [m] and points (..., 3) [m], object frame."""

@@ -7,7 +7,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from common.messages import Source
-from master.outputs.object_look import OBJECT_RGB, ObjectLook
+from master.outputs.object_appearance import OBJECT_RGB, ObjectAppearance
 from master.outputs.palette import SOURCE_MEANING, SOURCE_RGB
 from master.rig_setup import RigSetup
 
@@ -81,14 +81,14 @@ def blueprint(setups: Sequence[RigSetup], *, live: bool, with_truth: bool) -> rr
         )
         for name in cameras
     ]
-    left_out = {name for name, there in (
+    rejected = {name for name, there in (
         ("plots/jitter_mm", with_markers), ("plots/error_mm", with_truth), ("plots/wrist_bend_deg", with_bend),
         ("plots/contact_mm", any(setup.objects for setup in setups)),
     ) if not there}  # fmt: skip
     rows = [
         (n, p, (0.0, 1.25 * rate_hz) if n == _RATE else r, several)
         for n, p, r, several in _PLOTS
-        if p not in left_out
+        if p not in rejected
     ]
     plots = [
         rrb.TimeSeriesView(
@@ -146,8 +146,8 @@ def legend() -> str:
         "- **small dim / large bright markers**: before / after the filter\n"
         + "".join(
             f"- **object** rgb{OBJECT_RGB[look]}: {look.value}\n"
-            for look in ObjectLook
-            if look is not ObjectLook.GONE
+            for look in ObjectAppearance
+            if look is not ObjectAppearance.GONE
         )
         + "- **red, yellow spots on it**: where a finger touches it, or is nearer than 3 cm, with the distance in mm\n"
         "- **pink line**: a pinch; **yellow circle**: a dial, by how much it was turned; **blue arrow**: pointing\n"

@@ -205,7 +205,7 @@ class Player:
                     hurry = Hurry()
                     world = world_of(self._setups, hurry)
             if isinstance(one.message, Backlog):
-                hurry.leave_out = one.message.leave_out
+                hurry.reject = one.message.reject
             told = self._told(world, one)
             if not silent:
                 self._write(told, digest)

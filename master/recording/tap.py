@@ -45,7 +45,7 @@ class Tap:
         self._hurry = threading.Event()
         self._busy = self._closed = False
         self._shown = self._dropped = 0
-        self._left_out, self._again = 0, False  # as was shown last; a reader may not have been there
+        self._rejected, self._again = 0, False  # as was shown last; a reader may not have been there
         if always:
             self._start()
 
@@ -63,7 +63,7 @@ class Tap:
         self._until_ns = self._clock.now_ns() + LEASE_NS
         self._start()
 
-    def show(self, message: Message, leave_out: int = 0) -> None:
+    def show(self, message: Message, reject: int = 0) -> None:
         """Publish it soon, if somebody taps; and before it that so many instants are left out, if that is news."""
         if not self._always:
             if self._until_ns == 0:
@@ -71,9 +71,9 @@ class Tap:
             if self._clock.now_ns() >= self._until_ns:
                 self._until_ns = 0
                 return
-        if leave_out != self._left_out or (self._again and leave_out):
-            self._left_out = leave_out
-            self._put(Backlog(MASTER, came_ns(message, self._clock.now_ns()), leave_out))
+        if reject != self._rejected or (self._again and reject):
+            self._rejected = reject
+            self._put(Backlog(MASTER, came_ns(message, self._clock.now_ns()), reject))
         self._again = False
         self._put(message)
 
@@ -158,4 +158,4 @@ class Tapped(Generic[TakenT]):
         """At the end: the last message, too."""
         last, self._last = self._last, None
         if last is not None:
-            self._tap.show(last, self._hurry.leave_out)
+            self._tap.show(last, self._hurry.reject)

@@ -160,8 +160,8 @@ def _reach_lines(cells: list[Cell], poses: list[str]) -> list[str]:
         lines.append(
             f"| {finger} | " + " | ".join(f"{cell.told} / {cell.tip} of {cell.trials}" for cell in own) + " |"
         )
-    blind = [cell for cell in cells if cell.blind]
-    told = ", ".join(f"{cell.finger} {_LETTER[cell.pose]} {cell.blind}" for cell in blind) or "none"
+    unseen = [cell for cell in cells if cell.unseen]
+    told = ", ".join(f"{cell.finger} {_LETTER[cell.pose]} {cell.unseen}" for cell in unseen) or "none"
     return [*lines, "", f"Trials in which a finger was tracked and neither was in sight: {told}."]
 
 

@@ -98,8 +98,8 @@ def record_guided(folder: Path, who: Participant, camera: CameraCalibration, cou
     model = HandModel.of(who.hand)
     motion = GuidedWearer(model, who.seed)
     scene = WristScene(who.rig, {camera.name: camera}, model, motion, "indoor", who.seed, who.reflectance)
-    instants: list[float] = (np.arange(count) * (WEARER_S / count)).tolist()
-    record_wrist(folder, scene, poses_s=instants, step=step)
+    epochs: list[float] = (np.arange(count) * (WEARER_S / count)).tolist()
+    record_wrist(folder, scene, poses_s=epochs, step=step)
 
 
 def write_trials(path: Path, held: list[Held]) -> None:

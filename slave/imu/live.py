@@ -16,7 +16,7 @@ from slave.report import Reporter
 from slave.service import Service
 from slave.uplink import Uplink
 
-LOOK_S = 0.5e-3  # between two samples it is looked whether the master has started
+CHECK_S = 0.5e-3  # between two samples it is looked whether the master has started
 
 
 def wait_for_start(
@@ -36,7 +36,7 @@ def wait_for_start(
         ImuError: The IMU is gone.
     """
     while not stop.is_set():
-        if barrier.wait_for_start(LOOK_S):
+        if barrier.wait_for_start(CHECK_S):
             return True
         if (sample := source.read()) is None:
             return False

@@ -28,14 +28,14 @@ from slave.markers.autocolour_things import Surroundings, Thing, coloured, hsv_o
 from slave.markers.classify import HUES
 from slave.markers.colours import (
     AROUND,
-    HUE_APART,
     HUE_GROW,
+    HUE_SEPARATION,
     PALE,
     RIM,
     ColourRow,
     circular_median,
-    hue_apart,
     hue_distance,
+    hue_separation,
     rows_of,
 )
 
@@ -45,7 +45,7 @@ SMOOTH = 2.5  # hues: standard deviation with which the hues of things are smoot
 SEEN_SHARE = 0.1  # of the frames in which a paint must be seen,
 SEEN_LEAST = 4  # and at least so many
 SIZE_SHARE = 0.25  # of the typical area of all; a smaller thing is the fringe of another
-RIVAL = 0.5  # a further hue seen this often, relative to the rarest paint, leaves a doubt
+ALTERNATIVE = 0.5  # a further hue seen this often, relative to the rarest paint, leaves a doubt
 TWIN_SIZE, TWIN_SHARE = (
     0.3,
     0.4,
@@ -153,7 +153,7 @@ def find_paints(things: Sequence[Sequence[Thing]], count: int, around: Surroundi
             f"{_why_fewer(every, around)}"
         )
     _refuse_twins(things, found[:count])
-    if len(found) > count and len(found[count].things) >= RIVAL * len(found[count - 1].things):
+    if len(found) > count and len(found[count].things) >= ALTERNATIVE * len(found[count - 1].things):
         raise FitError(
             f"{len(found)} colours move with the hand (hues {hues}), the rig has {count} markers: take off or cover "
             f"what else is coloured (sleeve, ring, nails), or give clicks"
@@ -195,7 +195,7 @@ def _by_hue(things: Sequence[Sequence[Thing]]) -> list[Paint]:
     for k in np.argsort(-density, kind="stable"):
         if density[k] < 1.0:
             break
-        if all(hue_apart(k, p) >= HUE_APART for p in peaks):
+        if all(hue_separation(k, p) >= HUE_SEPARATION for p in peaks):
             peaks.append(int(k))
     peaks = [p for p in peaks if density[p] >= max(density[p - 1], density[(p + 1) % HUES])]
     nearest = np.argmin([hue_distance(hue, p) for p in peaks], axis=0)
@@ -203,7 +203,7 @@ def _by_hue(things: Sequence[Sequence[Thing]]) -> list[Paint]:
     for n, peak in enumerate(peaks):
         mine = [
             thing for thing, k in zip(flat, nearest, strict=True)
-            if k == n and hue_apart(thing.hue, peak) <= HUE_GROW
+            if k == n and hue_separation(thing.hue, peak) <= HUE_GROW
         ]  # fmt: skip
         best: dict[int, Thing] = {}
         for thing in mine:
@@ -222,7 +222,7 @@ def _refuse_twins(things: Sequence[Sequence[Thing]], paints: Sequence[Paint]) ->
             others = [
                 t for t in things[largest.frame]
                 if t is not largest and t.area > TWIN_SIZE * largest.area
-                and hue_apart(t.hue, paint.hue) < HUE_APART
+                and hue_separation(t.hue, paint.hue) < HUE_SEPARATION
             ]  # fmt: skip
             double += bool(others)
         if double > TWIN_SHARE * len(paint.things):
@@ -259,7 +259,7 @@ def _others(
         hsv = hsv_of(images[k])
         paint = np.zeros(hsv.shape[:2], np.uint8)
         for thing in things[k]:
-            if any(hue_apart(thing.hue, p.hue) <= HUE_GROW for p in paints):
+            if any(hue_separation(thing.hue, p.hue) <= HUE_GROW for p in paints):
                 paint.reshape(-1)[thing.pixels] = 1
         paint |= _scraps(hsv, around, largest)
         rim, near = (cv2.dilate(paint, np.ones((2 * r + 1, 2 * r + 1), np.uint8)) != 0 for r in (RIM, AROUND))

@@ -134,16 +134,16 @@ def evidence(half: Image, table: ColourTable, reference: Float, log_gains: Float
     close = np.nan_to_num(1.0 - (fit.misfit / FITS) ** 2, nan=0.0)
     score = float(np.maximum(close, 0.0).sum())
     light = bounded(fit.log_gains)
-    beyond = _hues_apart(light, fit.log_gains) > ROUNDED
+    beyond = _separated_hues(light, fit.log_gains) > ROUNDED
     return Evidence(light, score, int((close > 0.0).sum()), fit.misfit, beyond=beyond)
 
 
 def different(a: Float, b: Float) -> bool:
     """Whether two lights, log gains (3,), are clearly different in hue."""
-    return _hues_apart(a, b) > OTHER
+    return _separated_hues(a, b) > OTHER
 
 
-def _hues_apart(a: Float, b: Float) -> float:
+def _separated_hues(a: Float, b: Float) -> float:
     """Log gain of red or blue against green, whichever differs more."""
     blue, green, red = (a - b).tolist()
     return max(abs(blue - green), abs(red - green))

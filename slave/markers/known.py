@@ -10,9 +10,9 @@ import numpy as np
 
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration
-from slave.markers.blind import BlindDetector
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.engine import NUMPY, Engine
+from slave.markers.null_detector import NullDetector
 
 
 class KnownDetector:
@@ -34,7 +34,7 @@ class KnownDetector:
         self.missing = tuple(name for name in markers if name not in known)
         self._rows = [markers.index(name) for name in known]
         self._count = len(markers)
-        self._nothing = BlindDetector(len(markers))
+        self._nothing = NullDetector(len(markers))
         self._plain = None
         if known:
             mine = [name for name in free if name in known]

@@ -21,15 +21,15 @@ from common.srgb import relit_bytes
 from slave.markers.classify import HUES, SKIN, in_range
 from slave.markers.colour_watch import hsv as hsv_of_light
 from slave.markers.colours import (
-    HUE_APART,
+    HUE_SEPARATION,
     PALE,
     SMALLEST,
     VALUE_LEAST,
     ColourRow,
     circular_median,
     grow,
-    hue_apart,
     hue_distance,
+    hue_separation,
     rows_of,
     surroundings,
 )
@@ -198,7 +198,7 @@ def _refuse_like(marker: str, paint: Mapping[str, Image]) -> None:
     hue = circular_median(paint[marker][:, 0])
     for name, pixels in paint.items():
         other = circular_median(pixels[:, 0])
-        if name != marker and hue_apart(hue, other) < HUE_APART:
+        if name != marker and hue_separation(hue, other) < HUE_SEPARATION:
             raise FitError(
                 f"pick {marker}: its paint has nearly the hue of marker {name} ({hue:.0f}, {other:.0f}): if this is "
                 f"the paint of {name}, click on that of {marker}; if {name} was picked wrongly, forget its colour "

@@ -16,7 +16,7 @@ from slave.report import Reporter
 from slave.service import Service
 from slave.uplink import Uplink
 
-LOOK_S = 0.5e-3  # between two poses it is looked whether the master has started
+CHECK_S = 0.5e-3  # between two poses it is looked whether the master has started
 
 
 def wait_for_start(
@@ -34,7 +34,7 @@ def wait_for_start(
         TrackerError: The tracking system is gone.
     """
     while not stop.is_set():
-        if barrier.wait_for_start(POLL_S if recorded else LOOK_S):
+        if barrier.wait_for_start(POLL_S if recorded else CHECK_S):
             return True
         if not recorded and source.read() is None:
             return False

@@ -24,7 +24,7 @@ from slave.objects.openvr_library import Library, VrSystem, connect, load_librar
 
 RATE_HZ = 120.0
 LOST_EVERY = 30  # poses of NaN: four a second suffice
-LOOK_NS = 1_000_000_000  # between two searches for the device
+POLL_NS = 1_000_000_000  # between two searches for the device
 _UNIT_WITHIN = 1e-3
 _NOTHING = (np.full(3, np.nan), np.full(4, np.nan))
 
@@ -127,7 +127,7 @@ class OpenVrTracker:
 
     def _found(self, system: VrSystem, now_ns: int) -> int | None:
         """The device's number, which stays while SteamVR runs; searched again once a second until it is there."""
-        if self._index is None and (self._looked_ns is None or now_ns - self._looked_ns >= LOOK_NS):
+        if self._index is None and (self._looked_ns is None or now_ns - self._looked_ns >= POLL_NS):
             self._looked_ns = now_ns
             self._index = self._search(system)
         if self._index is None:

@@ -57,14 +57,14 @@ def shown(paint: float = 100.0, line: float = 0.02) -> Shown:
     """So much paint of every marker in both cameras, and so much line on every finger, at all times."""
     times = np.arange(0.0, 6.0, 1.0 / HZ)
     cameras = BOTH.markers.rig.cameras
-    sight = Sight(
+    line_of_sight = Sight(
         dict.fromkeys(cameras, times),
         {name: np.full((len(times), 6), paint) for name in cameras},
         times,
         np.full((len(times), 5), line),
         np.zeros((len(times), 5), np.bool_),
     )
-    return Shown(BOTH, 6.0, [], sight)
+    return Shown(BOTH, 6.0, [], line_of_sight)
 
 
 def figures(one: Solved, of: Shown, away: Away | None = None) -> Figures:
@@ -183,15 +183,15 @@ def test_what_is_cut_off_does_not_come() -> None:
 def test_a_finger_is_in_sight_around_the_frame_that_shows_it() -> None:
     both = shown(paint=0.0, line=0.0)
     name = BOTH.markers.rig.cameras[0]
-    both.sight.paint_px2[name][120, INDEX] = 50.0  # at 2 s
-    seen = both.sight.cameras_of(np.array([1.94, 1.97, 2.0, 2.03, 2.06]), 0.04)[:, INDEX]
+    both.line_of_sight.paint_px2[name][120, INDEX] = 50.0  # at 2 s
+    seen = both.line_of_sight.cameras_of(np.array([1.94, 1.97, 2.0, 2.03, 2.06]), 0.04)[:, INDEX]
     assert seen.tolist() == [0, 1, 1, 1, 0]
 
 
 def test_hand_overs_are_where_sight_changes() -> None:
     both = shown()
     for name in BOTH.markers.rig.cameras:
-        both.sight.paint_px2[name][180:, INDEX] = 0.0  # from 3 s on
+        both.line_of_sight.paint_px2[name][180:, INDEX] = 0.0  # from 3 s on
     sighted = Sighted.of(both, solved(), None)
     near = sighted.hand_over[:, INDEX]
     assert near[np.abs(T_S - 3.04) < 0.45].all()

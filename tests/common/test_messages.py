@@ -94,7 +94,7 @@ def detections(draw: st.DrawFn) -> MarkerDetections:
         area=draw(floats(kind, "area", m)),
         quality=draw(floats(kind, "quality", m)),
         sigma_px=positive(draw, seen),
-        rival_uv=np.where(seen[:, None], draw(rows(kind, "rival_uv", m, 2)), np.nan),
+        alternative_uv=np.where(seen[:, None], draw(rows(kind, "alternative_uv", m, 2)), np.nan),
         t_sigma_ns=draw(st.floats(0.0, 1e10)),
     )
 
@@ -241,7 +241,7 @@ healths = st.builds(
     gauges=st.dictionaries(names, st.floats(-1e18, 1e18), max_size=64),
 )
 commands = st.builds(Command, target=names, verb=names, body=st.text(max_size=200))
-backlogs = st.builds(Backlog, source=names, t_ns=times, leave_out=st.integers(0, 64))
+backlogs = st.builds(Backlog, source=names, t_ns=times, reject=st.integers(0, 64))
 previews = st.builds(
     Preview, camera=names, t_ns=times, jpeg=st.binary(max_size=200).map(lambda tail: JPEG_HEAD + tail)
 )
@@ -267,12 +267,14 @@ def sample_pose(markers: int = 6) -> HandPose:
     )
 
 
-def sample_detections(markers: int = 6, rivals: Float | None = None) -> MarkerDetections:
+def sample_detections(markers: int = 6, alternatives: Float | None = None) -> MarkerDetections:
     uv = np.arange(2.0 * markers).reshape(markers, 2)
     uv[1:2] = np.nan
     sigma = np.where(np.isnan(uv[:, 0]), np.nan, 0.1)
-    rival = np.full((markers, 2), np.nan) if rivals is None else rivals
-    return MarkerDetections("left", 1, 2, 3, 4, uv, np.full(markers, 80.0), np.ones(markers), sigma, rival)
+    alternative = np.full((markers, 2), np.nan) if alternatives is None else alternatives
+    return MarkerDetections(
+        "left", 1, 2, 3, 4, uv, np.full(markers, 80.0), np.ones(markers), sigma, alternative
+    )
 
 
 def sample_triple() -> WristDetections:
@@ -464,16 +466,16 @@ def test_the_detections_of_24_markers_are_one_ethernet_packet_while_none_has_a_r
 
 
 def test_no_rival_travels_as_no_bytes_and_one_rival_with_its_row() -> None:
-    assert as_map(sample_detections())["rival_uv"] == b""
+    assert as_map(sample_detections())["alternative_uv"] == b""
     decoded = decode(encode(sample_detections()))
     assert isinstance(decoded, MarkerDetections)
-    assert decoded.rival_uv.shape == (6, 2)
-    assert np.isnan(decoded.rival_uv).all()
-    rivals = np.full((6, 2), np.nan)
-    rivals[3] = 7.0, 8.0
-    decoded = decode(encode(sample_detections(6, rivals)))
+    assert decoded.alternative_uv.shape == (6, 2)
+    assert np.isnan(decoded.alternative_uv).all()
+    alternatives = np.full((6, 2), np.nan)
+    alternatives[3] = 7.0, 8.0
+    decoded = decode(encode(sample_detections(6, alternatives)))
     assert isinstance(decoded, MarkerDetections)
-    np.testing.assert_array_equal(decoded.rival_uv, rivals)
+    np.testing.assert_array_equal(decoded.alternative_uv, alternatives)
 
 
 @pytest.mark.parametrize("value", [np.inf, -np.inf])
@@ -497,14 +499,14 @@ def test_a_restamped_message_is_another_one_with_the_same_arrays() -> None:
 
 
 def test_a_message_knows_whether_a_marker_has_a_rival() -> None:
-    rivals = np.full((6, 2), np.nan)
-    rivals[3] = [40.0, 50.0]
-    assert sample_detections(6, rivals).has_rivals
+    alternatives = np.full((6, 2), np.nan)
+    alternatives[3] = [40.0, 50.0]
+    assert sample_detections(6, alternatives).has_alternatives
     none = sample_detections(6)
-    assert not none.has_rivals
+    assert not none.has_alternatives
     back = decode(encode(none))
     assert isinstance(back, MarkerDetections)
-    assert not back.has_rivals
+    assert not back.has_alternatives
 
 
 @pytest.mark.parametrize(
@@ -532,10 +534,10 @@ def test_a_message_knows_whether_a_marker_has_a_rival() -> None:
         (MarkerDetections, {"sigma_px": np.array([0.1, np.nan, 0.1, np.inf, 0.1, 0.1]).tobytes()}),
         (MarkerDetections, {"sigma_px": np.array([0.1, np.nan, 0.1, np.nan, 0.1, 0.1]).tobytes()}),  # seen
         (MarkerDetections, {"sigma_px": np.full(6, 0.1).tobytes()}),  # the second is not seen
-        (MarkerDetections, {"rival_uv": b"\0" * 8}),
-        (MarkerDetections, {"rival_uv": np.zeros((5, 2)).tobytes()}),
-        (MarkerDetections, {"rival_uv": np.zeros((6, 2)).tobytes()}),  # the second is not seen
-        (MarkerDetections, {"rival_uv": np.full((6, 2), -np.inf).tobytes()}),
+        (MarkerDetections, {"alternative_uv": b"\0" * 8}),
+        (MarkerDetections, {"alternative_uv": np.zeros((5, 2)).tobytes()}),
+        (MarkerDetections, {"alternative_uv": np.zeros((6, 2)).tobytes()}),  # the second is not seen
+        (MarkerDetections, {"alternative_uv": np.full((6, 2), -np.inf).tobytes()}),
         (MarkerDetections, {"surplus": 1}),
         (MarkerDetections, {"type": "HandPose"}),
         (MarkerDetections, {"type": "Pickle"}),
@@ -551,8 +553,8 @@ def test_a_message_knows_whether_a_marker_has_a_rival() -> None:
         (Health, {"gauges": {"rate_hz": float("inf")}}),
         (Health, {"gauges": {"a b": 1.0}}),
         (Command, {"verb": ""}),
-        (Backlog, {"leave_out": -1}),
-        (Backlog, {"leave_out": 65}),
+        (Backlog, {"reject": -1}),
+        (Backlog, {"reject": 65}),
         (Preview, {"jpeg": b""}),
         (Preview, {"jpeg": b"GIF89a"}),
         (Preview, {"jpeg": "text"}),
@@ -642,7 +644,7 @@ def test_a_number_beyond_its_bounds_is_refused_as_such(
         (MarkerDetections, {"t_sigma_ns": 1e11}),
         (MarkerDetections, {"seq": -1}),
         (WristDetections, {"exposure_us": 1e8}),
-        (Backlog, {"leave_out": 65}),
+        (Backlog, {"reject": 65}),
         (TrackerPose, {"orientation_wxyz": np.array([0.5, 0.0, 0.0, 0.0]).tobytes()}),
         (ImuSample, {"orientation_wxyz": np.zeros(4).tobytes()}),
     ],
@@ -807,8 +809,8 @@ def test_constructors_refuse_what_does_not_fit() -> None:
         msgspec.structs.replace(sample_detections(), uv=np.zeros((6, 3)))
     with pytest.raises(ValueError, match="sigma_px: 0 is not within"):
         msgspec.structs.replace(sample_detections(), sigma_px=np.zeros(6))
-    with pytest.raises(ValueError, match="rival_uv: a rival of a marker that is not seen"):
-        msgspec.structs.replace(sample_detections(), rival_uv=np.ones((6, 2)))
+    with pytest.raises(ValueError, match="alternative_uv: a rival of a marker that is not seen"):
+        msgspec.structs.replace(sample_detections(), alternative_uv=np.ones((6, 2)))
     with pytest.raises(ValueError, match="at most 48"):
         sample_detections(MAX_MARKERS + 1)
     with pytest.raises(ValueError, match="at most 48"):

@@ -149,11 +149,11 @@ def test_corners_and_beads_are_where_the_object_is_when_their_row_is_exposed(
 
 
 def test_a_lone_bead_covers_the_cone_of_rays_that_meet_its_ball() -> None:
-    lone = msgspec.structs.replace(OBJECTS["wand"], shape=())
-    scene = placed("desk-wand", Placed(MIDDLE), {"wand": lone})
+    single = msgspec.structs.replace(OBJECTS["wand"], shape=())
+    scene = placed("desk-wand", Placed(MIDDLE), {"wand": single})
     view, optics = markers_of(scene, "right"), scene.optics["right"]
     v, u = np.mgrid[0:1920, 0:2560] / 4.0 - 0.375  # sixteen rays a pixel
-    for m, bead in zip((6, 7, 8), lone.markers.values(), strict=True):
+    for m, bead in zip((6, 7, 8), single.markers.values(), strict=True):
         middle = transform(invert(optics.T_rig_camera), scene.truth(0.0).markers_m[m])
         near = np.hypot(u - view.uv[m, 0], v - view.uv[m, 1]) < 15.0
         rays = optics.undistort(np.stack([u[near], v[near]], axis=-1))

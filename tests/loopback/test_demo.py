@@ -132,7 +132,7 @@ def test_demo_tracks_scores_and_leaves_its_results(demo_of: Demo, tmp_path: Path
         assert np.isfinite(summary[key]), key
     assert summary["camera_hz"] == pytest.approx({"left": 60.0, "right": 60.0}, rel=2e-3)
     assert set(summary["received_hz"]) == {"left", "right"}
-    assert set(summary["stage_us"]) == {"pairing", "triangulate", "filter", "fabrik", "hand", "gestures"}
+    assert set(summary["stage_us"]) == {"frame_sync", "triangulate", "filter", "fabrik", "hand", "gestures"}
     for name in ("hand.png", "run.rrd", "poses.npz", "left.log", "right.log", "master.log"):
         assert (tmp_path / name).stat().st_size > 0, name
     poses = load_poses(tmp_path / "poses.npz")

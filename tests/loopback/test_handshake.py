@@ -321,7 +321,7 @@ def test_replayed_beacons_neither_end_nor_renew_a_session() -> None:
         wires.carry(datagram, ("6.6.6.6", 6), BROADCAST, keep=False)
         wires.step()
     assert [slave._session for slave in (old_left, old_right)] == sessions
-    assert old_left.refused[Refusal.RIVAL] > 0  # those of the first life
+    assert old_left.refused[Refusal.OTHER_MASTER] > 0  # those of the first life
     assert old_left.refused[Refusal.REPLAYED] > 0  # those of this one
     assert wires.all_started()
 
@@ -329,14 +329,14 @@ def test_replayed_beacons_neither_end_nor_renew_a_session() -> None:
 def test_a_second_master_does_not_tear_the_slaves_apart() -> None:
     wires = Wires()
     _, left, right = started_pair(wires)
-    rival = MasterLink(("left", "right"), KEY, wires.clock, BROADCAST, "", S, seeded(99))
+    alternative = MasterLink(("left", "right"), KEY, wires.clock, BROADCAST, "", S, seeded(99))
     sessions = (left._session, right._session)
     for _ in range(100):
-        for datagram, to in rival.due():
+        for datagram, to in alternative.due():
             wires.carry(datagram, ("10.0.0.2", 1), to, keep=False)
         wires.step()
     assert (left._session, right._session) == sessions
-    assert left.refused[Refusal.RIVAL] > 0
+    assert left.refused[Refusal.OTHER_MASTER] > 0
 
 
 def test_a_master_that_vanishes_is_noticed_and_its_return_too() -> None:

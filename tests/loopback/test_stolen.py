@@ -223,7 +223,7 @@ def test_secrets_that_do_not_fit_are_named_on_both_sides(
 
 def test_an_unproven_that_the_thief_says_changes_nothing() -> None:
     scene = Scene()
-    told = Unproven(scene.master._nonce, bytes(NONCE_BYTES), apart=False)
+    told = Unproven(scene.master._nonce, bytes(NONCE_BYTES), has_secrets=False)
     scene.wires.carry(seal(scene.sealer, told), THIEF, scene.address)
     assert scene.left.refused == {Refusal.REPLAYED: 1}
     assert scene.left.wrong is None

@@ -69,13 +69,13 @@ class Paired:
 class Lived:
     """Instants that were solved, when each was begun and told, and how many were left out."""
 
-    instants: list[int]
+    epochs: list[int]
     begun: list[int]
     told: list[int]
     shed: int
 
     def ages_ms(self) -> list[float]:
-        return [1e-6 * (told - instant) for told, instant in zip(self.told, self.instants, strict=True)]
+        return [1e-6 * (told - epoch) for told, epoch in zip(self.told, self.epochs, strict=True)]
 
 
 def lived(
@@ -99,13 +99,13 @@ def lived(
             continue
         assert isinstance(message, MarkerDetections)
         hurry.look(message)
-        for instant in pairs.push(message):
+        for epoch in pairs.push(message):
             if shed():
                 out.shed += 1
                 continue
-            out.instants.append(instant)
+            out.epochs.append(epoch)
             out.begun.append(now)
-            now += solve_ns(instant)
+            now += solve_ns(epoch)
             out.told.append(now)
     return out
 
@@ -119,7 +119,7 @@ def test_who_keeps_up_leaves_nothing_out(load: float, offset_ns: int) -> None:
     for jitter_ns in (0, 1 * MS, 4 * MS):
         out = lived(arrivals(5.0, offset_ns, jitter_ns), lambda _t: round(load * PERIOD_NS))
         assert out.shed == 0
-        assert len(out.instants) >= 299
+        assert len(out.epochs) >= 299
 
 
 @pytest.mark.parametrize("rates_hz", [(90.0, 30.0), (30.0, 90.0), (60.0, 50.0)])
@@ -136,7 +136,7 @@ def test_after_a_pause_the_newest_instant_is_solved_next(offset_ns: int) -> None
     out = lived(came, lambda _t: round(0.75 * PERIOD_NS), pauses=[(begin, end)])
     pairs = Paired()
     newest = [t for one in came if one.t_ns <= end for t in pairs.push(one.message)][-1]
-    assert next(t for t, begun in zip(out.instants, out.begun, strict=True) if begun >= end) == newest
+    assert next(t for t, begun in zip(out.epochs, out.begun, strict=True) if begun >= end) == newest
     assert 4 <= out.shed <= 6, "what came in 100 ms, once; it is not behind any more"
     assert max(out.ages_ms()[-60:]) < 40.0
 
@@ -176,7 +176,7 @@ def test_instants_are_left_out_while_a_newer_one_waits(waiting: dict[str, Span],
     hurry.look(detections("left", 1, 0, 0))
     hurry.waiting = lambda: waiting
     hurry.look(detections("right", 1, 0, 0))
-    assert hurry.leave_out == (MOST if behind else 0)
+    assert hurry.reject == (MOST if behind else 0)
 
 
 def test_nobody_waits_for_a_camera_that_is_silent() -> None:
@@ -184,9 +184,9 @@ def test_nobody_waits_for_a_camera_that_is_silent() -> None:
     hurry.look(detections("right", 1, 0, 0))
     hurry.waiting = lambda: waits(left=(21, 23))
     hurry.look(detections("left", 1, 11, 11 * PERIOD_NS))
-    assert hurry.leave_out == 0
+    assert hurry.reject == 0
     hurry.look(detections("left", 1, 13, 13 * PERIOD_NS))
-    assert hurry.leave_out == MOST
+    assert hurry.reject == MOST
 
 
 def test_what_is_no_frame_and_who_is_not_known_change_nothing() -> None:
@@ -194,14 +194,14 @@ def test_what_is_no_frame_and_who_is_not_known_change_nothing() -> None:
     hurry.waiting = lambda: waits(left=(1, 1), right=(1, 1))
     hurry.look(detections("third", 1, 0, 0))
     hurry.look(triple("wrist", 1, 0, 0))
-    assert hurry.leave_out == 0
+    assert hurry.reject == 0
     hurry.look(detections("left", 1, 0, 0))
-    assert hurry.leave_out == MOST
+    assert hurry.reject == MOST
 
 
 def test_a_master_that_has_no_time_but_for_messages_tells_some_instants() -> None:
     hurry = Hurry()
-    hurry.leave_out, shedding = MOST, Shedding(hurry)
+    hurry.reject, shedding = MOST, Shedding(hurry)
     assert [shedding() for _ in range(2 * MOST + 2)] == 2 * [*[True] * MOST, False]
 
 

@@ -5,7 +5,7 @@ from collections import Counter
 import numpy as np
 
 from master.odd_watch import OddWatch
-from tests.master.test_odd_camera import THREE, messages, rig, solve
+from tests.master.test_camera_outlier import THREE, messages, rig, solve
 
 
 def looks(watch: OddWatch, counts: Counter[str], seconds: int, **per_second: int) -> list[str]:

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from common.bus import LoopbackBus
 from common.messages import Contact, Gesture, ObjectPose, ObjectSource
 from common.object_profile import Bead, BoxShape, CylinderShape, ObjectProfile, SphereShape, Tag, Tags
-from master.outputs.object_look import ObjectLook
+from master.outputs.object_appearance import ObjectAppearance
 from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
 from master.outputs.rerun_gestures import arc, said
@@ -92,7 +92,7 @@ def times(path: Path, entity: str, component: str) -> list[int]:
 
 def test_the_look_of_an_object_is_how_well_its_place_is_known() -> None:
     looks = [bar(0), bar(0, occluded=True), bar(0, tracked=False), bar(0, tracked=False, known=False)]
-    assert [ObjectLook.of(one) for one in looks] == list(ObjectLook)
+    assert [ObjectAppearance.of(one) for one in looks] == list(ObjectAppearance)
 
 
 def test_an_object_goes_its_way_and_is_dressed_only_when_its_look_changes(tmp_path: Path) -> None:

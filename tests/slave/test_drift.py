@@ -85,9 +85,9 @@ def test_nothing_seen_changes_nothing_and_one_marker_stays_alone() -> None:
 
 
 @pytest.mark.parametrize("lone", range(6))
-def test_a_lone_marker_of_another_shade_does_not_carry_the_light_away(lone: int) -> None:
+def test_a_lone_marker_of_another_shade_does_not_carry_the_light_away(single: int) -> None:
     drift, seen = ColourDrift(PAINTS), np.full((6, 3), np.nan)
-    seen[lone] = PAINTS[lone] * 1.4 + 0.02  # a flat, bright patch with a sheen
+    seen[single] = PAINTS[single] * 1.4 + 0.02  # a flat, bright patch with a sheen
     for k in range(600):
         drift.push(seen, ONES, k * SECOND // 10)
     assert np.abs(against_green(drift.log_gains)).max() < 0.2

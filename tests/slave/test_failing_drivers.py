@@ -29,14 +29,14 @@ from slave.imu import live as imu_live
 from slave.imu import reopening as imu_reopening
 from slave.imu.reopening import ReopeningImu
 from slave.imu.tally import SampleTally
-from slave.markers.blind import BlindDetector
 from slave.markers.detector import Detections
+from slave.markers.null_detector import NullDetector
 from slave.objects import live as objects_live
 from slave.objects import reopening as objects_reopening
 from slave.objects.reopening import ReopeningTracker
 from slave.objects.tally import PoseTally
 from slave.tally import Tally
-from slave.wrist.blind import BlindWrist
+from slave.wrist.null_detector import NullWristDetector
 from tests.slave.fake_picamera2 import OV7251, Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice
 
@@ -95,7 +95,7 @@ def tracked(
     stop = threading.Event()
     source = ReopeningCamera(opener, FILE, CLOCK, stop)
     wire, shown = Wire(stop, most), list[Frame]()
-    run(source, BlindDetector(6), wire, "left", Tally(("a",) * 6), stop, shown.append)
+    run(source, NullDetector(6), wire, "left", Tally(("a",) * 6), stop, shown.append)
     source.close()
     seqs = [one.seq for one in wire.sent if isinstance(one, MarkerDetections)]
     assert len(seqs) == len(shown) == most
@@ -139,7 +139,7 @@ def test_a_pi_library_that_raises_something_of_its_own_costs_no_process(
 
 @pytest.mark.parametrize("where", ["open", "close", "counts", "figures", "tune"])
 def test_nothing_else_that_a_driver_raises_ends_the_slave(where: str) -> None:
-    class Odd(V4l2Camera):
+    class Faulty(V4l2Camera):
         pass
 
     def fail(*_arguments: object) -> None:
@@ -151,7 +151,7 @@ def test_nothing_else_that_a_driver_raises_ends_the_slave(where: str) -> None:
         if where == "open" and len(opened) == 1:
             opened.append(opened[0])
             fail()
-        camera = Odd(file, V4l2Options(controls=CODES, pixels=Pixels.GREY), CLOCK, device)
+        camera = Faulty(file, V4l2Options(controls=CODES, pixels=Pixels.GREY), CLOCK, device)
         opened.append(camera)
         return camera
 
@@ -159,11 +159,11 @@ def test_nothing_else_that_a_driver_raises_ends_the_slave(where: str) -> None:
         return FakeDevice(Camera(formats=GREY, gone_after=20 if not opened else None))
 
     if where != "open":
-        setattr(Odd, where, fail)
+        setattr(Faulty, where, fail)
     stop = threading.Event()
     source = ReopeningCamera(opener, FILE, CLOCK, stop)
     wire = Wire(stop, 30)
-    run(source, BlindDetector(1), wire, "left", Tally(("a",)), stop)
+    run(source, NullDetector(1), wire, "left", Tally(("a",)), stop)
     assert len(wire.sent) == 30
     if where == "tune":
         with pytest.raises(CameraError, match="its settings cannot be changed: KeyError"):
@@ -209,7 +209,7 @@ def test_a_camera_that_stays_frozen_is_never_measured_again() -> None:
 
     source = ReopeningCamera(opener, FILE, CLOCK, stop)
     tally = Tally(())
-    run_wrist(source, BlindWrist(), Wire(stop, 1), "left", tally, stop, lambda _frame: stop.set())
+    run_wrist(source, NullWristDetector(), Wire(stop, 1), "left", tally, stop, lambda _frame: stop.set())
     source.close()
     assert tally.counts()["frames"] == 1, "its first picture, and no other"
     assert source.counts()["camera.lost"] >= 3
@@ -256,7 +256,7 @@ def test_a_driver_that_hands_the_same_buffers_round_is_found_in_the_third_turn(b
     assert found == [False] * (2 * buffers) + [True] * (2 * buffers)
 
 
-class Failing(BlindDetector):
+class Failing(NullDetector):
     """A detector that raises in some frames."""
 
     def __init__(self, fails: frozenset[int]) -> None:
@@ -289,7 +289,7 @@ def test_what_shows_or_finds_tags_costs_no_detection() -> None:
     stop = threading.Event()
     source = usb(Camera(formats=GREY), FILE)
     wire, tally = Wire(stop, 10), Tally(("a",))
-    run(source, BlindDetector(1), wire, "left", tally, stop, fail)
+    run(source, NullDetector(1), wire, "left", tally, stop, fail)
     source.close()
     counts = tally.counts()
     assert (counts["frames"], counts["failed"], len(wire.sent)) == (10, 10, 10)

@@ -41,7 +41,7 @@ def grasping(seed: int) -> Scene:
     )
 
 
-def hues_apart(a: Float, b: Float) -> float:
+def separated_hues(a: Float, b: Float) -> float:
     d = a - b
     return float(max(abs(d[0] - d[1]), abs(d[2] - d[1])))
 
@@ -53,7 +53,7 @@ def test_a_whole_hand_proves_its_light(kelvin: float, exposure: float) -> None:
     found = first_light(under(painted.render(painted.hand()), gains), TABLE, REFERENCE, np.zeros(3))
     assert found.proven
     assert found.matched == 6
-    assert hues_apart(found.log_gains, np.log(gains)) < 0.06
+    assert separated_hues(found.log_gains, np.log(gains)) < 0.06
     assert abs(found.log_gains[1] - np.log(gains[1])) < 0.25
 
 
@@ -66,7 +66,7 @@ def test_a_few_markers_prove_the_right_light_or_none(shown: tuple[int, ...], kel
     gains = Light(kelvin).gains_bgr()
     found = first_light(under(painted.render(discs), gains), TABLE, REFERENCE, np.zeros(3))
     if found.proven:
-        assert hues_apart(found.log_gains, np.log(gains)) < OTHER
+        assert separated_hues(found.log_gains, np.log(gains)) < OTHER
 
 
 @pytest.mark.parametrize(("seed", "t_s"), [(3, 2.7), (7, 5.0)])
@@ -79,7 +79,7 @@ def test_skin_of_a_closed_hand_is_no_paint_under_a_light_that_no_lamp_gives(seed
     reference = np.array([colour.reference_bgr_linear for colour in colours])
     found = first_light(Renderer(shown, "left").render(t_s), ColourTable(colours), reference, np.zeros(3))
     assert not found.excluded
-    assert hues_apart(found.log_gains, np.zeros(3)) < OTHER
+    assert separated_hues(found.log_gains, np.zeros(3)) < OTHER
 
 
 def test_clutter_in_a_marker_colour_does_not_bend_the_light() -> None:
@@ -87,7 +87,7 @@ def test_clutter_in_a_marker_colour_does_not_bend_the_light() -> None:
     gains = Light(3200.0).gains_bgr()
     found = first_light(under(painted.render(discs), gains), TABLE, REFERENCE, np.zeros(3))
     assert found.proven
-    assert hues_apart(found.log_gains, np.log(gains)) < 0.1
+    assert separated_hues(found.log_gains, np.log(gains)) < 0.1
 
 
 @pytest.mark.parametrize(
@@ -139,8 +139,8 @@ def test_no_simulator_is_imported_to_know_the_light() -> None:
 @pytest.mark.parametrize("kelvin", [3000.0, 6500.0])
 def test_the_light_that_is_expected_is_kept_until_the_picture_excludes_it(kelvin: float) -> None:
     there, elsewhere = np.log(Light(kelvin).gains_bgr()), np.zeros(3)
-    lone = under(painted.render(painted.finger(5, 300.0, 200.0)), np.exp(there))
-    assert not first_light(lone, TABLE, REFERENCE, there).excluded
+    single = under(painted.render(painted.finger(5, 300.0, 200.0)), np.exp(there))
+    assert not first_light(single, TABLE, REFERENCE, there).excluded
     whole = under(painted.render(painted.hand()), np.exp(there))
     assert not first_light(whole, TABLE, REFERENCE, there).excluded
     assert first_light(whole, TABLE, REFERENCE, elsewhere).excluded

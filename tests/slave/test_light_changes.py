@@ -126,8 +126,8 @@ def test_it_says_that_a_light_is_not_known_and_what_to_do() -> None:
     }
     camera = msgspec.structs.replace(painted.camera(), markers=ranges)
     detector = FollowingDetector(camera, painted.NAMES, Inline())
-    lone = painted.render(painted.finger(5, 300.0, 200.0), noise=2.0)
-    found = detector.push(lone, 0)
+    single = painted.render(painted.finger(5, 300.0, 200.0), noise=2.0)
+    found = detector.push(single, 0)
     assert [warning.marker for warning in detector.warnings] == [None]
     assert "show 2 or more markers" in detector.warnings[0].text
     assert np.isfinite(found.uv[5]).all()  # nothing speaks against the light of calibration

@@ -19,7 +19,7 @@ from common.srgb import relit_bytes
 from slave.cameras.source import Frame
 from slave.markers.changing import ChangingDetector, marker_changes
 from slave.markers.classify import in_range
-from slave.markers.colours import calibrate, hue_apart
+from slave.markers.colours import calibrate, hue_separation
 from slave.markers.detector import MarkerDetector
 from slave.markers.following import FollowingDetector
 from slave.markers.known import KnownDetector
@@ -152,7 +152,7 @@ def test_under_another_light_a_colour_is_picked_as_under_that_of_calibration() -
     )
     np.testing.assert_allclose(back.hsv_low, plain.hsv_low, atol=2)
     astray = picked(other, "ring")["ring"]
-    assert hue_apart(astray.hsv_low[0], plain.hsv_low[0]) > 3, "the light does matter"
+    assert hue_separation(astray.hsv_low[0], plain.hsv_low[0]) > 3, "the light does matter"
     assert in_range(undone(other, gains), plain)[int(AT["ring"][1]), int(AT["ring"][0])]
 
 

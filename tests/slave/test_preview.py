@@ -17,7 +17,7 @@ from slave import preview
 from slave.app import run
 from slave.cameras.source import Frame
 from slave.markers.detector import MarkerDetector
-from slave.preview import LOOK_NS, PERIOD_NS, Gate, Previews, small_jpeg, whole_jpeg
+from slave.preview import PERIOD_NS, POLL_NS, Gate, Previews, small_jpeg, whole_jpeg
 from slave.report import Reporter
 from slave.tally import Tally
 from tests.network_helpers import ManualClock, until
@@ -41,7 +41,7 @@ def test_never_two_within_a_tenth_of_a_second_and_none_without_a_request(
         elif gate.wants(t_ns):
             shown.append(t_ns)
     assert all(later - earlier >= PERIOD_NS for earlier, later in pairwise(shown))
-    assert all(any(0 <= t - asked <= LOOK_NS for asked in requests) for t in shown)
+    assert all(any(0 <= t - asked <= POLL_NS for asked in requests) for t in shown)
 
 
 def test_one_request_is_three_seconds_of_pictures() -> None:

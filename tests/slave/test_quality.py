@@ -16,7 +16,7 @@ from tests.slave.painted import NAMES, RANGES, Disc, camera, paint, render
 SIX = ("thumb", "index", "middle", "ring", "little", "back")
 CLEAR = Evidence(
     contrast=math.log(18.0), unclear=0.0, outlined=0.0, fullness=0.95, slender=0.1, hue=0.02,
-    rival=0.0, ragged=0.0, cut=0.0,
+    alternative=0.0, ragged=0.0, cut=0.0,
 )  # fmt: skip
 
 

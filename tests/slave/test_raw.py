@@ -23,7 +23,7 @@ from slave.__main__ import main
 from slave.app import run
 from slave.cameras.source import Frame
 from slave.join import join_recordings
-from slave.markers.blind import BlindDetector
+from slave.markers.null_detector import NullDetector
 from slave.offline import detect_recording
 from slave.raw import RawFrames, RawSettings
 from slave.report import Reporter
@@ -60,7 +60,7 @@ class Slave:
     def read(self, given: list[Frame]) -> None:
         """The loop, over these frames."""
         source = self.raw.reading(ListCamera(given))
-        run(source, BlindDetector(6), Wire(), self.name, self.tally, threading.Event())
+        run(source, NullDetector(6), Wire(), self.name, self.tally, threading.Event())
 
     def ask(self, verb: str, body: str = "") -> Health:
         return self.bus.ask(Command(self.name, verb, body), 10.0)

@@ -128,7 +128,7 @@ def test_generated_markers_are_the_same(name: str, engine: str) -> None:
             assert seen(one) == seen(other)
             same += assert_same(one, other)
             # A marker that was not tracked may be anywhere, and so may its rival, which its quality remembers.
-            np.testing.assert_array_equal(one.rival_uv[tracked], other.rival_uv[tracked])
+            np.testing.assert_array_equal(one.alternative_uv[tracked], other.alternative_uv[tracked])
             always &= seen(one)
             np.testing.assert_array_equal(one.quality[always], other.quality[always])
             tracked = seen(one)
@@ -159,7 +159,7 @@ def test_a_rival_in_the_window_is_seen_and_one_beyond_it_is_not() -> None:
         detector = windowed()
         frames = push_all(detector, [render(hand())] * 2 + [render([*hand(), thing])] * 3)
         assert all(seen(frames[-1]))
-        assert math.isfinite(frames[-1].rival_uv[1, 0]) is there
+        assert math.isfinite(frames[-1].alternative_uv[1, 0]) is there
         assert detector.beside.frames["index"] == (3 if there else 0)
 
 
@@ -196,11 +196,11 @@ def test_a_marker_that_jumps_out_of_its_window_is_found_within_as_many_frames_as
 @pytest.mark.parametrize("v", [8.0, 120.0, 239.0, 240.0, 300.0, 472.0])
 def test_when_all_are_lost_a_marker_anywhere_is_found_within_all_strips(v: float, engine: str) -> None:
     detector = windowed(engine)
-    lone = render([Disc(paint(1), 320.0, v, 6.0)])
-    frames = push_all(detector, [render(hand()), *[EMPTY] * 40, *[lone] * STRIPS])
+    single = render([Disc(paint(1), 320.0, v, 6.0)])
+    frames = push_all(detector, [render(hand()), *[EMPTY] * 40, *[single] * STRIPS])
     assert not any(any(seen(f)) for f in frames[1:41])
     assert np.hypot(*(frames[-1].uv[1] - (320.0, v))) < 0.3
-    whole = DETECTORS[engine].fresh().push(lone, 0)
+    whole = DETECTORS[engine].fresh().push(single, 0)
     np.testing.assert_array_equal(frames[-1].uv[1], whole.uv[1])
 
 

@@ -188,7 +188,7 @@ class Nowhere:
     def send(self, message: Message) -> None: ...
 
 
-class Blind:
+class Null:
     """Finds nothing, and hangs after so many frames, until it is let go."""
 
     def __init__(self, hang_after: int, released: threading.Event) -> None:
@@ -215,7 +215,7 @@ class Blind:
 def test_a_detection_that_hangs_feeds_nothing(manager: Manager) -> None:
     time, stop, released = Time(), threading.Event(), threading.Event()
     service = begun(manager, time)
-    detector = Blind(5, released)
+    detector = Null(5, released)
 
     def alive() -> None:
         time.passes(1.5)

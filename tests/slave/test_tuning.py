@@ -351,10 +351,10 @@ def test_a_new_calibration_goes_over_the_bus_into_the_running_slave_and_its_file
         bad["markers"].pop("index")
         with pytest.raises(BusError, match="no HSV range for index"):
             left.ask("load", msgspec.json.encode(bad).decode())
-        blind = msgspec.json.decode(text(new))
-        blind["markers"]["index"]["reference_bgr_linear"] = None
+        null_detector = msgspec.json.decode(text(new))
+        null_detector["markers"]["index"]["reference_bgr_linear"] = None
         with pytest.raises(BusError, match="the light is followed: restart the slave"):
-            left.ask("load", msgspec.json.encode(blind).decode())
+            left.ask("load", msgspec.json.encode(null_detector).decode())
         assert left.ask("settings").gauges["wanted.exposure_us"] == 4500.0
 
 

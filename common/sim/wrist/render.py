@@ -78,7 +78,7 @@ class WristRenderer:
         state = self._scene.motion.at(t_s)
         bodies = self._scene.bodies_of(state)
         palm = self._skin.palm(bodies, state.bend_rad)
-        fingers = self._skin.look(bodies, palm)
+        fingers = self._skin.appearance(bodies, palm)
         leds = lit is Illumination.LED
         count = len(self._scene.flesh.group)
         things = bodies.of(slice(count, None)) if len(bodies.start_m) > count else None

@@ -91,7 +91,7 @@ class Skin:
             self._bent = steps, self._palm(rounded, self._turning)
         return self._bent[1]
 
-    def look(self, bodies: Cones, palm: Palm) -> SkinView:
+    def appearance(self, bodies: Cones, palm: Palm) -> SkinView:
         """What is seen of fingers, thumb and things, of a hand whose flesh is at `bodies`, before its palm."""
         depth = palm.depth.copy()
         hit = self._cast(bodies, range(self._scene.flesh.still, len(bodies.start_m)), depth)

@@ -80,7 +80,7 @@ def capture(
         if verdict.kept:
             view = live.views[-1]
             spread.append(round_.spread_ms)
-            _keep(folder, view.name, {name: round_.stills[name] for name in view.sightings})
+            _keep(folder, view.name, {name: round_.stills[name] for name in view.observations})
             say(f"view {len(live.views)} of {wanted}: {text}{_then(advise())}")
         elif text != said or began_ns - said_ns > _SAY_NS:
             say(text)

@@ -211,7 +211,7 @@ def _known_cameras(
 
 def _only(views: BoardViews, camera: str) -> BoardViews:
     """The views of one camera."""
-    own = tuple(View(name, {camera: sighting}) for name, sighting in views.of(camera))
+    own = tuple(View(name, {camera: observation}) for name, observation in views.of(camera))
     return replace(views, views=own, sizes_px={camera: views.sizes_px[camera]})
 
 

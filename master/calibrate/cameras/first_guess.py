@@ -11,7 +11,7 @@ from common.geometry import rigid
 _FOCAL = np.geomspace(0.35, 6.0, 24)  # of the image's width: 110 to 10 degrees of view
 
 
-def guess_lens(sightings: Sequence[tuple[Int, Float]], drawn_m: Float, size_px: tuple[int, int]) -> Float:
+def guess_lens(observations: Sequence[tuple[Int, Float]], drawn_m: Float, size_px: tuple[int, int]) -> Float:
     """A lens (9,) without distortion, by the focal length under which the middle image fits best.
 
     The middle one: up to half of the images may be wrong altogether.
@@ -26,7 +26,7 @@ def guess_lens(sightings: Sequence[tuple[Int, Float]], drawn_m: Float, size_px: 
         np.array([f * width, f * width, (width - 1) / 2, (height - 1) / 2, 0, 0, 0, 0, 0]) for f in _FOCAL
     ]
     errors = [
-        np.median([place_board(drawn_m[corners], uv, lens)[1] for corners, uv in sightings])
+        np.median([place_board(drawn_m[corners], uv, lens)[1] for corners, uv in observations])
         for lens in lenses
     ]
     return lenses[int(np.argmin(errors))]

@@ -50,7 +50,7 @@ class Seen:
         by_name = {view.name: view for view in self.views.views}
         found: list[Observation] = []
         for shot in shots:
-            corners, uv = corners_seen(by_name[shot.view].sightings[shot.camera])
+            corners, uv = corners_seen(by_name[shot.view].observations[shot.camera])
             true = self.turned[shot.view][shot.camera][corners]
             found.append(Observation(cameras.index(shot.camera), number[shot.place], true, uv))
         return tuple(found)
@@ -162,7 +162,7 @@ def _to_part(seen: Seen, own: Sequence[Shot], bundle: Bundle, sigma: Float, boun
     """The cameras to part from a view: the one without which the others agree, or else all."""
     if len(own) < 3:
         return {shot.camera for shot in own}
-    without = [[shot for shot in own if shot != left_out] for left_out in own]
+    without = [[shot for shot in own if shot != rejected] for rejected in own]
     errors = [float(_view_errors(seen, [rest], bundle, sigma)[0]) for rest in without]
     best = int(np.argmin(errors))
     return {own[best].camera} if errors[best] <= bound else {shot.camera for shot in own}

@@ -83,7 +83,7 @@ class HandRoutineProblem:
         rows = len(off), -1
         scale = np.sqrt(seen)[..., None]
         off = off * scale
-        out.add_instants(
+        out.add_epochs(
             self.knots,
             (jacobian * scale[..., None]).reshape(*rows, CHANNELS),
             (by_shape * scale[..., None]).reshape(*rows, size),

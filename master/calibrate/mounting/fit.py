@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from common.hand_model import HandModel
+from master.calibrate.mounting.lines_of_sight import LinesOfSight
 from master.calibrate.mounting.problem import Problem
 from master.calibrate.mounting.seen import Fit, Triples
-from master.calibrate.mounting.sights import Sights
 from master.calibrate.mounting.tracks import HandTrack, ImuTrack
 from master.calibrate.mounting.unknown import Unknown
 
@@ -16,7 +16,7 @@ _ROUNDS = (5, 5, 8)  # steps from one linearisation of the tracks to the next
 
 
 def fit_mounting(
-    sights: Sights,
+    lines_of_sight: LinesOfSight,
     model: HandModel,
     names: tuple[str, ...],
     hand: HandTrack,
@@ -40,10 +40,10 @@ def fit_mounting(
     coarse = triples.of(some)
     best: tuple[float, Unknown] | None = None
     for first in firsts:
-        problem = Problem(sights, model, names, hand, imu, coarse, px_per_m, first)
+        problem = Problem(lines_of_sight, model, names, hand, imu, coarse, px_per_m, first)
         unknown, hands, _ = problem.followed(first, _COARSE_ROUNDS)
         if best is None or problem.cost(unknown, hands) < best[0]:
             best = problem.cost(unknown, hands), unknown
     first = firsts[0] if best is None else best[1]
-    problem = Problem(sights, model, names, hand, imu, triples, px_per_m, first)
+    problem = Problem(lines_of_sight, model, names, hand, imu, triples, px_per_m, first)
     return problem.result(*problem.followed(first, _ROUNDS))

@@ -18,10 +18,10 @@ from common.hand_model import CHAINS, FINGERS, HandModel
 from common.messages import HandPose, ImuSample, WristDetections
 from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.mounting.fit import fit_mounting
+from master.calibrate.mounting.lines_of_sight import FINGERS as WORN
+from master.calibrate.mounting.lines_of_sight import LinesOfSight
 from master.calibrate.mounting.report import left_of, refuse, report_lines, sigmas
 from master.calibrate.mounting.seen import Fit, Triples
-from master.calibrate.mounting.sights import FINGERS as WORN
-from master.calibrate.mounting.sights import Sights
 from master.calibrate.mounting.start import started
 from master.calibrate.mounting.tracks import GAP_S, HandTrack, ImuTrack
 from master.calibrate.tree_files import provenance
@@ -35,7 +35,7 @@ MOTION = (
 )
 _MOST = 200  # triples: more of the same motion add time, not knowledge
 _FEWEST, _LEAST_S = 60, 5.0
-_SIGHTS = 2  # fingers with a laser point or a tip
+_LINES_OF_SIGHT = 2  # fingers with a laser point or a tip
 _MARKERS = 4
 
 
@@ -90,9 +90,9 @@ def calibrate_mounting(
         missing = "the markers" if not poses else "the wrist camera" if not triples else "the IMU"
         raise FitError(f"{missing} saw nothing: {MOTION}")
     setup = WristSetup.of(rig, camera, model)
-    sights, zero_ns = Sights(setup), triples[0].t_ns
+    lines_of_sight, zero_ns = LinesOfSight(setup), triples[0].t_ns
     hand, imu = HandTrack.of(poses, model, zero_ns), ImuTrack(samples, zero_ns)
-    seen = _triples(setup, sights, camera, triples, zero_ns)
+    seen = _triples(setup, lines_of_sight, camera, triples, zero_ns)
     chosen = _chosen(hand, imu, seen)
     tips = hand.points_m[:, [_marker_of(model, markers, finger) for finger in FINGERS[WORN]]]
     start = started(hand, tips, imu, setup.optics, setup.T_camera_palm, seen)
@@ -103,7 +103,7 @@ def calibrate_mounting(
     )
     px_per_m = float(setup.optics.matrix[0, 0] / distance)
     firsts = [replaced(start, camera_late_s=late_s).unknown for late_s in (start.camera_late_s, 0.0)]
-    fit = fit_mounting(sights, model, markers, hand, imu, seen.of(chosen), px_per_m, firsts)
+    fit = fit_mounting(lines_of_sight, model, markers, hand, imu, seen.of(chosen), px_per_m, firsts)
     sigma = sigmas(fit)
     refuse(fit, sigma)
     new = _documented(rig, camera, rig.imu, fit, imu, sigma, source)
@@ -125,7 +125,7 @@ def _marker_of(model: HandModel, markers: tuple[str, ...], finger: str) -> int:
 
 def _triples(
     setup: WristSetup,
-    sights: Sights,
+    lines_of_sight: LinesOfSight,
     camera: CameraCalibration,
     messages: Sequence[WristDetections],
     zero_ns: int,
@@ -135,8 +135,8 @@ def _triples(
     for one in messages:
         shown = in_image(setup, one.laser_uv, one.laser_sigma_px)
         found = laser_points(setup, np.where(shown[:, None], one.laser_uv, np.nan), one.laser_sigma_px)
-        laser.append(sights.flat(found.point_m))
-        sigma.append(np.sqrt(np.einsum("fii->fi", sights.flat_cov(found.cov_m2))))
+        laser.append(lines_of_sight.flat(found.point_m))
+        sigma.append(np.sqrt(np.einsum("fii->fi", lines_of_sight.flat_cov(found.cov_m2))))
         shown = in_image(setup, one.tip_uv, one.tip_sigma_px)
         tips.append(np.where(shown[:, None], one.tip_uv, np.nan))
         tip_sigma.append(one.tip_sigma_px)
@@ -164,7 +164,7 @@ def _chosen(hand: HandTrack, imu: ImuTrack, seen: Triples) -> Bool:
     fingers = (np.isfinite(seen.laser_m[..., 0]) | np.isfinite(seen.tip_uv[..., 0])).sum(axis=1)
     near = hand.nearest(seen.t_s)
     marked = np.isfinite(hand.points_m[near, :, 0]).sum(axis=1) >= _MARKERS
-    both = (fingers >= _SIGHTS) & marked & (np.abs(hand.t_s[near] - seen.t_s) < GAP_S)
+    both = (fingers >= _LINES_OF_SIGHT) & marked & (np.abs(hand.t_s[near] - seen.t_s) < GAP_S)
     both &= (seen.t_s > imu.t_s[0]) & (seen.t_s < imu.t_s[-1])
     rows = np.flatnonzero(both)
     if len(rows) < _FEWEST or np.ptp(seen.t_s[rows]) < _LEAST_S:

@@ -28,9 +28,9 @@ from common.arrays import Float
 from common.geometry import rotation_vector_to_matrix
 from common.hand_model import HandModel
 from master.calibrate.mounting.hands import HandProblem, Hands
+from master.calibrate.mounting.lines_of_sight import FINGERS, SEEN, LinesOfSight
 from master.calibrate.mounting.normal import Normal
 from master.calibrate.mounting.seen import STRAYS, Fit, Triples
-from master.calibrate.mounting.sights import FINGERS, SEEN, Sights
 from master.calibrate.mounting.tracks import HandTrack, ImuTrack, Markers, Turns
 from master.calibrate.mounting.unknown import (
     CAMERA_IMU,
@@ -78,7 +78,7 @@ class Problem:
 
     def __init__(
         self,
-        sights: Sights,
+        lines_of_sight: LinesOfSight,
         model: HandModel,
         names: tuple[str, ...],
         hand: HandTrack,
@@ -87,7 +87,13 @@ class Problem:
         px_per_m: float,
         first: Unknown,
     ) -> None:
-        self._sights, self._hand, self._imu, self._triples, self._first = sights, hand, imu, triples, first
+        self._lines_of_sight, self._hand, self._imu, self._triples, self._first = (
+            lines_of_sight,
+            hand,
+            imu,
+            triples,
+            first,
+        )
         model = replace(model, tolerance_rad=np.zeros((5, 4)))  # nothing here weighs what is beyond limits
         self._model, self._parameters = model, HandParameters.of(model)
         count = len(triples.t_s)
@@ -154,7 +160,7 @@ class Problem:
         turns = self._mended.at(at - unknown.imu_late_s)
         R = self._camera_rig(unknown, replace(turns, R_world_imu=np.nan_to_num(turns.R_world_imu)))
         angles = self._parameters.angles(hands.x)
-        seen = self._sights(
+        seen = self._lines_of_sight(
             R @ hands.T_rig_palm[:, :3, :3], unknown.shift_m, angles, unknown.thick, unknown.reach_m
         )
         speed = np.gradient(seen[..., 2:], t_s, axis=0)
@@ -227,11 +233,11 @@ class Problem:
         return unknown.R_forearm_imu @ palm
 
     def _shown(self, unknown: Unknown, hands: Hands) -> tuple[Float, Float]:
-        """Sights (T, 4, SEEN), and flexion, deviation and twist of the wrist (T, 3) [rad]."""
+        """LinesOfSight (T, 4, SEEN), and flexion, deviation and twist of the wrist (T, 3) [rad]."""
         turns = self._turned(unknown)
         R = self._camera_rig(unknown, turns) @ hands.T_rig_palm[:, :3, :3]
         angles = self._parameters.angles(hands.x)
-        seen = self._sights(R, unknown.shift_m, angles, unknown.thick, unknown.reach_m)
+        seen = self._lines_of_sight(R, unknown.shift_m, angles, unknown.thick, unknown.reach_m)
         return seen, bends(self._wrists(unknown, hands, turns))
 
     def _off(self, shown: Float) -> Float:
@@ -259,18 +265,20 @@ class Problem:
         problem = replace(self._hands, points_m=here.points_m)
         linear = problem.linearise(hands)
         out = Normal.of_markers(problem, linear, hands, here.speed_m_s)
-        rows = self._sight_rows(unknown, hands, turns), self._wrist_rows(unknown, hands, turns)
+        rows = self._line_of_sight_rows(unknown, hands, turns), self._wrist_rows(unknown, hands, turns)
         for residual, own, shared in rows:
             out = out.and_rows(residual, own, shared)
         out = out.shared_out(self._share, unknown.off(self._first), self._believed)
         return out.within(hands.x, self._parameters)
 
-    def _sight_rows(self, unknown: Unknown, hands: Hands, turns: Turns) -> tuple[Float, Float, Float]:
+    def _line_of_sight_rows(self, unknown: Unknown, hands: Hands, turns: Turns) -> tuple[Float, Float, Float]:
         """Residuals (T, 16), and derivatives by own (T, 16, 6 + n) and shared unknowns (T, 16, UNKNOWN)."""
         camera_rig = self._camera_rig(unknown, turns)
         R = camera_rig @ hands.T_rig_palm[:, :3, :3]
         angles = self._parameters.angles(hands.x)
-        shown, by = self._sights.derivatives(R, unknown.shift_m, angles, unknown.thick, unknown.reach_m)
+        shown, by = self._lines_of_sight.derivatives(
+            R, unknown.shift_m, angles, unknown.thick, unknown.reach_m
+        )
         off = self._off(shown)
         pairs = off[..., 0::2] ** 2 + off[..., 1::2] ** 2
         root = np.repeat((1.0 + pairs / STRAYS**2) ** -0.5, 2, axis=-1)
@@ -294,7 +302,7 @@ class Problem:
         return (off * root).reshape(count, -1), own, shared
 
     def _wrist_rows(self, unknown: Unknown, hands: Hands, turns: Turns) -> tuple[Float, Float, Float]:
-        """As `_sight_rows`, of flexion, deviation and twist."""
+        """As `_line_of_sight_rows`, of flexion, deviation and twist."""
         wrist = self._wrists(unknown, hands, turns)
         bent = bends(wrist) / self._bend_sigma
         root = (1.0 + np.vecdot(bent, bent) / STRAYS**2) ** -0.5  # where the hand itself was mistaken

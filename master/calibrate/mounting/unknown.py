@@ -33,7 +33,7 @@ class Unknown:
         R_rig_world: (3, 3) the world of the IMU's track -> rig.
         gyro: (12,) errors of its gyroscope, as of `tracks.ImuTrack`.
         camera_late_s, imu_late_s: How much later frames, samples are than their stamps say.
-        thick, reach_m: (4,) of the fingers, as of `sights.Sights`.
+        thick, reach_m: (4,) of the fingers, as of `lines_of_sight.LinesOfSight`.
     """
 
     R_camera_imu: Float

@@ -6,7 +6,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.geometry import matrix_to_rotation_vector
-from master.calibrate.tracker.tracks import PoseTrack, shared_instants
+from master.calibrate.tracker.tracks import PoseTrack, shared_epochs
 
 LEAST_S, LEAST_TURN_RAD, LEAST_WAY_M = 8.0, np.radians(45.0), 0.10
 LEAST_PACE_RAD_S, LEAST_PACE_M_S = np.radians(20.0), 0.05
@@ -76,7 +76,7 @@ class Coverage:
 
 def coverage_of(seen: PoseTrack, tracker: PoseTrack, late_s: float = 0.0) -> Coverage:
     """What cameras and tracker saw together, at a lag that is right to a tenth of a second."""
-    rows = shared_instants(seen, tracker, late_s, len(seen))
+    rows = shared_epochs(seen, tracker, late_s, len(seen))
     times = (_known_s(seen.t_s), _known_s(tracker.t_s), _known_s(seen.t_s[rows]))
     if len(rows) < 3:
         return Coverage(*times, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 0.0)

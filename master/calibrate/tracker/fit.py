@@ -18,7 +18,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.geometry import invert, matrix_to_rotation_vector, rigid, rotation_vector_to_matrix, skew
 from master.calibrate.tracker.start import Placed, foretold
-from master.calibrate.tracker.tracks import PoseTrack, shared_instants
+from master.calibrate.tracker.tracks import PoseTrack, shared_epochs
 
 MOST = 900  # instants
 BLOCKS = 12
@@ -49,7 +49,7 @@ class Fit:
         stray: (N,) which instants no registration explains.
         scale: By how much more than foretold the good half is off.
         cov: (13, 13) of the unknowns, by the normal equations.
-        left_out: (B, 13) how the unknowns change when a block of time is left out.
+        rejected: (B, 13) how the unknowns change when a block of time is left out.
     """
 
     placed: Placed
@@ -61,7 +61,7 @@ class Fit:
     outlier: Bool
     scale: float
     cov: Float
-    left_out: Float
+    rejected: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,16 +120,16 @@ def fit_registration(seen: PoseTrack, tracker: PoseTrack, first: Placed) -> Fit:
         tracker: The device, by its system.
         first: Right to some centimetres, degrees and ten milliseconds.
     """
-    rough = _Problem(seen, tracker, shared_instants(seen, tracker, first.late_s, MOST))
+    rough = _Problem(seen, tracker, shared_epochs(seen, tracker, first.late_s, MOST))
     better, _ = _refined(rough, first)
     # Again, because the lag decides which instants are known.
-    problem = _Problem(seen, tracker, shared_instants(seen, tracker, better.late_s, MOST))
+    problem = _Problem(seen, tracker, shared_epochs(seen, tracker, better.late_s, MOST))
     placed, scale = _refined(problem, better)
     lines = problem.lines(placed)
     sizes = _sizes(problem.weight, lines.off) / scale
     counts = _counts(sizes)
     normal = _normal(problem.weight, lines, counts) / scale**2 + np.diag(_PRIOR)
-    left_out = [_without(problem, lines, counts / scale**2, block) for block in _blocks(problem.t_s)]
+    rejected = [_without(problem, lines, counts / scale**2, block) for block in _blocks(problem.t_s)]
     return Fit(
         placed,
         problem.middle_m,
@@ -140,7 +140,7 @@ def fit_registration(seen: PoseTrack, tracker: PoseTrack, first: Placed) -> Fit:
         sizes > OUTLIER,
         scale,
         np.asarray(np.linalg.inv(normal), np.float64),
-        np.array(left_out).reshape(-1, _UNKNOWNS),
+        np.array(rejected).reshape(-1, _UNKNOWNS),
     )
 
 
@@ -154,8 +154,8 @@ def sigma_at(fit: Fit, R: Float, p_m: Float) -> tuple[float, float]:
     slope[:, :3, 3:6] = slope[:, 3:, 0:3] = np.eye(3)
     slope[:, 3:, 6:9] = slope[:, :3, 9:12] = R
     formal = np.einsum("tij,jk,tik->ti", slope, fit.cov, slope)
-    count = len(fit.left_out)
-    change = np.einsum("tij,bj->tbi", slope, fit.left_out - fit.left_out.mean(axis=0))
+    count = len(fit.rejected)
+    change = np.einsum("tij,bj->tbi", slope, fit.rejected - fit.rejected.mean(axis=0))
     left = (count - 1) / count * (change**2).sum(axis=1) if count > 1 else np.zeros_like(formal)
     both = np.maximum(formal, left)
     place, turn = both[:, :3].sum(axis=1).mean(), both[:, 3:].sum(axis=1).mean()
@@ -164,8 +164,8 @@ def sigma_at(fit: Fit, R: Float, p_m: Float) -> tuple[float, float]:
 
 def late_sigma_s(fit: Fit) -> float:
     """Standard deviation of the lag [s]."""
-    count = len(fit.left_out)
-    off = fit.left_out[:, 12] - fit.left_out[:, 12].mean()
+    count = len(fit.rejected)
+    off = fit.rejected[:, 12] - fit.rejected[:, 12].mean()
     left = (count - 1) / count * float((off**2).sum()) if count > 1 else 0.0
     return float(np.sqrt(max(left, fit.cov[12, 12])))
 

@@ -21,7 +21,7 @@ from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.tracker.coverage import Coverage, coverage_of
 from master.calibrate.tracker.fit import Fit, fit_registration, late_sigma_s, sigma_at
 from master.calibrate.tracker.start import first_lag, first_places
-from master.calibrate.tracker.tracks import object_track, shared_instants, tracker_track
+from master.calibrate.tracker.tracks import object_track, shared_epochs, tracker_track
 from master.calibrate.tree_files import provenance
 
 TOOL = "calibrate tracker"
@@ -76,7 +76,7 @@ def register(objects: Sequence[ObjectPose], tracked: Sequence[TrackerPose]) -> R
         )
     late_s = first_lag(seen, device)
     first = None if late_s is None else first_places(seen, device, late_s)
-    if first is None or len(shared_instants(seen, device, first.late_s, _FEWEST)) < _FEWEST:
+    if first is None or len(shared_epochs(seen, device, first.late_s, _FEWEST)) < _FEWEST:
         raise FitError(f"cameras and tracker hardly saw the object at the same time: {MOTION}")
     coverage = coverage_of(seen, device, first.late_s)
     fit = fit_registration(seen, device, first)

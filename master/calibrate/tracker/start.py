@@ -14,12 +14,12 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.geometry import matrix_to_rotation_vector, rigid
-from master.calibrate.tracker.tracks import PoseTrack, shared_instants
+from master.calibrate.tracker.tracks import PoseTrack, shared_epochs
 
 MOST_LAG_S = 0.5
 _GRID_S, _CHORD_S = 0.01, 0.2
 _LEAST_OVERLAP = 100  # of the grid: one second
-_INSTANTS, _DRAWS, _DRAWN = 240, 120, 6
+_EPOCHS, _DRAWS, _DRAWN = 240, 120, 6
 _NEAR_M, _NEAR_RAD = 0.03, np.radians(6.0)
 
 
@@ -82,7 +82,7 @@ def first_places(seen: PoseTrack, tracker: PoseTrack, late_s: float, seed: int =
         late_s: How much later its poses hold than they say [s].
         seed: Of the draws.
     """
-    rows = shared_instants(seen, tracker, late_s, _INSTANTS)
+    rows = shared_epochs(seen, tracker, late_s, _EPOCHS)
     if len(rows) < 2 * _DRAWN:
         return None
     RA, pA = seen.R[rows], seen.p_m[rows]

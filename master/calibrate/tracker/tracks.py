@@ -85,7 +85,7 @@ def _track(t_ns: list[int], place: list[Float], turn: list[Float], cov: list[Flo
     return PoseTrack(np.multiply(times[kept], 1e-9, dtype=np.float64), turned, places[kept], covs[kept])
 
 
-def shared_instants(seen: PoseTrack, tracker: PoseTrack, late_s: float, most: int) -> Int:
+def shared_epochs(seen: PoseTrack, tracker: PoseTrack, late_s: float, most: int) -> Int:
     """Which of the seen poses count: those at whose instants the tracker knows where it is; at most so many, spread.
 
     Args:

@@ -17,7 +17,7 @@ from common.camera_model import CameraModel
 from common.errors import FitError
 from common.geometry import transform
 from master.calibrate.cameras.boards import Board, grid_shape
-from master.calibrate.wrist.placed import PlacedBoard
+from master.calibrate.wrist.board_pose import BoardPose
 
 Grey = npt.NDArray[np.float32]
 
@@ -54,7 +54,7 @@ class BoardLine:
 
 
 def line_on_board(
-    laser: Image, ambient: Image, placed: PlacedBoard, board: Board, optics: CameraModel
+    laser: Image, ambient: Image, placed: BoardPose, board: Board, optics: CameraModel
 ) -> BoardLine:
     """Points of the laser's line on the board.
 
@@ -134,7 +134,7 @@ def _profiles(
     along: Float,
     pixel_m: float,
     noise: float,
-    placed: PlacedBoard,
+    placed: BoardPose,
     board: Board,
     optics: CameraModel,
 ) -> _Centred:

@@ -21,7 +21,7 @@ from common.arrays import Float
 from common.errors import FitError
 from common.geometry import invert, matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
 from master.calibrate.cameras.boards import Board, grid_shape
-from master.calibrate.wrist.placed import PlacedBoard
+from master.calibrate.wrist.board_pose import BoardPose
 
 _FLAT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # board axes -> palm axes
 _MOVED_M = 0.003  # between views: the hand shifted in the device
@@ -65,7 +65,7 @@ class PalmFit:
     note: str
 
 
-def palm_from_board(placed: Sequence[PlacedBoard], board: Board, mounting: Mounting) -> PalmFit:
+def palm_from_board(placed: Sequence[BoardPose], board: Board, mounting: Mounting) -> PalmFit:
     """The palm's pose, as mean over views in which the hand did not move.
 
     Raises:

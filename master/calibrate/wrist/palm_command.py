@@ -17,10 +17,10 @@ from master.calibrate.cameras.boards import Board
 from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.cameras.options import Dictionary, MarkerMm, board_of
 from master.calibrate.tree_files import provenance
+from master.calibrate.wrist.board_pose import BoardPose, board_pose
 from master.calibrate.wrist.device import Device, device_of, say, write_device
 from master.calibrate.wrist.lit_views import lit_views, told_by_reason
 from master.calibrate.wrist.palm_board import Mounting, PalmFit, palm_from_board
-from master.calibrate.wrist.placed import PlacedBoard, placed_board
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.summary import write_summary
 
@@ -90,11 +90,11 @@ def palm(
 
 
 def _by_board(source: Path, board: Board, mounting: Mounting, device: Device) -> PalmFit:
-    placed: list[PlacedBoard] = []
+    placed: list[BoardPose] = []
     refused: dict[str, str] = {}
     for view in lit_views(source, device.camera.name, Illumination.LED):
         try:
-            placed.append(placed_board(view, board, device.optics))
+            placed.append(board_pose(view, board, device.optics))
         except FitError as error:
             refused[view.name] = str(error)
     say(f"left out: {reason}" for reason in told_by_reason(refused))

@@ -19,7 +19,7 @@ from common.messages import WristDetections
 from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.guided import FLAT, MOTION, Guided, guided
-from master.calibrate.wrist.wearer_fit import Fit, Sightings, fit_wearer, prior_sigma
+from master.calibrate.wrist.wearer_fit import Fit, ImageObservations, fit_wearer, prior_sigma
 from master.calibrate.wrist.wearer_model import MCP, Unknown, WearerModel, wearing
 from master.wrist_setup import WristSetup
 
@@ -55,7 +55,7 @@ class Wearer:
     hand: HandProfile
     report: tuple[str, ...]
     chosen: Guided
-    seen: Sightings
+    seen: ImageObservations
     fit: Fit
     model: WearerModel
 
@@ -98,7 +98,7 @@ def calibrate_wearer(
     chosen = guided(points[..., 1])
     tips = np.array([one.tip_uv for one in triples])[chosen.row, 1:]
     doubt = np.array([one.tip_sigma_px for one in triples])[chosen.row, 1:]
-    seen = Sightings(points[chosen.row], tips, doubt, chosen.bend)
+    seen = ImageObservations(points[chosen.row], tips, doubt, chosen.bend)
     sigma = prior_sigma(_pose_sigma(rig), _length_sigma(hand))
     fit = fit_wearer(model, seen, sigma)
     _check(fit, seen)
@@ -133,7 +133,7 @@ def _length_sigma(hand: HandProfile) -> Float:
     )
 
 
-def _check(fit: Fit, seen: Sightings) -> None:
+def _check(fit: Fit, seen: ImageObservations) -> None:
     """Refuse what does not reach the minimum, and what is not likely.
 
     Raises:

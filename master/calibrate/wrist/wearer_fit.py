@@ -45,7 +45,7 @@ _KNUCKLES, _FIST = 0, 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sightings:
+class ImageObservations:
     """Triples (T) of index ... little; NaN: not seen.
 
     Attributes:
@@ -101,7 +101,7 @@ def prior_sigma(pose: Float, length: Float) -> Float:
     return np.r_[pose, np.full(12, _KNUCKLE_M), np.full(4, SPREAD), length]
 
 
-def fit_wearer(model: WearerModel, seen: Sightings, sigma: Float) -> Fit:
+def fit_wearer(model: WearerModel, seen: ImageObservations, sigma: Float) -> Fit:
     """Fit wearer and angles.
 
     Args:
@@ -128,7 +128,7 @@ class _Guess:
 class _Problem:
     """Residuals, habits and steps. What it holds was prepared by the constructor."""
 
-    def __init__(self, model: WearerModel, seen: Sightings, sigma: Float) -> None:
+    def __init__(self, model: WearerModel, seen: ImageObservations, sigma: Float) -> None:
         self._model, self._bend, self.prior_sigma = model, seen.bend, sigma
         self._data = np.concatenate([seen.laser_m, seen.tip_uv], axis=-1)
         tip_px = np.hypot(np.nan_to_num(seen.tip_sigma_px), _TIP_SIGMA_M * model.px_per_m)

@@ -15,7 +15,7 @@ CAMERAS = (
     CameraPlan("wrist", 90.0, (640, 480), True, ()),
 )
 PLAN = Plan(CAMERAS, ("imu",), ((("left", "right"), len(MARKERS)),))
-LOOK_NS = 250_000_000
+POLL_NS = 250_000_000
 NAMES = ("left", "right", "wrist", "imu")
 
 
@@ -47,7 +47,7 @@ class Bench:
         """Look four times a second; what each look told, with the time since now [s]."""
         told: list[tuple[float, tuple[CheckItem, ...]]] = []
         for k in range(round(seconds * 4)):
-            self.t_ns += LOOK_NS
+            self.t_ns += POLL_NS
             self._looks += 1
             for name in NAMES:
                 self._count(name, 0.25)

@@ -263,7 +263,7 @@ def test_a_palm_that_contradicts_is_the_markers_alone(root: Path) -> None:
     worn.forearm.push(4_000 * MS, arm.said(4_000))
     before, cov = worn.estimator.extras.copy(), worn.estimator.extras_cov.copy()
     hand = worn.epoch(arm, 4_000)
-    assert hand.turn_left_out
+    assert hand.rotation_rejected
     assert degrees(found(hand.solution).T_rig_palm[:3, :3], arm.palm(4_000)) < 3.0
     assert worn.counts["forearm.outlier"] == 1
     assert np.abs(worn.estimator.extras - before)[HEADING] < radians(1.0)

@@ -34,9 +34,9 @@ def gone(message: Observed) -> bool:
     return GONE_S < 1e-9 * (message.t_ns - START_NS) < BACK_S
 
 
-def without(seen: Seen, left_out: Callable[[Observed], bool]) -> Solved:
+def without(seen: Seen, rejected: Callable[[Observed], bool]) -> Solved:
     both, messages = seen
-    return Solved.of(both, solve(both.fused, [one for one in messages if not left_out(one)]), both.fused)
+    return Solved.of(both, solve(both.fused, [one for one in messages if not rejected(one)]), both.fused)
 
 
 @pytest.fixture(scope="module")
@@ -97,21 +97,21 @@ def test_bend_and_turn_of_the_palm_are_told_with_their_doubt(seen: Seen, whole: 
 
 
 def test_without_the_wrist_device_the_cameras_go_on_by_themselves(seen: Seen, whole: Solved) -> None:
-    lone = without(seen, lambda message: isinstance(message, WristDetections) and gone(message))
-    at = (lone.t_s > GONE_S + 0.1) & (lone.t_s < BACK_S)
-    np.testing.assert_array_equal(lone.t_s, whole.t_s)
-    assert not (lone.poses.level[at] > 0).any()
-    assert lone.poses.valid[at].all()
-    assert np.nanmedian(lone.off_mm[at]) < 8.0
-    assert (lone.poses.level[lone.t_s > BACK_S + 0.1] > 0).any()
+    single = without(seen, lambda message: isinstance(message, WristDetections) and gone(message))
+    at = (single.t_s > GONE_S + 0.1) & (single.t_s < BACK_S)
+    np.testing.assert_array_equal(single.t_s, whole.t_s)
+    assert not (single.poses.level[at] > 0).any()
+    assert single.poses.valid[at].all()
+    assert np.nanmedian(single.off_mm[at]) < 8.0
+    assert (single.poses.level[single.t_s > BACK_S + 0.1] > 0).any()
 
 
 def test_without_the_imu_the_palm_is_that_of_the_markers(seen: Seen, whole: Solved) -> None:
-    lone = without(seen, lambda message: isinstance(message, ImuSample) and gone(message))
-    at = (lone.t_s > GONE_S + 0.1) & (lone.t_s < BACK_S - 0.1)
-    assert np.isnan(lone.poses.palm_world_wxyz[at]).all()
-    assert np.isfinite(lone.poses.palm_world_wxyz[lone.t_s > BACK_S + 0.1]).all()
-    assert np.nanmedian(lone.off_mm[at]) < 1.5 * np.nanmedian(whole.off_mm[at]) + 1.0
+    single = without(seen, lambda message: isinstance(message, ImuSample) and gone(message))
+    at = (single.t_s > GONE_S + 0.1) & (single.t_s < BACK_S - 0.1)
+    assert np.isnan(single.poses.palm_world_wxyz[at]).all()
+    assert np.isfinite(single.poses.palm_world_wxyz[single.t_s > BACK_S + 0.1]).all()
+    assert np.nanmedian(single.off_mm[at]) < 1.5 * np.nanmedian(whole.off_mm[at]) + 1.0
 
 
 def test_fingers_are_better_with_the_wrist_device_than_without(seen: Seen, whole: Solved) -> None:

@@ -144,7 +144,7 @@ def past(whole: Whole) -> None:
     near = rotation_vector_to_matrix(rng.normal(0.0, 1e-3, 3)) @ whole.T[:3, :3]
     belief.palm[:] = rigid(near, whole.T[:3, 3] + rng.normal(0.0, 0.01, 3))
     belief.palm_w2[:] = np.repeat([20.0, 3e3], 3)
-    belief.sight[:], belief.depth_w2[0] = any_rotation(rng)[:, 0], 5e4
+    belief.line_of_sight[:], belief.depth_w2[0] = any_rotation(rng)[:, 0], 5e4
 
 
 def facing(whole: Whole) -> None:
@@ -170,7 +170,7 @@ def extras(whole: Whole) -> None:
 
 def points(whole: Whole) -> None:
     rng, observed = whole.rng, whole.observed
-    observed.seen[:] = observed.placed[:] = True
+    observed.seen[:] = observed.triangulated[:] = True
     observed.point[:] = whole.points + rng.normal(0.0, 0.02, (6, 3))
     root = rng.normal(0.0, 300.0, (6, 3, 3))
     observed.information[:] = root @ root.swapaxes(1, 2)

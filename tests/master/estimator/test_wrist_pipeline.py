@@ -287,9 +287,9 @@ def test_light_resolves_what_laser_and_tip_leave_open(
     both = (pose.level == Level.IK) & (without.level == Level.IK)
     both[0] = False
     assert both.sum() >= 3
-    off, blind = (np.abs(one.angles_rad - angles)[:, PIP][both] for one in (pose, without))
+    off, no_observation = (np.abs(one.angles_rad - angles)[:, PIP][both] for one in (pose, without))
     assert np.degrees(off).max() < 7.0
-    assert off.mean() <= blind.mean() + np.radians(3.5)
+    assert off.mean() <= no_observation.mean() + np.radians(3.5)
 
 
 @pytest.mark.parametrize("worthless", [np.nan, 0.0, 1e-30])

@@ -42,25 +42,25 @@ def spd(rng: np.random.Generator, n: int) -> Float:
 
 
 def laser(whole: Whole, seen: Seen, off: float) -> None:
-    sights = whole.belief.sights
-    sights.rows[0], sights.lit[:], sights.teaches[:] = 1.0, 1.0, 1.0
-    sights.lack[:] = whole.rng.normal(0.0, 0.02, (5, 2))
-    sights.laser[:] = seen.ridge + sights.lack + off * whole.rng.normal(size=(5, 2))
-    sights.laser_W[:] = [spd(whole.rng, 2) for _ in range(5)]
+    lines_of_sight = whole.belief.lines_of_sight
+    lines_of_sight.rows[0], lines_of_sight.lit[:], lines_of_sight.teaches[:] = 1.0, 1.0, 1.0
+    lines_of_sight.lack[:] = whole.rng.normal(0.0, 0.02, (5, 2))
+    lines_of_sight.laser[:] = seen.ridge + lines_of_sight.lack + off * whole.rng.normal(size=(5, 2))
+    lines_of_sight.laser_W[:] = [spd(whole.rng, 2) for _ in range(5)]
 
 
 def tip(whole: Whole, seen: Seen, off: float) -> None:
-    sights = whole.belief.sights
-    sights.rows[0], sights.shown[:], sights.teaches[:] = 1.0, 1.0, 1.0
-    sights.tip[:] = seen.tip + off * whole.rng.normal(size=(5, 2))
-    sights.tip_W[:] = [spd(whole.rng, 2) for _ in range(5)]
+    lines_of_sight = whole.belief.lines_of_sight
+    lines_of_sight.rows[0], lines_of_sight.shown[:], lines_of_sight.teaches[:] = 1.0, 1.0, 1.0
+    lines_of_sight.tip[:] = seen.tip + off * whole.rng.normal(size=(5, 2))
+    lines_of_sight.tip_W[:] = [spd(whole.rng, 2) for _ in range(5)]
 
 
 def tip_depth(whole: Whole, seen: Seen, off: float) -> None:
     tip(whole, seen, off)
-    sights = whole.belief.sights
-    sights.depth[:] = np.log(seen.depth_m) + whole.z[LIGHT] + off * whole.rng.normal(size=5)
-    sights.depth_w2[:] = whole.rng.uniform(1.0, 9.0, 5)
+    lines_of_sight = whole.belief.lines_of_sight
+    lines_of_sight.depth[:] = np.log(seen.depth_m) + whole.z[LIGHT] + off * whole.rng.normal(size=5)
+    lines_of_sight.depth_w2[:] = whole.rng.uniform(1.0, 9.0, 5)
 
 
 def turn(whole: Whole, seen: Seen, off: float) -> None:
@@ -103,16 +103,16 @@ def test_the_laser_row_is_that_of_ridge_and_lack(worn: Worn) -> None:
     for seed in range(4):
         whole, seen = hand(worn, seed)
         laser(whole, seen, 0.3)
-        sights, n = whole.belief.sights, whole.n
+        lines_of_sight, n = whole.belief.lines_of_sight, whole.n
         by_free = whole.parameters.by_angles(whole.x).reshape(5, 4, n)
         expected, cost = np.zeros(6 + n + len(whole.z)), 0.0
         for f in range(5):
-            r = seen.ridge[f] + sights.lack[f] - sights.laser[f]
-            pull = seen.by[f, :2].T @ sights.laser_W[f] @ r
+            r = seen.ridge[f] + lines_of_sight.lack[f] - lines_of_sight.laser[f]
+            pull = seen.by[f, :2].T @ lines_of_sight.laser_W[f] @ r
             expected[6 : 6 + n] += by_free[f].T @ pull[:4]
             expected[6 + n + f] += pull[4]
             expected[6 + n + BEND : 6 + n + BEND + 2] += pull[5:]
-            cost += 0.5 * r @ sights.laser_W[f] @ r
+            cost += 0.5 * r @ lines_of_sight.laser_W[f] @ r
         found, gradient, _ = whole.cost()
         assert found == pytest.approx(cost, rel=1e-9)
         np.testing.assert_allclose(gradient, expected, atol=1e-9)
@@ -136,7 +136,7 @@ def test_rows_that_are_not_seen_say_nothing(worn: Worn) -> None:
     whole, seen = hand(worn, 1)
     tip_depth(whole, seen, 0.3)
     laser(whole, seen, 0.3)
-    whole.belief.sights.lit[:] = whole.belief.sights.shown[:] = 0.0
+    whole.belief.lines_of_sight.lit[:] = whole.belief.lines_of_sight.shown[:] = 0.0
     cost, gradient, normal = whole.cost()
     assert cost == 0.0
     assert not gradient.any()
@@ -149,9 +149,9 @@ def test_a_finger_tells_its_own_angles_and_twist_and_the_bend(worn: Worn, teache
     whole, seen = hand(worn, 2)
     tip_depth(whole, seen, 0.3)
     laser(whole, seen, 0.3)
-    sights = whole.belief.sights
-    sights.lit[:] = sights.shown[:] = np.arange(5) == 2
-    sights.teaches[:] = teaches
+    lines_of_sight = whole.belief.lines_of_sight
+    lines_of_sight.lit[:] = lines_of_sight.shown[:] = np.arange(5) == 2
+    lines_of_sight.teaches[:] = teaches
     _, gradient, _ = whole.cost()
     own, extras = np.flatnonzero(whole.parameters.free // 4 == 2), 6 + whole.n
     moved = set(np.flatnonzero(gradient).tolist())

@@ -100,7 +100,7 @@ def test_a_flat_marker_and_one_not_found_have_no_bias() -> None:
 def test_markers_without_caps_have_no_tables_and_the_same_hand_has_its_own_once() -> None:
     back = CapTables.of(RIGHT, ("back", "cube"))
     assert back.row.tolist() == [-1, -1]
-    assert len(back.looks) == len(back.radius_m) == 0
+    assert len(back.appearances) == len(back.radius_m) == 0
     points = np.array([[0.0, 0.0, 0.5]] * 2)
     np.testing.assert_array_equal(hidden_px(np.full((2, 2), 3.0), points, np.zeros((1, 2, 2)), back), 0.0)
     assert CapTables.of(RIGHT, MARKERS) is CAPS

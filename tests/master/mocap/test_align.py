@@ -63,8 +63,8 @@ def test_a_movement_that_repeats_is_said() -> None:
         return hand_at(t_s % 2.0).position_m
 
     found = align(track_of(again(OURS_S), OURS_S), Track(ns(THEIRS_S), again(THEIRS_S + 0.7)))
-    assert abs(found.rival_s) % 2.0 == pytest.approx(0.0, abs=0.05)
-    assert np.isnan(align(track_of(hand_at(OURS_S).position_m, OURS_S), theirs()).rival_s)
+    assert abs(found.alternative_s) % 2.0 == pytest.approx(0.0, abs=0.05)
+    assert np.isnan(align(track_of(hand_at(OURS_S).position_m, OURS_S), theirs()).alternative_s)
 
 
 def test_another_movement_is_refused() -> None:

@@ -206,12 +206,14 @@ def test_beads_do_not_begin_with_one_camera_alone() -> None:
     assert all(np.isnan(pose.position_m).all() for pose in run(WAND.line(), iter(messages)))
 
 
-def with_uv(message: MarkerDetections, row: int, uv: Float, rival: Float | None = None) -> MarkerDetections:
-    places, rivals = message.uv.copy(), message.rival_uv.copy()
+def with_uv(
+    message: MarkerDetections, row: int, uv: Float, alternative: Float | None = None
+) -> MarkerDetections:
+    places, alternatives = message.uv.copy(), message.alternative_uv.copy()
     places[row] = uv
-    if rival is not None:
-        rivals[row] = rival
-    return msgspec.structs.replace(message, uv=places, rival_uv=rivals)
+    if alternative is not None:
+        alternatives[row] = alternative
+    return msgspec.structs.replace(message, uv=places, alternative_uv=alternatives)
 
 
 def test_another_thing_in_the_colour_of_a_bead_does_no_harm() -> None:

@@ -76,7 +76,7 @@ def test_what_a_master_that_fell_behind_left_out_is_left_out_again(tmp_path: Pat
     (path, live), shed = overloaded_run(tmp_path / "run.mcap", root / "calib_json", bursts)
     recording = open_messages(path)
     said = [one.message for one in recording.read(["taken"]) if isinstance(one.message, Backlog)]
-    assert [one.leave_out for one in said] == 4 * [MOST, 0]
+    assert [one.reject for one in said] == 4 * [MOST, 0]
     assert (shed, live.counts["poses"]) == (10, FRAMES - 10)
     setups = recorded_setups(recording)
     for passed in (Player(recording, setups, []).run(), Player(recording, setups, [], speed=2.0).run()):

@@ -183,11 +183,11 @@ def test_an_output_that_cannot_open_costs_its_messages_and_says_why_once() -> No
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_an_output_that_ends_by_an_error_nobody_foresaw_is_closed_and_not_called_open() -> None:
-    class Odd(Kept):
+    class Faulty(Kept):
         def write(self, message: Told) -> None:
             raise KeyError(message.t_ns)
 
-    sink, tally = Odd(), Tally()
+    sink, tally = Faulty(), Tally()
     line = OutputLine("lsl", lambda: sink, tally, print)
     eventually(lambda: line.open)
     line.offer(hand_pose("left"))

@@ -178,9 +178,9 @@ def test_doubt_is_that_of_the_errors_and_more_where_the_leds_show_nothing() -> N
                 truth.laser_len_vis[1:6] > VISIBLE_M
             ]
         )
-        blind = laser_lines(lit(laser, ambient), separate(BLACK, VIEW), VIEW)
-        both = np.isfinite(found.sigma_px) & np.isfinite(blind.sigma_px)
-        assert (blind.sigma_px[both] > 3.5).all()
+        null_detector = laser_lines(lit(laser, ambient), separate(BLACK, VIEW), VIEW)
+        both = np.isfinite(found.sigma_px) & np.isfinite(null_detector.sigma_px)
+        assert (null_detector.sigma_px[both] > 3.5).all()
     deviations = np.concatenate(off)
     deviations = deviations[np.isfinite(deviations)]
     assert 0.3 < np.quantile(deviations, 0.68) < 1.3

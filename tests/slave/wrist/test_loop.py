@@ -12,10 +12,10 @@ from slave.__main__ import main
 from slave.app import DARK_AFTER, run_wrist
 from slave.cameras.source import Frame
 from slave.tally import Tally
-from slave.wrist.blind import BlindWrist
 from slave.wrist.detector import WristDetector, WristFound
 from slave.wrist.fingertips import Fingertips
 from slave.wrist.laser import LaserLines
+from slave.wrist.null_detector import NullWristDetector
 from slave.wrist.strobe import Triple
 from tests.slave.wrist.wrist_frames import CAMERA, ROOT, VIEW, strobed
 
@@ -94,7 +94,7 @@ def test_while_there_are_no_triples_every_frame_is_shown_and_nothing_is_sent() -
     wire, tally, shown = Wire(), Tally(()), list[int]()
     run_wrist(
         Source(frames(list(range(30)))),
-        BlindWrist(),
+        NullWristDetector(),
         wire,
         "wrist",
         tally,

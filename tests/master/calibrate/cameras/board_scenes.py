@@ -9,7 +9,7 @@ import numpy as np
 from common.arrays import Float
 from common.geometry import axis_rotation, invert, rigid, rotation_vector_to_matrix, transform
 from master.calibrate.cameras.boards import Board, Charuco, Checkerboard, board_corners
-from master.calibrate.cameras.detect import Sighting
+from master.calibrate.cameras.detect import ImageObservation
 from master.calibrate.cameras.views import BoardViews, View
 
 SIZE = (640, 480)
@@ -52,7 +52,7 @@ class Scene:
         views: list[View] = []
         unseen: list[str] = []
         for number in range(len(self.T_rig_board)):
-            sightings: dict[str, Sighting] = {}
+            observations: dict[str, ImageObservation] = {}
             for camera in self.lenses:
                 uv = self.corners(number, camera)
                 inside = ((uv > 4) & (uv < np.array(SIZE) - 5)).all(axis=1)
@@ -61,9 +61,9 @@ class Scene:
                     unseen.append(f"{number:02d} {camera}")
                     continue
                 uv[~inside] = np.nan
-                sightings[camera] = Sighting(uv, float(rng.uniform(0.7, 1.1)))
-            if sightings:
-                views.append(View(f"{number:02d}", sightings))
+                observations[camera] = ImageObservation(uv, float(rng.uniform(0.7, 1.1)))
+            if observations:
+                views.append(View(f"{number:02d}", observations))
         return BoardViews(self.board, dict.fromkeys(self.lenses, SIZE), tuple(views), tuple(unseen))
 
 

@@ -45,7 +45,7 @@ def test_a_view_is_kept_once_it_is_held_still_and_only_once(renderers: dict[str,
     again = [live.push(at(renderers, STEP_S + t)) for t in (0.1, 0.4)]
     assert [verdict.kept for verdict in again] == [False, True]
     assert [view.name for view in live.views] == ["001", "002"]
-    assert set(live.views[0].sightings) == {"left", "right"}
+    assert set(live.views[0].observations) == {"left", "right"}
     assert live.board_views().sizes_px == {"left": (640, 480), "right": (640, 480)}
 
 
@@ -96,7 +96,7 @@ def test_what_was_kept_is_a_folder_that_the_calibrations_read(
     assert [view.name for view in views.views] == ["001", "002", "003"]
     for mine, read in zip(live.views, views.views, strict=True):
         for name in RIG.cameras:
-            step = mine.sightings[name].corners_px - read.sightings[name].corners_px
+            step = mine.observations[name].corners_px - read.observations[name].corners_px
             assert np.abs(step).max() < 0.2  # what JPEG costs
     with pytest.raises(CalibrationError, match=r"holds .* already"):
         new_folder(folder)

@@ -9,9 +9,9 @@ from common.arrays import Float
 from common.geometry import quaternion_to_matrix, rotation_vector_to_matrix
 from common.wrist_bend import forearm_palm
 from master.calibrate.mounting.hands import Hands
+from master.calibrate.mounting.lines_of_sight import LinesOfSight
 from master.calibrate.mounting.mounting import _triples
 from master.calibrate.mounting.problem import Problem
-from master.calibrate.mounting.sights import Sights
 from master.calibrate.mounting.tracks import HandTrack, ImuTrack
 from master.calibrate.mounting.unknown import UNKNOWN, Unknown, believed
 from master.calibrate.mounting.wrists import bends, bends_by_turn
@@ -25,12 +25,12 @@ def problem() -> tuple[Problem, Unknown, Hands]:
     """Twelve instants by tips alone (the laser's line jumps where a finger hides it), somewhat away from the truth."""
     seen, rng = moved(), np.random.default_rng(4)
     setup = WristSetup.of(seen.both.wrist.rig, seen.both.wrist.cameras["wrist"], seen.both.markers.hand)
-    sights, zero_ns = Sights(setup), seen.triples[0].t_ns
+    lines_of_sight, zero_ns = LinesOfSight(setup), seen.triples[0].t_ns
     imu = seen.both.wrist.rig.imu
     assert imu is not None
     assert imu.q_palm_imu is not None
     R = quaternion_to_matrix(np.array(imu.q_palm_imu))
-    chosen = _triples(setup, sights, seen.both.wrist.cameras["wrist"], seen.triples[20:80:5], zero_ns)
+    chosen = _triples(setup, lines_of_sight, seen.both.wrist.cameras["wrist"], seen.triples[20:80:5], zero_ns)
     chosen = replace(chosen, laser_m=np.full_like(chosen.laser_m, np.nan))
     track = ImuTrack(seen.samples, zero_ns)
     middle = seen.samples[len(seen.samples) // 2]
@@ -49,7 +49,7 @@ def problem() -> tuple[Problem, Unknown, Hands]:
     )
     hand = HandTrack.of(seen.poses, seen.both.markers.hand, zero_ns)
     out = Problem(
-        sights, seen.both.markers.hand, seen.both.markers.markers, hand, track, chosen, 3000.0, first
+        lines_of_sight, seen.both.markers.hand, seen.both.markers.markers, hand, track, chosen, 3000.0, first
     )
     hands = out.guessed(first)
     out.tell(first, hands)

@@ -219,7 +219,7 @@ def test_the_guided_motion_ends_by_itself_and_says_what_is_missing_until_then() 
 
 
 @pytest.mark.parametrize(
-    ("left_out", "text"),
+    ("rejected", "text"),
     [
         ("tracker", "no tracker is heard"),
         ("object", "the cameras do not see the object"),
@@ -227,11 +227,11 @@ def test_the_guided_motion_ends_by_itself_and_says_what_is_missing_until_then() 
         ("both", "no tracker is heard"),
     ],
 )
-def test_who_is_silent_is_said(left_out: str, text: str) -> None:
+def test_who_is_silent_is_said(rejected: str, text: str) -> None:
     motion, clock, said = Motion(9, seconds=8.0), Clock(), list[str]()
     nowhere = [replace(one, position_m=np.full(3, np.nan)) for one in motion.tracked()]
-    messages: list[ObjectPose | TrackerPose] = [] if left_out in ("object", "both") else [*motion.objects()]
-    messages += {"tracker": [], "both": [], "place": nowhere}.get(left_out, motion.tracked())
+    messages: list[ObjectPose | TrackerPose] = [] if rejected in ("object", "both") else [*motion.objects()]
+    messages += {"tracker": [], "both": [], "place": nowhere}.get(rejected, motion.tracked())
     try:
         guide(played(messages, clock), clock, said.append, 7.0)
     except FitError as error:

@@ -11,8 +11,8 @@ from common.geometry import (
     transform,
 )
 from master.calibrate.cameras.boards import Checkerboard, board_corners
+from master.calibrate.wrist.board_pose import BoardPose, place_corners
 from master.calibrate.wrist.palm_board import Mounting, palm_from_board
-from master.calibrate.wrist.placed import PlacedBoard, place_corners
 from tests.master.calibrate.wrist.devices import OPTICS, RIG
 
 BOARD = Checkerboard(7, 4, 0.010)
@@ -21,7 +21,7 @@ TRUE = np.array(RIG.T_camera_palm)
 KNUCKLES = np.array([0.0, 0.0, 0.08])
 
 
-def seen_on_palm(noise_px: float = 0.0, seed: int = 0, *, turned: bool = False) -> PlacedBoard:
+def seen_on_palm(noise_px: float = 0.0, seed: int = 0, *, turned: bool = False) -> BoardPose:
     """The board on the true palm, by its corners."""
     uv = OPTICS.project(transform(TRUE @ MOUNTING.T_palm_board(BOARD), board_corners(BOARD)))
     uv = uv + noise_px * np.random.default_rng(seed).standard_normal(uv.shape)
@@ -66,7 +66,7 @@ def test_a_hand_that_moved_and_a_board_not_seen_are_refused() -> None:
     still = seen_on_palm()
     T = still.T_camera_board.copy()
     T[0, 3] += 0.008
-    moved = PlacedBoard(T, still.centre_m, still.covariance, still.rms_px)
+    moved = BoardPose(T, still.centre_m, still.covariance, still.rms_px)
     with pytest.raises(FitError, match="board moved by"):
         palm_from_board([still, still, moved], BOARD, MOUNTING)
     with pytest.raises(FitError, match="seen in no view"):

@@ -6,8 +6,8 @@ import pytest
 from common.arrays import Float
 from common.errors import FitError
 from common.geometry import rigid, rotation_vector_to_matrix
+from master.calibrate.wrist.board_pose import BoardPose
 from master.calibrate.wrist.laser_command import lines_of
-from master.calibrate.wrist.placed import PlacedBoard
 from master.calibrate.wrist.plane import ViewLine, fit_plane
 from tests.master.calibrate.wrist.devices import (
     BOARD,
@@ -37,7 +37,7 @@ def view_line(
     point = np.linalg.solve(system, np.array([facing @ at, OFFSET_M, way @ at]))
     points = point + np.linspace(-0.05, 0.05, 60)[:, None] * way
     ends = point + np.array([[-0.03], [0.03]]) * way
-    placed = PlacedBoard(rigid(turn, at), at, BOARD_SIGMA, 0.06)
+    placed = BoardPose(rigid(turn, at), at, BOARD_SIGMA, 0.06)
     return ViewLine(name, points, ends, placed, 0.02, FOCAL_PX)
 
 
@@ -148,7 +148,7 @@ def test_noise_beyond_the_spread_is_refused() -> None:
             one.name,
             one.points_m,
             one.ends_m,
-            PlacedBoard(one.placed.T_camera_board, one.placed.centre_m, unsure, 0.9),
+            BoardPose(one.placed.T_camera_board, one.placed.centre_m, unsure, 0.9),
             0.02,
             FOCAL_PX,
         )

@@ -95,8 +95,8 @@ def test_a_camera_that_was_knocked_by_two_degrees_is_left_out(
     poses, counts = solve(rig(names, knocked, by), messages(names))
     assert off_mm(poses).max() < 5.0  # without it nothing was found, or a centimetre off
     every = len(poses) * len(MARKERS)
-    assert {name: n for name, n in counts.items() if "left_out" in name} == {
-        f"left_out.{knocked}": every,
+    assert {name: n for name, n in counts.items() if "rejected" in name} == {
+        f"rejected.{knocked}": every,
         f"mostly_left_out.{knocked}": len(poses),
     }
     assert counts["epipolar_misfits"] == 0
@@ -109,19 +109,19 @@ def test_markers_that_one_camera_swaps_are_taken_from_the_others(
 ) -> None:
     poses, counts = solve(rig(names), messages(names, swapped))
     assert off_mm(poses).max() < 5.0
-    assert counts[f"left_out.{swapped}"] == 2 * len(poses)
+    assert counts[f"rejected.{swapped}"] == 2 * len(poses)
     assert counts["epipolar_misfits"] == 0
     assert f"mostly_left_out.{swapped}" not in counts
 
 
 def test_nothing_is_left_out_where_rays_meet_or_two_cameras_disagree() -> None:
     _, counts = solve(rig(FOUR), messages(FOUR))
-    assert not any("left_out" in name for name in counts)
+    assert not any("rejected" in name for name in counts)
     two = THREE[:2]
     poses, counts = solve(rig(two, "right", np.radians([2.0, 0.0, 0.0])), messages(two))
     assert np.isnan(off_mm(poses)).all()
     assert counts["epipolar_misfits"] == len(poses) * len(MARKERS)
-    assert not any("left_out" in name for name in counts)
+    assert not any("rejected" in name for name in counts)
 
 
 # -- which one it is ---------------------------------------------------------------------------------------------
@@ -134,7 +134,7 @@ def located(file: RigCalibration, uv: Float) -> MarkerPositions:
 
 
 def odd(file: RigCalibration, uv: Float) -> Bool:
-    return located(file, uv).left_out
+    return located(file, uv).rejected
 
 
 def images(names: tuple[str, ...], seed: int, count: int = 300) -> Float:
@@ -171,7 +171,7 @@ def test_of_three_side_by_side_one_that_is_off_sideways_is_not_told() -> None:
     row = rig_file(THREE)
     uv = np.stack([camera.project(TRUTH) for camera in camera_models(row).values()])
     uv[1, :, 0] += 15.0
-    assert located(row, uv).apart.all()
+    assert located(row, uv).outliers.all()
     assert not odd(row, uv).any()
     uv[1] += [-15.0, 15.0]  # up or down it is
     assert odd(row, uv)[1].all()

@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.arrays import Float
-from master.fabrik.carry import HISTORY, NEVER, SIGHTINGS, Reach, TrackHistory, carry
+from master.fabrik.propagate import HISTORY, NEVER, OBSERVATIONS, Reach, TrackHistory, propagate
 from master.fabrik.sync import FrameSet
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -39,7 +39,7 @@ class Frame:
 
     t_ms: float
     uv: Float
-    rivals: Float | None = None
+    alternatives: Float | None = None
     sigma_px: float = 0.1
     t_sigma_ms: float = 0.0
 
@@ -56,8 +56,8 @@ def history(views: list[list[Frame]], scale: Float, row_time_ns: float = 0.0) ->
         for k, one in enumerate(sorted(view, key=lambda one: one.t_ms)):
             times[c, k], t_sigma[c, k] = round(one.t_ms * MS), one.t_sigma_ms * MS
             marks[c, k, :2], marks[c, k, 4], marks[c, k, 5] = one.uv.T, one.sigma_px, 100.0
-            if one.rivals is not None:
-                marks[c, k, 2:4] = one.rivals.T
+            if one.alternatives is not None:
+                marks[c, k, 2:4] = one.alternatives.T
     count = np.array([len(view) for view in views], np.int64)
     return TrackHistory(count, times, t_sigma, marks, np.full(len(views), row_time_ns), scale)
 
@@ -66,16 +66,16 @@ def carried(held: TrackHistory, t_ns: int = 0, reach_ns: Reach = REACH_NS) -> Fr
     shape = (len(held.total), held.marks.shape[3])
     uv, sigma, area = np.empty((2, *shape, 2)), np.empty((2, *shape)), np.empty(shape)
     missing = np.empty(shape[0], np.bool_)
-    ready, rivals = carry(held, t_ns, reach_ns, uv, sigma, area, missing)
+    ready, alternatives = propagate(held, t_ns, reach_ns, uv, sigma, area, missing)
     return FrameSet(
-        t_ns, uv[0], sigma[0], area, ready, missing, *((uv[1], sigma[1]) if rivals else (None, None))
+        t_ns, uv[0], sigma[0], area, ready, missing, *((uv[1], sigma[1]) if alternatives else (None, None))
     )
 
 
-def carry_one(frames: list[Frame]) -> FrameSet:
+def propagate_one(frames: list[Frame]) -> FrameSet:
     """To time 0, of one camera, whose axis is then taken off."""
     found = carried(history([frames], np.array([PX_M])))
-    named = [None if x is None else x[0] for x in (found.rival_uv, found.rival_sigma_px)]
+    named = [None if x is None else x[0] for x in (found.alternative_uv, found.alternative_sigma_px)]
     return FrameSet(0, found.uv[0], found.sigma_px[0], found.area[0], found.ready_t_ns, found.missing, *named)
 
 
@@ -89,68 +89,82 @@ def mug(t_ms: float) -> Float:
     return np.array([300.0, 260.0]) + 0.0 * t_ms
 
 
-def sighting(t_ms: float, first: Float, second: Float | None = None) -> Frame:
+def observation(t_ms: float, first: Float, second: Float | None = None) -> Frame:
     """Two markers: one with the places given, one that is always clear and never moves."""
-    rivals = None if second is None else np.stack([second, NOWHERE])
-    return Frame(t_ms, np.stack([first, [10.0, 20.0]]), rivals)
+    alternatives = None if second is None else np.stack([second, NOWHERE])
+    return Frame(t_ms, np.stack([first, [10.0, 20.0]]), alternatives)
 
 
 def test_without_a_rival_there_are_none() -> None:
-    found = carry_one([sighting(5, marker(5)), sighting(-11, marker(-11)), sighting(-27, marker(-27))])
-    assert found.rival_uv is None
-    assert found.rival_sigma_px is None
+    found = propagate_one(
+        [observation(5, marker(5)), observation(-11, marker(-11)), observation(-27, marker(-27))]
+    )
+    assert found.alternative_uv is None
+    assert found.alternative_sigma_px is None
     np.testing.assert_allclose(found.uv, np.array([marker(0), (10.0, 20.0)]), atol=0.02)
 
 
 @pytest.mark.parametrize("swapped", [(), (0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)])
 def test_two_things_that_change_their_roles_keep_their_own_paths(swapped: tuple[int, ...]) -> None:
-    near: list[Frame] = []
+    warm_start: list[Frame] = []
     for i, t in enumerate((5.0, -11.0, -27.0)):
         first, second = (mug, marker) if i in swapped else (marker, mug)
-        near.append(sighting(t, first(t), second(t)))
-    found = carry_one(near)
-    assert found.rival_uv is not None
+        warm_start.append(observation(t, first(t), second(t)))
+    found = propagate_one(warm_start)
+    assert found.alternative_uv is not None
     # Which of the two is called the marker is what the nearest sighting says.
     first, second = (mug, marker) if 0 in swapped else (marker, mug)
     np.testing.assert_allclose(found.uv[0], first(0.0), atol=0.02)
-    np.testing.assert_allclose(found.rival_uv[0], second(0.0), atol=0.02)
-    assert np.isnan(found.rival_uv[1]).all()
+    np.testing.assert_allclose(found.alternative_uv[0], second(0.0), atol=0.02)
+    assert np.isnan(found.alternative_uv[1]).all()
     np.testing.assert_allclose(found.uv[1], [10.0, 20.0])
 
 
 def test_a_rival_seen_in_the_nearest_frame_alone_is_held_there_with_a_larger_sigma() -> None:
-    near = [sighting(5, marker(5), mug(5)), sighting(-11, marker(-11)), sighting(-27, marker(-27))]
-    found = carry_one(near)
-    assert found.rival_uv is not None
-    assert found.rival_sigma_px is not None
+    warm_start = [
+        observation(5, marker(5), mug(5)),
+        observation(-11, marker(-11)),
+        observation(-27, marker(-27)),
+    ]
+    found = propagate_one(warm_start)
+    assert found.alternative_uv is not None
+    assert found.alternative_sigma_px is not None
     np.testing.assert_allclose(found.uv[0], marker(0.0), atol=0.02)
-    np.testing.assert_allclose(found.rival_uv[0], mug(5.0))
-    assert found.rival_sigma_px[0] == pytest.approx(np.hypot(0.1, HELD_PX_S * 0.005), rel=2e-3)
+    np.testing.assert_allclose(found.alternative_uv[0], mug(5.0))
+    assert found.alternative_sigma_px[0] == pytest.approx(np.hypot(0.1, HELD_PX_S * 0.005), rel=2e-3)
     assert found.sigma_px[0] < 0.3
 
 
 def test_a_rival_of_the_oldest_frame_alone_changes_nothing() -> None:
     """The marker moves 9.6 px a frame, and no place of it is given to a track that has not begun."""
-    near = [sighting(5, marker(5)), sighting(-11, marker(-11)), sighting(-27, mug(-27), marker(-27))]
-    found = carry_one(near)
-    clear = carry_one([sighting(t, marker(t)) for t in (5.0, -11.0, -27.0)])
+    warm_start = [
+        observation(5, marker(5)),
+        observation(-11, marker(-11)),
+        observation(-27, mug(-27), marker(-27)),
+    ]
+    found = propagate_one(warm_start)
+    clear = propagate_one([observation(t, marker(t)) for t in (5.0, -11.0, -27.0)])
     np.testing.assert_array_equal(found.uv, clear.uv)
     np.testing.assert_array_equal(found.sigma_px, clear.sigma_px)
 
 
 def test_a_rival_of_an_older_frame_is_no_rival_now_but_does_not_lead_the_marker_astray() -> None:
-    near = [sighting(5, marker(5)), sighting(-11, mug(-11), marker(-11)), sighting(-27, mug(-27))]
-    found = carry_one(near)
-    assert found.rival_uv is not None
-    assert np.isnan(found.rival_uv[0]).all()
+    warm_start = [
+        observation(5, marker(5)),
+        observation(-11, mug(-11), marker(-11)),
+        observation(-27, mug(-27)),
+    ]
+    found = propagate_one(warm_start)
+    assert found.alternative_uv is not None
+    assert np.isnan(found.alternative_uv[0]).all()
     # A line through two sightings; the third is the mug.
     np.testing.assert_allclose(found.uv[0], marker(0.0), atol=0.05)
 
 
 def test_what_is_a_leap_away_is_another_thing() -> None:
     far = np.array([500.0, 200.0])
-    near = [sighting(5, marker(5), mug(5)), sighting(-11, far), sighting(-27, far)]
-    found = carry_one(near)
+    warm_start = [observation(5, marker(5), mug(5)), observation(-11, far), observation(-27, far)]
+    found = propagate_one(warm_start)
     np.testing.assert_allclose(found.uv[0], marker(5.0))  # held: the others are not its past
     assert found.sigma_px[0] == pytest.approx(np.hypot(0.1, HELD_PX_S * 0.005), rel=2e-3)
 
@@ -168,9 +182,9 @@ def test_without_noise_a_cubic_is_met(times: tuple[float, ...]) -> None:
     """1 m/s, 10 m/s^2, 200 m/s^3: a brisk hand."""
     t = np.array(times)[:, None, None] * 1e-3
     places = 300.0 + PX_M * (t * [1.0, -0.5] + t**2 * [-5.0, 3.0] + t**3 * [33.0, 20.0])
-    found = carry_one(seen(times, places, sigma_px=1e-3))
+    found = propagate_one(seen(times, places, sigma_px=1e-3))
     np.testing.assert_allclose(found.uv, [[300.0, 300.0]], atol=0.1)
-    straight = carry_one(seen(times[:2], places[:2], sigma_px=1e-3))
+    straight = propagate_one(seen(times[:2], places[:2], sigma_px=1e-3))
     assert np.abs(straight.uv - 300.0).max() > 0.15  # two sightings do not know the turn
 
 
@@ -179,8 +193,8 @@ def test_a_marker_at_rest_is_no_less_steady_than_its_sightings(
     times: tuple[float, ...], most_px: float
 ) -> None:
     rng = np.random.default_rng(2)
-    noise = rng.normal(0.0, 0.1, (SIGHTINGS, 4000, 2))
-    found = carry_one(seen(times, 300.0 + noise))
+    noise = rng.normal(0.0, 0.1, (OBSERVATIONS, 4000, 2))
+    found = propagate_one(seen(times, 300.0 + noise))
     assert (found.uv - 300.0).std() < most_px
 
 
@@ -196,7 +210,7 @@ def test_sigma_covers_the_error_of_a_swinging_hand(times: tuple[float, ...], pea
         return 300.0 + PX_M * peak_m_s2 / turn**2 * np.sin(turn * t_s + phase)
 
     t = np.array(times)[:, None, None] * 1e-3
-    found = carry_one(seen(times, place(t) + rng.normal(0.0, 0.1, (SIGHTINGS, 2000, 2))))
+    found = propagate_one(seen(times, place(t) + rng.normal(0.0, 0.1, (OBSERVATIONS, 2000, 2))))
     error = np.abs(found.uv - place(0.0)) / found.sigma_px[:, None]
     assert 0.9 < (error < 1.96).mean() < 0.995
     assert np.median(found.sigma_px) < (0.25 if times is PAST else 1.6)  # and says something
@@ -208,9 +222,9 @@ def test_a_shifted_picture_or_a_clock_that_began_elsewhere_changes_nothing(
     seed: int, shift: float, late_ms: float
 ) -> None:
     rng = np.random.default_rng(seed)
-    places = 300.0 + rng.normal(0.0, 3.0, (SIGHTINGS, 5, 2))
-    plain = carry_one(seen(PAST, places))
-    shifted = carry_one(seen(PAST, places + shift))
+    places = 300.0 + rng.normal(0.0, 3.0, (OBSERVATIONS, 5, 2))
+    plain = propagate_one(seen(PAST, places))
+    shifted = propagate_one(seen(PAST, places + shift))
     np.testing.assert_allclose(shifted.uv, plain.uv + shift, atol=1e-8)
     np.testing.assert_allclose(shifted.sigma_px, plain.sigma_px)
     later_ms = tuple(t + late_ms for t in PAST)
@@ -221,8 +235,8 @@ def test_a_shifted_picture_or_a_clock_that_began_elsewhere_changes_nothing(
 def test_a_time_error_adds_with_the_speed() -> None:
     t = np.array(PAST)[:, None, None] * 1e-3
     places = np.concatenate([300.0 + t * [900.0, 0.0], 300.0 + 0.0 * t * [1.0, 1.0]], axis=1)
-    exact = carry_one(seen(PAST, places))
-    unsure = carry_one([changed(s, t_sigma_ms=0.5) for s in seen(PAST, places)])
+    exact = propagate_one(seen(PAST, places))
+    unsure = propagate_one([changed(s, t_sigma_ms=0.5) for s in seen(PAST, places)])
     np.testing.assert_array_equal(unsure.uv, exact.uv)
     added = np.sqrt(unsure.sigma_px**2 - exact.sigma_px**2)
     assert added[0] == pytest.approx(np.sqrt(0.75) * 0.45, rel=0.03)
@@ -230,11 +244,11 @@ def test_a_time_error_adds_with_the_speed() -> None:
 
 
 def test_a_jump_farther_than_a_hand_goes_is_another_thing_also_without_a_rival() -> None:
-    places = np.full((SIGHTINGS, 1, 2), 300.0)
+    places = np.full((OBSERVATIONS, 1, 2), 300.0)
     jumped = places.copy()
     jumped[1:] += 200.0
-    held = carry_one(seen(PAST[:1], places[:1]))
-    found = carry_one(seen(PAST, jumped))
+    held = propagate_one(seen(PAST[:1], places[:1]))
+    found = propagate_one(seen(PAST, jumped))
     np.testing.assert_allclose(found.uv, held.uv)
     np.testing.assert_allclose(found.sigma_px, held.sigma_px)
 
@@ -244,17 +258,19 @@ def test_a_sighting_that_missed_the_marker_leaves_a_gap_and_no_more() -> None:
     places = 300.0 + t * [600.0, -200.0]
     gap = places.copy()
     gap[1] = np.nan
-    found, whole = carry_one(seen(PAST, gap)), carry_one(seen(PAST, places))
+    found, whole = propagate_one(seen(PAST, gap)), propagate_one(seen(PAST, places))
     np.testing.assert_allclose(found.uv, [[300.0, 300.0]], atol=0.3)
     assert found.sigma_px[0] > whole.sigma_px[0]
     gap[0] = np.nan
-    assert np.isnan(carry_one(seen(PAST, gap)).uv).all()  # what the nearest frame does not hold is not seen
-    assert np.isnan(carry_one(seen(PAST, gap)).sigma_px).all()
+    assert np.isnan(
+        propagate_one(seen(PAST, gap)).uv
+    ).all()  # what the nearest frame does not hold is not seen
+    assert np.isnan(propagate_one(seen(PAST, gap)).sigma_px).all()
 
 
 def test_cameras_are_carried_each_by_itself() -> None:
     rng = np.random.default_rng(4)
-    places = 300.0 + rng.normal(0.0, 2.0, (2, SIGHTINGS, 3, 2))
+    places = 300.0 + rng.normal(0.0, 2.0, (2, OBSERVATIONS, 3, 2))
     views = [seen(PAST, places[0]), seen(AHEAD[:2], places[1][:2]), []]
     scale = np.array([1000.0, 700.0, 900.0])
     together = carried(history(views, scale))
@@ -268,7 +284,7 @@ def test_cameras_are_carried_each_by_itself() -> None:
 
 
 def by_formula(t_s: Float, y: Float, sigma: Float) -> tuple[Float, float]:
-    """Mean (2,) and variance of the noise-free place at time 0, by the head of `carry`, with dense matrices."""
+    """Mean (2,) and variance of the noise-free place at time 0, by the head of `propagate`, with dense matrices."""
     fresh = np.minimum(0.7 * sigma**2, 0.01)
     tt = np.outer(t_s, t_s)
     one, found = np.ones(len(t_s)), list[tuple[float, Float, float, Float]]()
@@ -290,7 +306,7 @@ def by_formula(t_s: Float, y: Float, sigma: Float) -> tuple[Float, float]:
     return mean, spread + (sigma[0] ** 2 - fresh[0]) * max(gain, 1.0)
 
 
-@given(st.integers(0, 10_000), st.integers(1, SIGHTINGS), st.sampled_from([PAST, AHEAD]))
+@given(st.integers(0, 10_000), st.integers(1, OBSERVATIONS), st.sampled_from([PAST, AHEAD]))
 @settings(max_examples=60)
 def test_place_and_variance_are_those_of_the_formula(seed: int, count: int, times: tuple[float, ...]) -> None:
     rng = np.random.default_rng(seed)
@@ -298,7 +314,7 @@ def test_place_and_variance_are_those_of_the_formula(seed: int, count: int, time
     sigma = rng.uniform(0.03, 1.0, count)
     frames = [Frame(t, uv[None], sigma_px=s) for t, uv, s in zip(times, y, sigma.tolist(), strict=False)]
     mean, variance = by_formula(1e-3 * np.array(times[:count]), y, sigma)
-    found = carry_one(frames)
+    found = propagate_one(frames)
     np.testing.assert_allclose(found.uv[0], mean, atol=1e-8)
     np.testing.assert_allclose(found.sigma_px[0] ** 2, variance, rtol=1e-8)
 
@@ -322,27 +338,25 @@ def examples() -> list[list[float]]:
             times = np.cumsum(rng.uniform(8.0, 24.0, rng.integers(1, HISTORY))) - 70.0
             way = rng.uniform(100.0, 300.0, (1, 4, 2)) + times[:, None, None] * rng.normal(0.0, 0.6, (4, 2))
             places = way + rng.normal(0.0, 0.2, way.shape)
-            rivals = places + rng.uniform(-50.0, 50.0, places.shape)
+            alternatives = places + rng.uniform(-50.0, 50.0, places.shape)
             swap = rng.uniform(size=(*places.shape[:2], 1)) < 0.2
-            places, rivals = np.where(swap, rivals, places), np.where(swap, places, rivals)
+            places, alternatives = np.where(swap, alternatives, places), np.where(swap, places, alternatives)
             places[rng.uniform(size=places.shape[:2]) < 0.1] = np.nan
-            rivals[(rng.uniform(size=places.shape[:2]) < 0.4) | np.isnan(places[..., 0])] = np.nan
-            steps = zip(times.tolist(), places, rivals, strict=True)
+            alternatives[(rng.uniform(size=places.shape[:2]) < 0.4) | np.isnan(places[..., 0])] = np.nan
+            steps = zip(times.tolist(), places, alternatives, strict=True)
             views.append([Frame(t, uv, r, float(rng.uniform(0.05, 0.6)), 0.2) for t, uv, r in steps])
         one = carried(history(views, np.array([1000.0, 800.0, 1200.0]), 20_600.0))
-        for array in (one.uv, one.sigma_px, one.rival_uv, one.rival_sigma_px):
+        for array in (one.uv, one.sigma_px, one.alternative_uv, one.alternative_sigma_px):
             found.append([] if array is None else array.ravel().tolist())
     return found
 
 
 def plain() -> bool:
-    return isfunction(carry)
+    return isfunction(propagate)
 
 
 def test_plain_python_finds_the_same() -> None:
-    code = (
-        "import json; from tests.master.fabrik.test_carry import *; print(json.dumps([plain(), examples()]))"
-    )
+    code = "import json; from tests.master.fabrik.test_propagate import *; print(json.dumps([plain(), examples()]))"
     was_plain, there = json.loads(
         subprocess.run(
             [sys.executable, "-c", code],

@@ -27,7 +27,7 @@ from common.arrays import Bool, Float, Int
 from common.kernels import inner, kernel
 
 HISTORY = 8
-SIGHTINGS = 4  # frames of one marker that are used: a fifth is too long ago to constrain anything
+OBSERVATIONS = 4  # frames of one marker that are used: a fifth is too long ago to constrain anything
 NEVER = -(2**63)
 _FAR_NS = 2**62
 # What hands do, per axis, as measured on recorded hands (docs/sync.md): laid down, gentle, brisk.
@@ -70,7 +70,7 @@ class TrackHistory(NamedTuple):
 
 
 @kernel
-def carry(
+def propagate(
     history: TrackHistory, t_ns: int, reach_ns: Reach, uv: Float, sigma: Float, area: Float, missing: Bool
 ) -> tuple[int, bool]:
     """Write the markers and their rivals in C cameras at an instant.
@@ -90,10 +90,14 @@ def carry(
         When the last frame that was used was handed to its slave [ns] (none: the instant), and whether there are
         rivals.
     """
-    used, track = np.empty(SIGHTINGS, np.int64), np.empty((SIGHTINGS, 2, 4))
-    known, L, z = np.empty((SIGHTINGS, 5)), np.empty((SIGHTINGS, SIGHTINGS)), np.empty((SIGHTINGS, 4))
-    fit, mixed = np.empty(6 + SIGHTINGS), np.empty(6 + SIGHTINGS)
-    ready_ns, rivals = NEVER, False
+    used, track = np.empty(OBSERVATIONS, np.int64), np.empty((OBSERVATIONS, 2, 4))
+    known, L, z = (
+        np.empty((OBSERVATIONS, 5)),
+        np.empty((OBSERVATIONS, OBSERVATIONS)),
+        np.empty((OBSERVATIONS, 4)),
+    )
+    fit, mixed = np.empty(6 + OBSERVATIONS), np.empty(6 + OBSERVATIONS)
+    ready_ns, alternatives = NEVER, False
     for c in range(len(history.total)):
         n = _around(history, c, t_ns, reach_ns, used)
         missing[c] = n == 0
@@ -102,13 +106,13 @@ def carry(
         scale, t_sigma_s = history.scale_px_m[c], 1e-9 * history.t_sigma_ns[c, used[0]] if n > 0 else 0.0
         for m in range(area.shape[1]):
             area[c, m] = history.marks[c, used[0], 5, m] if n > 0 else nan
-            rival = _read(history, c, m, t_ns, used, n, track)
-            rivals |= rival
-            if rival:
+            alternative = _read(history, c, m, t_ns, used, n, track)
+            alternatives |= alternative
+            if alternative:
                 _sort(track, n, _LEAP_M_S * scale)
             for i in range(2):
                 uv[i, c, m, 0] = uv[i, c, m, 1] = sigma[i, c, m] = nan
-                count = _select(track, n, i, scale, known) if rival or i == 0 else 0
+                count = _select(track, n, i, scale, known) if alternative or i == 0 else 0
                 if count > 0:
                     gain = _mix(known, count, scale, L, z, fit, mixed)
                     uv[i, c, m, 0], uv[i, c, m, 1] = track[0, i, 0] + mixed[1], track[0, i, 1] + mixed[2]
@@ -116,7 +120,7 @@ def carry(
                     vary = mixed[3] + (_variance(track[0, i, 3]) - known[0, 4]) * max(gain, 1.0)
                     moved = t_sigma_s * t_sigma_s * (mixed[4] * mixed[4] + mixed[5] * mixed[5])
                     sigma[i, c, m] = sqrt(vary + _ALONG * moved)
-    return t_ns if ready_ns == NEVER else ready_ns, rivals
+    return t_ns if ready_ns == NEVER else ready_ns, alternatives
 
 
 @inner
@@ -133,7 +137,7 @@ def _around(history: TrackHistory, c: int, t_ns: int, reach_ns: Reach, used: Int
     while after > oldest and history.times_ns[c, (after - 1) % HISTORY, 0] >= t_ns:
         after -= 1
     before, end, n = after - 1, min(after + (1 if after > oldest else 2), newest), 0
-    while n < SIGHTINGS and (before >= oldest or after < end):
+    while n < OBSERVATIONS and (before >= oldest or after < end):
         back_ns = t_ns - history.times_ns[c, before % HISTORY, 0] if before >= oldest else _FAR_NS
         ahead_ns = history.times_ns[c, after % HISTORY, 0] - t_ns if after < end else _FAR_NS
         if min(back_ns, ahead_ns) > reach_ns[n]:
@@ -154,7 +158,7 @@ def _read(history: TrackHistory, c: int, m: int, t_ns: int, used: Int, n: int, t
 
     `track`: (SIGHTINGS, 2, 4) u, v [px], time of the row from the instant [s], sigma [px].
     """
-    rival = False
+    alternative = False
     for k in range(n):
         slot = used[k]
         for i in range(2):
@@ -162,8 +166,8 @@ def _read(history: TrackHistory, c: int, m: int, t_ns: int, used: Int, n: int, t
             track[k, i, 0], track[k, i, 1] = history.marks[c, slot, 2 * i, m], v
             track[k, i, 2] = 1e-9 * (history.times_ns[c, slot, 1] - t_ns + history.row_time_ns[c] * v)
             track[k, i, 3] = history.marks[c, slot, 4, m]
-        rival |= isfinite(track[k, 1, 0])
-    return rival
+        alternative |= isfinite(track[k, 1, 0])
+    return alternative
 
 
 @inner

@@ -8,7 +8,7 @@ from common.messages import ObjectPose
 from master.outputs.palette import Rgb
 
 
-class ObjectLook(Enum):
+class ObjectAppearance(Enum):
     """One state of an object, and what it means."""
 
     WHOLE = "tracked"
@@ -17,18 +17,18 @@ class ObjectLook(Enum):
     GONE = "nobody knows where"
 
     @staticmethod
-    def of(pose: ObjectPose) -> "ObjectLook":
+    def of(pose: ObjectPose) -> "ObjectAppearance":
         """That of a pose."""
         if not np.isfinite(pose.position_m).all():
-            return ObjectLook.GONE
+            return ObjectAppearance.GONE
         if not pose.tracked:
-            return ObjectLook.HELD
-        return ObjectLook.HIDDEN if pose.occluded else ObjectLook.WHOLE
+            return ObjectAppearance.HELD
+        return ObjectAppearance.HIDDEN if pose.occluded else ObjectAppearance.WHOLE
 
 
-OBJECT_RGB: dict[ObjectLook, Rgb] = {
-    ObjectLook.WHOLE: (0, 158, 115),
-    ObjectLook.HIDDEN: (86, 180, 233),
-    ObjectLook.HELD: (230, 159, 0),
-    ObjectLook.GONE: (130, 130, 130),
+OBJECT_RGB: dict[ObjectAppearance, Rgb] = {
+    ObjectAppearance.WHOLE: (0, 158, 115),
+    ObjectAppearance.HIDDEN: (86, 180, 233),
+    ObjectAppearance.HELD: (230, 159, 0),
+    ObjectAppearance.GONE: (130, 130, 130),
 }

@@ -3,7 +3,7 @@
 from slave.cameras.source import Frame
 
 
-class BlindWrist:
+class NullWristDetector:
     """A detector that never completes a triple."""
 
     def push(self, frame: Frame) -> None:

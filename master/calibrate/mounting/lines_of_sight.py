@@ -25,8 +25,8 @@ _TURN, _SHIFT_M, _THICK = np.radians(0.2), 2e-4, 0.01  # steps of differences
 _STEPS = np.repeat([_TURN, _SHIFT_M, _TURN, _THICK], (3, 3, 4, 1))
 
 
-class Sights:
-    """Sights of one device and hand. What it holds was prepared by the constructor."""
+class LinesOfSight:
+    """LinesOfSight of one device and hand. What it holds was prepared by the constructor."""
 
     def __init__(self, setup: WristSetup) -> None:
         self._setup, self._skin, self._axes = setup, Skin.of(setup.model), PlaneAxes.of(setup)

@@ -22,7 +22,7 @@ _MOST_RMS_PX = 1.0  # beyond it, it is another board or another lens
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PlacedBoard:
+class BoardPose:
     """A board in the camera's frame.
 
     Attributes:
@@ -44,7 +44,7 @@ def lens_of_model(optics: CameraModel) -> Float:
     return np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2], *optics.distortion])
 
 
-def placed_board(view: LitView, board: Board, optics: CameraModel) -> PlacedBoard:
+def board_pose(view: LitView, board: Board, optics: CameraModel) -> BoardPose:
     """The board of one view, at the middle of its triple where both of its ends show the board.
 
     Raises:
@@ -61,8 +61,8 @@ def placed_board(view: LitView, board: Board, optics: CameraModel) -> PlacedBoar
                 f"its image is {image.shape[1]} x {image.shape[0]} px,"
                 f" the camera {optics.width_px} x {optics.height_px}"
             )
-        if (sighting := find_board(board, image)) is not None:
-            seen.append(sighting.corners_px)
+        if (observation := find_board(board, image)) is not None:
+            seen.append(observation.corners_px)
     if not seen:
         raise FitError("no board found: show all of it with its white margin, sharp and not too bright")
     # The ambient frame comes before the laser's and the LED's after it: their mean is where the board was between.
@@ -72,7 +72,7 @@ def placed_board(view: LitView, board: Board, optics: CameraModel) -> PlacedBoar
     return place_corners(np.mean(seen, axis=0), board, optics)
 
 
-def place_corners(corners_px: Float, board: Board, optics: CameraModel) -> PlacedBoard:
+def place_corners(corners_px: Float, board: Board, optics: CameraModel) -> BoardPose:
     """The pose of a board from its corners (N, 2) [px], NaN where not seen.
 
     Raises:
@@ -90,7 +90,7 @@ def place_corners(corners_px: Float, board: Board, optics: CameraModel) -> Place
     jacobian = np.stack([_moved(points, centre, k, optics) for k in range(6)], axis=-1).reshape(-1, 6)
     dof = 2.0 * len(drawn) - 6.0
     sigma = max(rms * np.sqrt(len(drawn) / dof), _CORNER_SIGMA_PX)
-    return PlacedBoard(T, centre, sigma**2 * np.linalg.inv(jacobian.T @ jacobian), rms)
+    return BoardPose(T, centre, sigma**2 * np.linalg.inv(jacobian.T @ jacobian), rms)
 
 
 def _moved(points: Float, centre: Float, k: int, optics: CameraModel) -> Float:

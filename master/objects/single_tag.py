@@ -16,7 +16,7 @@ import numpy as np
 from common.arrays import Float
 from common.camera_model import CameraModel
 from common.geometry import matrix_to_rotation_vector
-from master.objects.chosen import Chosen, sighted_now
+from master.objects.association import Association, sighted_now
 from master.objects.features import Features
 from master.objects.fit import Fitted, PoseFit
 from master.objects.motion import Motion
@@ -43,7 +43,7 @@ class _Clear:
     frames: int
 
 
-class LoneTag:
+class SingleTag:
     """Push machine. Holds how much better the other pose has been of late, and what was clear when it was fitted."""
 
     def __init__(self, features: Features, cameras: tuple[CameraModel, ...], fit: PoseFit) -> None:
@@ -56,7 +56,7 @@ class LoneTag:
         """Begin anew: what is seen is another thing."""
         self._doubt, self._clear = 0.0, None
 
-    def of_two(self, window: Window, seen: Chosen, fitted: Fitted, *, begins: bool) -> Fitted:
+    def of_two(self, window: Window, seen: Association, fitted: Fitted, *, begins: bool) -> Fitted:
         """The pose to believe, its covariance grown by the other; the fit itself where more than a tag is seen.
 
         Args:
@@ -93,7 +93,7 @@ class LoneTag:
             self._clear = _Clear(who, better, _UNLOOKED)
         return _reaching(fitted, other, better)
 
-    def _other(self, window: Window, seen: Chosen, fitted: Fitted, feature: int) -> Fitted | None:
+    def _other(self, window: Window, seen: Association, fitted: Fitted, feature: int) -> Fitted | None:
         """The fit of the only tag's other pose, where there is another."""
         own = self._features.points[self._features.corners_of(feature - self._features.beads)]
         best: Fitted | None = None

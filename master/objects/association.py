@@ -11,13 +11,13 @@ from master.objects.features import Features
 from master.objects.fit import Fitted
 from master.objects.start import Sighted, reach
 from master.objects.sums import Observations
-from master.objects.window import Sighting, Window
+from master.objects.window import ImageObservation, Window
 
 Doubt = Callable[[int, Float, Float], Float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Chosen:
+class Association:
     """Observations of a window with one place for each; `feature` (n,) is what each is a part of."""
 
     seen: Observations
@@ -34,7 +34,7 @@ class Chosen:
         cameras: tuple[CameraModel, ...],
         T: Float | None,
         doubt: Doubt,
-    ) -> "Chosen | None":
+    ) -> "Association | None":
         """All that is seen; None: nothing.
 
         Args:
@@ -47,7 +47,7 @@ class Chosen:
         columns: list[tuple[Int, Int, Float, Float, Float, Float, Bool]] = []
         for c, both in enumerate(window.views):
             for kind, line in enumerate(both):
-                told = [sighting for sighting in line if len(sighting.point)]
+                told = [observation for observation in line if len(observation.point)]
                 if not told:
                     continue
                 point = np.concatenate([one.point for one in told])
@@ -75,22 +75,22 @@ class Chosen:
     def used(self, fitted: Fitted) -> Bool:
         """(C, F) which features the pose rests on in which camera, in the frames nearest to the instant."""
         out = np.zeros((self.cameras, self.features), np.bool_)
-        chosen = fitted.used & self.now
-        out[self.seen.camera[chosen], self.feature[chosen]] = True
+        associated = fitted.used & self.now
+        out[self.seen.camera[associated], self.feature[associated]] = True
         return out
 
 
 def _nearer(
-    line: list[Sighting], point: Int, features: Features, camera: CameraModel, T: Float | None
+    line: list[ImageObservation], point: Int, features: Features, camera: CameraModel, T: Float | None
 ) -> tuple[Float, Float]:
     """Places (K, 2) of the points (K,) of sightings, rivals taken where a pose has the point nearer to them; sigmas."""
     uv, sigma = np.concatenate([one.uv for one in line]), np.concatenate([one.sigma_px for one in line])
-    rival = np.concatenate([one.rival_uv for one in line])
-    if T is None or np.isnan(rival).all():
+    alternative = np.concatenate([one.alternative_uv for one in line])
+    if T is None or np.isnan(alternative).all():
         return uv, sigma
     there = camera.project(features.points[point] @ T[:3, :3].T + T[:3, 3])
-    first, second = (np.linalg.norm(one - there, axis=1) for one in (uv, rival))
-    return np.where((second < first)[:, None], rival, uv), sigma
+    first, second = (np.linalg.norm(one - there, axis=1) for one in (uv, alternative))
+    return np.where((second < first)[:, None], alternative, uv), sigma
 
 
 def sighted_now(window: Window, features: Features) -> list[Sighted]:
@@ -107,22 +107,24 @@ def sighted_now(window: Window, features: Features) -> list[Sighted]:
                 if np.isnan(first.uv[rows]).any():
                     continue
                 uv = _brought(first.point[rows], line, at_ns)
-                rival = first.rival_uv[rows]
-                places = [uv] if np.isnan(rival).any() else [uv, rival]
+                alternative = first.alternative_uv[rows]
+                places = [uv] if np.isnan(alternative).any() else [uv, alternative]
                 out.append(Sighted(c, int(feature), np.stack(places)))
     return out
 
 
-def _brought(points: Int, line: tuple[Sighting, ...], at_ns: int) -> Float:
+def _brought(points: Int, line: tuple[ImageObservation, ...], at_ns: int) -> Float:
     """Points (n, 2) of the nearest sighting, moved on as from the next one that has them all."""
     found: list[tuple[Float, Float]] = []
-    for sighting in line:
-        rows = [int(np.flatnonzero(sighting.point == p)[0]) for p in points if (sighting.point == p).any()]
-        if len(rows) == len(points) and np.isfinite(sighting.uv[rows]).all():
-            found.append((sighting.uv[rows], (sighting.t_ns[rows] - at_ns) * 1e-9))
-    chosen = reach(np.array([tau[0] for _, tau in found]))
-    if len(chosen) < 2:
+    for observation in line:
+        rows = [
+            int(np.flatnonzero(observation.point == p)[0]) for p in points if (observation.point == p).any()
+        ]
+        if len(rows) == len(points) and np.isfinite(observation.uv[rows]).all():
+            found.append((observation.uv[rows], (observation.t_ns[rows] - at_ns) * 1e-9))
+    associated = reach(np.array([tau[0] for _, tau in found]))
+    if len(associated) < 2:
         return found[0][0]
-    uv, tau = found[int(chosen[0])]
-    other, other_tau = found[int(chosen[1])]
+    uv, tau = found[int(associated[0])]
+    other, other_tau = found[int(associated[1])]
     return uv - (tau / (other_tau - tau))[:, None] * (other - uv)

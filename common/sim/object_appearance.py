@@ -28,7 +28,7 @@ class Points:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Looks:
+class Appearances:
     """How one camera looks: towards the light (3,), camera frame; `unit_circle`; points (..., 3) [m] to pixels."""
 
     to_light: Float

@@ -6,7 +6,7 @@ from common.arrays import Image
 from slave.markers.detector import Detections
 
 
-class BlindDetector:
+class NullDetector:
     """A detector that detects nothing. Holds the answer."""
 
     def __init__(self, markers: int) -> None:
