@@ -105,12 +105,14 @@ def _hand(setup: RigSetup, name: str, profile: ObjectProfile, seconds: float) ->
     hand = load(CALIBRATION / f"hands/{setup.rig.hand}.json", HandProfile)
     scene = scene_by_name("grasp", setup.rig, setup.cameras, hand, SEED, {name: profile})
     rng, count = np.random.default_rng(SEED), len(setup.rig.markers)
-    worn = [row for row, marker in enumerate(setup.rig.markers) if marker not in setup.rig.free_markers]
+    on_hand = [row for row, marker in enumerate(setup.rig.markers) if marker not in setup.rig.free_markers]
     for seq in range(round(60.0 * seconds)):
         for index, (camera, model) in enumerate(setup.models.items()):
             t_s = seq / 60.0 + 0.005 * index
             uv = np.full((count, 2), np.nan)
-            uv[worn] = model.project(scene.truth(t_s).markers_m[worn]) + rng.normal(0.0, _PX, (len(worn), 2))
+            uv[on_hand] = model.project(scene.truth(t_s).markers_m[on_hand]) + rng.normal(
+                0.0, _PX, (len(on_hand), 2)
+            )
             seen = np.isfinite(uv[:, 0])
             area, one, sigma = (np.where(seen, value, np.nan) for value in (150.0, 1.0, 0.1))
             t_ns, nowhere = round(t_s * 1e9), np.full((count, 2), np.nan)

@@ -118,7 +118,7 @@ class TurnedArm(Gestures):
     """Those gestures of a forearm that lies any way. Pure in time: holds how."""
 
     def __init__(self, seed: int) -> None:
-        """Rest first, as a wearer is asked to."""
+        """Rest first, as a subject is asked to."""
         super().__init__(seed, _REST_S)
         self._lies = rotation_vector_to_matrix(np.random.default_rng([seed, 8]).normal(size=3))
 
@@ -239,9 +239,9 @@ def rows() -> Iterator[Row]:
 
 def _rigs() -> tuple[RigSetup, WristSetup]:
     """Three markers on the back, and the device with this IMU."""
-    markers, worn = load_setup(CALIBRATION, "desk-back3"), load_setup(CALIBRATION, "wrist-back3")
-    assert worn.wrist is not None
-    return markers, replace(worn.wrist, imu=IMU)
+    markers, wrist_setup = load_setup(CALIBRATION, "desk-back3"), load_setup(CALIBRATION, "wrist-back3")
+    assert wrist_setup.wrist is not None
+    return markers, replace(wrist_setup.wrist, imu=IMU)
 
 
 def _cost(arm: Arm, rigs: tuple[RigSetup, WristSetup]) -> Row:

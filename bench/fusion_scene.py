@@ -43,7 +43,7 @@ class Both:
     name: str
     seed: int
     scene: Scene
-    worn: WristScene
+    wrist_scene: WristScene
     markers: RigSetup
     wrist: RigSetup
 
@@ -62,8 +62,8 @@ class Both:
         """
         markers, wrist = (load_setup(calibration, rig) for rig in rigs)
         scene = scene_by_name(name, markers.rig, markers.cameras, markers.hand.profile, seed)
-        worn = WristScene(wrist.rig, wrist.cameras, wrist.hand, scene.motion, seed=seed)
-        return cls(name, seed, scene, worn, markers, wrist)
+        wrist_scene = WristScene(wrist.rig, wrist.cameras, wrist.hand, scene.motion, seed=seed)
+        return cls(name, seed, scene, wrist_scene, markers, wrist)
 
     @property
     def fused(self) -> RigSetup:
@@ -103,7 +103,7 @@ class Sight:
             count += _about(t_s, times, self.paint_px2[name] >= SPOT_PX2, within_s)
         return count if without is None else np.where(without[:, None], 0, count)
 
-    def worn(self, t_s: Float, within_s: float, without: Bool | None = None) -> Bool:
+    def in_wrist_sight(self, t_s: Float, within_s: float, without: Bool | None = None) -> Bool:
         """(N, 5) whether the wrist device has laser line or tip of each finger in sight, as in `cameras_of`."""
         seen = _about(t_s, self.line_t_s, (self.line_m >= LINE_M) | self.tip, within_s)
         return seen if without is None else seen & ~without[:, None]
@@ -144,4 +144,4 @@ def orientations(both: Both, seconds: float) -> list[Observed]:
     if imu is None:
         return []
     fusion = OrientationFilter(imu.rate_hz)
-    return [fusion.push(one) for one in SimulatedImu.of(both.worn).around(0.0, seconds, START_NS)]
+    return [fusion.push(one) for one in SimulatedImu.of(both.wrist_scene).around(0.0, seconds, START_NS)]

@@ -34,7 +34,7 @@ class Sighted:
     """
 
     cameras: Int
-    worn: Bool
+    in_wrist_sight: Bool
     hidden: Bool
     oriented: Bool
     strapped: bool
@@ -50,9 +50,9 @@ class Sighted:
             before = away.at(t_s - ABOUT_S)
             gone = (gone[0] & before[0], gone[1] & before[1])
         cameras = shown.line_of_sight.cameras_of(t_s, ABOUT_S, gone[0] | (not solved.markers))
-        worn = shown.line_of_sight.worn(t_s, ABOUT_S, gone[1] | (not solved.wrist))
+        in_wrist_sight = shown.line_of_sight.in_wrist_sight(t_s, ABOUT_S, gone[1] | (not solved.wrist))
         oriented = ~gone[1] & solved.wrist
-        by = np.concatenate([cameras[:, :_FINGERS] >= 2, worn], axis=1)
+        by = np.concatenate([cameras[:, :_FINGERS] >= 2, in_wrist_sight], axis=1)
         changed = np.zeros(by.shape, np.int64)
         changed[1:] = by[1:] != by[:-1]
         total = np.concatenate([np.zeros((1, by.shape[1]), np.int64), np.cumsum(changed, axis=0)])
@@ -60,7 +60,12 @@ class Sighted:
         near = total[last] > total[first]
         hidden = shown.line_of_sight.cameras_of(t_s, ABOUT_S)[:, :_FINGERS] < 2
         return cls(
-            cameras, worn, hidden, oriented, not solved.markers, near[:, :_FINGERS] | near[:, _FINGERS:]
+            cameras,
+            in_wrist_sight,
+            hidden,
+            oriented,
+            not solved.markers,
+            near[:, :_FINGERS] | near[:, _FINGERS:],
         )
 
     @property
@@ -75,7 +80,7 @@ class Sighted:
         out = np.zeros((len(seen), 26), np.bool_)
         palm = (count >= 3) | (seen[:, _BACK] & (count >= 2)) | ((count >= 1) & self.oriented)
         out[:, _PALM_JOINTS] = palm[:, None] | self.strapped
-        out[:, CHAINS] = (seen[:, :_FINGERS] | self.worn)[:, :, None]
+        out[:, CHAINS] = (seen[:, :_FINGERS] | self.in_wrist_sight)[:, :, None]
         return out
 
 

@@ -131,7 +131,7 @@ def _triples(both: Both, times_s: Float, frame_s: float) -> tuple[list[Observed]
     lines: list[Float] = []
     tips: list[Bool] = []
     for k, t in enumerate(times_s.tolist()):
-        laser, led = both.worn.truth(t), both.worn.truth(t + frame_s)
+        laser, led = both.wrist_scene.truth(t), both.wrist_scene.truth(t + frame_s)
         lines.append(laser.laser_len_vis[1:6])
         tips.append(led.tip_visible)
         t_ns = START_NS + round(t * 1e9)
@@ -144,7 +144,7 @@ class _WristErrors:
 
     def __init__(self, both: Both, step_s: float) -> None:
         rng = np.random.default_rng([both.seed, 22])
-        self._camera, self._fx = both.wrist.rig.cameras[0], float(both.worn.optics.matrix[0, 0])
+        self._camera, self._fx = both.wrist.rig.cameras[0], float(both.wrist_scene.optics.matrix[0, 0])
         self._rng = rng
         self._other, self._missed, self._false = (_Wander(rng, (5,), step_s) for _ in range(3))
         self._laser, self._tip, self._aside = (_Wander(rng, (5, 2), step_s) for _ in range(3))

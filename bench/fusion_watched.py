@@ -56,14 +56,14 @@ def triples_of(both: Both, seconds: float) -> tuple[list[Observed], Float, Float
         if (found := detector.push(frame)) is not None:
             out.append(found.message(name, session=1))
             times.append(1e-9 * (found.triple.laser.t_ns - START_NS))
-    truths = [(both.worn.truth(t), both.worn.truth(t + 1.0 / own.frame_rate_hz)) for t in times]
+    truths = [(both.wrist_scene.truth(t), both.wrist_scene.truth(t + 1.0 / own.frame_rate_hz)) for t in times]
     line = np.array([laser.laser_len_vis[1:6] for laser, _ in truths])
     return out, np.array(times), line, np.array([led.tip_visible for _, led in truths])
 
 
 def _frames(both: Both, name: str, seconds: float) -> Iterator[Frame]:
     """Frames of the wrist camera, strobed in turn."""
-    own, renderer = both.wrist.cameras[name], WristRenderer(both.worn, name)
+    own, renderer = both.wrist.cameras[name], WristRenderer(both.wrist_scene, name)
     for seq, t in enumerate((np.arange(round(seconds * own.frame_rate_hz)) / own.frame_rate_hz).tolist()):
         t_ns = START_NS + round(t * 1e9)
         image = renderer.render(t, STROBE[seq % len(STROBE)])

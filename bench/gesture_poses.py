@@ -45,14 +45,14 @@ from master.study.trials import read_trials
 CALIBRATION = Path(__file__).parent.parent / "calib_json"
 SIGMA_M = 1e-3
 _PERIOD_NS = 16_666_667
-_SEED, _PEOPLE, _WORN = 31, 12, 3
+_SEED, _PEOPLE, _WRIST_PEOPLE = 31, 12, 3
 
 
 def rows() -> Iterator[Row]:
     """All parts; a row that says so where the data are absent."""
     yield from people(range(1, _PEOPLE + 1)).rows("12 people, all markers seen")
     yield from rigs()
-    yield from worn(range(1, _WORN + 1)).rows(f"wrist device, {_WORN} people")
+    yield from wrist_device(range(1, _WRIST_PEOPLE + 1)).rows(f"wrist device, {_WRIST_PEOPLE} people")
     yield from static_rows()
     yield from leap_rows()
     yield _cost()
@@ -84,7 +84,7 @@ def people(numbers: Sequence[int] | range, seconds: float = 15.0) -> Told:
     return out
 
 
-def worn(numbers: Sequence[int] | range) -> Told:
+def wrist_device(numbers: Sequence[int] | range) -> Told:
     """Trials of the study: rendered, detected by the slave, calibrated and solved as everybody's."""
     rig = load(CALIBRATION / "rigs/wrist.json", RigCalibration)
     camera = load(CALIBRATION / "cameras/wrist.json", CameraCalibration)

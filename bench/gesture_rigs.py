@@ -69,17 +69,17 @@ def by_markers(number: int, seconds: float = SECONDS) -> dict[str, Told]:
 
 def by_both(number: int, seconds: float = SECONDS) -> dict[str, Told]:
     """One person before two cameras with three markers on the back, and what a wrist device adds."""
-    marked, worn = _setup("desk-back3"), load_setup(CALIBRATION, "wrist-back3")
+    marked, wrist_setup = _setup("desk-back3"), load_setup(CALIBRATION, "wrist-back3")
     who = _person(number, marked)
     model, seed = HandModel.of(who.hand), _MOTION + number
     motion = Bent(posed := StudyPoses(model, view_centre(marked.rig), seed), seed)
     scene = Scene.of_motion(marked.rig, marked.cameras, who.hand, motion, seed)
     rng = np.random.default_rng([number, 77])
-    true = replace(worn.rig, T_camera_palm=who.rig.T_camera_palm)
+    true = replace(wrist_setup.rig, T_camera_palm=who.rig.T_camera_palm)
     file = turned(true, rng.normal(0.0, _TURN_RAD, 3), rng.normal(0.0, _SHIFT_M, 3))
-    device = WristScene(true, worn.cameras, model, motion, seed=seed, reflectance=who.reflectance)
+    device = WristScene(true, wrist_setup.cameras, model, motion, seed=seed, reflectance=who.reflectance)
     alone = _known(marked, who)
-    wrist = RigSetup.of(file, worn.cameras, alone.hand)
+    wrist = RigSetup.of(file, wrist_setup.cameras, alone.hand)
     both = Both("both-poses", seed, scene, device, alone, wrist)
     markers = _watched(scene, seconds)
     everything = in_order([*markers, *orientations(both, seconds), *triples_of(both, seconds)[0]])

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float
+from common.capsule_gaps import TaperedCapsules, gaps_between
 from common.gesture_settings import GestureSettings
 from common.hand_model import CHAINS, FINGERS, TIPS, HandModel
 from common.sim.gestures import Gestures, Said
-from common.skin_gaps import RoundCones, gaps_between
 
 RATE_HZ = 240.0
 
@@ -58,8 +58,10 @@ class GestureTruth:
         joints = model.forward(
             np.stack([state.T_rig_palm for state in states]), np.stack([state.angles_rad for state in states])
         ).position_m
-        cones = RoundCones.of_segments(joints, model.radius_m)
-        gap = gaps_between(cones.part(slice(0, 1), slice(2, 3)), cones.part(slice(1, 5), slice(0, 3))).gap_m
+        capsules = TaperedCapsules.of_segments(joints, model.radius_m)
+        gap = gaps_between(
+            capsules.part(slice(0, 1), slice(2, 3)), capsules.part(slice(1, 5), slice(0, 3))
+        ).gap_m
         seen = cls(motion, t, joints, gap[..., 2], gap.min(axis=-1), ())
         said = (seen._event(one, settings) for one in motion.said if one.stop_s < seconds - 1.0)
         return cls(motion, t, joints, seen.pinch_m, seen.key_m, tuple(one for one in said if one is not None))

@@ -45,7 +45,7 @@ from master.rig_setup import RigSetup
 
 RATE_HZ = 60.0
 FUSED = "desk-back3+wrist-back3"
-WORN = "wrist"
+WRIST = "wrist"
 SILENT = ("wave", "HandSplay-110fps", "rollAndPitchWithEntry", "three-claps", "confidence-demo")
 _CALIBRATION = Path(__file__).parent.parent / "calib_json"
 _DATA = Path(os.environ.get("PHALANX_DATASETS", Path(__file__).parent.parent.parent / "shared/datasets"))
@@ -128,14 +128,14 @@ def rows() -> Iterator[Row]:
         yield from table(rig, scored(rig, (1,), 75.0, exact=False))
     yield from table(FUSED, scored(FUSED, (7,), 29.0, exact=False))
     yield from table("silent, true hands", silent(SILENT, None, 60.0))
-    yield from table("silent, wrist device alone", silent(SILENT, WORN, 25.0))
+    yield from table("silent, wrist device alone", silent(SILENT, WRIST, 25.0))
 
 
 def scored(rig: str, seeds: Sequence[int], seconds: float, *, exact: bool) -> Score:
     """The scene of several seeds before a marker rig, or MARKER_RIG+WRIST_RIG."""
     settings, score = default_gestures(), Score()
     for seed in seeds:
-        marked, _, worn = rig.partition("+")
+        marked, _, wrist_rig = rig.partition("+")
         setup = load_setup(_CALIBRATION, marked)
         scene = scene_by_name("gestures", setup.rig, setup.cameras, setup.hand.profile, seed)
         if not isinstance(scene.motion, Gestures):
@@ -143,8 +143,8 @@ def scored(rig: str, seeds: Sequence[int], seconds: float, *, exact: bool) -> Sc
         truth = GestureTruth.of(scene.motion, scene.model, settings, min(seconds, scene.period_s))
         if exact:
             poses: Iterable[HandPose] = true_poses(scene.motion, scene.model, seconds)
-        elif worn:
-            poses = fused_poses((marked, worn), seed, seconds)
+        elif wrist_rig:
+            poses = fused_poses((marked, wrist_rig), seed, seconds)
         else:
             poses = seen_poses(setup, "gestures", seed, seconds)
         score.add(told_of(poses, scene.model, settings), truth)
@@ -155,13 +155,13 @@ def silent(names: Sequence[str], rig: str | None, seconds: float) -> Score:
     """Recorded hands that say nothing, each for so long: as they truly are, or rendered before a rig."""
     settings, score = default_gestures(), Score()
     for name in names:
-        setup = load_setup(_CALIBRATION, "desk-back3" if rig in (None, WORN) else rig)
+        setup = load_setup(_CALIBRATION, "desk-back3" if rig in (None, WRIST) else rig)
         scene = f"leap:{_DATA / 'leapjs' / name}.npz"
         made = scene_by_name(scene, setup.rig, setup.cameras, setup.hand.profile, 1)
         if rig is None:
             poses: Iterable[HandPose] = true_poses(made.motion, made.model, seconds)
-        elif rig == WORN:
-            poses = worn_poses(scene, 1, seconds)
+        elif rig == WRIST:
+            poses = wrist_poses(scene, 1, seconds)
         else:
             poses = seen_poses(setup, scene, 1, seconds)
         score.add_silent(told_of(poses, made.model, settings))
@@ -189,7 +189,7 @@ def fused_poses(rigs: tuple[str, str], seed: int, seconds: float) -> list[HandPo
     return solve_both(shown.both.fused, shown.messages)
 
 
-def worn_poses(name: str, seed: int, seconds: float) -> list[HandPose]:
+def wrist_poses(name: str, seed: int, seconds: float) -> list[HandPose]:
     """The poses of a scene by the wrist device alone, of messages made of the truth."""
     shown = shown_of(Both.of(name, seed), seconds)
     return solve_both(shown.both.wrist, shown.messages)

@@ -1,7 +1,7 @@
 """What the calibration of a wrist device is worth: laser plane, flat field and palm against the truth they are of.
 
 Boards are rendered before the wrist camera by `common.sim.wrist_board`, each seed another laser and other places of the
-board. Wearers are those of `bench.wrist_wearers`, each seed another person.
+board. Wearers are those of `bench.wrist_subjects`, each seed another person.
 """
 
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from bench.row import Row
-from bench.wrist_wearers import Person
+from bench.wrist_subjects import Person
 from common.arrays import Float
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.camera_model import CameraModel
@@ -34,7 +34,7 @@ from master.calibrate.wrist.laser_command import LinesSeen, lines_of
 from master.calibrate.wrist.lit_views import LitView
 from master.calibrate.wrist.palm_board import Mounting, palm_from_board
 from master.calibrate.wrist.plane import PlaneFit, ViewLine, fit_plane
-from master.calibrate.wrist.wearer import Wearer, calibrate_wearer
+from master.calibrate.wrist.subject import Subject, calibrate_subject
 from master.estimator.wrist_pipeline import WristPipeline
 from master.wrist_setup import WristSetup
 
@@ -57,7 +57,7 @@ def rows() -> Iterator[Row]:
     yield from _planes(camera, rig)
     yield from _fields(camera, rig)
     yield from _palms(camera, rig)
-    yield from _wearers()
+    yield from _subjects()
 
 
 def _planes(camera: CameraCalibration, rig: RigCalibration) -> Iterator[Row]:
@@ -133,16 +133,16 @@ def _palms(camera: CameraCalibration, rig: RigCalibration) -> Iterator[Row]:
     )
 
 
-def _wearers() -> Iterator[Row]:
+def _subjects() -> Iterator[Row]:
     """Mounting and knuckles before and after a guided motion, and the PIP of a natural curl with the files of each."""
     turn: list[tuple[Float, Float]] = []
     knuckle: list[tuple[Float, Float]] = []
     unlikely: list[Float] = []
     refused = 0
-    people: list[tuple[Person, Wearer]] = []
+    people: list[tuple[Person, Subject]] = []
     for person in map(Person.of, SEEDS):
         try:
-            found = calibrate_wearer(person.detected("wearer")[0], person.rig, person.camera, person.hand)
+            found = calibrate_subject(person.detected("subject")[0], person.rig, person.camera, person.hand)
         except FitError:
             refused += 1
             continue
@@ -154,12 +154,12 @@ def _wearers() -> Iterator[Row]:
     note = f"{len(people)} people, {refused} refused; palm 3 deg, 2 mm, knuckles 5 mm off per axis"
     for k, axis in enumerate(("x, the pitch of the hand", "y", "z")):
         was, now = (_rms(np.array([one[side][k] for one in turn])) for side in (0, 1))
-        yield Row(f"wearer: palm's turn about {axis}, rms", now, "deg", f"before {was:.2f}; {note}")
+        yield Row(f"subject: palm's turn about {axis}, rms", now, "deg", f"before {was:.2f}; {note}")
     for k, axis in enumerate(("across", "away from the lens, down", "away from the lens, ahead")):
         was, now = (_rms(np.array([one[side][:, k] for one in knuckle])) for side in (0, 1))
-        yield Row(f"wearer: knuckles {axis}, rms", now, "mm", f"before {was:.2f}")
+        yield Row(f"subject: knuckles {axis}, rms", now, "mm", f"before {was:.2f}")
     yield Row(
-        "wearer: knuckles by stated sigma, rms",
+        "subject: knuckles by stated sigma, rms",
         _rms(np.array(unlikely)),
         "sigma",
         "1 is honest, less is careful",
@@ -168,11 +168,11 @@ def _wearers() -> Iterator[Row]:
     for k, name in enumerate(("files as they were", "calibrated", "true files")):
         value = _rms(np.concatenate([one[k] for one in errors]))
         yield Row(
-            f"wearer: PIP of a natural curl, {name}, rms", value, "deg", f"{len(errors)} people, to 90 deg"
+            f"subject: PIP of a natural curl, {name}, rms", value, "deg", f"{len(errors)} people, to 90 deg"
         )
 
 
-def _pip_errors(person: Person, found: Wearer) -> list[Float]:
+def _pip_errors(person: Person, found: Subject) -> list[Float]:
     """Errors [deg] with the old, the new and the true files."""
     triples, true = person.detected("curl", np.linspace(0.3, 3.6, 24))
     out: list[Float] = []

@@ -99,12 +99,12 @@ class Paced:
 def both_of(rig: str, seed: int, pace: float = 1.0, scene: str = SCENE) -> Both:
     """A scene before a marker rig and the wrist device, whose hand is that of the marker rig."""
     markers, wrist = load_setup(CALIBRATION, rig), load_setup(CALIBRATION, WRIST_RIG)
-    worn_rig = msgspec.structs.replace(wrist.rig, hand=markers.rig.hand)
+    wrist_rig = msgspec.structs.replace(wrist.rig, hand=markers.rig.hand)
     seen = scene_by_name(scene, markers.rig, markers.cameras, markers.hand.profile, seed)
     seen = dataclass_replace(seen, motion=Paced(seen.motion, pace))
-    wrist = RigSetup.of(worn_rig, wrist.cameras, markers.hand)
-    worn = WristScene(worn_rig, wrist.cameras, markers.hand, seen.motion, seed=seed)
-    return Both(scene, seed, seen, worn, markers, wrist)
+    wrist = RigSetup.of(wrist_rig, wrist.cameras, markers.hand)
+    wrist_scene = WristScene(wrist_rig, wrist.cameras, markers.hand, seen.motion, seed=seed)
+    return Both(scene, seed, seen, wrist_scene, markers, wrist)
 
 
 def guessed(rig: RigCalibration, seed: int) -> RigCalibration:
@@ -156,7 +156,7 @@ def seen_rendered(rig: str, seed: int, folder: Path, pace: float = 1.0, seconds:
     both = both_of(rig, seed, pace)
     wrong = guessed(both.wrist.rig, seed)
     late_ns = -round(1e9 * CAMERA_LATE_S)
-    record_both(folder, both.scene, both.worn, seconds, wrist_late_ns=late_ns, step=3, wrist_rig=wrong)
+    record_both(folder, both.scene, both.wrist_scene, seconds, wrist_late_ns=late_ns, step=3, wrist_rig=wrong)
     for camera in (*both.markers.rig.cameras, *wrong.cameras):
         target = ["-o", str(folder / f"detections_{camera}.npz")]
         command = ["detect", str(folder), "--camera", camera, "--calibration", str(CALIBRATION), *target]

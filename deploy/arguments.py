@@ -108,7 +108,7 @@ def _add_scene(demo: argparse.ArgumentParser) -> None:
         default="standard",
         help="standard, lights (it changes), poses, hand-routine (of calibrate hand), object (that is tracked, on its "
         "way), or leap:FILE.npz; of a wrist device "
-        "standard, curl, wearer, poses, spread or random; of both kinds of rig at once grasp, gestures, both-poses, "
+        "standard, curl, subject, poses, spread or random; of both kinds of rig at once grasp, gestures, both-poses, "
         "both-curl, both-travel or both-moves; the last two kinds each with @dark, @indoor, @bright or @sun",
     )
 

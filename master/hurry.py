@@ -82,9 +82,9 @@ class Hurry:
         self._newest_ns: dict[str, int] = {}
         self._cameras: dict[str, list[Cameras]] = {}
         for setup in setups:
-            worn = setup.wrist_cameras
-            marked = [name for name in setup.models if name not in worn]
-            for names in (marked, *([name] for name in worn)):
+            of_wrist = setup.wrist_cameras
+            marked = [name for name in setup.models if name not in of_wrist]
+            for names in (marked, *([name] for name in of_wrist)):
                 for name in names:
                     self._cameras.setdefault(name, []).append(Cameras.of(setup, names))
 

@@ -204,7 +204,7 @@ def _summarise(
     stacked = Poses.of(poses)
     if setup.has_markers:
         summary |= _score_markers(recording, setup, stacked)
-    return summary | _score_worn(recording, setup, messages, stacked)
+    return summary | _score_wrist(recording, setup, messages, stacked)
 
 
 def _score_markers(recording: FrameRecording, setup: RigSetup, poses: Poses) -> dict[str, float]:
@@ -219,7 +219,7 @@ def _score_markers(recording: FrameRecording, setup: RigSetup, poses: Poses) -> 
     return scores
 
 
-def _score_worn(
+def _score_wrist(
     recording: FrameRecording, setup: RigSetup, messages: Sequence[Detections], poses: Poses
 ) -> dict[str, float]:
     """Of what a wrist device saw; of a hand without markers also the hand made of that."""

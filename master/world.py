@@ -141,7 +141,7 @@ class World:
             for setup in setups
             for name in setup.camera_names
         }
-        self._worn_by = {name: line for setup, line in self._hands for name in setup.imus}
+        self._line_of_imu = {name: line for setup, line in self._hands for name in setup.imus}
         self._counts: Counter[str] = Counter()
         self._now = _Beside.of(setups, self._counts, gestures=gestures)
         self._begun: dict[tuple[str, str, str], Gesture] = {}
@@ -176,7 +176,7 @@ class World:
         if self._next:
             yield from self._take_over(self._next.popleft())
         if isinstance(message, ImuSample):
-            if (line := self._worn_by.get(message.source)) is not None:
+            if (line := self._line_of_imu.get(message.source)) is not None:
                 line.push_orientation(message.t_ns, message.orientation_wxyz, message.heading_sigma_rad)
             return
         poses: list[SolvedPose] = []

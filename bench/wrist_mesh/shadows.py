@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from bench.wrist_mesh.hand_mesh import Posed
 from bench.wrist_mesh.raster import rasterise
-from bench.wrist_mesh.skin import Posed
 from common.arrays import Float, Int
 
 WITHIN_M = 0.002  # behind what the light sees first: lit

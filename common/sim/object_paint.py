@@ -97,11 +97,11 @@ class ObjectPainter:
         boxes = boxes.reshape(-1, 2, 2)
         away = np.array([depth for _, depth in hand])
         markers: list[raster.Marker] = []
-        for k, skin in enumerate(hand_before(snapshot, places)):
+        for k, surface in enumerate(hand_before(snapshot, places)):
             depth = float(places.depth[k])
             over = (away < depth) & raster.overlaps(boxes[:, 0], boxes[:, 1], places.low[k], places.high[k])
             things = things_before(snapshot, places, k, depth - TOUCHING_M, features[k][1])
-            nearer = (*things, *skin, *(hand[int(n)][0] for n in np.flatnonzero(over)), *cards)
+            nearer = (*things, *surface, *(hand[int(n)][0] for n in np.flatnonzero(over)), *cards)
             markers.append(raster.Marker(shapes[k], nearer))
         covers = raster.cover(markers, self._view.exposure_s, self._size)
         return [PaintedFeature(feature, cover) for (feature, _), cover in zip(features, covers, strict=True)]

@@ -107,14 +107,14 @@ class Painter:
             raster.Marker(
                 outlines[k],
                 (
-                    *skin,
+                    *surface,
                     *(outlines[n] for n in np.flatnonzero(touching[k])),
                     *things_before(snapshot, places, k, float(places.depth[k])),
                     *cards,
                 ),
                 view.own_finger(snapshot, k) if k < len(caps) else None,
             )
-            for k, skin in enumerate(hand_before(snapshot, places))
+            for k, surface in enumerate(hand_before(snapshot, places))
         ]
         numbers = [marker.marker for marker in (*caps, *boxes)]
         points = [*view.cap_centre.tolist(), *(box.corners.start for box in boxes)]

@@ -19,7 +19,7 @@ from master.calibrate.wrist.curl_command import curl
 from master.calibrate.wrist.flat_command import flat_field
 from master.calibrate.wrist.laser_command import laser_plane
 from master.calibrate.wrist.palm_command import palm
-from master.calibrate.wrist.wearer_command import wearer
+from master.calibrate.wrist.subject_command import subject
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "board": board,
@@ -34,7 +34,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "flat-field": flat_field,
     "curl": curl,
     "palm": palm,
-    "wearer": wearer,
+    "subject": subject,
     "mounting": mounting,
     "tracker": tracker,
     "cube": cube,

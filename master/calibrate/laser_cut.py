@@ -1,6 +1,6 @@
 """Where the laser's fan meets the skin of a finger, and which of that the camera sees: the forward function of a pose.
 
-The skin (`common.hand_skin`) is cut by a fan of rays from the laser; each lights what it meets first (row D17: the
+The skin (`common.palmar_surface`) is cut by a fan of rays from the laser; each lights what it meets first (row D17: the
 nearest intersection). What of the line the camera sees is kept, and its centroid in the image is put back on the
 plane: that is what the sensing calls the laser point. Other fingers, which may cover it, are left out.
 
@@ -19,8 +19,8 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.geometry import transform
-from common.hand_skin import ROOT, Skin
-from common.round_cones import Cones, first_hits, terms
+from common.palmar_surface import ROOT, PalmarSurface
+from common.tapered_capsules import Capsules, first_hits, terms
 from master.estimator.laser_plane import PlaneAxes
 from master.wrist_setup import WristSetup
 
@@ -49,7 +49,7 @@ class LaserCut:
     """Cuts the fingers of one hand with the laser of one device. What it holds was prepared by the constructor."""
 
     def __init__(self, setup: WristSetup, rays: int = RAYS) -> None:
-        self._setup, self._skin, self._axes = setup, Skin.of(setup.model), PlaneAxes.of(setup)
+        self._setup, self._surface, self._axes = setup, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
         self._nodes = -_INSIDE * np.cos(np.pi * np.arange(rays) / (rays - 1))
 
     def bent(self, setup: WristSetup) -> "LaserCut":
@@ -64,9 +64,9 @@ class LaserCut:
         Returns:
             As of `Line`: points, lengths (5, C, A), places (5, C, A).
         """
-        spheres = self._skin.spheres(self._setup.model.chains(angles_rad))
+        spheres = self._surface.spheres(self._setup.model.chains(angles_rad))
         spheres = np.moveaxis(transform(self._setup.T_camera_palm, spheres), 2, 0)  # (5, C, A, K, 3)
-        found = [self.line(spheres[f], self._skin.radius_m[f], np.bool_(f == 0)) for f in range(5)]
+        found = [self.line(spheres[f], self._surface.radius_m[f], np.bool_(f == 0)) for f in range(5)]
         return (
             np.stack([line.point_m for line in found]),
             np.stack([line.length_px for line in found]),
@@ -79,7 +79,7 @@ class LaserCut:
         radius = np.broadcast_to(radius, (*batch, spheres.shape[1])).reshape(-1, spheres.shape[1])
         thumb = np.broadcast_to(thumb, batch).ravel()
         laser = self._setup.laser_m[:, None, None]
-        chain = Cones(spheres[:, :-1], spheres[:, 1:], radius[:, :-1], radius[:, 1:])
+        chain = Capsules(spheres[:, :-1], spheres[:, 1:], radius[:, :-1], radius[:, 1:])
         known = _known(chain, self._setup.laser_m)
         rays, broad = self._fan(spheres, radius, known), 2.0 * radius.max(axis=1)
         hits = _hits(known, rays)
@@ -124,7 +124,7 @@ class LaserCut:
         """Turns (N,) [rad] of the first and the last ray of the plane that touches a finger; 0 where none does.
 
         The plane cuts a sphere in a circle. It touches the side of a cone where the discriminant of its quadric
-        (`common.round_cones`), for directions (s, c) the form A s^2 + 2 B s c + C c^2, is nought.
+        (`common.tapered_capsules`), for directions (s, c) the form A s^2 + 2 B s c + C c^2, is nought.
         """
         flat = self._axes.flat(spheres)
         height = spheres @ self._setup.normal - self._setup.offset_m
@@ -155,7 +155,7 @@ class LaserCut:
         return out[0], out[1]
 
 
-def _known(chain: Cones, origin: Float) -> Float:
+def _known(chain: Capsules, origin: Float) -> Float:
     """The terms (12, K - 1, N) of chains of cones (N, K - 1), seen from a point."""
     return np.ascontiguousarray(np.swapaxes(terms(chain, origin, np.float64), 1, 2))
 
@@ -216,7 +216,7 @@ def _at_edge(
 def _depths(known: Float, rays: Float) -> tuple[Float, Float]:
     """How deep rays (3, M) pass into both spheres and the side of cones of terms (12, M), below 0: beside them (3, M).
 
-    Also the feet (M,) of their hits of the side, as in `common.round_cones`.
+    Also the feet (M,) of their hits of the side, as in `common.tapered_capsules`.
     """
     d2, k0, lean, shift, c1, c2 = known[6:]
     m2, m3 = (rays * known[:3]).sum(axis=0), (rays * known[3:6]).sum(axis=0)

@@ -6,7 +6,7 @@
              "Kalman filtering and smoothing solutions to temporal Gaussian process regression models")
     tilt     what the IMU has the vertical off by, for seconds
     heading  walks as far as the IMU is told to
-    light    logarithm of the unit of distances by light: of the device and its wearer, all but constant
+    light    logarithm of the unit of distances by light: of the device and its subject, all but constant
 
 Wrists at work flex by a median of 1.4...54 deg/s about a median posture of -30...3 deg (43 types of work; Hansson et
 al. 2009, Int. J. Ind. Ergonomics 39, 221); most of what hands do daily takes 5 deg of flexion, 30 of extension, 10 and
@@ -58,7 +58,9 @@ def stationary_of(settings: Settings, *, loose: bool, tilt_rad: float) -> Float:
     stationary = np.zeros(EXTRAS)
     stationary[:BEND] = settings.hinge_rad**2
     stationary[:1] = 1e-6  # a thumb's hinges are no parallel ones
-    bend = np.array([settings.flexion_rad, settings.deviation_rad] if loose else 2 * [settings.worn_rad])
+    bend = np.array(
+        [settings.flexion_rad, settings.deviation_rad] if loose else 2 * [settings.calibrated_palm_rad]
+    )
     stationary[BEND : BEND + 2] = bend**2
     stationary[RATE : RATE + 2] = (settings.pace_1_s * bend) ** 2
     stationary[TILT : TILT + 2] = max(tilt_rad, 1e-3) ** 2

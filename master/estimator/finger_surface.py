@@ -1,6 +1,6 @@
 """Kernels of a finger before a wrist device: its skin, where the laser meets it, and its tip.
 
-The skin of a finger is a chain of round cones (`common.hand_skin`), cut by the plane of the laser. What the camera
+The skin of a finger is a chain of capsules (`common.palmar_surface`), cut by the plane of the laser. What the camera
 makes of the cut is the centroid of the part that is lit and seen. It lies near a *ridge*: the points of the spheres
 that face the laser, pulled in to 0.77 of the radius, for the mean of a cosine over the half circle that faces the light
 lies there (pi / 4, less what is seen at a slant). Where the chain of ridge points crosses the plane nearest to the
@@ -204,7 +204,7 @@ def _away(S: Float, k: int) -> float:
 
 @inlined
 def first_hit(t: Float, dx: float, dy: float, dz: float) -> float:
-    """How far along a unit ray the cone of terms (12,) begins; inf: it is missed (`common.round_cones`)."""
+    """How far along a unit ray the cone of terms (12,) begins; inf: it is missed (`common.tapered_capsules`)."""
     m2, m3 = dx * t[0] + dy * t[1] + dz * t[2], dx * t[3] + dy * t[4] + dz * t[5]
     best, d2 = inf, t[6]
     k2, k1 = d2 - m2 * m2, d2 * m3 + m2 * t[8]

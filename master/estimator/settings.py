@@ -229,7 +229,7 @@ class Settings(NamedTuple):
     light_unit: Annotated[float, Range("1", 0.1, 10.0, "of the unit's logarithm, which may be any")] = 3.0
     flexion_rad: Annotated[float, Range("rad", 0.01, 1.5, "of wrists; Palmer et al. 1985")] = radians(14.0)
     deviation_rad: Annotated[float, Range("rad", 0.01, 1.5, "of wrists; Palmer et al. 1985")] = radians(11.0)
-    worn_rad: Annotated[
+    calibrated_palm_rad: Annotated[
         float, Range("rad", 0.001, 0.5, "of a palm that was calibrated before its device")
     ] = radians(1.0)
     bend_share: Annotated[

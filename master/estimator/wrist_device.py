@@ -12,8 +12,8 @@ import numpy as np
 
 from common.arrays import Float
 from common.fingertips import Fingertips
-from common.hand_skin import PLACES, SPREAD, Skin
 from common.kernels import inlined, inner, kernel
+from common.palmar_surface import PLACES, SPREAD, PalmarSurface
 from common.records import filled, record
 from master.estimator.laser_plane import PlaneAxes
 from master.wrist_setup import WristSetup
@@ -57,15 +57,15 @@ class Device:
     local: Float
     back: Float
     tip: Float
-    skin2: Float
+    surface2: Float
     tip2: Float
 
     @classmethod
     def of(cls, setup: WristSetup) -> "Device":
         """Lay out a device."""
-        model, skin, axes = setup.model, Skin.of(setup.model), PlaneAxes.of(setup)
+        model, surface, axes = setup.model, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
         tips = Fingertips.of(model)
-        deep = skin.radius_m - skin.palmar_m
+        deep = surface.radius_m - surface.palmar_m
         back, local = np.zeros((5, 3, 3)), np.zeros((5, len(PLACES), 3))
         up = np.array([0.0, 1.0, 0.0])
         for f in range(5):
@@ -87,12 +87,12 @@ class Device:
                 "offset": np.array([setup.offset_m]),
                 "focal": np.array([setup.optics.matrix[0, 0]]),
                 "before": np.array([side]),
-                "radius": skin.radius_m,
+                "radius": surface.radius_m,
                 "deep": deep,
                 "local": local,
                 "back": back,
                 "tip": last * (1.0 + tips.beyond_m / length)[:, None] + tips.dorsal_m * back[:, 2],
-                "skin2": (SPREAD * skin.palmar_m.mean(axis=1)) ** 2,
+                "surface2": (SPREAD * surface.palmar_m.mean(axis=1)) ** 2,
                 "tip2": (SPREAD * tips.beyond_m) ** 2 + _PALM_M**2,
             },
         )
@@ -113,7 +113,7 @@ class Device:
             local=(5, 8, 3),
             back=(5, 3, 3),
             tip=(5, 3),
-            skin2=5,
+            surface2=5,
             tip2=5,
         )
 
@@ -281,8 +281,8 @@ def observe_wrist(
         x, y = laser[f, 0], laser[f, 1]
         if np.isfinite(x + y + laser_sigma_px[f]) and on_plane(device, x, y, point, A):
             sensed = (laser_sigma_px[f] ** 2 + _BLUR_PX**2) / device.focal[0] ** 2
-            across = 0.25 * device.skin2[f] + _PALM_M**2
-            along = device.skin2[f] + _PALM_M**2
+            across = 0.25 * device.surface2[f] + _PALM_M**2
+            along = device.surface2[f] + _PALM_M**2
             a = sensed + A[0, 0] ** 2 * across + A[0, 1] ** 2 * along
             b = A[0, 0] * A[1, 0] * across + A[0, 1] * A[1, 1] * along
             c = sensed + A[1, 0] ** 2 * across + A[1, 1] ** 2 * along

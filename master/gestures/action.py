@@ -29,10 +29,10 @@ class ActionWatch:
         self.pinch, self.dial = PinchWatch(settings.pinch), DialWatch(settings.dial)
         self.tap, self.point = TapWatch(settings.tap), PointWatch(settings.point)
 
-    def push(self, seen: HandFeatures, *, worn_only: bool = False) -> list[Gesture]:
+    def push(self, seen: HandFeatures, *, wrist_device_only: bool = False) -> list[Gesture]:
         """What is to be told at the instant of the features.
 
-        `worn_only`: all that sees the hand is worn on its arm, and the rig frame goes with it.
+        `wrist_device_only`: all that sees the hand is worn on its arm, and the rig frame goes with it.
         """
         pinch, dial, tap, point = self.pinch, self.dial, self.tap, self.point
         touch = thumb_touch(seen, self._radius_m)
@@ -44,7 +44,9 @@ class ActionWatch:
             told += tap.push(seen, touch, may_begin=True)
         others = pinch.active or tap.active
         dial_may = not others and not point.active
-        told += dial.push(seen, float(touch.gap_m.min()), may_begin=dial_may, worn_only=worn_only)
+        told += dial.push(
+            seen, float(touch.gap_m.min()), may_begin=dial_may, wrist_device_only=wrist_device_only
+        )
         return told + point.push(seen, may_begin=not others and not dial.active)
 
     def lost(self, t_ns: int) -> list[Gesture]:

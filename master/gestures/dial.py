@@ -73,7 +73,7 @@ class DialWatch:
         return self._dial is not None
 
     def push(
-        self, seen: HandFeatures, across_m: float, *, may_begin: bool, worn_only: bool = False
+        self, seen: HandFeatures, across_m: float, *, may_begin: bool, wrist_device_only: bool = False
     ) -> list[Gesture]:
         """What is to be told at the instant of the features.
 
@@ -81,7 +81,7 @@ class DialWatch:
             seen: The hand.
             across_m: Between the skins of the thumb and the finger next to it [m].
             may_begin: Whether a dial may begin.
-            worn_only: All that sees the hand is worn on its arm: the rig frame goes with it.
+            wrist_device_only: All that sees the hand is worn on its arm: the rig frame goes with it.
         """
         if self._dial is None and not may_begin:
             self._maybe.clear()
@@ -89,7 +89,7 @@ class DialWatch:
         grips = self._dial is None and may_grip(seen, across_m, self._settings)
         if self._dial is None and not grips and not self._maybe:
             return []
-        tips = Tips.of(seen, self._settings.sigma_most_m, worn_only=worn_only)
+        tips = Tips.of(seen, self._settings.sigma_most_m, wrist_device_only=wrist_device_only)
         if self._dial is None:
             grips = grips and is_grip(seen, tips, self._settings)
             axis = self._held(seen.t_ns, tips, self._settings.hold_s, grips=grips)

@@ -40,13 +40,13 @@ class Tips(NamedTuple):
     T_still_rig: Float
 
     @classmethod
-    def of(cls, seen: HandFeatures, sigma_most_m: float, *, worn_only: bool) -> "Tips":
+    def of(cls, seen: HandFeatures, sigma_most_m: float, *, wrist_device_only: bool) -> "Tips":
         """Those of a hand.
 
-        `worn_only`: all that sees it is worn on its arm, and the rig frame goes with it.
+        `wrist_device_only`: all that sees it is worn on its arm, and the rig frame goes with it.
         """
         turn = _EYE
-        if worn_only and not np.isnan(seen.palm_world_wxyz).any():
+        if wrist_device_only and not np.isnan(seen.palm_world_wxyz).any():
             turn = quaternion_to_matrix(seen.palm_world_wxyz) @ seen.T_rig_palm[:3, :3].T
         place = seen.caps_m if turn is _EYE else seen.caps_m @ turn.T
         return cls(place, seen.sigma_m, seen.sigma_m <= sigma_most_m, turn @ seen.palmar, turn)
@@ -325,7 +325,7 @@ def _spread(place: Float, known: Bool, before: Float, known_before: Bool) -> flo
 
 def rehearse(seen: HandFeatures) -> None:
     """Call the kernels once, so that none is compiled while a hand is about a knob."""
-    tips = Tips.of(seen, inf, worn_only=False)
+    tips = Tips.of(seen, inf, wrist_device_only=False)
     is_grip(seen, tips, DialSettings())
     axis_of(tips.palmar, 1.0, turned_by(tips, tips))
     spread_m(tips, tips)

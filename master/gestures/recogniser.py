@@ -38,7 +38,7 @@ class GestureRecogniser:
         seen = self._features.of(pose)
         if seen is None:
             return self._poses.lose(pose.hand, pose.t_ns) + self._actions.lost(pose.t_ns)
-        return self._poses.push(seen) + self._actions.push(seen, worn_only=len(pose.markers_m) == 0)
+        return self._poses.push(seen) + self._actions.push(seen, wrist_device_only=len(pose.markers_m) == 0)
 
 
 def _at_rest(model: HandModel) -> HandPose:

@@ -7,9 +7,9 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from common.arrays import Float
+from common.capsule_gaps import ROUNDS, foot_of, nearest
 from common.hand_model import CHAINS
 from common.kernels import constant, inner, kernel
-from common.skin_gaps import ROUNDS, foot_of, nearest
 from master.estimator.matrices import spread
 from master.fabrik.rotations import Vector, cross, dot, length, minus
 from master.gestures.features import PAD_SHARE, HandFeatures
@@ -105,7 +105,7 @@ def _on(joints: Float, a: int, b: int, share: float) -> Vector:
 
 @inner
 def _shares(joints: Float, radius: Float, a: int, a_end: int, b: int, b_end: int) -> tuple[float, float]:
-    """Return where along two segments their skins are nearest, as `common.skin_gaps`."""
+    """Return where along two segments their skins are nearest, as `common.capsule_gaps`."""
     u, v = minus(_at(joints, a_end), _at(joints, a)), minus(_at(joints, b_end), _at(joints, b))
     apart = minus(_at(joints, b), _at(joints, a))
     uu, vv, uv, au, bv, square = (

@@ -1,6 +1,6 @@
 """How near the fingers of a hand are to objects, and which of them touch.
 
-The skin of a finger is round cones from joint to joint with the radii of the profile (`common.round_cones`). The
+The skin of a finger is capsules from joint to joint with the radii of the profile (`common.tapered_capsules`). The
 distance that is published is that of the last segment; a finger *touches* with any of its three, since whoever grasps a
 bar often holds it with the middle ones. The object's poses around the hand's instant are brought to it: between two of
 them by interpolation, behind the last by its motion, a tenth of a second at most.
@@ -33,12 +33,12 @@ from common.geometry import (
 from common.hand_model import CHAINS, METACARPALS, HandModel
 from common.messages import Contact, HandPose, ObjectPose
 from common.object_profile import ObjectProfile
-from common.round_cones import Cones
+from common.tapered_capsules import Capsules
 from master.objects.carried import Carried
 from master.objects.surface import Nearest, Surface
 
 NEAR_M, FAR_M = 2.5e-3, 5.0e-3
-FLESH_M = 1.0e-3  # standard deviation of the skin about the profile's radii
+SURFACE_SIGMA_M = 1.0e-3  # standard deviation of the skin about the profile's radii
 LED_S = 0.1  # by which an object's pose is led on, at most
 _POSES = 6
 _SURE_M = 0.02  # a distance less sure than this tells of no touch
@@ -139,10 +139,10 @@ def _gaps(pose: HandPose, surface: Surface, placed: _PointEstimate) -> tuple[Nea
     """Distances of all bones (19,), object frame, and their standard deviations; NaN where a joint is not valid."""
     points = transform(invert(placed.T), np.nan_to_num(pose.position_m))
     start, stop = _BONES.T
-    cones = Cones(points[start], points[stop], pose.radius_m[start], pose.radius_m[stop])
-    found = surface.nearest_to_cones(cones)
+    capsules = Capsules(points[start], points[stop], pose.radius_m[start], pose.radius_m[stop])
+    found = surface.nearest_to_capsules(capsules)
     usable = (pose.valid & np.isfinite(pose.position_m).all(axis=1))[_BONES].all(axis=1)
-    middle = cones.start_m + found.along[:, None] * (cones.stop_m - cones.start_m)
+    middle = capsules.start_m + found.along[:, None] * (capsules.stop_m - capsules.start_m)
     out = middle - found.point_m
     length = np.linalg.norm(out, axis=1)
     R = placed.T[:3, :3]
@@ -154,7 +154,7 @@ def _gaps(pose: HandPose, surface: Surface, placed: _PointEstimate) -> tuple[Nea
     hand = np.einsum("ni,nij,nj->n", normal, cov, normal)
     pull = np.concatenate([normal, cross(lever, normal)], axis=1)
     own = np.einsum("ni,ij,nj->n", pull, placed.cov, pull)
-    sigma = np.sqrt(hand + own + FLESH_M**2)
+    sigma = np.sqrt(hand + own + SURFACE_SIGMA_M**2)
     nan = np.where(usable, 0.0, np.nan)
     return Nearest(found.distance_m + nan, found.point_m + nan[:, None], found.along), sigma + nan
 

@@ -4,7 +4,7 @@ An object is a union of boxes, closed cylinders and balls, each convex. Outside 
 least of theirs, exactly; inside of two at once it is that of the one whose surface is farther, which is a bound.
 
 A body of round cones is a union of balls along its bones, so its distance to a surface is the least of "distance of the
-middle less radius" along the bone (`nearest_to_cones`). For one convex part that is a convex function of the place on
+middle less radius" along the bone (`nearest_to_capsules`). For one convex part that is a convex function of where on
 the bone, which a search on a grid and a second on the cell around its best narrows to a 256th of the bone.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.geometry import invert
 from common.object_profile import Shape
-from common.round_cones import Cones
+from common.tapered_capsules import Capsules
 from master.objects.parts import Parts, by_kind
 
 _STEPS = 17
@@ -96,15 +96,15 @@ class Surface:
             best = np.minimum(best, kind.parts.distances(kind.own(points)).min(axis=0))
         return best
 
-    def nearest_to_cones(self, cones: Cones) -> Nearest:
+    def nearest_to_capsules(self, capsules: Capsules) -> Nearest:
         """Where the surface is nearest to each of N round cones, object frame."""
-        rows: Int = np.arange(len(cones.start_m))
-        along, scale_up = cones.stop_m - cones.start_m, cones.stop_radius_m - cones.start_radius_m
+        rows: Int = np.arange(len(capsules.start_m))
+        along, scale_up = capsules.stop_m - capsules.start_m, capsules.stop_radius_m - capsules.start_radius_m
 
         def least(share: Float) -> tuple[Int, Float]:
             """Which of the balls at places (N, S) on the bones is the nearest, and how near (N,)."""
-            middle = cones.start_m[:, None] + share[..., None] * along[:, None]
-            radius = cones.start_radius_m[:, None] + share * scale_up[:, None]
+            middle = capsules.start_m[:, None] + share[..., None] * along[:, None]
+            radius = capsules.start_radius_m[:, None] + share * scale_up[:, None]
             gap = self.distances(middle.reshape(-1, 3)).reshape(share.shape) - radius
             best: Int = gap.argmin(axis=1)
             return best, gap[rows, best]
@@ -114,7 +114,7 @@ class Surface:
         share = low[:, None] + (high - low)[:, None] * _GRID
         best, gap = least(share)
         associated = share[rows, best]
-        return Nearest(gap, self.nearest(cones.start_m + associated[:, None] * along)[1], associated)
+        return Nearest(gap, self.nearest(capsules.start_m + associated[:, None] * along)[1], associated)
 
     def hides(self, eye: Float, points: Float) -> Bool:
         """(...) whether the object itself is between an eye (3,) [m] and points (..., 3) [m], object frame."""

@@ -137,9 +137,12 @@ def _header(
         :_MOST_FIGURES
     ]
     many = len(shown) > 8
-    worn = [wrist.rig] if wrist is not None and wrist.in_rig else []
-    count = len(rig.cameras) + len(worn)
-    rigs, cameras = f"rig {' and '.join([rig.name, *worn])}", f"{count} camera{'s' if count > 1 else ''}"
+    wrist_rigs = [wrist.rig] if wrist is not None and wrist.in_rig else []
+    count = len(rig.cameras) + len(wrist_rigs)
+    rigs, cameras = (
+        f"rig {' and '.join([rig.name, *wrist_rigs])}",
+        f"{count} camera{'s' if count > 1 else ''}",
+    )
     hand = f"hand {model.profile.name} ({model.profile.side})"
     watched = f"{rigs} · {cameras}"
     if len(watched) > _HALF_LINE:

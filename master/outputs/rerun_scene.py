@@ -86,15 +86,15 @@ class RerunScene:
             self._log_volume(self._first.rig.volume)
         for name, model in self._models.items():
             self._log_camera(name, model)
-        worn = {
+        wrist_models = {
             name: setup.wrist.optics
             for setup in setups
             if setup.wrist is not None
             for name in setup.wrist_cameras
         }
-        for name in worn.keys() - self._models.keys():
-            self._log_lens(name, worn[name])  # beside markers; where it is changes
-        self._images = CameraImages(recording, self._models | worn)
+        for name in wrist_models.keys() - self._models.keys():
+            self._log_lens(name, wrist_models[name])  # beside markers; where it is changes
+        self._images = CameraImages(recording, self._models | wrist_models)
         for hand, setup in self._setups.items():
             group = self._group(hand)
             if setup.wrist is not None and setup.wrist_rig is not None:

@@ -3,7 +3,7 @@
 Each is drawn from the study's seed and a number. What is known of somebody before a trial is one of
 
 - **all**: the exact bones, and exactly how the device sits (never the skin, which no file describes);
-- **calibrated**: bones as a hand calibration measures them, and what `master.calibrate.wrist.wearer` makes of the
+- **calibrated**: bones as a hand calibration measures them, and what `master.calibrate.wrist.subject` makes of the
   guided motion this person performed;
 - **nothing**: the hand that the rig names, and the pose of the palm in the rig's file.
 """

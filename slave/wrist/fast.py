@@ -57,7 +57,7 @@ def energy(strips: Image, crossed: int) -> Float32:
     behind = np.asarray(cv2.dilate(strips, valleys.BESIDE, anchor=(0, 0)), np.uint8)
     around = np.asarray(cv2.dilate(strips, valleys.AROUND), np.uint8)
     out = np.empty(strips.shape, dtype=np.float32)
-    limits = (valleys.DARK, valleys.SKIN, valleys.OPEN, valleys.BEYOND_THUMB)
+    limits = (valleys.DARK, valleys.SURFACE, valleys.OPEN, valleys.BEYOND_THUMB)
     _energy(strips, before, behind, around, valleys.PRIOR, valleys.STARTS[3], crossed, limits, out)
     return out
 
@@ -74,7 +74,7 @@ def _energy(
     limits: tuple[float, float, float, float],
     out: Float32,
 ) -> None:
-    dark, skin = np.float32(limits[0]), np.float32(limits[1])
+    dark, surface = np.float32(limits[0]), np.float32(limits[1])
     open_, beyond_thumb = np.float32(limits[2]), np.float32(limits[3])
     stations, width = strips.shape
     for s in range(stations):
@@ -88,7 +88,7 @@ def _energy(
                 above = np.float32(1.0) - max(side - level, np.float32(0.0)) / (side + dark)
                 share = max(above, level / (np.float32(around[s, k]) + dark))
                 cube = share * share * share
-                found = skin * cube * cube
+                found = surface * cube * cube
             out[s, k] = found + prior[k]
 
 

@@ -74,7 +74,7 @@ LEAST_SHOWN = np.array([0.75, 0.6])
 MOST_MISFIT, LIKELY = 32.0, 0.4  # of one that is less likely to be seen in proportion
 # Standard deviations: edges; of the radius, how far flesh is off its cones, and where on its disk an end is that faces
 # the camera; and the misfit at which they are twice as large.
-PIXEL, FLESH, PULP, DOUBTFUL = 0.7, 0.05, 0.08, 20.0
+PIXEL, SURFACE, PULP, DOUBTFUL = 0.7, 0.05, 0.08, 20.0
 OF_SPREAD = 0.6  # postures that are possible differ by more than the mean of them is off
 
 
@@ -371,10 +371,10 @@ class Ends(NamedTuple):
 def reported(finger: Int, circle: Circles, misfit: Float, ends: Ends) -> Candidates:
     """Ends of K fingers, by the circles about them."""
     radius = circle.radius
-    flesh = radius * np.sqrt(
-        FLESH**2 + (PULP * np.maximum(ends.facing, 0.0)) ** 2 + (OF_SPREAD * ends.spread) ** 2
+    surface = radius * np.sqrt(
+        SURFACE**2 + (PULP * np.maximum(ends.facing, 0.0)) ** 2 + (OF_SPREAD * ends.spread) ** 2
     )
-    sigma = np.sqrt(PIXEL**2 + flesh**2 + circle.sigma_px**2) * (1.0 + misfit / DOUBTFUL)
+    sigma = np.sqrt(PIXEL**2 + surface**2 + circle.sigma_px**2) * (1.0 + misfit / DOUBTFUL)
     at = circle.middle + ends.towards * radius[:, None]
     return Candidates(finger, at, sigma, radius, misfit, circle.shown, ends.seen)
 

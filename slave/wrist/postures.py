@@ -20,7 +20,7 @@ from common.errors import CalibrationError
 from common.fingertips import Fingertips
 from common.geometry import rotation_vector_to_matrix
 from common.hand_model import CHAINS, FINGER_JOINTS
-from common.round_cones import Cones, first_hits, terms
+from common.tapered_capsules import Capsules, first_hits, terms
 from slave.wrist.led_depth import Float32
 from slave.wrist.sweep import NEAREST_M, thumb_postures
 from slave.wrist.view import WristView
@@ -39,7 +39,7 @@ _AROUND = 1.4  # of its radius: where other parts of the finger are looked for
 SOFT = 0.3  # of the light comes from inside the skin and from the skin around, whatever the incidence
 HIDDEN_M = 4e-3  # so far behind the finger's own skin its end still counts as seen
 BEYOND_END = 0.25  # of the last bone: how far its skin goes on beyond its joint
-SKIN_SHARE = 0.8  # of the radius: where the middle of a visible line on a finger is before its axis
+SURFACE_SHARE = 0.8  # of the radius: where the middle of a visible line on a finger is before its axis
 # Samples: the middle of the fingertip, along the bones, the highest joint of the finger in the image; above that; and
 # the end of the finger.
 END, BONES, HIGHEST, ABOVE, APEX = 0, slice(0, 6), 6, slice(7, 13), 13
@@ -151,10 +151,10 @@ def _postures(view: WristView, finger: int, angles: Float) -> _OfFinger:
     end = chain[:, 3] + (OVERHANG - 1.0) * radius[3] * along + BALL * dorsal_m * tip[:, :, 1]
     apex = end + radius[3] * along + (1.0 - BALL) * dorsal_m * tip[:, :, 1]
     bones = np.concatenate([chain[:, :3], end[:, None]], axis=1)
-    skin = _skin(bones, radius)
-    laser = _on_plane(view, skin)
+    surface = _surface_lines(bones, radius)
+    laser = _on_plane(view, surface)
     project = view.optics.project
-    points = [skin[k][0] + share * (skin[k][1] - skin[k][0]) for k, share in _ALONG]
+    points = [surface[k][0] + share * (surface[k][1] - surface[k][0]) for k, share in _ALONG]
     above = _above(view, bones, radius, nodes)
     uv = np.stack([project(end), *(project(each) for each in points), *above, project(apex)], axis=1)
     uv = uv.reshape(count, nodes, SAMPLES, 2)
@@ -195,7 +195,7 @@ def _twist(view: WristView, finger: int, angles: Float, bones: Float, apex: Floa
     moved: list[Float] = []
     for by in (np.eye(3), turn):
         turned, tip = ((each - chain[0]) @ by.T + chain[0] for each in (bones, apex))
-        laser = _on_plane(view, _skin(turned, radius)) @ plane_axes(view)[0]
+        laser = _on_plane(view, _surface_lines(turned, radius)) @ plane_axes(view)[0]
         moved.append(
             np.concatenate(
                 [view.optics.project(turned[:, 3]), view.optics.project(tip), laser[:, None]], axis=1
@@ -212,7 +212,7 @@ def _parabola(values: Float) -> Float:
     return np.stack([middle, 0.5 * (high - low), 0.5 * (high + low) - middle], axis=1)
 
 
-def _skin(bones: Float, radius: Float) -> list[tuple[Float, Float]]:
+def _surface_lines(bones: Float, radius: Float) -> list[tuple[Float, Float]]:
     """Start and stop (T, 3) of the line along each bone's skin that faces the camera, of joints (T, 4, 3) [m]."""
     out: list[tuple[Float, Float]] = []
     for k in range(3):
@@ -221,15 +221,17 @@ def _skin(bones: Float, radius: Float) -> list[tuple[Float, Float]]:
         toward = -0.5 * (start + stop)
         toward -= (toward * way).sum(axis=-1, keepdims=True) * way
         toward /= np.maximum(np.linalg.norm(toward, axis=-1, keepdims=True), 1e-9)
-        out.append((start + SKIN_SHARE * radius[k] * toward, stop + SKIN_SHARE * radius[k + 1] * toward))
+        out.append(
+            (start + SURFACE_SHARE * radius[k] * toward, stop + SURFACE_SHARE * radius[k + 1] * toward)
+        )
     return out
 
 
-def _on_plane(view: WristView, skin: list[tuple[Float, Float]]) -> Float:
+def _on_plane(view: WristView, surface: list[tuple[Float, Float]]) -> Float:
     """Where lines along the skin first meet the laser's plane (T, 3) [m], seen from the camera; NaN: nowhere."""
-    best = np.full(skin[0][0].shape, np.nan)
+    best = np.full(surface[0][0].shape, np.nan)
     nearest = np.full(len(best), np.inf)
-    for k, (start, stop) in enumerate(skin):
+    for k, (start, stop) in enumerate(surface):
         before, behind = (point @ view.normal - view.offset_m for point in (start, stop))
         with np.errstate(divide="ignore", invalid="ignore"):
             share = before / (before - behind)
@@ -265,13 +267,13 @@ def _drawn_some(view: WristView, bones: Float, radius: Float, uv: Float) -> tupl
     ray = view.optics.ray(uv)
     count = len(bones)
     near_r, far_r = (np.tile(part, count) for part in (radius[:-1], radius[1:]))
-    cones = Cones(bones[:, :-1].reshape(-1, 3), bones[:, 1:].reshape(-1, 3), near_r, far_r)
-    known = terms(cones, _ORIGIN, np.float64).reshape(12, count, 3)
+    capsules = Capsules(bones[:, :-1].reshape(-1, 3), bones[:, 1:].reshape(-1, 3), near_r, far_r)
+    known = terms(capsules, _ORIGIN, np.float64).reshape(12, count, 3)
     distance = np.stack([first_hits(known[:, :, k, None], np.moveaxis(ray, -1, 0)) for k in range(3)])
     which, distance = distance.argmin(axis=0), distance.min(axis=0)
     hit = np.isfinite(distance)
     body = (3 * np.arange(count, dtype=np.int64)[:, None] + which)[hit]
-    normal = cones.normals(body, ray[hit] * distance[hit][:, None])
+    normal = capsules.normals(body, ray[hit] * distance[hit][:, None])
     near = np.zeros(distance.shape)
     shade = np.sqrt((np.clip(-(normal * ray[hit]).sum(axis=-1), 0.0, 1.0) + SOFT) / (1.0 + SOFT))
     near[hit] = shade / distance[hit]

@@ -83,7 +83,7 @@ class Reach:
         if not self.bent:
             return np.zeros(len(uv), np.bool_)
         points = self._before_palm(uv)
-        return self.palm.skin(points, self.palm.place(points))
+        return self.palm.surface(points, self.palm.place(points))
 
     def only_thumb(self, beyond_m: Float, place: Float) -> Bool:
         """Whether there (N,) the laser meets the thumb or nothing."""
@@ -146,7 +146,7 @@ class Palm:
         here, there = np.take_along_axis(off, left, 1)[:, 0], np.take_along_axis(off, left + 1, 1)[:, 0]
         return 1.0 + left[:, 0] + here / np.maximum(here - there, _LEAST_SPACING_M)
 
-    def skin(self, points: Float, place: Float) -> Bool:
+    def surface(self, points: Float, place: Float) -> Bool:
         """Whether points (N, 3) of these places (N,) are on the palm's skin: before the knuckles, near their bones.
 
         A finger that is folded to it lies on it, and is thicker than that.

@@ -8,7 +8,7 @@ from slave.wrist.corridors import LATERAL, MARGIN, Float32
 from slave.wrist.paths import FENCE
 
 DARK = 6.0  # grey levels: what the noise of a difference of two frames leaves
-SKIN = 20.0  # energy of a bright, even surface: no seam crosses a finger
+SURFACE = 20.0  # energy of a bright, even surface: no seam crosses a finger
 OPEN = 1.0  # energy in the dark beside one finger only
 BEYOND_THUMB = 0.2  # energy in the dark beyond the thumb's tip
 ASIDE = 3.0  # energy at the edge of a corridor
@@ -24,7 +24,7 @@ BESIDE = np.ones((1, MARGIN), dtype=np.uint8)
 
 
 def energy(strips: Image, crossed: int) -> Float32:
-    """Energy of the straightened corridors (S, K): from 0 in a black valley to `SKIN` on a finger, and `PRIOR`.
+    """Energy of the straightened corridors (S, K): from 0 in a black valley to `SURFACE` on a finger, and `PRIOR`.
 
     A pixel is as much of a valley as it lies below the darker of its two sides, and below what is brightest right
     beside it. The thumb's seam has the thumb on one side, and on the other perhaps nothing near: only the thumb's side
@@ -40,7 +40,7 @@ def energy(strips: Image, crossed: int) -> Float32:
     above = 1.0 - cv2.subtract(side, strips) / (side + np.float32(DARK))
     out = np.maximum(above, level)
     out *= out * out
-    out *= SKIN * out  # the sixth power
+    out *= SURFACE * out  # the sixth power
     bare = side <= DARK
     np.putmask(out[:, :thumb], bare[:, :thumb], OPEN)
     np.putmask(out[crossed:, thumb:], bare[crossed:, thumb:], BEYOND_THUMB)

@@ -70,13 +70,13 @@ def test_both_kinds_of_rig_see_one_motion_of_a_seed(name: str) -> None:
     wrist = wrist_scene(name, 7)
     apart = desk.truth(0.0).T_rig_palm[:3, 3] - wrist.motion.at(0.0).T_rig_palm[:3, 3]
     for t in (0.4, 2.9, 5.7, 8.3):
-        marked, worn = desk.truth(t), wrist.motion.at(t)
-        np.testing.assert_array_equal(marked.angles_rad, worn.angles_rad)
-        np.testing.assert_array_equal(marked.bend_rad, worn.bend_rad)
-        np.testing.assert_array_equal(marked.T_rig_palm[:3, :3], worn.T_rig_palm[:3, :3])
-        np.testing.assert_allclose(marked.T_rig_palm[:3, 3] - worn.T_rig_palm[:3, 3], apart, atol=1e-12)
-        assert len(marked.things) == len(worn.things) == (name == "grasp")
-        for one, other in zip(marked.things, worn.things, strict=True):
+        marked, device = desk.truth(t), wrist.motion.at(t)
+        np.testing.assert_array_equal(marked.angles_rad, device.angles_rad)
+        np.testing.assert_array_equal(marked.bend_rad, device.bend_rad)
+        np.testing.assert_array_equal(marked.T_rig_palm[:3, :3], device.T_rig_palm[:3, :3])
+        np.testing.assert_allclose(marked.T_rig_palm[:3, 3] - device.T_rig_palm[:3, 3], apart, atol=1e-12)
+        assert len(marked.things) == len(device.things) == (name == "grasp")
+        for one, other in zip(marked.things, device.things, strict=True):
             moved = one.T_rig_object[:3, 3] - other.T_rig_object[:3, 3]
             np.testing.assert_allclose(moved, apart, atol=1e-12)
     assert (motion_of(name, 8).at(1.0).angles_rad != motion_of(name).at(1.0).angles_rad).any()

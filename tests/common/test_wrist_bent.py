@@ -16,11 +16,11 @@ from common.sim.imu import SimulatedImu
 from common.sim.motion import HandMotion, HandState
 from common.sim.scenes import scene_by_name
 from common.sim.together import TOGETHER
-from common.sim.wrist.flesh import THING_GROUP
-from common.sim.wrist.light import SKIN_AT_M, Leds
+from common.sim.wrist.capsules import THING_GROUP
+from common.sim.wrist.light import SURFACE_AT_M, Leds
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
-from common.sim.wrist.skin import Skin
+from common.sim.wrist.surface import HandSurface
 from common.sim.wrist.things import bodies_of
 from common.wrist_bend import STRAIGHT, forearm_palm
 
@@ -59,10 +59,10 @@ def doing(bend_rad: Float = STRAIGHT, thing: Float | None = None) -> WristScene:
 
 
 @pytest.mark.parametrize("t_s", [4.0, 19.0])
-def test_a_bent_wrist_is_seen_as_a_device_that_is_worn_so(t_s: float) -> None:
+def test_a_flexed_wrist_is_seen_as_a_device_that_is_mounted_so(t_s: float) -> None:
     T = SCENE.T_camera_palm @ rigid(forearm_palm(BEND), np.zeros(3))
-    worn = replace(SCENE, rig=msgspec.structs.replace(RIG, T_camera_palm=tuple(map(tuple, T.tolist()))))
-    bent, same = doing(BEND), worn.truth(t_s)
+    device = replace(SCENE, rig=msgspec.structs.replace(RIG, T_camera_palm=tuple(map(tuple, T.tolist()))))
+    bent, same = doing(BEND), device.truth(t_s)
     truth = bent.truth(t_s)
     np.testing.assert_array_equal(truth.bend_rad, BEND)
     np.testing.assert_allclose(truth.joints.position_m, same.joints.position_m, atol=1e-12)
@@ -71,30 +71,32 @@ def test_a_bent_wrist_is_seen_as_a_device_that_is_worn_so(t_s: float) -> None:
     np.testing.assert_array_equal(truth.tip_visible, same.tip_visible)
     assert np.nanmax(np.abs(truth.laser_uv - SCENE.truth(t_s).laser_uv)) > 20.0  # or nothing was bent
     for lit in (LASER, LED):
-        one, other = (WristRenderer(s, "wrist", COARSE).render(t_s, lit).astype(int) for s in (bent, worn))
+        one, other = (WristRenderer(s, "wrist", COARSE).render(t_s, lit).astype(int) for s in (bent, device))
         assert (np.abs(one - other) > 2).mean() < 1e-3  # rounding decides which texel an edge has
 
 
 def test_the_forearm_stays_before_its_camera_when_the_wrist_bends() -> None:
     bent, straight = doing(BEND).bodies_at(4.0), SCENE.bodies_at(4.0)
-    forearm = SCENE.flesh.forearm
+    forearm = SCENE.capsules.forearm
     np.testing.assert_allclose(bent.start_m[forearm], straight.start_m[forearm], atol=1e-12)
     moved = np.linalg.norm(bent.stop_m - straight.stop_m, axis=1)
     assert np.delete(moved, forearm).min() > 0.001
 
 
 def test_a_palm_that_never_bends_is_prepared_once_and_one_that_hardly_bends_looks_alike() -> None:
-    skin = Skin(SCENE, COARSE)
-    assert skin.palm(SCENE.bodies_at(7.0), np.zeros(2)) is skin.straight
+    surface = HandSurface(SCENE, COARSE)
+    assert surface.palm(SCENE.bodies_at(7.0), np.zeros(2)) is surface.straight
     hardly = doing(np.array([1e-9, 0.0]))
-    assert skin.palm(hardly.bodies_at(7.0), hardly.motion.at(7.0).bend_rad) is not skin.straight
+    assert surface.palm(hardly.bodies_at(7.0), hardly.motion.at(7.0).bend_rad) is not surface.straight
     one, other = (WristRenderer(s, "wrist", COARSE).render(7.0, LED).astype(int) for s in (SCENE, hardly))
     assert (one != other).mean() < 1e-3
 
 
 def test_a_palm_bent_out_of_the_picture_leaves_it_empty() -> None:
     away = doing(np.array([-1.6, 0.0]))
-    assert not len(Skin(away, COARSE).palm(away.bodies_at(7.0), away.motion.at(7.0).bend_rad).seen.pixel)
+    assert not len(
+        HandSurface(away, COARSE).palm(away.bodies_at(7.0), away.motion.at(7.0).bend_rad).seen.pixel
+    )
     assert WristRenderer(away, "wrist", COARSE).render(7.0, LED).max() < 12
     assert np.isnan(away.truth(7.0).laser_uv).all()
 
@@ -140,18 +142,20 @@ def test_a_dark_thing_gives_little_light_back() -> None:
 
 
 def test_behind_a_thing_the_leds_do_not_shine() -> None:
-    across = rigid(axis_rotation(0, np.pi / 2), np.array([0.0, 0.0, 0.5 * SKIN_AT_M]))
+    across = rigid(axis_rotation(0, np.pi / 2), np.array([0.0, 0.0, 0.5 * SURFACE_AT_M]))
     bar = bodies_of([Cylinder(across, 0.004, 0.06, False)], np.eye(4))
     leds = Leds(np.array([[0.01, 0.0, 0.0], [-0.01, 0.0, 0.0]]))
     # The shadow of the bar's axis by each LED, the middle between them, and far outside.
-    points = np.array([[x, 0.0, SKIN_AT_M] for x in (-0.01, 0.01, 0.0, 0.05)], dtype=np.float32)
+    points = np.array([[x, 0.0, SURFACE_AT_M] for x in (-0.01, 0.01, 0.0, 0.05)], dtype=np.float32)
     normals = np.tile(np.array([0.0, 0.0, -1.0], dtype=np.float32), (4, 1))
-    whole, shaded = leds.on_skin(points, normals), leds.on_skin(points, normals, bar)
+    whole, shaded = leds.on_surface(points, normals), leds.on_surface(points, normals, bar)
     assert 0.3 < shaded[0] / whole[0] < 0.7
     assert shaded[0] == pytest.approx(shaded[1], rel=1e-5)
     np.testing.assert_array_equal(shaded[2:], whole[2:])
-    on_bar = np.array([[0.0, 0.0, 0.5 * SKIN_AT_M - 0.004]], dtype=np.float32)
-    np.testing.assert_array_equal(leds.on_skin(on_bar, normals[:1], bar), leds.on_skin(on_bar, normals[:1]))
+    on_bar = np.array([[0.0, 0.0, 0.5 * SURFACE_AT_M - 0.004]], dtype=np.float32)
+    np.testing.assert_array_equal(
+        leds.on_surface(on_bar, normals[:1], bar), leds.on_surface(on_bar, normals[:1])
+    )
 
 
 def test_the_round_ends_hold_as_much_as_flat_ones_and_a_disc_is_refused() -> None:

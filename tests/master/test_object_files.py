@@ -59,7 +59,7 @@ def gesture(k: int) -> Gesture:
 
 
 def written(folder: Path) -> list[Told]:
-    sink = RunFiles(folder / "poses.npz", {HAND: 6, "worn": 0}, ["cube"])
+    sink = RunFiles(folder / "poses.npz", {HAND: 6, "device": 0}, ["cube"])
     told: list[Told] = []
     for k in range(9):
         told += [random_pose(k), object_pose(k), contact(k), gesture(k)]
@@ -89,7 +89,7 @@ def test_what_is_told_is_read_back_exactly(tmp_path: Path) -> None:
     for one, other in zip(said, gestures, strict=True):
         for field in Gesture.__struct_fields__:
             np.testing.assert_array_equal(getattr(one, field), getattr(other, field), err_msg=field)
-    assert not contact_path(tmp_path, "worn", "cube").exists(), "a wrist device alone touches nothing"
+    assert not contact_path(tmp_path, "device", "cube").exists(), "a wrist device alone touches nothing"
 
 
 def test_the_same_run_makes_the_same_bytes(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ def setup(root: Path) -> RigSetup:
 
 
 @pytest.fixture(scope="module")
-def worn(setup: RigSetup) -> list[WristTruth]:
+def wrist_truths(setup: RigSetup) -> list[WristTruth]:
     """What is true of the device at each instant, in the frame of its camera."""
     assert setup.wrist_rig is not None
     scene = WristScene.by_name("both-moves", setup.wrist_rig, setup.cameras, setup.hand.profile, 7)
@@ -43,13 +43,13 @@ def worn(setup: RigSetup) -> list[WristTruth]:
 
 
 @pytest.fixture(scope="module")
-def poses(setup: RigSetup, worn: list[WristTruth]) -> Poses:
+def poses(setup: RigSetup, wrist_truths: list[WristTruth]) -> Poses:
     """What an errorless master would publish; the fingers' bones by the device, the palm by markers."""
     scene = scene_by_name("both-moves", setup.rig, setup.cameras, setup.hand.profile, 7)
     out: list[HandPose] = []
     source = np.full(26, Source.WRIST, np.uint8)
     source[: WRIST + 1] = Source.SOLVED
-    for k, (t, device) in enumerate(zip(TIMES_S, worn, strict=True)):
+    for k, (t, device) in enumerate(zip(TIMES_S, wrist_truths, strict=True)):
         now = scene.truth(float(t))
         out.append(
             HandPose(
@@ -76,12 +76,12 @@ def poses(setup: RigSetup, worn: list[WristTruth]) -> Poses:
 
 
 def test_what_the_device_sees_stands_in_the_rig_where_the_hand_is(
-    setup: RigSetup, poses: Poses, worn: list[WristTruth]
+    setup: RigSetup, poses: Poses, wrist_truths: list[WristTruth]
 ) -> None:
     assert setup.wrist is not None
     assert np.abs(poses.wrist_bend_rad).max() > np.radians(5.0), "a straight wrist would prove little"
     cameras = DevicePlace.of(poses, setup.hand).cameras(setup.wrist.T_camera_palm)
-    for T, now, there in zip(cameras, worn, poses.position_m, strict=True):
+    for T, now, there in zip(cameras, wrist_truths, poses.position_m, strict=True):
         np.testing.assert_allclose(transform(T, now.joints.position_m), there, atol=1e-6)
     straight = replace(poses, wrist_bend_rad=np.full((len(poses), 2), np.nan))
     moved = DevicePlace.of(straight, setup.hand).cameras(setup.wrist.T_camera_palm)

@@ -72,8 +72,10 @@ def write_truth(folder: Path, both: Both) -> None:
             [np.nan_to_num(renderer.visible_fraction(t)) for renderer in renderers] for t in times.tolist()
         ],
     }
-    worn = {f"wrist_{name}": array for name, array in WristTake(both.worn, SECONDS).truth().items()}
-    np.savez(folder / "truth.npz", **arrays, **worn)  # pyright: ignore[reportArgumentType]
+    wrist_scene = {
+        f"wrist_{name}": array for name, array in WristTake(both.wrist_scene, SECONDS).truth().items()
+    }
+    np.savez(folder / "truth.npz", **arrays, **wrist_scene)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.fixture(scope="module")
@@ -147,8 +149,8 @@ def test_a_second_hand_has_files_of_its_own_and_no_score_of_the_first(
     recorded: Recorded, tmp_path: Path
 ) -> None:
     both, left = recorded.both, msgspec.structs.replace(recorded.both.markers.rig, hand="made-left")
-    worn = msgspec.structs.replace(both.wrist.rig, level="fk")
-    first = RigSetup.of(worn, both.wrist.cameras, both.wrist.hand)
+    wrist_scene = msgspec.structs.replace(both.wrist.rig, level="fk")
+    first = RigSetup.of(wrist_scene, both.wrist.cameras, both.wrist.hand)
     second = RigSetup.of(left, both.markers.cameras, LEFT)
     solve_hands(recorded.opened, (first, second), recorded.opened.folder, tmp_path)
     names = {"poses.npz", "summary.json", "poses-made-left.npz", "summary-made-left.json", "gestures.jsonl"}
@@ -164,9 +166,9 @@ def test_an_imu_whose_world_is_not_placed_is_of_no_use_to_a_hand_with_markers(
     both = recorded.both
     assert both.wrist.rig.imu is not None
     unplaced = msgspec.structs.replace(both.wrist.rig, imu=ImuCalibration(q_palm_imu=(1.0, 0.0, 0.0, 0.0)))
-    worn = RigSetup.of(unplaced, both.wrist.cameras, both.wrist.hand)
-    samples, _ = recorded_samples(recorded.opened, RigSetup.joined([both.markers, worn]))
+    wrist_scene = RigSetup.of(unplaced, both.wrist.cameras, both.wrist.hand)
+    samples, _ = recorded_samples(recorded.opened, RigSetup.joined([both.markers, wrist_scene]))
     assert samples == ()
     assert "imu.csv: not used" in caplog.text
-    samples, _ = recorded_samples(recorded.opened, worn)
+    samples, _ = recorded_samples(recorded.opened, wrist_scene)
     assert len(samples) > 20

@@ -142,13 +142,13 @@ def test_a_pose_of_the_hand_is_out_before_what_it_does_is_worked_out(wand: Objec
 
 
 def test_contact_is_made_for_every_hand_of_cameras_and_every_object(wand: ObjectRun, root: Path) -> None:
-    (worn,) = load_setups(root / "calib_json", ("wrist-left",))
+    (device,) = load_setups(root / "calib_json", ("wrist-left",))
     second = with_fields(wand.setup, objects=())
     profile = msgspec.structs.replace(second.hand.profile, name="another")
     second = with_fields(second, hand=HandModel.of(profile))
     other = msgspec.structs.replace(wand.setup.objects[0], name="twin")
     first = with_fields(wand.setup, objects=(*wand.setup.objects, other))
-    world = world_of(first, second, worn)
+    world = world_of(first, second, device)
     assert set(world._now.contacts) == {"default-right", "another"}, "a wrist device has a frame of its own"
     contacts = [one for one in told(world, wand.messages) if isinstance(one, Contact)]
     assert Counter((one.hand, one.object) for one in contacts) == {

@@ -112,14 +112,14 @@ def test_a_hand_before_both_kinds_of_rig_is_played_by_one_motion(root: Path) -> 
     (both,) = load_setups(root / "calib_json", ("desk", "wrist"))
     played = Played.of(both, "both-curl@dark", 5)
     assert played.shown is not None
-    assert played.worn is not None
-    assert played.worn.ambient == "dark"
-    seen, worn = (scene.motion.at(1.3).angles_rad for scene in (played.shown, played.worn))
-    np.testing.assert_array_equal(seen, worn)
+    assert played.wrist_scene is not None
+    assert played.wrist_scene.ambient == "dark"
+    seen, device = (scene.motion.at(1.3).angles_rad for scene in (played.shown, played.wrist_scene))
+    np.testing.assert_array_equal(seen, device)
     with pytest.raises(PhalanxError, match="see one hand only in grasp, both-poses"):
         Played.of(both, "standard", 5)
     (desk,), (wrist,) = (load_setups(root / "calib_json", (name,)) for name in ("desk", "wrist"))
-    assert Played.of(desk, "grasp", 5).worn is Played.of(wrist, "curl@sun", 5).shown is None
+    assert Played.of(desk, "grasp", 5).wrist_scene is Played.of(wrist, "curl@sun", 5).shown is None
     assert [Played.of(desk, name, 5).together for name in ("grasp", "poses")] == [True, False]
 
 

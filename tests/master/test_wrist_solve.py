@@ -128,7 +128,7 @@ def test_unrelated_poses_do_not_depend_on_their_order(
         write_detections(folder, rows, t_ns=times, seq=numbers)
         solve(recording(folder, setup), setup, folder, folder)
         angles[name] = load_poses(folder / "poses.npz").angles_rad
-    # Hinges and the unit of light are of the wearer, and learnt from whatever pose comes.
+    # Hinges and the unit of light are of the subject, and learnt from whatever pose comes.
     np.testing.assert_allclose(angles["there"], angles["back"][::-1], atol=np.radians(8.0))
 
 

@@ -141,10 +141,10 @@ def with_watch(frames: Moving) -> Moving:
     lilac = np.asarray(cv2.cvtColor(np.array([[(126, 200, 180)]], np.uint8), cv2.COLOR_HSV2BGR))[0, 0]
 
     def change(image: Image, k: int) -> Image:
-        worn = image.copy()
+        faded = image.copy()
         u, v = np.round(frames.uv[k, NAMES.index("back")]).astype(int)
-        cv2.rectangle(worn, (u - 9, v + 38), (u + 9, v + 48), [int(c) for c in lilac], -1)
-        return worn
+        cv2.rectangle(faded, (u - 9, v + 38), (u + 9, v + 48), [int(c) for c in lilac], -1)
+        return faded
 
     return each(change, frames)
 

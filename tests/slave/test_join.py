@@ -101,7 +101,7 @@ def test_joined_recordings_can_be_joined_again(tmp_path: Path) -> None:
     assert join_recordings([two, part(tmp_path, "top")], tmp_path / "three") == dict.fromkeys(NAMES, 3)
 
 
-def worn(folder: Path, first_ns: int = 1020) -> Path:
+def device(folder: Path, first_ns: int = 1020) -> Path:
     """A triple of a wrist device."""
     wrist = msgspec.structs.replace(camera(), name="wrist")
     manifest = Manifest(version=1, kind="wrist", cameras={"wrist": wrist}, rig=WRIST, clock=HERE)
@@ -116,7 +116,7 @@ def worn(folder: Path, first_ns: int = 1020) -> Path:
 def test_marker_cameras_and_a_wrist_device_become_one_recording_of_both(
     order: tuple[int, ...], tmp_path: Path
 ) -> None:
-    parts = [part(tmp_path, "left"), part(tmp_path, "right", 1050), worn(tmp_path)]
+    parts = [part(tmp_path, "left"), part(tmp_path, "right", 1050), device(tmp_path)]
     join_recordings([parts[k] for k in order], tmp_path / "both")
     joined = open_recording(tmp_path / "both")
     assert joined.manifest.kind == "both"

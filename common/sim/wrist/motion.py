@@ -31,7 +31,7 @@ MOVE_S = 0.8  # at most: the way from one posture to the next
 CURL_S = 10.0  # there and back
 CURL_PIP_DEG = 110.0
 MCP_PER_PIP, DIP_PER_PIP = 0.54, 0.84  # row D8, Kamper's ratios
-WEARER_S = 16.0
+SUBJECT_S = 16.0
 KNUCKLES_S, FIST_S = (0.8, 7.2), (8.8, 15.2)  # of the two bends within it, there and back
 WOBBLE = np.radians(1.0)
 THUMB_OPEN_DEG, THUMB_CLOSED_DEG = (-6.0, -4.0, 0.0, 0.0), (-2.0, 18.0, 18.0, 26.0)
@@ -149,8 +149,8 @@ class GuidedCurl:
         return HandState(_forearm(self._model, t, np.zeros(3), np.zeros(3)), angles)
 
 
-class GuidedWearer:
-    """What `calibrate wearer` asks for: flat hand, straight fingers bent at their knuckles and back, fist and back.
+class GuidedSubject:
+    """What `calibrate subject` asks for: flat hand, straight fingers bent at their knuckles and back, fist and back.
 
     Nobody does it exactly: each seed is a person whose flat hand is not quite flat, whose straight fingers follow a
     little, and whose fist has ratios of its own. The state it holds is that person, fixed by the constructor.
@@ -172,16 +172,16 @@ class GuidedWearer:
     @property
     def period_s(self) -> float:
         """Time [s] after which the motion repeats."""
-        return WEARER_S
+        return SUBJECT_S
 
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
-        t = max(t_s, 0.0) % WEARER_S
+        t = max(t_s, 0.0) % SUBJECT_S
         bend, fist = (
             0.5 - 0.5 * np.cos(2.0 * np.pi * np.clip((t - first) / (last - first), 0.0, 1.0))
             for first, last in (KNUCKLES_S, FIST_S)
         )
-        wobble = WOBBLE * np.sin(2.0 * np.pi * self._cycles * t / WEARER_S + self._phase)
+        wobble = WOBBLE * np.sin(2.0 * np.pi * self._cycles * t / SUBJECT_S + self._phase)
         angles = np.empty((5, 4))
         angles[0] = self._open + fist * (self._closed - self._open)
         angles[1:] = self._flat + wobble + bend * self._bent + fist * self._fist
@@ -244,12 +244,12 @@ class OnForearm:
 
 def wrist_motion(
     name: str, model: HandModel, seed: int
-) -> Stations | GuidedCurl | GuidedWearer | RandomPoses | None:
+) -> Stations | GuidedCurl | GuidedSubject | RandomPoses | None:
     """The motion of a scene's name; None: there is no such."""
     if name == "curl":
         return GuidedCurl(model)
-    if name == "wearer":
-        return GuidedWearer(model, seed)
+    if name == "subject":
+        return GuidedSubject(model, seed)
     if name == "random":
         return RandomPoses(model, seed)
     if name == "standard":

@@ -23,7 +23,7 @@ from common.sim.record import (
     write_frames,
     write_truth,
 )
-from common.sim.wrist.flesh import GROUPS
+from common.sim.wrist.capsules import GROUPS
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 

@@ -12,20 +12,20 @@ from common.camera_model import CameraModel
 from common.errors import CalibrationError, PhalanxError
 from common.geometry import invert, rigid
 from common.hand_model import WRIST, HandJoints, HandModel
-from common.round_cones import Cones
 from common.sim.motion import HandMotion, HandState
 from common.sim.scene import STANDARD_SEED, CameraTiming
 from common.sim.together import TOGETHER, together_motion
-from common.sim.wrist.flesh import Flesh
+from common.sim.wrist.capsules import HandCapsules
 from common.sim.wrist.laser import LaserSheet, LineTruth
 from common.sim.wrist.motion import wrist_motion
 from common.sim.wrist.things import bodies_of, with_things
+from common.tapered_capsules import Capsules
 from common.wrist_bend import forearm_palm
 
 Ambient = Literal["dark", "indoor", "bright", "sun"]
 TIP_WITHIN_M = 0.003  # of its own finger before a tip: it lies 12 degrees behind the edge of a round tip
 AMBIENTS: tuple[Ambient, ...] = get_args(Ambient)
-MOTIONS = ("standard", "curl", "wearer", "poses", "spread", "random")
+MOTIONS = ("standard", "curl", "subject", "poses", "spread", "random")
 WRIST_NAMES = f"{' | '.join((*MOTIONS, *TOGETHER))}, each with @{' | @'.join(AMBIENTS)}"
 
 
@@ -90,7 +90,7 @@ class WristScene:
     seed: int = STANDARD_SEED
     reflectance: float = 1.0
     optics: CameraModel = field(init=False)
-    flesh: Flesh = field(init=False)
+    capsules: HandCapsules = field(init=False)
     sheet: LaserSheet = field(init=False)
     T_camera_palm: Float = field(init=False)
     _straight: HandJoints = field(init=False)
@@ -112,10 +112,10 @@ class WristScene:
         optics = CameraModel.of(self.cameras[name], np.eye(4))
         object.__setattr__(self, "optics", optics)
         object.__setattr__(self, "T_camera_palm", np.array(self.rig.T_camera_palm, dtype=np.float64))
-        object.__setattr__(self, "flesh", Flesh.of(self.model, self.seed))
+        object.__setattr__(self, "capsules", HandCapsules.of(self.model, self.seed))
         straight = self.model.forward(self.T_camera_palm, np.zeros((5, 4)))
         object.__setattr__(self, "_straight", straight)
-        object.__setattr__(self, "sheet", LaserSheet.of(self.rig, self.flesh, straight))
+        object.__setattr__(self, "sheet", LaserSheet.of(self.rig, self.capsules, straight))
 
     @classmethod
     def by_name(
@@ -152,19 +152,19 @@ class WristScene:
         """The joints at scene time `t_s` [s], camera frame."""
         return self._joints(self.motion.at(t_s))
 
-    def bodies_at(self, t_s: float) -> Cones:
+    def bodies_at(self, t_s: float) -> Capsules:
         """All that camera and laser meet at scene time `t_s` [s], camera frame: the flesh, after it the things."""
         return self.bodies_of(self.motion.at(t_s))
 
-    def bodies_of(self, state: HandState) -> Cones:
+    def bodies_of(self, state: HandState) -> Capsules:
         """The same of a hand in that state."""
         return self._bodies(state, self._joints(state))
 
-    def straight_bodies(self) -> Cones:
+    def straight_bodies(self) -> Capsules:
         """The flesh while wrist and fingers are straight, camera frame."""
-        return self.flesh.bodies(self._straight)
+        return self.capsules.bodies(self._straight)
 
-    def bent_bodies(self, bend_rad: Float) -> Cones:
+    def bent_bodies(self, bend_rad: Float) -> Capsules:
         """The flesh of straight fingers while the wrist is bent by that (2,), camera frame."""
         return self.bodies_of(HandState(np.eye(4), np.zeros((5, 4)), bend_rad))
 
@@ -174,7 +174,7 @@ class WristScene:
         joints = self._joints(state)
         bodies = self._bodies(state, joints)
         line = LineTruth.of(self.sheet.cross(bodies), self.optics, self.sheet)
-        tips = self.flesh.tips(bodies)
+        tips = self.capsules.tips(bodies)
         return WristTruth(
             t_s,
             state.angles_rad,
@@ -198,9 +198,9 @@ class WristScene:
             T = T @ rigid(forearm_palm(state.bend_rad), np.zeros(3))
         return self.model.forward(T, state.angles_rad)
 
-    def _bodies(self, state: HandState, joints: HandJoints) -> Cones:
+    def _bodies(self, state: HandState, joints: HandJoints) -> Capsules:
         R_straight = self._straight.rotation[WRIST] if state.bend_rad.any() else None
-        flesh = self.flesh.bodies(joints, R_straight)
+        capsules = self.capsules.bodies(joints, R_straight)
         if not state.things:
-            return flesh
-        return with_things(flesh, bodies_of(state.things, joints.T_rig_palm @ invert(state.T_rig_palm)))
+            return capsules
+        return with_things(capsules, bodies_of(state.things, joints.T_rig_palm @ invert(state.T_rig_palm)))

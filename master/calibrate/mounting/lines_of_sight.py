@@ -13,7 +13,7 @@ import numpy as np
 from common.arrays import Float
 from common.fingertips import Fingertips
 from common.geometry import rotation_vector_to_matrix
-from common.hand_skin import Skin
+from common.palmar_surface import PalmarSurface
 from master.calibrate.laser_cut import LaserCut
 from master.estimator.laser_plane import PlaneAxes
 from master.wrist_setup import WristSetup
@@ -29,7 +29,7 @@ class LinesOfSight:
     """LinesOfSight of one device and hand. What it holds was prepared by the constructor."""
 
     def __init__(self, setup: WristSetup) -> None:
-        self._setup, self._skin, self._axes = setup, Skin.of(setup.model), PlaneAxes.of(setup)
+        self._setup, self._surface, self._axes = setup, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
         self._cut, self._tips = LaserCut(setup, _RAYS), Fingertips.of(setup.model)
 
     def flat(self, point_m: Float) -> Float:
@@ -62,7 +62,7 @@ class LinesOfSight:
             (T, 4, SEEN), and derivatives (T, 4, SEEN, 12): by a turn of the palm (3, camera axes, about the wrist
             joint), its shift (3), the finger's own four angles, its thickness and reach; 0 where not known.
         """
-        skin, radius, _ = local = self._local(angles, thick, reach_m)
+        surface, radius, _ = local = self._local(angles, thick, reach_m)
         all_of = [self._moved(R, shift_m, *local)]
         for k in range(3):
             turn = rotation_vector_to_matrix(_TURN * np.eye(3)[k])
@@ -76,7 +76,7 @@ class LinesOfSight:
         seen = self._seen(all_of)
         out = np.zeros((*seen.shape[1:], len(_STEPS) + 1))
         out[..., :-1] = np.moveaxis(seen[1:] - seen[0], 0, -1) / _STEPS
-        farther = self._moved(R, shift_m, skin, radius, self._local(angles, thick, reach_m + _SHIFT_M)[2])
+        farther = self._moved(R, shift_m, surface, radius, self._local(angles, thick, reach_m + _SHIFT_M)[2])
         out[..., 2:, -1] = (self._setup.optics.project(farther[2]) - seen[0][..., 2:]) / _SHIFT_M
         return seen[0], np.nan_to_num(out)
 
@@ -85,12 +85,12 @@ class LinesOfSight:
         chains = self._setup.model.chains(angles)
         factor = np.ones((5, 1))
         factor[FINGERS, 0] = np.exp(thick)
-        skin = Skin(factor * self._skin.palmar_m, factor * self._skin.radius_m)
+        surface = PalmarSurface(factor * self._surface.palmar_m, factor * self._surface.radius_m)
         beyond = self._tips.beyond_m.copy()
         beyond[FINGERS] += reach_m
         return (
-            skin.spheres(chains)[:, FINGERS],
-            skin.radius_m[FINGERS],
+            surface.spheres(chains)[:, FINGERS],
+            surface.radius_m[FINGERS],
             replace(self._tips, beyond_m=beyond).points(chains)[:, FINGERS],
         )
 

@@ -18,7 +18,7 @@ from common.hand_model import CHAINS, FINGERS, HandModel
 from common.messages import HandPose, ImuSample, WristDetections
 from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.mounting.fit import fit_mounting
-from master.calibrate.mounting.lines_of_sight import FINGERS as WORN
+from master.calibrate.mounting.lines_of_sight import FINGERS as LASER_FINGERS
 from master.calibrate.mounting.lines_of_sight import LinesOfSight
 from master.calibrate.mounting.report import left_of, refuse, report_lines, sigmas
 from master.calibrate.mounting.seen import Fit, Triples
@@ -94,7 +94,7 @@ def calibrate_mounting(
     hand, imu = HandTrack.of(poses, model, zero_ns), ImuTrack(samples, zero_ns)
     seen = _triples(setup, lines_of_sight, camera, triples, zero_ns)
     chosen = _chosen(hand, imu, seen)
-    tips = hand.points_m[:, [_marker_of(model, markers, finger) for finger in FINGERS[WORN]]]
+    tips = hand.points_m[:, [_marker_of(model, markers, finger) for finger in FINGERS[LASER_FINGERS]]]
     start = started(hand, tips, imu, setup.optics, setup.T_camera_palm, seen)
     if start is None:
         raise FitError(f"hand and IMU were hardly seen at the same time: {MOTION}")
@@ -142,10 +142,10 @@ def _triples(
         tip_sigma.append(one.tip_sigma_px)
     return Triples(
         np.array([1e-9 * (one.t_ns - zero_ns) for one in messages]),
-        np.array(laser)[:, WORN],
-        np.array(sigma)[:, WORN],
-        np.array(tips)[:, WORN],
-        np.array(tip_sigma)[:, WORN],
+        np.array(laser)[:, LASER_FINGERS],
+        np.array(sigma)[:, LASER_FINGERS],
+        np.array(tips)[:, LASER_FINGERS],
+        np.array(tip_sigma)[:, LASER_FINGERS],
         1.0 / camera.frame_rate_hz,  # the frame with the LEDs follows that with the laser
     )
 

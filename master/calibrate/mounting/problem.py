@@ -52,7 +52,7 @@ from master.estimator.attached import Attached
 from master.estimator.parameters import HandParameters
 from master.estimator.priors import Habits, habits_of
 
-_SKIN_M, _TIP_M = 8e-4, 1e-3  # skin of another shape than the cones; a tip is seen anywhere on its pulp
+_SURFACE_M, _TIP_M = 8e-4, 1e-3  # skin of another shape than the cones; a tip is seen anywhere on its pulp
 _CAP_M = 5e-4  # where caps sit, beyond the noise of the cameras
 _HABITS = 1e-2  # of their information: what sensors tell is to count
 _TWIST_RAD = np.radians(1.0)
@@ -105,7 +105,7 @@ class Problem:
             np.zeros((count, len(names), 3, 3)),
         )
         tip_px = np.hypot(np.nan_to_num(triples.tip_sigma_px), _TIP_M * px_per_m)
-        laser_m = np.hypot(np.nan_to_num(triples.laser_sigma_m), _SKIN_M)
+        laser_m = np.hypot(np.nan_to_num(triples.laser_sigma_m), _SURFACE_M)
         self.sigma = np.concatenate([laser_m, np.repeat(tip_px[..., None], 2, axis=-1)], axis=-1)
         last_s, first_s = triples.t_s[-1], triples.t_s[0]
         self._share = min(_PER_S * (last_s - first_s) / count, 1.0)

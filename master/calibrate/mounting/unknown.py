@@ -7,7 +7,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.geometry import rigid, rotation_vector_to_matrix
-from common.hand_skin import SPREAD
+from common.palmar_surface import SPREAD
 
 UNKNOWN = 34
 CAMERA_IMU, SHIFT, FOREARM_IMU, RIG_WORLD, ZERO = (slice(3 * k, 3 * k + 3) for k in range(5))

@@ -60,7 +60,7 @@ def palm(
     out: ResultTree = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Measure where the palm is before the wrist camera, by a board that lies on it; without one: calibrate wearer.
+    """Measure where the palm is before the wrist camera, by a board that lies on it; without one: calibrate subject.
 
     The board lies flat on palm and straight fingers, print to the camera, columns along the middle finger. Nothing is
     written without --out.

@@ -202,7 +202,7 @@ def test_it_stays_a_covariance_whatever_comes(seed: int) -> None:
 
 
 def test_a_palm_that_was_calibrated_does_not_bend_and_a_tilt_is_at_least_of_a_milliradian() -> None:
-    worn, loose = (stationary_of(DEFAULT, loose=loose, tilt_rad=0.0) for loose in (False, True))
-    np.testing.assert_allclose(np.sqrt(worn[BEND : BEND + 2]), DEFAULT.worn_rad)
+    strapped, loose = (stationary_of(DEFAULT, loose=loose, tilt_rad=0.0) for loose in (False, True))
+    np.testing.assert_allclose(np.sqrt(strapped[BEND : BEND + 2]), DEFAULT.calibrated_palm_rad)
     np.testing.assert_allclose(np.sqrt(loose[BEND : BEND + 2]), [DEFAULT.flexion_rad, DEFAULT.deviation_rad])
     np.testing.assert_allclose(np.sqrt(loose[TILT : TILT + 2]), 1e-3)

@@ -15,25 +15,25 @@ from master.estimator.wrist_device import BEND, HEADING, LIGHT, TILT
 from tests.hand_helpers import any_rotation
 from tests.master.estimator.kernels import turn_slope_at
 from tests.master.estimator.whole import Whole, silent
-from tests.master.estimator.worn import Seen, Worn
+from tests.master.estimator.wrist_case import Seen, WristCase
 
 seeds = st.integers(0, 2**32 - 1)
 BENT = np.radians([-8.0, 4.0])
 
 
 @pytest.fixture(scope="module")
-def worn(root: Path) -> Worn:
-    return Worn.of(root)
+def wrist_case(root: Path) -> WristCase:
+    return WristCase.of(root)
 
 
-def hand(worn: Worn, seed: int) -> tuple[Whole, Seen]:
+def hand(wrist_case: WristCase, seed: int) -> tuple[Whole, Seen]:
     """One before the device, of which nothing is believed, and what is seen of it."""
-    whole = Whole(worn.model, seed, worn.device)
+    whole = Whole(wrist_case.model, seed, wrist_case.device)
     silent(whole)
     whole.z[:5], whole.z[BEND : BEND + 2] = whole.rng.normal(0.0, 0.05, 5), BENT
     whole.z[LIGHT] = whole.rng.normal()
     angles = whole.parameters.angles(whole.x)
-    return whole, worn.looks(angles, BENT, whole.z[:5])
+    return whole, wrist_case.looks(angles, BENT, whole.z[:5])
 
 
 def spd(rng: np.random.Generator, n: int) -> Float:
@@ -85,10 +85,10 @@ KINDS = [(laser, 0.35), (tip, 1e-5), (tip_depth, 1e-5), (turn, 1e-5)]
 
 @pytest.mark.parametrize(("kind", "share"), KINDS[1:])
 def test_the_gradient_of_each_kind_of_row_is_the_derivative_of_its_cost(
-    worn: Worn, kind: Callable[[Whole, Seen, float], None], share: float
+    wrist_case: WristCase, kind: Callable[[Whole, Seen, float], None], share: float
 ) -> None:
     for seed in range(6):
-        whole, seen = hand(worn, seed)
+        whole, seen = hand(wrist_case, seed)
         kind(whole, seen, 0.3)
         _, gradient, normal = whole.cost()
         numeric = whole.slope()
@@ -98,10 +98,10 @@ def test_the_gradient_of_each_kind_of_row_is_the_derivative_of_its_cost(
         assert np.linalg.eigvalsh(normal).min() > -1e-9 * np.abs(normal).max()
 
 
-def test_the_laser_row_is_that_of_ridge_and_lack(worn: Worn) -> None:
+def test_the_laser_row_is_that_of_ridge_and_lack(wrist_case: WristCase) -> None:
     """Of what `look` says of angles, twist and bend, by plain algebra."""
     for seed in range(4):
-        whole, seen = hand(worn, seed)
+        whole, seen = hand(wrist_case, seed)
         laser(whole, seen, 0.3)
         lines_of_sight, n = whole.belief.lines_of_sight, whole.n
         by_free = whole.parameters.by_angles(whole.x).reshape(5, 4, n)
@@ -120,10 +120,10 @@ def test_the_laser_row_is_that_of_ridge_and_lack(worn: Worn) -> None:
 
 @pytest.mark.parametrize(("kind", "share"), KINDS)
 def test_the_normal_matrix_is_the_bend_of_the_cost_where_nothing_is_off(
-    worn: Worn, kind: Callable[[Whole, Seen, float], None], share: float
+    wrist_case: WristCase, kind: Callable[[Whole, Seen, float], None], share: float
 ) -> None:
     for seed in range(3):
-        whole, seen = hand(worn, seed)
+        whole, seen = hand(wrist_case, seed)
         kind(whole, seen, 0.0)
         cost, gradient, normal = whole.cost()
         assert abs(cost) < 1e-12
@@ -132,8 +132,8 @@ def test_the_normal_matrix_is_the_bend_of_the_cost_where_nothing_is_off(
         np.testing.assert_allclose(normal, numeric, atol=share * np.abs(numeric).max())
 
 
-def test_rows_that_are_not_seen_say_nothing(worn: Worn) -> None:
-    whole, seen = hand(worn, 1)
+def test_rows_that_are_not_seen_say_nothing(wrist_case: WristCase) -> None:
+    whole, seen = hand(wrist_case, 1)
     tip_depth(whole, seen, 0.3)
     laser(whole, seen, 0.3)
     whole.belief.lines_of_sight.lit[:] = whole.belief.lines_of_sight.shown[:] = 0.0
@@ -144,9 +144,9 @@ def test_rows_that_are_not_seen_say_nothing(worn: Worn) -> None:
 
 
 @pytest.mark.parametrize("teaches", [True, False])
-def test_a_finger_tells_its_own_angles_and_twist_and_the_bend(worn: Worn, teaches: bool) -> None:
+def test_a_finger_tells_its_own_angles_and_twist_and_the_bend(wrist_case: WristCase, teaches: bool) -> None:
     """One that is in doubt teaches nothing of its hinges."""
-    whole, seen = hand(worn, 2)
+    whole, seen = hand(wrist_case, 2)
     tip_depth(whole, seen, 0.3)
     laser(whole, seen, 0.3)
     lines_of_sight = whole.belief.lines_of_sight
@@ -161,10 +161,10 @@ def test_a_finger_tells_its_own_angles_and_twist_and_the_bend(worn: Worn, teache
     assert (extras + 2 in moved) == teaches
 
 
-def test_tilt_and_heading_away_from_the_believed_turn_the_palm(worn: Worn) -> None:
+def test_tilt_and_heading_away_from_the_believed_turn_the_palm(wrist_case: WristCase) -> None:
     """To second order: of a few degrees the cost's slope is right to a few percent."""
     for seed in range(4):
-        whole, seen = hand(worn, seed)
+        whole, seen = hand(wrist_case, seed)
         turn(whole, seen, 0.1)
         whole.z[TILT : HEADING + 1] += whole.rng.normal(0.0, 0.05, 3)
         _, gradient, _ = whole.cost()

@@ -51,7 +51,7 @@ def test_left_hands_tell_what_right_hands_tell() -> None:
     np.testing.assert_allclose(Quantities.of(left).value, Quantities.of(right).value, atol=1e-6)
 
 
-def test_a_pad_is_on_the_palmar_side_as_far_from_the_bone_as_the_skin() -> None:
+def test_a_pad_is_on_the_palmar_side_as_far_from_the_bone_as_the_surface() -> None:
     features = of(shown(np.zeros((5, 4)), T_rig_palm=np.eye(4)))
     assert (features.pads_m[1:, 1] < features.tips_m[1:, 1] - 0.8 * features.radius_m[1:]).all()
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 import master.gestures
+from common.capsule_gaps import TaperedCapsules, gaps_between
 from common.geometry import axis_rotation, rigid
 from common.gesture_settings import default_gestures
 from common.hand_model import CHAINS
 from common.messages import HandPose
 from common.sim.gesture_postures import knob_grip, pinch_posture
 from common.sim.motion import POSES, angles_of
-from common.skin_gaps import RoundCones, gaps_between
 from master.estimator.matrices import diagonalise, spread
 from master.gestures.features import FeatureExtractor
 from master.gestures.grip import Tips, turned_by
@@ -60,8 +60,8 @@ def test_a_covariance_spreads_by_the_roots_of_its_eigenvalues() -> None:
 def test_gaps_of_the_thumb_are_those_between_round_cones(name: str) -> None:
     seen = FeatureExtractor(RIGHT).of(shown(angles_of(RIGHT, np.array(POSES[name], np.float64), STILL)))
     assert seen is not None
-    cones = RoundCones.of_segments(seen.joints_m, RIGHT.radius_m)
-    want = gaps_between(cones.part(slice(0, 1), slice(2, 3)), cones.part(slice(1, 5), slice(0, 3)))
+    capsules = TaperedCapsules.of_segments(seen.joints_m, RIGHT.radius_m)
+    want = gaps_between(capsules.part(slice(0, 1), slice(2, 3)), capsules.part(slice(1, 5), slice(0, 3)))
     found = thumb_touch(seen, RIGHT.radius_m)
     np.testing.assert_allclose(found.key_gap_m, want.gap_m, atol=1e-12)
     np.testing.assert_allclose(found.middle_m, want.middle_m[:, 2], atol=1e-12)

@@ -38,9 +38,9 @@ def over(
     ends = np.array([[CHAINS[f, s], CHAINS[f, s + 1]] for f, s in places])
     middle = joints.position_m[ends].mean(axis=(0, 1))
     out = -joints.rotation[ends[0, 0], :, 1] * (-1.0 if dorsal else 1.0)
-    skin_m = RIGHT.radius_m[ends].mean() + RIGHT.radius_m[CHAINS[0, 3]]
+    surface_m = RIGHT.radius_m[ends].mean() + RIGHT.radius_m[CHAINS[0, 3]]
     position, wxyz = hand.position_m.copy(), hand.orientation_wxyz.copy()
-    position[CHAINS[0]] = middle + out * (skin_m + gap_m + np.array([0.10, 0.065, 0.03, 0.0])[:, None])
+    position[CHAINS[0]] = middle + out * (surface_m + gap_m + np.array([0.10, 0.065, 0.03, 0.0])[:, None])
     across = joints.rotation[ends[0, 0], :, 0]
     wxyz[CHAINS[0]] = matrix_to_quaternion(np.column_stack([across, np.cross(out, across), out]))
     return msgspec.structs.replace(hand, position_m=position, orientation_wxyz=wxyz)

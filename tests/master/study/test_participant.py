@@ -26,7 +26,7 @@ def lengths(hand: HandProfile) -> Float:
     return np.linalg.norm(np.diff(place, axis=1), axis=2)
 
 
-def test_bones_mounting_and_skin_stay_within_their_ranges_and_fill_them() -> None:
+def test_bones_mounting_and_reflectance_stay_in_their_ranges_and_fill_them() -> None:
     share = np.array([lengths(one.hand) for one in PEOPLE]) / lengths(HAND) - 1.0
     assert np.abs(share).max() <= 0.08 + 1e-6
     assert np.ptp(share, axis=0).min() > 0.14  # every bone of its own

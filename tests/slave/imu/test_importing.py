@@ -36,7 +36,7 @@ def test_it_says_what_is_in_it_and_writes_our_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = rested(tmp_path / "foreign.csv", off_deg=1.0)
-    assert main(["imu", "--csv", str(path), "--out", str(tmp_path / "taken"), "--name", "worn"]) == 0
+    assert main(["imu", "--csv", str(path), "--out", str(tmp_path / "taken"), "--name", "device"]) == 0
     said = capsys.readouterr().out
     assert "Timestamp (ms) in ms (header)" in said
     assert "gx_dps, gy_dps, gz_dps in deg/s (header)" in said
@@ -46,7 +46,7 @@ def test_it_says_what_is_in_it_and_writes_our_file(
     against = next(line for line in said.splitlines() if line.startswith("inclination"))
     assert "deg rms against opt_qw, opt_qx, opt_qy, opt_qz, taken for true" in against
     assert float(against.split()[1]) == pytest.approx(1.0, abs=0.1)
-    samples = read_imu(tmp_path / "taken", "worn")
+    samples = read_imu(tmp_path / "taken", "device")
     assert len(samples) == 495
     np.testing.assert_allclose(samples[0].gyro_rad_s, [np.radians(1.0), 0.0, 0.0])
     found = samples[-1].orientation_wxyz

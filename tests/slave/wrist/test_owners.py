@@ -70,7 +70,7 @@ def test_lines_of_a_palm_that_deviates_and_holds_something_are_counted_from_the_
     both = Both.of("grasp", 7, rigs=("desk-back3", "wrist-back3"))
     name = both.wrist.rig.cameras[0]
     view = WristView.of(both.wrist.rig, both.wrist.cameras[name], both.wrist.hand.profile)
-    renderer, truth = WristRenderer(both.worn, name, 2), both.worn.truth(t)
+    renderer, truth = WristRenderer(both.wrist_scene, name, 2), both.wrist_scene.truth(t)
     ambient, laser, led = (renderer.render(t, kind) for kind in STROBE)
     fingers = separate(lit(led, ambient), view)
     assert abs(np.degrees(truth.bend_rad[1])) > 5.0

@@ -44,7 +44,7 @@ def moved() -> Moved:
     )
     poses = [pose_at(both, t) for t in np.arange(0.0, SECONDS, 1.0 / HAND_HZ).tolist()]
     triples = [triple_at(both, t) for t in np.arange(0.1, SECONDS - 0.1, 1.0 / TRIPLE_HZ).tolist()]
-    sensor = SimulatedImu(SimulatedImu.of(both.worn)._motion, rig.imu, 3, PERFECT)
+    sensor = SimulatedImu(SimulatedImu.of(both.wrist_scene)._motion, rig.imu, 3, PERFECT)
     fusion = OrientationFilter(sensor.rate_hz)
     samples = [fusion.push(one) for one in sensor.around(0.0, SECONDS, ZERO_NS - IMU_LATE_NS)]
     return Moved(both, wrong, poses, triples, samples)
@@ -76,7 +76,7 @@ def triple_at(both: Both, t_s: float) -> WristDetections:
     """What the wrist camera would see in the triple whose laser shines at scene time `t_s` [s], stamped too early."""
     camera = both.wrist.rig.cameras[0]
     frame_s = 1.0 / both.wrist.cameras[camera].frame_rate_hz
-    laser, led = both.worn.truth(t_s), both.worn.truth(t_s + frame_s)
+    laser, led = both.wrist_scene.truth(t_s), both.wrist_scene.truth(t_s + frame_s)
     line = np.where((laser.laser_len_vis[1:6] > 3e-3)[:, None], laser.laser_uv[1:6], np.nan)
     tips = np.where(led.tip_visible[:, None], led.tip_uv, np.nan)
     t_ns = ZERO_NS + round(1e9 * t_s) - CAMERA_LATE_NS

@@ -250,7 +250,7 @@ def test_broken_recordings_say_what_is_wrong(
             "expected a rig of kind 'wrist'",
         ),
         (
-            ("wearer", "nowhere", "--detections", "x", "--rig", "wrist"),
+            ("subject", "nowhere", "--detections", "x", "--rig", "wrist"),
             RecordingError,
             "phalanx-slave detect",
         ),

@@ -20,7 +20,7 @@ _ALONG = 1e-6  # a ray within the cone's own angle of its axis meets the spheres
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Cones:
+class Capsules:
     """B round cones, or several hands of them: (..., B).
 
     Attributes:
@@ -33,9 +33,9 @@ class Cones:
     start_radius_m: Float
     stop_radius_m: Float
 
-    def of(self, bodies: slice) -> "Cones":
+    def of(self, bodies: slice) -> "Capsules":
         """Some of them."""
-        return Cones(
+        return Capsules(
             self.start_m[bodies], self.stop_m[bodies], self.start_radius_m[bodies], self.stop_radius_m[bodies]
         )
 
@@ -56,15 +56,15 @@ class Cones:
         return out
 
 
-def terms(cones: Cones, origin: Float, kind: type[np.float32] | type[np.float64]) -> Any:
+def terms(capsules: Capsules, origin: Float, kind: type[np.float32] | type[np.float64]) -> Any:
     """What `first_hits` needs to know of each body, seen from the rays' origin (3,) [m]: (12, ..., B) of a kind."""
-    axis = cones.stop_m - cones.start_m
-    r1, narrowing = cones.start_radius_m, cones.start_radius_m - cones.stop_radius_m
-    away, beyond = origin - cones.start_m, origin - cones.stop_m
+    axis = capsules.stop_m - capsules.start_m
+    r1, narrowing = capsules.start_radius_m, capsules.start_radius_m - capsules.stop_radius_m
+    away, beyond = origin - capsules.start_m, origin - capsules.stop_m
     m0, m1, m5 = (np.vecdot(a, b) for a, b in ((axis, axis), (axis, away), (away, away)))
     d2 = m0 - narrowing**2
     k0 = d2 * m5 - m1**2 + 2.0 * m1 * narrowing * r1 - m0 * r1**2
-    ends = m5 - r1**2, np.vecdot(beyond, beyond) - cones.stop_radius_m**2
+    ends = m5 - r1**2, np.vecdot(beyond, beyond) - capsules.stop_radius_m**2
     ways = np.moveaxis(axis, -1, 0), np.moveaxis(away, -1, 0)
     return np.array((*ways[0], *ways[1], d2, k0, narrowing * r1 - m1, m1 - r1 * narrowing, *ends), dtype=kind)
 
@@ -95,14 +95,14 @@ def first_hits(known: Any, directions: Real) -> Real:
     return hit
 
 
-def distances(cones: Cones, origin: Float, directions: Float) -> Float:
+def distances(capsules: Capsules, origin: Float, directions: Float) -> Float:
     """How far along each ray (N, 3) from one origin each body begins (N, B) [m]; inf: not hit."""
-    middle = 0.5 * (cones.start_m + cones.stop_m) - origin
-    half = 0.5 * np.linalg.norm(cones.stop_m - cones.start_m, axis=1)
-    radius = half + np.maximum(cones.start_radius_m, cones.stop_radius_m)
+    middle = 0.5 * (capsules.start_m + capsules.stop_m) - origin
+    half = 0.5 * np.linalg.norm(capsules.stop_m - capsules.start_m, axis=1)
+    radius = half + np.maximum(capsules.start_radius_m, capsules.stop_radius_m)
     along = directions @ middle.T
     # Only bodies whose spheres about them are met.
     ray, body = np.nonzero((middle * middle).sum(axis=1) - along * along < radius**2)
     out = np.full(along.shape, np.inf)
-    out[ray, body] = first_hits(terms(cones, origin, np.float64)[:, body], directions[ray].T)
+    out[ray, body] = first_hits(terms(capsules, origin, np.float64)[:, body], directions[ray].T)
     return out

@@ -2,7 +2,7 @@
 
 The place of a knuckle is told by the laser where its finger is bent most: there the line lies beside it. One motion
 shows that, and the flat hand, from which everything is counted, and a fist, in which fingertips are seen. What is
-made of it is in `guided`, `wearer_model` and `wearer_fit`; here are what goes in, what comes out, and what is refused.
+made of it is in `guided`, `subject_model` and `subject_fit`; here is what goes in, comes out and is refused.
 """
 
 from collections.abc import Sequence
@@ -19,11 +19,11 @@ from common.messages import WristDetections
 from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.guided import FLAT, MOTION, Guided, guided
-from master.calibrate.wrist.wearer_fit import Fit, ImageObservations, fit_wearer, prior_sigma
-from master.calibrate.wrist.wearer_model import MCP, Unknown, WearerModel, wearing
+from master.calibrate.wrist.subject_fit import Fit, ImageObservations, fit_subject, prior_sigma
+from master.calibrate.wrist.subject_model import MCP, SubjectModel, Unknown, fitted_profile
 from master.wrist_setup import WristSetup
 
-TOOL = "calibrate wearer"
+TOOL = "calibrate subject"
 _NAMES = FINGERS[1:]
 _GUESS = np.radians(5.0), 5e-3  # of a drawing's pose of the palm, standard deviations
 _RULER = np.radians(1.0), 1.5e-3  # of a board's: how it lies on the palm, and what was measured with a ruler
@@ -34,11 +34,11 @@ _LENGTH, _MEASURED = (
 _BENT_RAD = np.radians(60.0)  # at its knuckle: from here on the line hardly moves any more
 _MISFIT = 1.5  # standard deviations: angles are free, so what is left is small
 _UNLIKELY = 3.0  # standard deviations
-_SURPRISE = 1.5  # rms of standard deviations: one in a hundred wearers, of 14 numbers that a motion tells
+_SURPRISE = 1.5  # rms of standard deviations: one in a hundred subjects, of 14 numbers that a motion tells
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Wearer:
+class Subject:
     """A device and a hand that explain what was seen.
 
     Attributes:
@@ -57,7 +57,7 @@ class Wearer:
     chosen: Guided
     seen: ImageObservations
     fit: Fit
-    model: WearerModel
+    model: SubjectModel
 
     @property
     def unknown(self) -> Unknown:
@@ -71,14 +71,14 @@ class Wearer:
         return np.sqrt(np.einsum("fki,ij,fkj->fk", by_x, self.fit.covariance, by_x))
 
 
-def calibrate_wearer(
+def calibrate_subject(
     triples: Sequence[WristDetections],
     rig: RigCalibration,
     camera: CameraCalibration,
     hand: HandProfile,
     source: str = "a guided motion",
-) -> Wearer:
-    """Fit the wearer of a wrist device to one guided motion: open hand, straight fingers bent at the knuckles, fist.
+) -> Subject:
+    """Fit the subject of a wrist device to one guided motion: open hand, straight fingers bent at the knuckles, fist.
 
     Args:
         triples: What the slave saw, in order.
@@ -92,7 +92,7 @@ def calibrate_wearer(
         CalibrationError: The rig lacks its laser plane or palm pose.
     """
     setup = WristSetup.of(rig, camera, HandModel.of(hand))
-    model = WearerModel(setup)
+    model = SubjectModel(setup)
     laser = np.array([one.laser_uv for one in triples]).reshape(-1, 5, 2)
     points = model.flat(setup.on_plane(laser))[:, 1:]
     chosen = guided(points[..., 1])
@@ -100,13 +100,13 @@ def calibrate_wearer(
     doubt = np.array([one.tip_sigma_px for one in triples])[chosen.row, 1:]
     seen = ImageObservations(points[chosen.row], tips, doubt, chosen.bend)
     sigma = prior_sigma(_pose_sigma(rig), _length_sigma(hand))
-    fit = fit_wearer(model, seen, sigma)
+    fit = fit_subject(model, seen, sigma)
     _check(fit, seen)
     unknown = Unknown.of(fit.x)
     report = report_lines(setup, fit, len(triples))
-    new_rig, new_hand = _documented(rig, wearing(setup.model, unknown), fit, source)
+    new_rig, new_hand = _documented(rig, fitted_profile(setup.model, unknown), fit, source)
     new_rig = replace(new_rig, T_camera_palm=matrix_of(model.palm(unknown)))
-    return Wearer(new_rig, new_hand, report, chosen, seen, fit, model)
+    return Subject(new_rig, new_hand, report, chosen, seen, fit, model)
 
 
 def _pose_sigma(rig: RigCalibration) -> Float:
@@ -164,7 +164,7 @@ def _check_likely(fit: Fit) -> None:
     worst = int(pull.argmax())
     if fit.rms > _MISFIT or pull[worst] > _UNLIKELY or fit.surprise > _SURPRISE or fit.unlike > _UNLIKELY:
         raise FitError(
-            f"no likely wearer explains what was seen: it is {fit.rms:.1f} times farther off than skin explains,"
+            f"no likely subject explains what was seen: it is {fit.rms:.1f} times farther off than skin explains,"
             f" fingers {fit.unlike:.1f} times from their habits, and {_name(worst)} {pull[worst]:.1f} standard"
             " deviations from the file; is the hand file that of this hand and side, the laser plane measured, and"
             f" the palm's pose right to a centimetre and ten degrees? The motion is: {MOTION}"
@@ -191,7 +191,7 @@ def report_lines(setup: WristSetup, fit: Fit, count: int) -> tuple[str, ...]:
     turn, shift = np.degrees(np.linalg.norm(new.pose[:3])), 1e3 * np.linalg.norm(new.pose[3:])
     knuckles = ~fit.fist & (fit.angles_rad[..., MCP].max(axis=1) > _BENT_RAD)
     lines = [
-        f"wearer from {len(fit.fist)} of {count} triples and {np.isfinite(fit.off[..., 2]).sum()} fingertips in them",
+        f"subject from {len(fit.fist)} of {count} triples and {np.isfinite(fit.off[..., 2]).sum()} fingertips in them",
         f"left: laser {1e3 * fit.laser_m:.2f} mm, tips {fit.tip_px:.1f} px; changed by {fit.surprise:.1f} of belief",
         f"palm turned by {turn:.1f} deg, about x, y, z ± {_three(np.degrees(sigma.pose[:3]))}",
         f"palm shifted by {shift:.1f} mm, along x, y, z ± {_three(1e3 * sigma.pose[3:])}",

@@ -13,7 +13,7 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.hand_model import CHAINS, FINGERS, METACARPALS, WRIST, HandJoints, HandModel
-from common.round_cones import Cones
+from common.tapered_capsules import Capsules
 
 GROUPS = ("palm", *FINGERS, "thenar")
 PALM_GROUP, THUMB_GROUP, THENAR_GROUP = 0, 1, 6
@@ -26,7 +26,7 @@ _PAD_M, _PULP_M = (0.0002, 0.0010), (0.0006, 0.0016)  # how far pads and pulps s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Flesh:
+class HandCapsules:
     """Round cones fixed to joints.
 
     Attributes:
@@ -54,7 +54,7 @@ class Flesh:
     still: int
 
     @classmethod
-    def of(cls, model: HandModel, seed: int) -> "Flesh":
+    def of(cls, model: HandModel, seed: int) -> "HandCapsules":
         """Draw the flesh of one hand; the same seed, the same flesh."""
         rng = np.random.default_rng([seed, 21])
         radius = (model.radius_m * np.clip(rng.normal(1.0, _RADIUS_SPREAD, 26), 0.88, 1.12)).tolist()
@@ -80,7 +80,7 @@ class Flesh:
             still=still,
         )
 
-    def bodies(self, joints: HandJoints, R_straight: Float | None = None) -> Cones:
+    def bodies(self, joints: HandJoints, R_straight: Float | None = None) -> Capsules:
         """Where they are, in the frame of the joints; of a bent wrist `R_straight` (3, 3) is the rotation that the
         wrist's joint had if it was straight: that of the forearm."""
         rotation, position = joints.rotation[self.joint], joints.position_m[self.joint]
@@ -88,9 +88,9 @@ class Flesh:
             rotation[self.forearm] = R_straight
         start = position + np.einsum("bij,bj->bi", rotation, self.start)
         stop = position + np.einsum("bij,bj->bi", rotation, self.stop)
-        return Cones(start, stop, self.start_radius_m, self.stop_radius_m)
+        return Capsules(start, stop, self.start_radius_m, self.stop_radius_m)
 
-    def same_palm(self, bodies: Cones, others: Cones) -> bool:
+    def same_palm(self, bodies: Capsules, others: Capsules) -> bool:
         """Whether the palm lies alike in two sets of bodies, to the last bit: what is true of one is of both."""
         palm = slice(self.still)
         return np.array_equal(bodies.start_m[palm], others.start_m[palm]) and np.array_equal(
@@ -102,7 +102,7 @@ class Flesh:
         last = len(self.group) - 1
         return np.where(body > last, THING_GROUP, self.group[np.minimum(body, last)])
 
-    def parts(self, bodies: Cones, body: Int, points: Float) -> tuple[Int, Int]:
+    def parts(self, bodies: Capsules, body: Int, points: Float) -> tuple[Int, Int]:
         """Group and segment (N,) of what is lit at points (N, 3) [m] of bodies (N,); a thing has segment 0.
 
         Where the thumb's ball and its phalanx run into each other, the plane that halves their angle parts them.
@@ -116,7 +116,7 @@ class Flesh:
         group = np.where(near, np.where(beyond, THUMB_GROUP, THENAR_GROUP), group)
         return group, np.where(near, np.where(beyond, THUMB_SEGMENTS[1], THUMB_SEGMENTS[0]), segment)
 
-    def tips(self, bodies: Cones) -> Float:
+    def tips(self, bodies: Capsules) -> Float:
         """The outermost points of the skin along the last bones of the five fingers (5, 3) [m]."""
         along = bodies.stop_m[self.tip] - bodies.start_m[self.tip]
         along /= np.linalg.norm(along, axis=1, keepdims=True)

@@ -41,7 +41,7 @@ class Posed:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Skin:
+class HandMesh:
     """A mesh, bound to the joints of a hand.
 
     Attributes:
@@ -65,7 +65,7 @@ class Skin:
     albedo: Float
 
     @classmethod
-    def of(cls, model: HandModel, datasets: Path) -> "Skin":
+    def of(cls, model: HandModel, datasets: Path) -> "HandMesh":
         """The mesh of the hand's side, as large as the hand."""
         hinges = Hinges.of(model)
         mesh = np.load(datasets / "webxr_hand" / f"{model.profile.side}_rest.npz")

@@ -6,10 +6,10 @@ import numpy as np
 
 from common.camera_model import CameraModel
 from master.calibrate.wrist.picture import BLUE, FINGER_COLOURS, GREY, figure_of, framed, saved
-from master.calibrate.wrist.wearer import Wearer
+from master.calibrate.wrist.subject import Subject
 
 
-def draw_wearer(path: Path, found: Wearer, optics: CameraModel) -> None:
+def draw_subject(path: Path, found: Subject, optics: CameraModel) -> None:
     """Laser points on their plane, fingertips and knuckles in the image, seen (dots) and fitted (rings). PNG.
 
     Raises:

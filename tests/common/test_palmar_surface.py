@@ -10,7 +10,7 @@ from common.calibration import HandProfile, load
 from common.fingertips import Fingertips
 from common.hand_model import CHAINS, HandModel
 from common.hand_profiles import generated_profile
-from common.hand_skin import Skin, first_hits
+from common.palmar_surface import PalmarSurface, first_hits
 
 
 @pytest.fixture(scope="module")
@@ -27,15 +27,15 @@ def test_a_ball_a_cylinder_and_a_cone_are_met_where_a_ruler_says() -> None:
     below = first_hits(np.array([0.0, -0.05, 0.1]), rays, centres, np.array([0.01, 0.02]))
     np.testing.assert_allclose(below[:, 0], [np.inf, 0.04])  # the ball at its end, from below
     # Radii 10 and 20 mm, 40 mm apart: half way the side is 15 mm / cos(asin(10 / 40)) from the axis.
-    cone = first_hits(np.array([0.0, 0.02, 0.0]), rays, centres, np.array([0.01, 0.02]))
-    assert cone[0, 0] == pytest.approx(0.1 - 0.015 / np.sqrt(1.0 - 1.0 / 16.0), abs=1e-12)
+    capsule = first_hits(np.array([0.0, 0.02, 0.0]), rays, centres, np.array([0.01, 0.02]))
+    assert capsule[0, 0] == pytest.approx(0.1 - 0.015 / np.sqrt(1.0 - 1.0 / 16.0), abs=1e-12)
 
 
-def test_skin_is_that_of_the_hand_file_or_of_a_hand_of_its_size(model: HandModel) -> None:
-    stated = Skin.of(model)
+def test_the_surface_is_that_of_the_hand_file_or_of_a_hand_of_its_size(model: HandModel) -> None:
+    stated = PalmarSurface.of(model)
     np.testing.assert_allclose(stated.palmar_m[1, [0, 4, 6, 7]], model.radius_m[[7, 8, 9, 10]])
     bare = HandModel.of(msgspec.structs.replace(model.profile, radius_m=None))
-    thick = 2e3 * Skin.of(bare).radius_m[1:, 4]
+    thick = 2e3 * PalmarSurface.of(bare).radius_m[1:, 4]
     assert (np.diff(thick[1:]) < 0.0).all()  # middle, ring, little
     assert ((thick > 12.0) & (thick < 20.0)).all()  # of fingers at the PIP, mm
 

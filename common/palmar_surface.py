@@ -12,7 +12,7 @@ own rig bends it to a PIP of 50 degrees, because skin folds. The breadths and de
 hand of Sancho-Bru et al. (0.23 and 0.23 of it at the proximal bone of the index finger, 0.17 and 0.16 at the middle
 bone of the little finger), with 0.57 of the depth on the palmar side of the bone, give the same within 0.8 mm RMS and
 1.5 mm at most, and as much may be wrong for another person: `SPREAD`. What a guided motion tells of a person
-(`phalanx-master calibrate wearer`) is the file's `palmar_scale`, which multiplies both.
+(`phalanx-master calibrate subject`) is the file's `palmar_scale`, which multiplies both.
 """
 
 from dataclasses import dataclass
@@ -23,8 +23,8 @@ import numpy as np
 from common.arrays import Float
 from common.calibration import Finger
 from common.hand_model import CHAINS, Chains, HandModel
-from common.round_cones import Cones, terms
-from common.round_cones import first_hits as cone_hits
+from common.tapered_capsules import Capsules, terms
+from common.tapered_capsules import first_hits as capsule_hits
 
 SPREAD = 0.10  # of the palmar distance, standard deviation
 # Of the spheres of a finger: on which of its three bones, and at what share of it.
@@ -56,7 +56,7 @@ _RADIUS = np.array(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Skin:
+class PalmarSurface:
     """The skin of one hand.
 
     Attributes:
@@ -68,7 +68,7 @@ class Skin:
     radius_m: Float
 
     @classmethod
-    def of(cls, model: HandModel) -> "Skin":
+    def of(cls, model: HandModel) -> "PalmarSurface":
         """That of a hand file, or else of a hand of its size; as thick as the file's `palmar_scale` says."""
         thick = np.array([[model.profile.palmar_scale.get(finger, 1.0)] for finger in get_args(Finger)])
         if model.profile.radius_m is None:
@@ -103,7 +103,7 @@ def first_hits(origin: Float, rays: Float, centres: Float, radius: Float) -> Flo
         centres: (..., K, 3) of the spheres of a chain.
         radius: (K,).
     """
-    chain = Cones(centres[..., :-1, :], centres[..., 1:, :], radius[:-1], radius[1:])
+    chain = Capsules(centres[..., :-1, :], centres[..., 1:, :], radius[:-1], radius[1:])
     known = terms(chain, origin, np.float64)[..., None, :]
-    hits: Float = cone_hits(known, np.moveaxis(rays, -1, 0)[..., None])
+    hits: Float = capsule_hits(known, np.moveaxis(rays, -1, 0)[..., None])
     return hits

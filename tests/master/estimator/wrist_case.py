@@ -49,7 +49,7 @@ class Seen:
     stretch: Float
 
 
-class Worn:
+class WristCase:
     """A wrist device and the hand before it."""
 
     def __init__(self, setup: WristSetup) -> None:
@@ -60,7 +60,7 @@ class Worn:
         self.device = Device.of(setup)
 
     @classmethod
-    def of(cls, root: Path, rig: str = "wrist") -> "Worn":
+    def of(cls, root: Path, rig: str = "wrist") -> "WristCase":
         """That of a shipped rig."""
         wrist = wrist_setup(root, rig).wrist
         assert wrist is not None
@@ -135,10 +135,10 @@ def message(
 
 
 def pipeline(
-    worn: Worn, level: Literal["fk", "ik", "auto"] = "auto", *, continuous: bool = False
+    wrist_case: WristCase, level: Literal["fk", "ik", "auto"] = "auto", *, continuous: bool = False
 ) -> WristPipeline:
     """The device alone."""
-    return WristPipeline(replace(worn.setup, level=level), continuous=continuous)
+    return WristPipeline(replace(wrist_case.setup, level=level), continuous=continuous)
 
 
 def pushed(line: WristPipeline, triple: WristDetections) -> HandPose:

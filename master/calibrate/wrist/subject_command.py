@@ -1,4 +1,4 @@
-"""`phalanx-master calibrate wearer`: palm pose, knuckles and fingers of who wears the device, from a guided motion."""
+"""`phalanx-master calibrate subject`: palm pose, knuckles and fingers of who wears the device, from a guided motion."""
 
 from pathlib import Path
 from typing import Annotated
@@ -13,8 +13,8 @@ from common.errors import CalibrationError, FitError
 from common.hand_model import FINGERS
 from master.calibrate.tree_files import write_hand
 from master.calibrate.wrist.device import Device, device_of, say, write_device
-from master.calibrate.wrist.wearer import Wearer, calibrate_wearer
-from master.calibrate.wrist.wearer_model import Unknown
+from master.calibrate.wrist.subject import Subject, calibrate_subject
+from master.calibrate.wrist.subject_model import Unknown
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.recorded import recorded_triples
 from master.summary import write_summary
@@ -36,7 +36,7 @@ Picture = Annotated[
 ]
 
 
-def wearer(
+def subject(
     recording: Recording,
     detections: Detections,
     hand: Hand = None,
@@ -58,7 +58,7 @@ def wearer(
 
       phalanx-slave detect RECORDING --camera wrist --calibration calib_json -o found/detections_wrist.npz
 
-      phalanx-master calibrate wearer RECORDING --detections found --rig wrist --name me --out calib_json
+      phalanx-master calibrate subject RECORDING --detections found --rig wrist --name me --out calib_json
     """
     device = device_of(recording, rig, calibration, out)
     if device.rig.T_camera_palm is None:
@@ -69,14 +69,14 @@ def wearer(
     profile = load(hand or _hand_of(device.rig.hand, calibration, out), HandProfile)
     triples = list(recorded_triples(detections, device.camera.name))
     try:
-        found = calibrate_wearer(triples, device.rig, device.camera, profile, device.source)
+        found = calibrate_subject(triples, device.rig, device.camera, profile, device.source)
     except FitError as error:
         raise FitError(f"{recording}: {error}") from error
     say(found.report)
     if picture is not None:
-        from master.calibrate.wrist.wearer_picture import draw_wearer  # matplotlib takes a second to import
+        from master.calibrate.wrist.subject_picture import draw_subject  # matplotlib takes a second to import
 
-        draw_wearer(picture, found, device.optics)
+        draw_subject(picture, found, device.optics)
         typer.echo(f"drew {picture}")
     new = replace(found.hand, name=name or profile.name)
     written = _write(out, device, found, new)
@@ -91,7 +91,7 @@ def _hand_of(name: str, calibration: Path, out: Path | None) -> Path:
     return next((path for path in paths if path.exists()), paths[-1])
 
 
-def _write(out: Path | None, device: Device, found: Wearer, hand: HandProfile) -> list[str]:
+def _write(out: Path | None, device: Device, found: Subject, hand: HandProfile) -> list[str]:
     """Write hand and rig, which names the hand; their paths, none without a tree."""
     rig = write_device(out, device, replace(found.rig, hand=hand.name), "T_camera_palm, hand")
     if out is None or rig is None:
@@ -101,7 +101,7 @@ def _write(out: Path | None, device: Device, found: Wearer, hand: HandProfile) -
     return [str(rig), str(path)]
 
 
-def summary(found: Wearer) -> dict[str, object]:
+def summary(found: Subject) -> dict[str, object]:
     """What was measured, as numbers."""
     sigma = Unknown.of(np.sqrt(np.diag(found.fit.covariance)))
     new = found.unknown

@@ -23,7 +23,7 @@ ROUNDS = 12  # what is left then is below 0.1 mm, at worst where fingers are par
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RoundCones:
+class TaperedCapsules:
     """Cones of any leading shape.
 
     Attributes:
@@ -37,15 +37,15 @@ class RoundCones:
     growth_m: Float
 
     @classmethod
-    def of_segments(cls, joints_m: Float, radius_m: Float) -> "RoundCones":
+    def of_segments(cls, joints_m: Float, radius_m: Float) -> "TaperedCapsules":
         """Segments (..., 5, 3), thumb ... little, from the root on, of joints (..., 26, 3) and radii (26,) [m]."""
         chain, radius = joints_m[..., CHAINS, :], radius_m[CHAINS]
         return cls(chain[..., :-1, :], np.diff(chain, axis=-2), radius[..., :-1], np.diff(radius, axis=-1))
 
-    def part(self, *at: int | slice | None) -> "RoundCones":
+    def part(self, *at: int | slice | None) -> "TaperedCapsules":
         """Some of the segments: indices into the two last axes, (finger, segment)."""
         where, place = (..., *at), (..., *at, slice(None))
-        return RoundCones(
+        return TaperedCapsules(
             self.start_m[place], self.along_m[place], self.radius_m[where], self.growth_m[where]
         )
 
@@ -68,7 +68,7 @@ class Gaps:
     a_to_b: Float
 
 
-def gaps_between(a: RoundCones, b: RoundCones) -> Gaps:
+def gaps_between(a: TaperedCapsules, b: TaperedCapsules) -> Gaps:
     """The gaps of cones against cones, broadcast against each other."""
     apart = b.start_m - a.start_m
     uu, vv = np.vecdot(a.along_m, a.along_m), np.vecdot(b.along_m, b.along_m)

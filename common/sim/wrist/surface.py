@@ -13,9 +13,9 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.flat_field import flat_of
-from common.round_cones import Cones, Plane, first_hits, terms
 from common.sim.wrist.scene import WristScene
 from common.sim.wrist.things import ALBEDO
+from common.tapered_capsules import Capsules, Plane, first_hits, terms
 
 CREASE_M, CREASE_DEPTH = 0.0008, 0.08
 PALM_SMOOTH_PX = 9.0  # about 2 mm at the palm's distance
@@ -27,7 +27,7 @@ _ORIGIN = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SkinView:
+class SurfaceView:
     """Seen skin (N,).
 
     Attributes:
@@ -47,11 +47,11 @@ class SkinView:
 class Palm:
     """The palm where no finger is before it: what is seen of it, and how far along each ray it begins (H * W,) [m]."""
 
-    seen: SkinView
+    seen: SurfaceView
     depth: Plane
 
 
-class Skin:
+class HandSurface:
     """The grid and the palm of one scene. Holds what was prepared by the constructor, and the last palm by its bend.
 
     Attributes:
@@ -71,17 +71,17 @@ class Skin:
         self._rays = np.ascontiguousarray(rays.T, dtype=np.float32)
         self._texture = _texture(np.random.default_rng([scene.seed, 41]))
         self._straight_bodies = scene.straight_bodies()
-        self.straight = self._palm(self._straight_bodies, range(scene.flesh.still))
+        self.straight = self._palm(self._straight_bodies, range(scene.capsules.still))
         # The forearm lies as it does whatever the wrist does; outside the picture nobody need look for it.
-        forearm = scene.flesh.forearm.tolist()
+        forearm = scene.capsules.forearm.tolist()
         met = self._cast(self._straight_bodies, forearm, np.full(len(rays), np.inf, dtype=np.float32))
         outside = set(forearm) - set(np.unique(met).tolist())
-        self._turning = [body for body in range(scene.flesh.still) if body not in outside]
+        self._turning = [body for body in range(scene.capsules.still) if body not in outside]
 
-    def palm(self, bodies: Cones, bend_rad: Float) -> Palm:
+    def palm(self, bodies: Capsules, bend_rad: Float) -> Palm:
         """The palm of a hand whose flesh is at `bodies`, of a wrist bent by that (2,); `straight` itself while it is
         straight."""
-        if self._scene.flesh.same_palm(bodies, self._straight_bodies):
+        if self._scene.capsules.same_palm(bodies, self._straight_bodies):
             return self.straight
         if self._bend_step_rad <= 0.0:
             return self._palm(bodies, self._turning)
@@ -91,24 +91,24 @@ class Skin:
             self._bent = steps, self._palm(rounded, self._turning)
         return self._bent[1]
 
-    def appearance(self, bodies: Cones, palm: Palm) -> SkinView:
+    def appearance(self, bodies: Capsules, palm: Palm) -> SurfaceView:
         """What is seen of fingers, thumb and things, of a hand whose flesh is at `bodies`, before its palm."""
         depth = palm.depth.copy()
-        hit = self._cast(bodies, range(self._scene.flesh.still, len(bodies.start_m)), depth)
+        hit = self._cast(bodies, range(self._scene.capsules.still, len(bodies.start_m)), depth)
         return self._view(bodies, np.flatnonzero(hit >= 0), hit, depth)
 
-    def _palm(self, bodies: Cones, which: Iterable[int]) -> Palm:
+    def _palm(self, bodies: Capsules, which: Iterable[int]) -> Palm:
         depth = np.full(self._rays.shape[1], np.inf, dtype=np.float32)
         hit = self._cast(bodies, which, depth)
         return Palm(self._smooth(self._view(bodies, np.flatnonzero(hit >= 0), hit, depth)), depth)
 
-    def _view(self, bodies: Cones, pixel: Int, hit: Int, depth: Plane) -> SkinView:
+    def _view(self, bodies: Capsules, pixel: Int, hit: Int, depth: Plane) -> SurfaceView:
         points = np.ascontiguousarray((self._rays[:, pixel] * depth[pixel]).T)
         body = hit[pixel]
         normals = bodies.normals(body, points)
-        return SkinView(pixel, points, normals, self._albedo(bodies, body, points, normals))
+        return SurfaceView(pixel, points, normals, self._albedo(bodies, body, points, normals))
 
-    def _cast(self, bodies: Cones, which: Iterable[int], depth: Plane) -> Int:
+    def _cast(self, bodies: Capsules, which: Iterable[int], depth: Plane) -> Int:
         """Bring nearer `depth` (H * W,) [m] along the rays; say by which body (H * W,), -1: by none of them."""
         low, high = self._boxes(bodies)
         known = terms(bodies, _ORIGIN, np.float32)
@@ -126,7 +126,7 @@ class Skin:
             np.copyto(hit[box], b, where=nearer)
         return hit.ravel()
 
-    def _boxes(self, bodies: Cones) -> tuple[Int, Int]:
+    def _boxes(self, bodies: Capsules) -> tuple[Int, Int]:
         """Corners (B, 2) of the boxes on the grid that hold the images of the bodies."""
         centre = np.stack([bodies.start_m, bodies.stop_m], axis=1)
         square = np.stack([bodies.start_radius_m, bodies.stop_radius_m], axis=1) ** 2
@@ -151,7 +151,7 @@ class Skin:
         size = np.array(self.size)
         return np.clip(first, 0, size).astype(np.int64), np.clip(last, 0, size).astype(np.int64)
 
-    def _albedo(self, bodies: Cones, body: Int, points: Plane, normals: Plane) -> Plane:
+    def _albedo(self, bodies: Capsules, body: Int, points: Plane, normals: Plane) -> Plane:
         """Skin is never even: blotches that stay on their body, dark lines across it where a joint is. Things are."""
         axis = bodies.stop_m - bodies.start_m
         axis /= np.linalg.norm(axis, axis=1, keepdims=True)
@@ -165,10 +165,10 @@ class Skin:
         texture = self._texture[row & last, (column + 37 * body) & last]
         albedo = texture * (1.0 - CREASE_DEPTH * np.exp(-((along / np.float32(CREASE_M)) ** 2)))
         # Things give back what they do, however bright the skin of this hand is.
-        albedo[body >= len(self._scene.flesh.group)] = ALBEDO / self._scene.reflectance
+        albedo[body >= len(self._scene.capsules.group)] = ALBEDO / self._scene.reflectance
         return albedo
 
-    def _smooth(self, palm: SkinView) -> SkinView:
+    def _smooth(self, palm: SurfaceView) -> SurfaceView:
         """Fill the gaps between the bones as flesh does: normals of the smoothed surface."""
         if not len(palm.pixel):  # bent out of the picture
             return palm
@@ -187,7 +187,7 @@ class Skin:
         smooth = cloud.reshape(-1, 4)[palm.pixel]
         normals = smooth[:, :3] / np.maximum(smooth[:, 3:], 1e-3)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        return SkinView(palm.pixel, palm.points, normals, palm.albedo)
+        return SurfaceView(palm.pixel, palm.points, normals, palm.albedo)
 
 
 def _flat_field(scene: WristScene, rays: Float) -> Float:

@@ -1,7 +1,7 @@
-"""The most probable wearer of a device, given what was seen of a guided motion: one least-squares problem.
+"""The most probable subject of a device, given what was seen of a guided motion: one least-squares problem.
 
 Laser point and tip give four numbers of a finger in a triple, its angles are three unknowns; so what is known of the
-wearer comes from habits as well, and each is believed as far as people keep it. A flat hand is flat and a finger that
+subject comes from habits as well, and each is believed as far as people keep it. A flat hand is flat and a finger that
 bends at its knuckle is straight, to a few degrees; a fist closes in natural ratios, about. Knuckles, thickness and
 length are those of a hand of its size, about. What none of that determines keeps what is believed, and the
 covariance says so: above all, a knuckle that lies farther from the camera looks like a thicker finger, and all
@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.hand_skin import SPREAD
+from common.palmar_surface import SPREAD
 from master.calibrate.wrist.guided import FLAT
-from master.calibrate.wrist.wearer_model import ABDUCTION, LOCAL, MCP, PIP, UNKNOWN, WearerModel
+from master.calibrate.wrist.subject_model import ABDUCTION, LOCAL, MCP, PIP, UNKNOWN, SubjectModel
 
 _LASER_SIGMA_M = 8e-4  # of skin of another shape than the cones
 _TIP_SIGMA_M = 2e-3  # what is seen as the tip of a finger is anywhere on its pulp
@@ -63,10 +63,10 @@ class ImageObservations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """The most probable wearer.
+    """The most probable subject.
 
     Attributes:
-        x: (26,) as of `wearer_model.Unknown`.
+        x: (26,) as of `subject_model.Unknown`.
         covariance: (26, 26).
         prior_sigma: (26,) what was believed before.
         angles_rad: (T, 4, 3) abduction, MCP, PIP.
@@ -97,12 +97,12 @@ class Fit:
 
 
 def prior_sigma(pose: Float, length: Float) -> Float:
-    """What is believed of a wearer (26,), with the palm's pose (6,) [rad, m] and the lengths of fingers (4,)."""
+    """What is believed of a subject (26,), with the palm's pose (6,) [rad, m] and the lengths of fingers (4,)."""
     return np.r_[pose, np.full(12, _KNUCKLE_M), np.full(4, SPREAD), length]
 
 
-def fit_wearer(model: WearerModel, seen: ImageObservations, sigma: Float) -> Fit:
-    """Fit wearer and angles.
+def fit_subject(model: SubjectModel, seen: ImageObservations, sigma: Float) -> Fit:
+    """Fit subject and angles.
 
     Args:
         model: Forward function about the first guess.
@@ -128,7 +128,7 @@ class _Guess:
 class _Problem:
     """Residuals, habits and steps. What it holds was prepared by the constructor."""
 
-    def __init__(self, model: WearerModel, seen: ImageObservations, sigma: Float) -> None:
+    def __init__(self, model: SubjectModel, seen: ImageObservations, sigma: Float) -> None:
         self._model, self._bend, self.prior_sigma = model, seen.bend, sigma
         self._data = np.concatenate([seen.laser_m, seen.tip_uv], axis=-1)
         tip_px = np.hypot(np.nan_to_num(seen.tip_sigma_px), _TIP_SIGMA_M * model.px_per_m)

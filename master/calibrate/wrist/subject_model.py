@@ -1,6 +1,6 @@
-"""What a wrist device sees of a hand of which little is known: the forward function of a wearer, and its derivatives.
+"""What a wrist device sees of a hand of which little is known: the forward function of a subject, and its derivatives.
 
-Unknown of the wearer (26) are the palm's pose, and of each of the four fingers where its knuckle is, how thick it is
+Unknown of the subject (26) are the palm's pose, and of each of the four fingers where its knuckle is, how thick it is
 and how long. Unknown in each triple are three angles of each finger; the DIP follows the PIP. What is seen are the
 laser point on its plane and the fingertip. Both are reckoned as the master does it (`master.calibrate.laser_cut`,
 `common.fingertips`), so that what is fitted is what will be used.
@@ -17,7 +17,7 @@ from common.calibration import Finger, HandProfile
 from common.fingertips import Fingertips
 from common.geometry import rigid, rotation_vector_to_matrix, transform
 from common.hand_model import CHAINS, JOINTS, Chains, HandModel
-from common.hand_skin import Skin
+from common.palmar_surface import PalmarSurface
 from master.calibrate.laser_cut import LaserCut
 from master.estimator.laser_plane import PlaneAxes
 from master.estimator.natural_curve import DIP, NaturalCurve
@@ -32,7 +32,7 @@ _TURN_STEP, _SHIFT_STEP, _SHARE_STEP = np.radians(0.5), 5e-4, 0.02  # of central
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Unknown:
-    """What is unknown of a wearer, as changes of a setup.
+    """What is unknown of a subject, as changes of a setup.
 
     Attributes:
         pose: (6,) turn [rad] about the wrist joint and shift [m] of the palm, camera axes. A strap holds a device at
@@ -52,11 +52,11 @@ class Unknown:
         return cls(x[:6], x[6:18].reshape(4, 3), x[18:22], x[22:26])
 
 
-class WearerModel:
+class SubjectModel:
     """Laser points and tips of one device and hand by unknowns. What it holds was prepared by the constructor."""
 
     def __init__(self, setup: WristSetup) -> None:
-        self._setup, self._skin, self._axes = setup, Skin.of(setup.model), PlaneAxes.of(setup)
+        self._setup, self._surface, self._axes = setup, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
         self._cut, self._tips = LaserCut(setup, _RAYS), Fingertips.of(setup.model)
         self._root = setup.model.rest_position_m[CHAINS[:, 0]]
         curve = NaturalCurve.of(setup.model)
@@ -98,7 +98,7 @@ class WearerModel:
             x: (26,) as of `Unknown`.
             angles: (T, 4, 3) abduction, MCP, PIP [rad].
         """
-        return self._seen([self._skinned(Unknown.of(x), angles)])[0]
+        return self._seen([self._surface_of(Unknown.of(x), angles)])[0]
 
     def derivatives(self, x: Float, angles: Float) -> tuple[Float, Float]:
         """How that moves with what is unknown, (T, 4, 4, 26), and with the angles, (T, 4, 4, 3); 0 where not known."""
@@ -106,13 +106,13 @@ class WearerModel:
         ways = np.zeros((8, UNKNOWN))
         ways[:6, :6] = np.eye(6)
         ways[6, 18:22] = ways[7, 22:26] = 1.0
-        skinned: list[tuple[Float, Float, Float]] = []
+        surfaces: list[tuple[Float, Float, Float]] = []
         for way, step in zip(ways, steps, strict=True):
-            skinned += [self._skinned(Unknown.of(x + sign * step * way), angles) for sign in (1.0, -1.0)]
+            surfaces += [self._surface_of(Unknown.of(x + sign * step * way), angles) for sign in (1.0, -1.0)]
         for k in range(LOCAL):
             turn = _TURN_STEP * np.eye(LOCAL)[k]
-            skinned += [self._skinned(Unknown.of(x), angles + sign * turn) for sign in (1.0, -1.0)]
-        seen = self._seen(skinned)
+            surfaces += [self._surface_of(Unknown.of(x), angles + sign * turn) for sign in (1.0, -1.0)]
+        seen = self._seen(surfaces)
         half = np.r_[steps, np.full(LOCAL, _TURN_STEP)]
         slope = np.nan_to_num((seen[0::2] - seen[1::2]) / (2.0 * half[:, None, None, None]))
         out = np.zeros((*angles.shape[:2], 4, UNKNOWN))
@@ -124,7 +124,7 @@ class WearerModel:
             out[:, f, :, 18 + f], out[:, f, :, 22 + f] = slope[6, :, f], slope[7, :, f]
         return out, np.moveaxis(slope[8:], 0, -1)
 
-    def _skinned(self, unknown: Unknown, angles: Float) -> tuple[Float, Float, Float]:
+    def _surface_of(self, unknown: Unknown, angles: Float) -> tuple[Float, Float, Float]:
         """Spheres (T, 4, K, 3) [m], their radii (4, K), and the tips (T, 4, 3) [m], camera frame."""
         whole = np.zeros((len(angles), 5, 4))
         whole[:, FINGERS, :3] = angles
@@ -138,29 +138,29 @@ class WearerModel:
         )
         root = self._root[:, None]
         chains = Chains(root + shift + long * (chains.position_m - root), chains.rotation)
-        skin = Skin(thick * self._skin.palmar_m, thick * self._skin.radius_m)
-        spheres = skin.spheres(chains)
+        surface = PalmarSurface(thick * self._surface.palmar_m, thick * self._surface.radius_m)
+        spheres = surface.spheres(chains)
         tips, palm = self._tips.points(chains), self.palm(unknown)
         return (
             transform(palm, spheres[:, FINGERS]),
-            skin.radius_m[FINGERS],
+            surface.radius_m[FINGERS],
             transform(palm, tips[:, FINGERS]),
         )
 
-    def _seen(self, skinned: list[tuple[Float, Float, Float]]) -> Float:
+    def _seen(self, surfaces: list[tuple[Float, Float, Float]]) -> Float:
         """(P, T, 4, 4) laser points and tips of P hands."""
-        spheres = np.stack([one[0] for one in skinned])
-        radius = np.stack([one[1] for one in skinned])[:, None]
+        spheres = np.stack([one[0] for one in surfaces])
+        radius = np.stack([one[1] for one in surfaces])[:, None]
         line = self._cut.line(spheres, radius, np.bool_(False))
-        tips = self._setup.optics.project(np.stack([one[2] for one in skinned]))
+        tips = self._setup.optics.project(np.stack([one[2] for one in surfaces]))
         return np.concatenate([line.point_m, tips], axis=-1)
 
 
-def wearing(model: HandModel, unknown: Unknown) -> HandProfile:
-    """The hand file with the knuckles, lengths and thickness of its wearer."""
+def fitted_profile(model: HandModel, unknown: Unknown) -> HandProfile:
+    """The hand file with the knuckles, lengths and thickness of its subject."""
     place, thick = (
         model.rest_position_m.copy(),
-        Skin.of(model).palmar_m[FINGERS] * np.exp(unknown.thick)[:, None],
+        PalmarSurface.of(model).palmar_m[FINGERS] * np.exp(unknown.thick)[:, None],
     )
     for f, chain in enumerate(CHAINS[FINGERS]):
         root = place[chain[0]].copy()
@@ -173,7 +173,7 @@ def wearing(model: HandModel, unknown: Unknown) -> HandProfile:
     names: tuple[Finger, ...] = get_args(Finger)[FINGERS]
     # Without radii the breadth of the knuckles tells the thickness, and they have moved.
     without = {name: scale for name, scale in plain.palmar_scale.items() if name not in names}
-    typical = Skin.of(HandModel.of(replace(plain, palmar_scale=without))).palmar_m[FINGERS]
+    typical = PalmarSurface.of(HandModel.of(replace(plain, palmar_scale=without))).palmar_m[FINGERS]
     scale = (thick / typical).mean(axis=1)
     told = {name: round(float(value), 4) for name, value in zip(names, scale, strict=True)}
     return replace(plain, palmar_scale=without | told)

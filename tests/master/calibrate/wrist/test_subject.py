@@ -9,22 +9,22 @@ import pytest
 import typer
 from msgspec.structs import replace
 
-from bench.wrist_wearers import CALIB, Person, knuckles
+from bench.wrist_subjects import CALIB, Person, knuckles
 from common.arrays import Float
 from common.calibration import HandProfile, RigCalibration, load, parse, save
 from common.errors import CalibrationError, FitError
 from common.geometry import rotation_vector_to_matrix, transform
 from common.hand_model import CHAINS, HandModel
-from common.hand_skin import Skin
 from common.messages import WristDetections
 from common.npz import write_npz
+from common.palmar_surface import PalmarSurface
 from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.cli import calibrate_app
 from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.guided import FLAT, guided
-from master.calibrate.wrist.wearer import Wearer, calibrate_wearer
-from master.calibrate.wrist.wearer_fit import fists_of
-from master.calibrate.wrist.wearer_model import UNKNOWN, Unknown, WearerModel, wearing
+from master.calibrate.wrist.subject import Subject, calibrate_subject
+from master.calibrate.wrist.subject_fit import fists_of
+from master.calibrate.wrist.subject_model import UNKNOWN, SubjectModel, Unknown, fitted_profile
 from master.wrist_setup import WristSetup
 
 ANGLES = np.radians(
@@ -45,23 +45,23 @@ def people() -> dict[int, Person]:
 @pytest.fixture(scope="module")
 def motions(people: dict[int, Person]) -> dict[int, list[WristDetections]]:
     """The guided motion of each, as seen."""
-    return {seed: person.detected("wearer")[0] for seed, person in people.items()}
+    return {seed: person.detected("subject")[0] for seed, person in people.items()}
 
 
 @pytest.fixture(scope="module")
-def wearers(people: dict[int, Person], motions: dict[int, list[WristDetections]]) -> dict[int, Wearer]:
+def subjects(people: dict[int, Person], motions: dict[int, list[WristDetections]]) -> dict[int, Subject]:
     """What is made of it."""
     return {
-        seed: calibrate_wearer(motions[seed], person.rig, person.camera, person.hand)
+        seed: calibrate_subject(motions[seed], person.rig, person.camera, person.hand)
         for seed, person in people.items()
     }
 
 
 @pytest.mark.parametrize("seed", [40, 41])
 def test_knuckles_5_mm_off_and_a_palm_askew_are_found_within_stated_sigma(
-    people: dict[int, Person], wearers: dict[int, Wearer], seed: int
+    people: dict[int, Person], subjects: dict[int, Subject], seed: int
 ) -> None:
-    person, found = people[seed], wearers[seed]
+    person, found = people[seed], subjects[seed]
     turn_before, before = person.errors(person.rig, person.hand)
     turn, after = person.errors(found.rig, found.hand)
     assert np.sqrt(np.mean(after**2)) < 0.75 * np.sqrt(np.mean(before**2))
@@ -72,7 +72,7 @@ def test_knuckles_5_mm_off_and_a_palm_askew_are_found_within_stated_sigma(
     # About y and z the palm is told by where fingers go aside, about x by the flat hand alone.
     assert np.linalg.norm(turn[1:]) < max(2.5, np.linalg.norm(turn_before[1:]))
     assert abs(turn[0]) < 3.0 * np.degrees(np.sqrt(found.fit.covariance[0, 0]))
-    assert found.rig.provenance["T_camera_palm"].tool == "calibrate wearer"
+    assert found.rig.provenance["T_camera_palm"].tool == "calibrate subject"
     assert {"knuckles", "palmar_scale"} <= found.hand.provenance.keys()
     # What is written is what was fitted.
     written = transform(np.array(found.rig.T_camera_palm), knuckles(found.hand))
@@ -80,22 +80,22 @@ def test_knuckles_5_mm_off_and_a_palm_askew_are_found_within_stated_sigma(
 
 
 def test_what_the_laser_cannot_tell_keeps_its_belief_and_says_so(
-    people: dict[int, Person], motions: dict[int, list[WristDetections]], wearers: dict[int, Wearer]
+    people: dict[int, Person], motions: dict[int, list[WristDetections]], subjects: dict[int, Subject]
 ) -> None:
-    person, triples, found = people[40], motions[40], wearers[40]
+    person, triples, found = people[40], motions[40], subjects[40]
     told = Unknown.of(np.sqrt(np.diag(found.fit.covariance)) / found.fit.prior_sigma)
     assert told.knuckle_m[:, 0].max() < 0.7  # across
     assert told.thick.min() > 0.8  # a thicker finger looks like a knuckle farther away
     # With a palm that a board has placed, knuckles are known better.
     rig = replace(person.true_rig, provenance={"T_camera_palm": provenance("calibrate palm", (), {})})
-    placed = calibrate_wearer(triples, rig, person.camera, person.hand)
+    placed = calibrate_subject(triples, rig, person.camera, person.hand)
     surer = Unknown.of(np.sqrt(np.diag(placed.fit.covariance)) / placed.fit.prior_sigma)
     assert (surer.knuckle_m[:, :2] < told.knuckle_m[:, :2]).all()  # across and up
     assert np.sqrt(np.mean(person.errors(placed.rig, placed.hand)[1] ** 2)) < 3.0
 
 
 def test_derivatives_are_those_of_the_function(people: dict[int, Person]) -> None:
-    model, rng = WearerModel(setup_of(people[41])), np.random.default_rng(0)
+    model, rng = SubjectModel(setup_of(people[41])), np.random.default_rng(0)
     x = 1e-3 * rng.standard_normal(UNKNOWN)
     by_x, by_angles = model.derivatives(x, ANGLES)
     way, turn = 3e-4 * rng.standard_normal(UNKNOWN), 3e-3 * rng.standard_normal(ANGLES.shape)
@@ -109,12 +109,12 @@ def test_the_files_written_show_what_was_fitted(people: dict[int, Person]) -> No
     person, rng = people[40], np.random.default_rng(1)
     for hand in (person.hand, replace(person.hand, radius_m=None)):
         setup = WristSetup.of(person.rig, person.camera, HandModel.of(hand))
-        model = WearerModel(setup)
+        model = SubjectModel(setup)
         x = rng.standard_normal(UNKNOWN) * np.r_[np.full(18, 1e-3), np.full(8, 0.02)]
         unknown = Unknown.of(x)
-        new = HandModel.of(wearing(setup.model, unknown))
+        new = HandModel.of(fitted_profile(setup.model, unknown))
         rig = replace(person.rig, T_camera_palm=matrix_of(model.palm(unknown)))
-        again = WearerModel(WristSetup.of(rig, person.camera, new))
+        again = SubjectModel(WristSetup.of(rig, person.camera, new))
         fitted, shown = model(x, ANGLES), again(np.zeros(UNKNOWN), ANGLES)
         np.testing.assert_allclose(shown[..., :2], fitted[..., :2], atol=3e-4)
         np.testing.assert_allclose(shown[..., 2:], fitted[..., 2:], atol=2.0)
@@ -177,8 +177,8 @@ def test_a_motion_without_its_parts_is_refused(seen: Float, match: str) -> None:
     [
         ("half", "bent at their knuckles to index .* bend them towards 90 deg|never bends straight fingers"),
         ("fists", "never bends straight fingers at their knuckles"),
-        ("hand", "no likely wearer.*hand file that of this hand and side"),
-        ("plane", "no likely wearer.*laser plane measured|never|bent at their knuckles"),
+        ("hand", "no likely subject.*hand file that of this hand and side"),
+        ("plane", "no likely subject.*laser plane measured|never|bent at their knuckles"),
     ],
 )
 def test_what_tells_nothing_or_a_lie_is_refused(
@@ -198,14 +198,14 @@ def test_what_tells_nothing_or_a_lie_is_refused(
         x, y, z = turned.tolist()
         rig = replace(rig, laser_plane=replace(rig.laser_plane, normal=(x, y, z)))
     with pytest.raises(FitError, match=match):
-        calibrate_wearer(triples, rig, person.camera, hand)
+        calibrate_subject(triples, rig, person.camera, hand)
 
 
 def test_a_hand_file_says_how_thick_its_fingers_are(people: dict[int, Person]) -> None:
     hand = people[40].hand
     for plain in (hand, replace(hand, radius_m=None)):
         typical, thick = (
-            Skin.of(HandModel.of(one)) for one in (plain, replace(plain, palmar_scale={"ring": 1.2}))
+            PalmarSurface.of(HandModel.of(one)) for one in (plain, replace(plain, palmar_scale={"ring": 1.2}))
         )
         ratio = thick.palmar_m / typical.palmar_m
         np.testing.assert_allclose(ratio[3], 1.2)
@@ -238,7 +238,7 @@ def test_the_command_writes_rig_and_hand_and_draws(
         for key in ("t_ns", "seq", "laser_uv", "laser_sigma_px", "tip_uv", "tip_sigma_px")
     }
     write_npz(tmp_path / "found" / f"detections_{person.camera.name}.npz", columns)
-    out, picture = tmp_path / "out", tmp_path / "wearer.png"
+    out, picture = tmp_path / "out", tmp_path / "subject.png"
     options = [
         "--detections",
         tmp_path / "found",
@@ -249,7 +249,7 @@ def test_the_command_writes_rig_and_hand_and_draws(
     ]
     options += ["--name", "me", "--out", out, "--picture", picture, "--json", tmp_path / "told.json"]
     app = typer.main.get_command(calibrate_app())
-    app.main(["wearer", str(tmp_path / "guided"), *map(str, options)], standalone_mode=False)
+    app.main(["subject", str(tmp_path / "guided"), *map(str, options)], standalone_mode=False)
     rig = load(out / "rigs" / f"{person.rig.name}.json", RigCalibration)
     hand = load(out / "hands" / "me.json", HandProfile)
     assert rig.hand == hand.name == "me"
