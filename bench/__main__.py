@@ -54,7 +54,7 @@ SECTIONS = {
     "wrist_mounting": "How a wrist device sits, its clocks, from 10 s with markers: noisy truth, rendered; exact truth",
     "tracker": "A Vive tracker registered to the cameras from 12 s, and its clock; goal 3 mm, 2 deg; exact truth",
     "objects": "Objects of beads and of tags at half a metre, rendered, detected, partly hidden; goal 3 mm, 2 deg",
-    "beside_cost": "Processor time of objects, contact and gestures, pose by pose; baseline: the hand's fit",
+    "auxiliary_cost": "Processor time of objects, contact and gestures, pose by pose; baseline: the hand's fit",
     "watched_cost": "A master with console, recording and four outputs; baseline: the same process without",
     "recording": "Raw frames to disk; baseline: PNG of level 1, and encoding and writing in the camera loop",
     "occlusion": "Finger tips that no two cameras see, in six poses: two pairs of cameras; baseline: one pair",

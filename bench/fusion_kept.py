@@ -69,8 +69,8 @@ def _digest() -> str:
 def _write(path: Path, made: Shown) -> None:
     coded = [encode(message) for message in made.messages]
     line_of_sight = made.line_of_sight
-    cameras = {f"paint_t_s.{name}": times for name, times in line_of_sight.paint_t_s.items()}
-    cameras |= {f"paint_px2.{name}": area for name, area in line_of_sight.paint_px2.items()}
+    cameras = {f"visible_t_s.{name}": times for name, times in line_of_sight.visible_t_s.items()}
+    cameras |= {f"visible_px2.{name}": area for name, area in line_of_sight.visible_px2.items()}
     write_npz(
         path,
         {
@@ -90,8 +90,8 @@ def _read(path: Path, both: Both, seconds: float) -> Shown:
     messages = [cast(Observed, decode(coded[a:b])) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
     names = both.markers.rig.cameras
     line_of_sight = Sight(
-        {name: data[f"paint_t_s.{name}"] for name in names},
-        {name: data[f"paint_px2.{name}"] for name in names},
+        {name: data[f"visible_t_s.{name}"] for name in names},
+        {name: data[f"visible_px2.{name}"] for name in names},
         data["line_t_s"],
         data["line_m"],
         np.asarray(data["tip"], np.bool_),

@@ -80,15 +80,15 @@ class Sight:
     """What is truly in sight, frame by frame.
 
     Attributes:
-        paint_t_s: Camera -> (T,) scene times [s] of its frames.
-        paint_px2: Camera -> (T, M) visible area of every marker [px^2].
+        visible_t_s: Camera -> (T,) scene times [s] of its frames.
+        visible_px2: Camera -> (T, M) visible area of every marker [px^2].
         line_t_s: (K,) scene times [s] of the wrist device's triples.
         line_m: (K, 5) length of the laser line on each finger that is lit and seen [m].
         tip: (K, 5) whether each fingertip is in sight of the wrist camera.
     """
 
-    paint_t_s: Mapping[str, Float]
-    paint_px2: Mapping[str, Float]
+    visible_t_s: Mapping[str, Float]
+    visible_px2: Mapping[str, Float]
     line_t_s: Float
     line_m: Float
     tip: Bool
@@ -98,9 +98,9 @@ class Sight:
 
         `without` (N,) says when the markers' stream is cut off.
         """
-        count = np.zeros((len(t_s), next(iter(self.paint_px2.values())).shape[1]), np.int64)
-        for name, times in self.paint_t_s.items():
-            count += _about(t_s, times, self.paint_px2[name] >= SPOT_PX2, within_s)
+        count = np.zeros((len(t_s), next(iter(self.visible_px2.values())).shape[1]), np.int64)
+        for name, times in self.visible_t_s.items():
+            count += _about(t_s, times, self.visible_px2[name] >= SPOT_PX2, within_s)
         return count if without is None else np.where(without[:, None], 0, count)
 
     def in_wrist_sight(self, t_s: Float, within_s: float, without: Bool | None = None) -> Bool:

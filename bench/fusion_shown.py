@@ -20,7 +20,7 @@ from bench.fusion_scene import Both, Observed, Shown, Sight, in_order, orientati
 from bench.played import START_NS, times_of
 from common.arrays import Bool, Float
 from common.messages import MarkerDetections, WristDetections
-from common.sim.paint import MarkerView
+from common.sim.painter import MarkerView
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from common.sim.wrist.scene import WristTruth
@@ -71,16 +71,16 @@ def shown(name: str, seconds: float, seed: int, every: int = 1) -> Shown:
 def shown_of(both: Both, seconds: float, every: int = 1) -> Shown:
     """The same of a scene before other rigs."""
     messages = orientations(both, seconds)
-    times, paint = dict[str, Float](), dict[str, Float]()
+    times, visible_area = dict[str, Float](), dict[str, Float]()
     for camera in both.markers.rig.cameras:
         rate = both.markers.cameras[camera].frame_rate_hz / every
         times[camera] = times_of(both.scene, camera, seconds, rate)
-        found, paint[camera] = markers_shown(both.scene, camera, times[camera], 1.0 / rate, both.seed)
+        found, visible_area[camera] = markers_shown(both.scene, camera, times[camera], 1.0 / rate, both.seed)
         messages += found
     frame_s = 1.0 / both.wrist.cameras[both.wrist.rig.cameras[0]].frame_rate_hz
     line_t = np.arange(1.0, seconds / frame_s - 1.0, 3.0) * frame_s
     triples, line, tip = _triples(both, line_t, frame_s)
-    return Shown(both, seconds, in_order(messages + triples), Sight(times, paint, line_t, line, tip))
+    return Shown(both, seconds, in_order(messages + triples), Sight(times, visible_area, line_t, line, tip))
 
 
 def markers_shown(
@@ -93,14 +93,14 @@ def markers_shown(
     least, lasting = _Wander(rng, (count,), step_s), _Wander(rng, (count, 2), step_s)
     renderer = Renderer(scene, camera)
     out: list[MarkerDetections] = []
-    paint: list[Float] = []
+    visible_area: list[Float] = []
     for seq, t in enumerate(times_s.tolist()):
         view = renderer.markers(t)
-        paint.append(np.where(np.isfinite(view.uv[:, 0]), view.area, 0.0))
+        visible_area.append(np.where(np.isfinite(view.uv[:, 0]), view.area, 0.0))
         off = 0.8 * lasting() + 0.6 * rng.normal(size=(count, 2))
         found = view.area > _SPOT_PX2 + _SPOT_SPREAD_PX2 * least()
         out.append(_marker_message(camera, seq, START_NS + round(t * 1e9), view, found, off))
-    return out, np.array(paint)
+    return out, np.array(visible_area)
 
 
 def _marker_message(

@@ -35,7 +35,7 @@ from master.rig_pipeline import pipeline_of
 from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from master.study.participant import Participant, participant, turned
-from slave.markers.following import detector_for
+from slave.markers.light_adaptive import detector_for
 from slave.markers.workers import Inline
 
 CALIBRATION = Path(__file__).parent.parent / "calib_json"

@@ -21,8 +21,8 @@ from common.sim.illuminant import CALIBRATED_KELVIN, LightCourse
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from slave.markers.detector import Detections, MarkerDetector
-from slave.markers.following import FollowingDetector
-from slave.markers.light import apart
+from slave.markers.light_adaptive import LightAdaptiveDetector
+from slave.markers.white_balance import apart
 from slave.markers.workers import Inline
 
 CALIBRATION = Path(__file__).resolve().parents[1] / "calib_json"
@@ -189,8 +189,8 @@ def outcome(
     """Judge one camera on one course; deterministic."""
     scene = replace(standard_scene(seed), light=course)
     renderer, model = Renderer(scene, camera), scene.cameras[camera]
-    following = FollowingDetector(model, scene.rig.markers, Inline()) if follow else None
-    detector: Detector = MarkerDetector(model, scene.rig.markers) if following is None else following
+    adaptive = LightAdaptiveDetector(model, scene.rig.markers, Inline()) if follow else None
+    detector: Detector = MarkerDetector(model, scene.rig.markers) if adaptive is None else adaptive
     got, warned = Outcome(0, 0, 0, 0, 0, 0, 0.0, 0), False
     for k in range(round(seconds * RATE_HZ)):
         t_s = begin_s + k / RATE_HZ
@@ -200,14 +200,14 @@ def outcome(
         allowed = np.maximum(FREE_PX, np.sqrt(truth.area / np.pi))
         swaps, wrong = _misplaced(found.uv, truth.uv, allowed)
         light = 0.0
-        if following is not None:
-            warned = warned or bool(following.warnings)
+        if adaptive is not None:
+            warned = warned or bool(adaptive.warnings)
             if k >= RATE_HZ:
-                light = apart(following.log_gains, np.log(course.gains_bgr(t_s)), dim=0.0)
+                light = apart(adaptive.log_gains, np.log(course.gains_bgr(t_s)), dim=0.0)
         missed = int((visible & ~seen).sum())
         unwarned = (0, 0) if warned else (swaps, missed)
         got += Outcome(int(visible.sum()), int((visible & seen).sum()), swaps, wrong, *unwarned, light, 0)
-    return replace(got, refused=0 if following is None else following.refused)
+    return replace(got, refused=0 if adaptive is None else adaptive.refused)
 
 
 def _misplaced(uv: Float, truth: Float, allowed: Float) -> tuple[int, int]:
@@ -229,10 +229,10 @@ def _times() -> list[Row]:
     camera = scene.cameras[scene.rig.cameras[0]]
     image = Renderer(scene, camera.name).render(OPEN_S)
     plain = MarkerDetector(camera, scene.rig.markers)
-    following = FollowingDetector(camera, scene.rig.markers, Inline())
+    adaptive = LightAdaptiveDetector(camera, scene.rig.markers, Inline())
     samples = np.empty((300, 2))
     for k in range(len(samples)):
-        for i, detector in enumerate((plain, following)):
+        for i, detector in enumerate((plain, adaptive)):
             start_ns = perf_counter_ns()
             detector.push(image, k * 16_666_667)
             samples[k, i] = (perf_counter_ns() - start_ns) * 1e-3

@@ -24,7 +24,7 @@ from common.sim.scene import Scene
 from common.sim.scenes import scene_by_name
 from master.objects.features import Features
 from master.objects.line import ObjectLine
-from slave.markers.following import detector_for
+from slave.markers.light_adaptive import detector_for
 from slave.markers.workers import Inline
 from slave.tags.finder import TagFinder
 

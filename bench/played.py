@@ -16,7 +16,7 @@ from master.rig_pipeline import build_pipeline
 from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from slave.markers.detector import Detections
-from slave.markers.following import detector_for
+from slave.markers.light_adaptive import detector_for
 from slave.markers.workers import Inline
 
 START_NS = 1_000_000_000  # scene time 0 on the clock of the messages

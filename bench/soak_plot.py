@@ -78,10 +78,10 @@ def _latency(axes: Axes, course: Course) -> None:
     axes.set_yscale("log")
     axes.set_ylabel("latency of poses [ms]")
     axes.legend(fontsize=8, loc="upper left")
-    beside = axes.twinx()
-    beside.plot(minutes, [one.load for one in course.minutes], color=_GREY, linewidth=0.9, linestyle=":")
-    beside.set_ylim(bottom=0.0)
-    beside.set_ylabel("load of the machine (dotted)", color=_GREY, fontsize=8)
+    right_axes = axes.twinx()
+    right_axes.plot(minutes, [one.load for one in course.minutes], color=_GREY, linewidth=0.9, linestyle=":")
+    right_axes.set_ylim(bottom=0.0)
+    right_axes.set_ylabel("load of the machine (dotted)", color=_GREY, fontsize=8)
 
 
 def _poses(axes: Axes, course: Course) -> None:
@@ -89,14 +89,14 @@ def _poses(axes: Axes, course: Course) -> None:
     axes.plot(minutes, [one.poses_hz for one in course.minutes], color=_COLOURS[0], label="poses [1/s]")
     axes.set_ylim(bottom=0.0)
     axes.set_ylabel("poses a second")
-    beside = axes.twinx()
+    right_axes = axes.twinx()
     for colour, name in zip(_COLOURS[1:], ("lost", "dropped", "skipped"), strict=False):
         totals = [one.counts.get(name, 0) for one in course.minutes]
-        beside.plot(
+        right_axes.plot(
             minutes, totals, color=colour, linewidth=1.2, label=f"{name}: {totals[-1] if totals else 0}"
         )
-    beside.set_ylabel("since the start", fontsize=8)
-    beside.legend(fontsize=8, loc="lower right")
+    right_axes.set_ylabel("since the start", fontsize=8)
+    right_axes.legend(fontsize=8, loc="lower right")
 
 
 def _clocks(axes: Axes, course: Course) -> None:

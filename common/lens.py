@@ -169,10 +169,10 @@ def _within(points: Float, low: Float, high: Float) -> Bool:
     with np.errstate(divide="ignore", invalid="ignore"):
         a, b = low / points, high / points
     near, far = np.fmin(a, b), np.fmax(a, b)
-    beside = (points == 0.0) & ((low > 0.0) | (high < 0.0))
+    outside = (points == 0.0) & ((low > 0.0) | (high < 0.0))
     enters = np.where(points == 0.0, -np.inf, near).max(axis=-1)
     leaves = np.where(points == 0.0, np.inf, far).min(axis=-1)
-    return (leaves >= np.maximum(enters, 1.0)) & ~beside.any(axis=-1)
+    return (leaves >= np.maximum(enters, 1.0)) & ~outside.any(axis=-1)
 
 
 def distorted(lens: Lens, xy: Float) -> Float:

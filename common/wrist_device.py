@@ -18,7 +18,7 @@ from common.hand_model import CHAINS, HandModel
 _ROTATION_WITHIN = 1e-3  # of a rotation matrix: what rounding leaves of one
 _ACROSS = 0.5  # of the normal's length along y: a plane tilted by more than 60 degrees crosses no finger
 _LEAST_M = 1e-3  # a plane nearer to the lens than this tells no distance
-_BESIDE = 1.0  # image sizes from the middle: half an image beside it
+_FIELD_MARGIN = 1.0  # image sizes from the middle: half an image beside it
 _FARTHEST_M = 0.5  # a forearm
 _ORIGIN = np.zeros(3)
 
@@ -94,7 +94,7 @@ def _check_before(optics: CameraModel, knuckles_m: Float, where: str) -> None:
     """Refuse a palm whose knuckles (4, 3) [m] lie behind the camera, or far beside its image: in another unit, say."""
     size = np.array([optics.width_px, optics.height_px])
     uv = optics.project(knuckles_m) / size
-    if not (np.abs(uv - 0.5) <= _BESIDE).all() or knuckles_m[:, 2].max() > _FARTHEST_M:
+    if not (np.abs(uv - 0.5) <= _FIELD_MARGIN).all() or knuckles_m[:, 2].max() > _FARTHEST_M:
         places = ", ".join(f"{1e3 * x:.0f} {1e3 * y:.0f} {1e3 * z:.0f}" for x, y, z in knuckles_m)
         raise CalibrationError(
             f"{where}: T_camera_palm: puts the knuckles of index ... little at {places} mm from the camera, where it"

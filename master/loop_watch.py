@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Generic
 
 from common.service_manager import ServiceManager
-from master.app import Beside, SeenT, Source
+from master.app import AuxiliaryMessage, SeenT, Source
 
 _FEEDS = 4  # in a period of the watchdog
 
@@ -39,7 +39,7 @@ class WatchedLoop(Generic[SeenT]):
         self._due_ns = now_ns() + self._every_ns
         manager.send("READY=1\nSTATUS=tracks", wait=True)
 
-    def get(self, timeout_s: float) -> SeenT | Beside | None:
+    def get(self, timeout_s: float) -> SeenT | AuxiliaryMessage | None:
         """The next message, or None when none came in time."""
         if self._every_ns and (now_ns := self._now_ns()) >= self._due_ns:
             self._manager.send("WATCHDOG=1")

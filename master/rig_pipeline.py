@@ -187,9 +187,9 @@ def build_pipeline(
         raise CalibrationError(f"rig {rig.name!r}: kind is 'wrist', this needs a rig of 'markers'")
     refine = rig.solver == "estimator"
     if not refine and (side is not None or rig.imu is not None):
-        beside = "an IMU" if side is None else "a wrist device"
+        sensor = "an IMU" if side is None else "a wrist device"
         raise CalibrationError(
-            f"rig {rig.name!r}: solver 'fabrik' knows markers alone, but {beside} watches this hand too: set solver to"
+            f"rig {rig.name!r}: solver 'fabrik' knows markers alone, but {sensor} watches this hand too: set solver to"
             " 'estimator'"
         )
     with log_if_slow():

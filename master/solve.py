@@ -136,12 +136,12 @@ def solve_hands(
     files.close()
     summaries: list[dict[str, object]] = []
     for number, (setup, pipeline, stage) in enumerate(zip(setups, pipelines, stages, strict=True)):
-        beside = dict[str, int]() if number else world.counts_beside
+        auxiliary = dict[str, int]() if number else world.auxiliary_counts
         own = [one for one in messages if not isinstance(one, TagDetections) and one.camera in setup.cameras]
         summary = _summarise(recording, setup, own, told.poses[setup.hand.profile.name]) | {
             "camera_hz": {name: hz for name, hz in told.rates.camera_hz.items() if name in setup.cameras},
             "lost": _lost(setup, own),
-            "counts": dict(sorted((dict(pipeline.counts) | beside).items())),
+            "counts": dict(sorted((dict(pipeline.counts) | auxiliary).items())),
             "stage_us": stage.mean_us(),
         }
         summary |= score_objects(_object_scores(recording, setup, told.objects))

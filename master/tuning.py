@@ -252,7 +252,9 @@ class RigTuning:
                 refuse_restart(old, new)
             changed = [(old, new, line) for old, new, line in both if _content(old) != _content(new)]
             switches = [line.prepare(new) for _, new, line in changed]
-            if self._world is not None and any(_beside(old) != _beside(new) for old, new, _ in both):
+            if self._world is not None and any(
+                _auxiliary_inputs(old) != _auxiliary_inputs(new) for old, new, _ in both
+            ):
                 switches.append(self._world.prepare(setups))
         except PhalanxError:
             self._refused += 1
@@ -321,5 +323,5 @@ def _content(setup: RigSetup) -> tuple[object, ...]:
     return setup.rig, setup.wrist_rig, setup.cameras, setup.hand.profile, setup.rows, setup.settings
 
 
-def _beside(setup: RigSetup) -> tuple[object, ...]:
+def _auxiliary_inputs(setup: RigSetup) -> tuple[object, ...]:
     return setup.rig, setup.cameras, setup.hand.profile, setup.rows, setup.objects, setup.gestures

@@ -43,7 +43,7 @@ _FRAMES = MarkerDetections, WristDetections
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Beside:
+class _Auxiliary:
     """What is made beside the hands with one state of the files.
 
     Attributes:
@@ -59,7 +59,7 @@ class _Beside:
     gestures: dict[str, GestureRecogniser]
 
     @classmethod
-    def of(cls, setups: Sequence[RigSetup], counts: Counter[str], *, gestures: bool) -> "_Beside":
+    def of(cls, setups: Sequence[RigSetup], counts: Counter[str], *, gestures: bool) -> "_Auxiliary":
         """Build all of it.
 
         Raises:
@@ -143,10 +143,10 @@ class World:
         }
         self._line_of_imu = {name: line for setup, line in self._hands for name in setup.imus}
         self._counts: Counter[str] = Counter()
-        self._now = _Beside.of(setups, self._counts, gestures=gestures)
+        self._now = _Auxiliary.of(setups, self._counts, gestures=gestures)
         self._begun: dict[tuple[str, str, str], Gesture] = {}
         # One thread fills it, another empties it.
-        self._next: deque[_Beside] = deque(maxlen=1)
+        self._next: deque[_Auxiliary] = deque(maxlen=1)
 
     @property
     def counts(self) -> Counter[str]:
@@ -162,7 +162,7 @@ class World:
         return Counter({event: n for _, own in each for event, n in own.items()} | dict(self._counts))
 
     @property
-    def counts_beside(self) -> dict[str, int]:
+    def auxiliary_counts(self) -> dict[str, int]:
         """Those of objects, gestures and trackers alone."""
         return dict(self._counts)
 
@@ -207,10 +207,10 @@ class World:
         Raises:
             CalibrationError: An object does not fit its rig; nothing has changed.
         """
-        new = _Beside.of(setups, self._counts, gestures=self._say_gestures)
+        new = _Auxiliary.of(setups, self._counts, gestures=self._say_gestures)
         return lambda: self._next.append(new)
 
-    def _take_over(self, new: _Beside) -> Iterator[Gesture]:
+    def _take_over(self, new: _Auxiliary) -> Iterator[Gesture]:
         """The old gestures end: who listens would wait for that for ever."""
         self._now = new
         begun, self._begun = list(self._begun.values()), {}

@@ -20,7 +20,7 @@ from slave.wrist.detector import WristFound
 
 
 class Detector(Protocol):
-    """What finds the markers; a `MarkerDetector` or a `FollowingDetector`."""
+    """What finds the markers; a `MarkerDetector` or a `LightAdaptiveDetector`."""
 
     def push(self, image: Image, t_ns: int) -> Detections:
         """Markers of one frame; times [ns] rise."""

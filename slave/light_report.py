@@ -16,11 +16,11 @@ ALL = "light"  # the subject of what concerns every marker
 _LOG = logging.getLogger(__name__)
 
 
-class Following(Protocol):
-    """What is reported on: a `ChangingDetector`."""
+class LightAdaptive(Protocol):
+    """What is reported on: a `ReloadableDetector`."""
 
     @property
-    def follows(self) -> bool:
+    def adapts(self) -> bool:
         """Whether the light is followed at present."""
         ...
 
@@ -67,7 +67,7 @@ class LightReport:
     def __init__(
         self,
         name: str,
-        detector: Following,
+        detector: LightAdaptive,
         others: Numbers,
         markers: tuple[str, ...],
         show: Callable[[Frame], None] = lambda _frame: None,
@@ -107,7 +107,7 @@ class LightReport:
         That is red and blue relative to green, and green. Of markers that look alike
         twins.<one>..<other>, the hues between them.
         """
-        if not self._detector.follows:
+        if not self._detector.adapts:
             return dict(self._others.gauges())
         blue, green, red = np.exp(self._detector.log_gains).tolist()
         light = {"light_red": red / green, "light_blue": blue / green, "light_exposure": green}

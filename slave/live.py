@@ -15,17 +15,17 @@ from common.keys import Access
 from common.zenoh_bus import ZenohBus
 from slave.app import run, run_wrist, wait_for_start
 from slave.cameras.source import FrameSource
+from slave.colour_sampler import ColourSampler
 from slave.light_report import LightReport
-from slave.markers.beside import told_frames, told_places
-from slave.markers.changing import Changeable, ChangingDetector, marker_changes
+from slave.markers.ambiguity import told_frames, told_places
+from slave.markers.calibrated import CalibratedDetector
 from slave.markers.detector import MarkerDetector
 from slave.markers.engine import Engine
-from slave.markers.following import can_follow, detector_for
-from slave.markers.known import KnownDetector
+from slave.markers.light_adaptive import can_adapt, detector_for
 from slave.markers.null_detector import NullDetector
+from slave.markers.reloadable import AnyDetector, ReloadableDetector, marker_changes
 from slave.markers.scan_choice import Scan, ScanChoice
 from slave.overlay import MarkerOverlay, WristOverlay
-from slave.picker import LivePicker
 from slave.preview import Previews
 from slave.raw import RawFrames, RawSettings
 from slave.report import Numbers, Reporter
@@ -34,10 +34,10 @@ from slave.tags.live import LiveTags, finder_of
 from slave.tally import Tally
 from slave.tuning import CameraFiles, CameraTuning, Prepare
 from slave.uplink import Uplink
-from slave.wrist.changing import view_of, wrist_changes
 from slave.wrist.detector import WristDetector
 from slave.wrist.engine import Engine as WristEngine
 from slave.wrist.null_detector import NullWristDetector
+from slave.wrist.reloadable import view_of, wrist_changes
 
 Colours = Literal["follow", "fixed", "none"]
 NO_REFERENCE = (
@@ -95,7 +95,7 @@ def run_live(
     else:
         line = _marker_line(name, files, read, uplink, clock, colours, scan, engine, stop, workers, service)
     tuning = CameraTuning(
-        files, source, line.prepare, lambda: line.numbers.counts()["frames"] > 0, line.picker
+        files, source, line.prepare, lambda: line.numbers.counts()["frames"] > 0, line.sampler
     )
     reporter = Reporter(
         name,
@@ -142,7 +142,7 @@ class _Line:
     numbers: Numbers
     previews: Previews
     prepare: Prepare | None
-    picker: LivePicker | None = None
+    sampler: ColourSampler | None = None
 
 
 def _marker_line(
@@ -171,7 +171,7 @@ def _marker_line(
         )
     make = _maker(files, colours, engine, workers)
     choice = ScanChoice(scan, files.camera)
-    detector = ChangingDetector(make(files.camera, rig), choice)
+    detector = ReloadableDetector(make(files.camera, rig), choice)
     tally = Tally(
         rig.markers,
         lambda: (
@@ -192,7 +192,7 @@ def _marker_line(
         numbers,
         previews,
         _both(marker_changes(detector, make), _tag_changes(tags)),
-        LivePicker(detector, previews.shown, rig.markers),
+        ColourSampler(detector, previews.shown, rig.markers),
     )
 
 
@@ -264,15 +264,15 @@ def _uncalibrated(missing: Sequence[str]) -> dict[str, int]:
 
 def _maker(
     files: CameraFiles, colours: Colours, engine: Engine, workers: ThreadPoolExecutor
-) -> Callable[[CameraCalibration, RigCalibration], Changeable]:
+) -> Callable[[CameraCalibration, RigCalibration], AnyDetector]:
     """What makes a detector for given content of the files, now and whenever it changes."""
 
-    def make(camera: CameraCalibration, rig: RigCalibration) -> Changeable:
+    def make(camera: CameraCalibration, rig: RigCalibration) -> AnyDetector:
         if missing := [name for name in rig.markers if name not in (camera.markers or {})]:
             _LOG.warning("%s", NO_COLOUR.format(files.camera_path, ", ".join(missing)))
-            return KnownDetector(camera, rig.markers, engine, rig.free_markers)
+            return CalibratedDetector(camera, rig.markers, engine, rig.free_markers)
         if colours == "follow":
-            if not can_follow(camera, rig.markers):
+            if not can_adapt(camera, rig.markers):
                 _LOG.warning("%s", NO_REFERENCE.format(files.camera_path))
             return detector_for(camera, rig.markers, workers, engine=engine, free=rig.free_markers)
         return MarkerDetector(camera, rig.markers, engine=engine, free=rig.free_markers)

@@ -17,9 +17,9 @@ from common.npz import write_npz
 from slave.markers.autocolour import calibrate_moving, frames_for
 from slave.markers.autocolour_names import by_clicks, by_hand, by_hues, checked
 from slave.markers.autocolour_surroundings import spread
-from slave.markers.changing import plain_of
 from slave.markers.colours import ColourRow, calibrate
-from slave.markers.following import detector_for
+from slave.markers.light_adaptive import detector_for
+from slave.markers.reloadable import plain_of
 from slave.markers.workers import Inline
 from slave.wrist.offline import RecordedWristDetections
 

@@ -96,8 +96,8 @@ def object_paths(rig_path: Path, rig: RigCalibration) -> tuple[Path, ...]:
 Prepare: TypeAlias = Callable[[CameraFiles, CameraFiles], Callable[[], None] | None]
 
 
-class Picker(Protocol):
-    """What makes a colour of a click; a `slave.picker.LivePicker`."""
+class Sampler(Protocol):
+    """What makes a colour of a click; a `slave.colour_sampler.ColourSampler`."""
 
     def pick(
         self, wish: ColourPick, camera: CameraCalibration
@@ -123,7 +123,7 @@ class CameraTuning:
         source: object,
         prepare: Prepare | None,
         running: Callable[[], bool],
-        picker: Picker | None = None,
+        sampler: Sampler | None = None,
     ) -> None:
         """Tune a camera.
 
@@ -136,7 +136,7 @@ class CameraTuning:
         """
         self._used = self._on_disk = files
         self._source = source if isinstance(source, Tunable) else None
-        self._prepare, self._running, self._picker = prepare, running, picker
+        self._prepare, self._running, self._sampler = prepare, running, sampler
         self._turn = threading.Lock()
         self._watched = WatchedFiles()
         self._applied = self._refused = 0
@@ -205,12 +205,12 @@ class CameraTuning:
     def _pick(self, body: str) -> dict[str, float]:
         with self._turn:
             wish = parse(body.encode(), ColourPick, "pick")
-            if self._picker is None:
+            if self._sampler is None:
                 raise CalibrationError(
                     "pick: this slave seeks no markers: the camera of a wrist device, or started with --colours none"
                 )
             refuse_strange((wish.marker,), self._used.rig.markers, "pick: marker")
-            camera, told = self._picker.pick(wish, self._used.camera)
+            camera, told = self._sampler.pick(wish, self._used.camera)
             self._apply(replace(self._used, camera=_told(camera, "pick", (wish.marker,))))
         return self._settings("") | dict(told)
 

@@ -21,8 +21,8 @@ from common.hand_model import CHAINS, FINGERS, WEBXR_JOINTS, HandModel
 from common.imu_recording import write_imu
 from common.npz import write_npz
 from common.sim.imu import SimulatedImu
-from common.sim.light import paint
-from common.sim.paint import MarkerView
+from common.sim.light import marker_colour
+from common.sim.painter import MarkerView
 from common.sim.render import Renderer
 from common.sim.scene import Scene, SceneTruth
 
@@ -163,7 +163,7 @@ class SceneTake:
             "joints": WEBXR_JOINTS,
             "angles": ANGLE_NAMES,
             "seed": scene.seed,
-            "paint_reflectance_linear_srgb": {name: paint(name) for name in self._painted()},
+            "paint_reflectance_linear_srgb": {name: marker_colour(name) for name in self._painted()},
             "objects": {name: scene.tracked.features(k) for k, name in enumerate(scene.rig.objects)},
         }
 

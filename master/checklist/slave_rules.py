@@ -25,9 +25,9 @@ BRIGHT, BRIGHT_WELL = (
 TWIN = "twins."  # gauges of the slave: hues between two markers as they are seen,
 OVERLAP = "overlap."  # and by which the ranges in use of two markers overlap
 BETWEEN = ".."  # the names of the two
-BESIDE = "beside."  # count: frames in which something beside the hand had the colour of a marker
+AMBIGUOUS = "ambiguous."  # count: frames in which something beside the hand had the colour of a marker
 UNCOLOURED = "uncalibrated."  # count: 1 of a marker without a colour
-BESIDE_SHARE, BESIDE_WELL = 0.5, 0.1  # of the frames
+AMBIGUOUS_SHARE, AMBIGUOUS_WELL = 0.5, 0.1  # of the frames
 HOT_WELL_C = 5.0
 FLAGS = {1: "the supply is too weak", 2: "the clock is capped", 4: "it is throttled", 8: "it is too warm"}
 CYCLE = 3  # frames: ambient, laser, LEDs
@@ -164,7 +164,7 @@ def _background(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
     if not frames:
         return
     for marker in camera.markers:
-        event = BESIDE + marker
+        event = AMBIGUOUS + marker
         if event not in said.counts:
             continue
         share = (said.increase(event) or 0) / frames
@@ -173,7 +173,7 @@ def _background(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
         yield Verdict(
             "background_in_range",
             f"{camera.name}.{marker}",
-            beyond(share, BESIDE_SHARE, BESIDE_WELL),
+            beyond(share, AMBIGUOUS_SHARE, AMBIGUOUS_WELL),
             f"Camera {camera.name} sees something else in the colour of marker {marker}{where}.",
             "Take it away or cover it; or paint the marker in another colour.",
             (camera.name,),

@@ -146,12 +146,12 @@ def _target(source: Path, wanted: Wanted) -> Path:
     return folder / name
 
 
-def _beside(target: Path, what: str) -> Path:
+def _sibling(target: Path, what: str) -> Path:
     return target.with_name(f"{target.stem}-{what}{target.suffix}")
 
 
 def _of_hand(target: Path, hands: tuple[str, ...], hand: str) -> Path:
-    return target if hand == hands[0] else _beside(target, hand)
+    return target if hand == hands[0] else _sibling(target, hand)
 
 
 def _tables(
@@ -180,16 +180,16 @@ def _tables(
     for thing in take.objects():
         _refuse_path(thing.object, target)
         columns = object_columns(thing, begin)
-        write(_beside(target, f"object_{thing.object}"), f"object {thing.object}", columns, [columns])
+        write(_sibling(target, f"object_{thing.object}"), f"object {thing.object}", columns, [columns])
     for near in take.contacts():
         columns, name = contact_columns(near, begin), f"{near.hand}_{near.object}"
         _refuse_path(name, target)
         if near.hand in hands:
             what = f"contact of {near.hand} and {near.object}"
-            write(_beside(target, f"contact_{name}"), what, columns, [columns])
+            write(_sibling(target, f"contact_{name}"), what, columns, [columns])
     if gestures := [one for one in take.gestures() if one.hand in hands]:
         columns = gesture_columns(gestures, begin)
-        write(_beside(target, "gestures"), "gestures", columns, [columns])
+        write(_sibling(target, "gestures"), "gestures", columns, [columns])
     return tuple(written)
 
 

@@ -237,10 +237,10 @@ def _in_plane(chain: ChainArrays, edges: Float, ratio: float, local: Vector, see
     x, y, z = local
     x, y, z = rotate_back(matrix_at(chain.links, ROOT, REST), (c * x - s * z, y, s * x + c * z))
     last, in_plane2 = len(edges) - 1, y * y + z * z
-    pip, beside = 0.0, 0.0
+    pip, lateral = 0.0, 0.0
     for _ in range(2):
-        pip, _off = _invert(chain, ratio, edges[last - 1], edges[last], in_plane2 + beside * beside)
-        beside = _point(chain, pip, ratio * pip)[0]
+        pip, _off = _invert(chain, ratio, edges[last - 1], edges[last], in_plane2 + lateral * lateral)
+        lateral = _point(chain, pip, ratio * pip)[0]
     w = _point(chain, pip, ratio * pip)
     f = hinge_fit(chain.spans[1, 0], chain.spans[1, 1], (-1.0, 0.0, 0.0), w, (x, y, z), 0.0)
     seeds[0, 0], seeds[0, 1], seeds[0, 2], seeds[0, 3] = a, f, pip, ratio * pip

@@ -142,13 +142,15 @@ def fit_offset(blocks: Float) -> TimeOffset | None:
         if total <= 0.0:
             return None
         offset = float((weight * ze).sum()) / total
-    told, said, beside = ((weight[:, None] * blocks[..., part]).sum(axis=2).ravel() for part in (1, 2, 3))
+    told, said, weight_of_rays = (
+        (weight[:, None] * blocks[..., part]).sum(axis=2).ravel() for part in (1, 2, 3)
+    )
     scatter = [_scatter(told, said - offset * told, length) for length in _LENGTHS]
     if scatter[0][1] < _BATCHES_AT_LEAST:
         return None
     sigma, count = max([scatter[0], *(of for of in scatter[1:] if of[1] >= _LONG_BATCHES_AT_LEAST)])
     sigma *= float(stdtrit(count - 1.0, _THREE_SIGMA)) / 3.0
-    sigma = hypot(sigma, sqrt(2.0) * RAYS.rig_px * float(beside.sum()) / total)
+    sigma = hypot(sigma, sqrt(2.0) * RAYS.rig_px * float(weight_of_rays.sum()) / total)
     return TimeOffset(offset * 1e9, sigma * 1e9, count)
 
 

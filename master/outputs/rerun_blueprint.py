@@ -32,7 +32,7 @@ _TABS = 4  # the last so many share one place
 _BACKGROUND = rrb.Background(color=(22, 24, 28))
 # Beside and above the hand, which is 0.3-0.5 m in front of the cameras; they stay in the picture on the left.
 _EYE_M, _TARGET_M = (0.21, -0.12, 0.0), (0.012, 0.018, 0.36)
-_BESIDE_M = 0.45  # cameras farther from the hand than that stand around it: the eye steps back, to 1.5 of the farthest
+_AROUND_M = 0.45  # cameras farther from the hand than that stand around it: the eye steps back, to 1.5 of the farthest
 # Of a wrist device: from above the palm and behind the camera, beside the forearm, towards the fingers.
 _WRIST_EYE_M, _WRIST_TARGET_M = (0.17, -0.17, -0.10), (0.0, 0.035, 0.12)
 _CAMERAS_A_ROW = 4
@@ -125,7 +125,7 @@ def _eye_of(setups: Sequence[RigSetup]) -> tuple[float, float, float]:
     target, eye = np.array(_TARGET_M), np.array(_EYE_M)
     models = [model for setup in setups if setup.has_markers for model in setup.models.values()]
     reach = max(float(np.linalg.norm(model.centre - target)) for model in models)
-    if reach > _BESIDE_M:
+    if reach > _AROUND_M:
         eye = target + 1.5 * reach * (eye - target) / np.linalg.norm(eye - target)
     x, y, z = (float(value) for value in eye)
     return x, y, z

@@ -25,7 +25,7 @@ from master.outputs.rerun_states import States
 _DIAL_M, _RAY_M, _LINE_M = 0.045, 0.35, 0.0012
 _ARC_STEP_RAD = np.deg2rad(4.0)
 _TAP_NS = 500_000_000
-_BESIDE_M = np.array([0.0, -0.02, 0.0])  # of a name: above what it names
+_LABEL_M = np.array([0.0, -0.02, 0.0])  # of a name: above what it names
 
 
 class GesturesLayer:
@@ -74,7 +74,7 @@ class GesturesLayer:
             self._states.log(f"{one.hand}/{one.kind}", one.t_ns, one.name)
             self._states.at(one.t_ns)
         if one.kind == "pose":
-            self._name(path, one.name, at[5] + _BESIDE_M, colour)
+            self._name(path, one.name, at[5] + _LABEL_M, colour)
         elif one.kind == "pinch":
             self._pinch(path, one, at, colour)
         elif one.kind == "dial" and np.isfinite(one.direction).all() and np.isfinite(one.origin_m).all():

@@ -31,7 +31,7 @@ SETTLE_NS = 2_000_000_000
 GAP_NS = 600_000_000_000  # longer than that nobody waits for the next message
 _STEP_S = 60.0  # of a wait, whatever the speed; a change ends it
 SOLVED = ("hand", "object", "contact", "gesture")
-BESIDE = ("health", "checklist", "preview", "still")  # told again as they were told
+AUXILIARY = ("health", "checklist", "preview", "still")  # told again as they were told
 _OWN = frozenset({"master", "recorder"})  # whose reports are not: the player is the master now
 
 
@@ -194,7 +194,7 @@ class Player:
         events = EventWatch(self._recording.begin_t_ns)
         with self._changed:
             self._clock.seek(start_ns, now_ns())  # to build a world took its time
-        streams = (*BESIDE, *(SOLVED if self._solved else ("taken",)))
+        streams = (*AUXILIARY, *(SOLVED if self._solved else ("taken",)))
         for one in self._recording.read(streams, start_ns - SETTLE_NS, self.last_ns):
             silent = one.t_ns < start_ns
             if not silent and not self._due(one.t_ns):
@@ -209,7 +209,7 @@ class Player:
             told = self._told(world, one)
             if not silent:
                 self._write(told, digest)
-                self._beside(one)
+                self._auxiliary(one)
                 self.at_ns = one.t_ns
             else:
                 for _ in told:
@@ -262,10 +262,10 @@ class Player:
                 sink.write(message)
             self.poses += isinstance(message, HandPose)
 
-    def _beside(self, one: Recorded) -> None:
+    def _auxiliary(self, one: Recorded) -> None:
         if one.stream == "taken":
             self._taken(one.message)
-        elif one.stream in BESIDE and one.name not in _OWN:
+        elif one.stream in AUXILIARY and one.name not in _OWN:
             self._again(one.stream, one.name, one.message)
 
     def _tell_events(self, lines: Sequence[str]) -> None:

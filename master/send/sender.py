@@ -177,7 +177,7 @@ class Sender:
             line.close()
 
 
-class Beside:
+class Housekeeping:
     """What goes on beside the sending, on a thread of its own: file, report, echoes of the master's clock.
 
     Holds the bus and the file, which belong to the caller.
@@ -232,13 +232,13 @@ def run_sender(
     """
     feeds = [bus.subscribe(stream, depth=_DEPTH) for stream in STREAMS]
     sender = Sender(settings, only, say)
-    beside = Beside(sender, bus, path, feeds)
+    housekeeping = Housekeeping(sender, bus, path, feeds)
 
     def obey(command: Command) -> Health:
         sender.obey(command)
         if command.verb == "stop":
             stop.set()
-        return beside.health()
+        return housekeeping.health()
 
     bus.serve(NAME, obey)
     bus.announce(NAME)
@@ -246,7 +246,9 @@ def run_sender(
         say(f"{name}: {sender.where(name)}")
     if not sender.on:
         say(f"all outputs are off; switch them on in {path}, or name them: --only osc,vmc")
-    thread = threading.Thread(target=lambda: _beside(beside, stop, say), name="outputs report", daemon=True)
+    thread = threading.Thread(
+        target=lambda: _report_until(housekeeping, stop, say), name="outputs report", daemon=True
+    )
     thread.start()
     try:
         while not stop.is_set():
@@ -259,10 +261,10 @@ def run_sender(
             feed.close()
 
 
-def _beside(beside: Beside, stop: threading.Event, say: Callable[[str], None]) -> None:
+def _report_until(housekeeping: Housekeeping, stop: threading.Event, say: Callable[[str], None]) -> None:
     while not stop.wait(1.0):
         try:
-            beside.step(say)
+            housekeeping.step(say)
         except BusError:
             return  # closing
 

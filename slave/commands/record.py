@@ -97,15 +97,15 @@ def run(options: argparse.Namespace, say: Callable[[str], None], aside: Callable
     imu = None
     if options.imu == "synthetic":
         imu = imu_of(str(options.camera), *world_of(options, scene.rig), options.scene, options.seed)
-    with _imu_beside(options, scene, aside) as beside:
-        done, failure = _record(options, scene, manifest, beside)
-        if beside is not None and done.frames:
-            beside.keep()
+    with _imu_recorder(options, scene, aside) as imu_recorder:
+        done, failure = _record(options, scene, manifest, imu_recorder)
+        if imu_recorder is not None and done.frames:
+            imu_recorder.keep()
     if imu is not None and done.frames:
         add_imu(options.output, imu, options.scene_epoch_ns, scene.clock)
     os.sync()  # what was said to be recorded is there, also when the power goes now
-    if failure is None and beside is not None:
-        failure = beside.failure
+    if failure is None and imu_recorder is not None:
+        failure = imu_recorder.failure
     if failure is not None:
         raise failure
     if not done.frames:
@@ -147,7 +147,7 @@ def _manifest(options: argparse.Namespace, scene: _Scene) -> "Manifest":
 
 
 def _record(
-    options: argparse.Namespace, scene: _Scene, manifest: "Manifest", beside: "ImuRecorder | None"
+    options: argparse.Namespace, scene: _Scene, manifest: "Manifest", imu_recorder: "ImuRecorder | None"
 ) -> "tuple[Progress, PhalanxError | None]":
     """Record the camera to its end; how much that is, and what has ended it before its time."""
     from slave.progress import Length, ProgressDisplay
@@ -166,8 +166,8 @@ def _record(
             round(options.queue_mb * 1e6),
         )
         try:
-            if beside is not None:
-                beside.start(options.output)
+            if imu_recorder is not None:
+                imu_recorder.start(options.output)
             with stop_by_signal() as stop:
                 feed(source, recorder, stop)
         finally:
@@ -180,7 +180,7 @@ def _record(
 
 
 @contextmanager
-def _imu_beside(
+def _imu_recorder(
     options: argparse.Namespace, scene: _Scene, aside: Callable[[str], None]
 ) -> "Generator[ImuRecorder | None, None, None]":
     """A real IMU of the rig that is recorded with a camera, if one is asked for."""
@@ -193,11 +193,11 @@ def _imu_beside(
     if imu is None:
         raise CalibrationError(f"rig {scene.rig.name!r}: imu: missing; there is none to record")
     orientation, stop = opening.orientation_of(imu), threading.Event()
-    beside = ImuRecorder(
+    imu_recorder = ImuRecorder(
         opening.open_real(imu.name, options.imu, imu.rate_hz, scene.clock, stop), orientation, stop
     )
     try:
-        yield beside
+        yield imu_recorder
     finally:
-        counts = beside.close()
+        counts = imu_recorder.close()
         aside(", ".join(f"{event} {count}" for event, count in counts.items()))

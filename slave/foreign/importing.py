@@ -137,10 +137,10 @@ def _taken(source: Source, camera: CameraCalibration, wish: Wish, say: Callable[
         raise RecordingError(f"{source.path}: cannot read: {error.strerror}") from error
     except PictureError as error:
         raise RecordingError(f"{source.path}: {error}") from error
-    beside = (
+    sidecar = (
         source.path.with_suffix(".csv") if source.is_video else source.path.parent / f"{source.path.name}.csv"
     )
-    table = wish.times or (beside if beside.is_file() else None)
+    table = wish.times or (sidecar if sidecar.is_file() else None)
     timed = own if table is None else by_table(table, read_times(table, source.camera), number)
     if timed is None:
         raise RecordingError(

@@ -19,7 +19,7 @@ import numpy as np
 
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, HsvRange
-from slave.markers.beside import Beside
+from slave.markers.ambiguity import ColourAmbiguityMonitor
 from slave.markers.blobs import Blob, with_fragments
 from slave.markers.centroid import PAD, Measured
 from slave.markers.classify import ColourTable, table_of
@@ -136,7 +136,7 @@ class MarkerDetector:
         self._lonely = [True] * len(markers)  # no other blob might have been it when it was found
         self._gains = (1.0, 1.0, 1.0)  # of the light against calibration, blue first
         self.windows_only = False
-        self.beside = Beside(markers)
+        self.ambiguity = ColourAmbiguityMonitor(markers)
         self.evidence: dict[int, Evidence] = {}
 
     def fresh(self, seeds: Mapping[str, tuple[float, float]] | None = None) -> "MarkerDetector":
@@ -168,7 +168,7 @@ class MarkerDetector:
         scanned = self._look(image, t_ns, windows)
         blobs = scanned.blobs
         chosen = self._decide(scanned, windows)
-        self.beside.push(blobs, chosen)
+        self.ambiguity.push(blobs, chosen)
         self._seeds = {}
         rows = list(chosen)
         alternatives: dict[int, Blob] = {}
@@ -228,7 +228,7 @@ class MarkerDetector:
         """Go on with the tracks of another detector, of the markers that both seek."""
         self._seeds = {}
         if other._names == self._names:
-            self._tracks, self._scanner, self.beside = other._tracks, other._scanner, other.beside
+            self._tracks, self._scanner, self.ambiguity = other._tracks, other._scanner, other.ambiguity
             self._last_ns, self._frame, self._outlines = other._last_ns, other._frame, other._outlines
             self._quality, self._lonely = other._quality, other._lonely
             return

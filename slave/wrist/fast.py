@@ -53,8 +53,8 @@ def _least_paths(energy: Float32, widths: Int, turn: np.float32, out: Int) -> No
 
 def energy(strips: Image, crossed: int) -> Float32:
     """As `valleys.energy`."""
-    before = np.asarray(cv2.dilate(strips, valleys.BESIDE, anchor=(MARGIN - 1, 0)), np.uint8)
-    behind = np.asarray(cv2.dilate(strips, valleys.BESIDE, anchor=(0, 0)), np.uint8)
+    before = np.asarray(cv2.dilate(strips, valleys.SIDE_KERNEL, anchor=(MARGIN - 1, 0)), np.uint8)
+    behind = np.asarray(cv2.dilate(strips, valleys.SIDE_KERNEL, anchor=(0, 0)), np.uint8)
     around = np.asarray(cv2.dilate(strips, valleys.AROUND), np.uint8)
     out = np.empty(strips.shape, dtype=np.float32)
     limits = (valleys.DARK, valleys.SURFACE, valleys.OPEN, valleys.BEYOND_THUMB)

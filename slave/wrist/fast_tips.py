@@ -244,7 +244,7 @@ def _postures(
 ) -> int:
     """Postures of index ... little that meet the laser where it is seen and are as bright as they should be."""
     length = table.laser.shape[3]
-    off, share, beside, known = np.empty(length), np.empty(length), np.empty(length), np.empty(length)
+    off, share, lateral, known = np.empty(length), np.empty(length), np.empty(length), np.empty(length)
     sure, typical, per_m = limits.aside_m**-2, limits.abduction_sigma**-2, 1.0 / limits.aside_m
     least = np.inf
     laser = table.laser[:, :, finger - 1]
@@ -256,9 +256,9 @@ def _postures(
         by = x * to
         by = (x - x2 * by * by) * to
         share[k] = by
-        beside[k] = (x - by * (x1 + by * x2)) * per_m
+        lateral[k] = (x - by * (x1 + by * x2)) * per_m
         off[k] = np.inf
-        if abs(by) < limits.most_abduction and abs(beside[k]) < limits.most_aside:
+        if abs(by) < limits.most_abduction and abs(lateral[k]) < limits.most_aside:
             off[k] = abs(by * (laser[1, 1, k] + by * laser[2, 1, k]) - z)
             if off[k] < least:
                 least = off[k]
@@ -273,9 +273,9 @@ def _postures(
         cost = (
             ((off[k] - least) / limits.sigma_m) ** 2
             + (share[k] / limits.abduction_sigma) ** 2
-            + beside[k] ** 2
+            + lateral[k] ** 2
         )
-        aside = beside[k] * limits.aside_m
+        aside = lateral[k] * limits.aside_m
         count = _take(image, gain, table, limits, first + k, share[k], aside, cost, found, count)
         spread = limits.variant / math.sqrt(known[k])
         if spread > limits.variant * limits.unsure:

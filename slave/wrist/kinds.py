@@ -102,8 +102,8 @@ def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
     if not lit > 0.0 or cv2.countNonZero(laser_gain) <= LASER_LEAST:
         return Evidence(lit, -inf, -inf, -inf)
     led_loss = cv2.subtract(cv2.subtract(ambient, led), explained)
-    beside_halo = cv2.subtract(laser_gain, cv2.convertScaleAbs(led_gain, alpha=HALO))
-    steady = -_octaves(max(_broad(over) for over in (beside_halo, laser_loss, led_loss)) / valid, LED_NEVER)
+    above_halo = cv2.subtract(laser_gain, cv2.convertScaleAbs(led_gain, alpha=HALO))
+    steady = -_octaves(max(_broad(over) for over in (above_halo, laser_loss, led_loss)) / valid, LED_NEVER)
     if not steady > 0.0:
         return Evidence(lit, -inf, -inf, steady)
     led_over_laser, laser_over_led = _each_over(led, laser)

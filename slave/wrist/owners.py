@@ -15,7 +15,7 @@ from slave.wrist.reach import Reach
 from slave.wrist.runs import SHORT, Runs
 
 _THUMB, _INDEX = 0, 1
-_BESIDE_INDEX = 0.5  # place: there is the thumb of a bent wrist where the index is in its own
+_OUTSIDE_INDEX = 0.5  # place: there is the thumb of a bent wrist where the index is in its own
 # Where `Reach.place` is a finger's, thumb ... little: half a spacing from its axis and what the palm may be off. Folded
 # fingers point to the root of the thumb, the little one a quarter of a spacing towards it.
 _FROM: Float = np.array([-np.inf, -np.inf, 1.35, 2.3, 3.1])
@@ -47,7 +47,7 @@ def owners(finger: Int, runs: Runs, points: Float, reach: Reach) -> Int:
     aside &= _room(of, nearest, aside | no_thumb)
     of = np.where(no_thumb | aside, nearest, of)
     if reach.bent:
-        beyond_index = (of == _INDEX) & (middle < _BESIDE_INDEX)
+        beyond_index = (of == _INDEX) & (middle < _OUTSIDE_INDEX)
         if ((of == _INDEX) & ~beyond_index).any():
             of = np.where(beyond_index, _THUMB, of)
     return np.repeat(of, count)

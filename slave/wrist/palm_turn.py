@@ -39,7 +39,7 @@ _METACARPAL, _LITTLE, _INDEX = (
     (0.15, 0.35),
     (0.2, 0.4),
 )  # along these bones
-_BESIDE_WEIGHT = 0.125
+_EDGE_WEIGHT = 0.125
 # A bend is believed that shows so much of what it should, and is so much more probable than a straight wrist: fists
 # have gaps of their own. One that shows less of it must be more probable.
 _BELIEVED = ((0.6, 3.0), (0.45, 5.0))
@@ -139,8 +139,8 @@ def bend_seen(near: Float32, view: WristView) -> Float:
 def _shown(near: Float32, marks: _Marks) -> Float32:
     """How much (B,) of what each bend would show is seen in roots of grey levels."""
     low, high, middle = (near[marks.gap[:, k]] for k in range(3))
-    beside = np.minimum(low, high)
-    gaps = (beside - middle) / (beside + middle + _DARK)
+    sides = np.minimum(low, high)
+    gaps = (sides - middle) / (sides + middle + _DARK)
     gaps = np.where(marks.gap_weight < 0.0, np.abs(gaps), gaps).clip(0.0, _TOP)
     inside, outside = near[marks.edge[:, 0]], near[marks.edge[:, 1]]
     edges = ((inside - outside) / (inside + outside + _DARK)).clip(0.0, _TOP)
@@ -157,14 +157,14 @@ def _marks(view: WristView) -> _Marks:
     gap, gap_weight = _gaps(view)
     edge, edge_weight = _edges(view)
     at, inside = zip(*(_pixels(turned(view, bend), gap) for bend in bends), strict=True)
-    beside, shows = zip(*(_pixels(turned(view, bend), edge) for bend in bends), strict=True)
+    sides, shows = zip(*(_pixels(turned(view, bend), edge) for bend in bends), strict=True)
     return _Marks(
         bends,
         (0.5 * ((bends / _TYPICAL_RAD) ** 2).sum(axis=1)).astype(np.float32),
         hardly,
         np.array(at),
         (gap_weight * np.array(inside)).astype(np.float32),
-        np.array(beside),
+        np.array(sides),
         (edge_weight * np.array(shows)).astype(np.float32),
     )
 
@@ -218,5 +218,5 @@ def _edges(view: WristView) -> tuple[Float, Float]:
         thick = radius[start] + share * (radius[thick_as] - radius[start])
         points.append(np.stack([axis + (thick + off) * way for off in (-_INSIDE_M, _OUTSIDE_M)]))
     few = len(_LITTLE) + len(_INDEX)
-    weight = np.concatenate([np.full(len(_METACARPAL), 1.0 / len(_METACARPAL)), np.full(few, _BESIDE_WEIGHT)])
+    weight = np.concatenate([np.full(len(_METACARPAL), 1.0 / len(_METACARPAL)), np.full(few, _EDGE_WEIGHT)])
     return np.concatenate(points, axis=1), weight

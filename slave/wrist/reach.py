@@ -28,7 +28,7 @@ _THUMB = 0
 _THUMBS_M, _NO_THUMBS_M = 4e-3, 10e-3
 _BALL_M = -3e-3  # nearer there is no finger
 _LEAST_SPACING_M = 5e-3  # of axes, which fan out from the knuckles and meet behind the wrist
-_BESIDE_PALM = 0.5  # place: beyond the outside of the index
+_OUTSIDE_PALM = 0.5  # place: beyond the outside of the index
 _FOLDED_RADII = 2.0  # of the knuckle, above the palm's bones: what a finger folded to the palm is beyond
 _ORIGIN = np.zeros(3)
 
@@ -91,7 +91,7 @@ class Reach:
 
     def no_thumb(self, beyond_m: Float, place: Float) -> Bool:
         """Whether there (N,) the laser never meets the thumb."""
-        return (beyond_m > _NO_THUMBS_M) & (place > _BESIDE_PALM)
+        return (beyond_m > _NO_THUMBS_M) & (place > _OUTSIDE_PALM)
 
     def metres_per_px(self, uv: Float) -> Float:
         """How much of the plane one pixel shows [m] at pixels (N, 2); 0 where they are NaN, or show none of it."""

@@ -20,7 +20,7 @@ PRIOR = np.concatenate(
     + [np.pad(ACROSS * np.linspace(1.0, 0.0, LATERAL[3]), MARGIN, constant_values=FENCE)]
 ).astype(np.float32)
 AROUND = np.ones((1, 7), dtype=np.uint8)
-BESIDE = np.ones((1, MARGIN), dtype=np.uint8)
+SIDE_KERNEL = np.ones((1, MARGIN), dtype=np.uint8)
 
 
 def energy(strips: Image, crossed: int) -> Float32:
@@ -31,8 +31,8 @@ def energy(strips: Image, crossed: int) -> Float32:
     counts. Where nothing is lit beside a pixel it is open, except for the thumb's seam on the first `crossed` circles:
     no thumb at all beyond it would mean that the seam lies outside of the thumb.
     """
-    before = cv2.dilate(strips, BESIDE, anchor=(MARGIN - 1, 0))
-    behind = cv2.dilate(strips, BESIDE, anchor=(0, 0))
+    before = cv2.dilate(strips, SIDE_KERNEL, anchor=(MARGIN - 1, 0))
+    behind = cv2.dilate(strips, SIDE_KERNEL, anchor=(0, 0))
     thumb = STARTS[3]
     side = cv2.min(before, behind)
     side[:, thumb:] = behind[:, thumb:]

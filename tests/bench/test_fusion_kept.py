@@ -44,9 +44,11 @@ def test_markers_are_reported_near_the_truth_and_only_where_paint_is_in_sight(ma
         seen = np.isfinite(message.uv[:, 0])
         off += np.linalg.norm(message.uv - uv, axis=1)[seen].tolist()
         k = int(
-            np.argmin(np.abs(made.line_of_sight.paint_t_s[message.camera] - 1e-9 * (message.t_ns - START_NS)))
+            np.argmin(
+                np.abs(made.line_of_sight.visible_t_s[message.camera] - 1e-9 * (message.t_ns - START_NS))
+            )
         )
-        assert (made.line_of_sight.paint_px2[message.camera][k][seen] > 0.0).all()
+        assert (made.line_of_sight.visible_px2[message.camera][k][seen] > 0.0).all()
     assert len(off) > 100
     assert np.median(off) < 5.0  # what is seen of a cap is not its middle
     assert max(off) < 12.0
@@ -79,8 +81,8 @@ def test_what_was_kept_is_what_was_made(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def _same(a: Sight, b: Sight) -> None:
-    for name in b.paint_t_s:
-        np.testing.assert_array_equal(a.paint_t_s[name], b.paint_t_s[name])
-        np.testing.assert_array_equal(a.paint_px2[name], b.paint_px2[name])
+    for name in b.visible_t_s:
+        np.testing.assert_array_equal(a.visible_t_s[name], b.visible_t_s[name])
+        np.testing.assert_array_equal(a.visible_px2[name], b.visible_px2[name])
     for field in ("line_t_s", "line_m", "tip"):
         np.testing.assert_array_equal(getattr(a, field), getattr(b, field))

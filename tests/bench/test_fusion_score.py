@@ -53,13 +53,13 @@ def solved(**changes: Float) -> Solved:
     return Solved.of(BOTH, poses(**changes), BOTH.fused)
 
 
-def shown(paint: float = 100.0, line: float = 0.02) -> Shown:
+def shown(visible_area: float = 100.0, line: float = 0.02) -> Shown:
     """So much paint of every marker in both cameras, and so much line on every finger, at all times."""
     times = np.arange(0.0, 6.0, 1.0 / HZ)
     cameras = BOTH.markers.rig.cameras
     line_of_sight = Sight(
         dict.fromkeys(cameras, times),
-        {name: np.full((len(times), 6), paint) for name in cameras},
+        {name: np.full((len(times), 6), visible_area) for name in cameras},
         times,
         np.full((len(times), 5), line),
         np.zeros((len(times), 5), np.bool_),
@@ -116,19 +116,19 @@ def test_a_tracked_bit_is_false_where_the_joint_is_far_off() -> None:
 
 @pytest.mark.parametrize(("paint", "line", "false"), [(0.0, 0.02, 1.0), (100.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
 def test_a_tracked_bit_is_false_where_nothing_tells_of_the_joint(
-    paint: float, line: float, false: float
+    visible_area: float, line: float, false: float
 ) -> None:
-    got = figures(solved(), shown(paint, line))  # without paint nothing tells where the palm is
+    got = figures(solved(), shown(visible_area, line))  # without paint nothing tells where the palm is
     assert got.false_tracked == false
     palm_apart = np.ones((COUNT, 26))
     palm_apart[:, np.setdiff1d(np.arange(26), CHAINS)] = 0.0
-    fingers = figures(solved(tracked=palm_apart), shown(paint, line))
-    assert fingers.unseen == (1.0 if paint == line == 0.0 else 0.0)
+    fingers = figures(solved(tracked=palm_apart), shown(visible_area, line))
+    assert fingers.unseen == (1.0 if visible_area == line == 0.0 else 0.0)
 
 
 def test_markers_alone_do_not_see_what_the_wrist_device_sees() -> None:
     alone = Solved.of(BOTH, poses(), BOTH.markers)
-    assert figures(alone, shown(paint=0.0)).unseen == 1.0
+    assert figures(alone, shown(visible_area=0.0)).unseen == 1.0
     assert figures(alone, shown(line=0.0)).unseen == 0.0
 
 
@@ -138,7 +138,7 @@ def test_a_wrist_device_s_hand_is_put_where_it_truly_is() -> None:
     elsewhere = [_moved(pose, turn, np.array([0.3, -0.1, 0.2])) for pose in moved]
     alone = Solved.of(BOTH, elsewhere, BOTH.wrist)
     assert np.nanmax(alone.off_mm) == pytest.approx(0.0, abs=1e-6)
-    strapped = figures(alone, shown(paint=0.0))
+    strapped = figures(alone, shown(visible_area=0.0))
     assert strapped.false_tracked == 0.0  # its palm is where the strap has it
 
 
@@ -181,9 +181,9 @@ def test_what_is_cut_off_does_not_come() -> None:
 
 
 def test_a_finger_is_in_sight_around_the_frame_that_shows_it() -> None:
-    both = shown(paint=0.0, line=0.0)
+    both = shown(visible_area=0.0, line=0.0)
     name = BOTH.markers.rig.cameras[0]
-    both.line_of_sight.paint_px2[name][120, INDEX] = 50.0  # at 2 s
+    both.line_of_sight.visible_px2[name][120, INDEX] = 50.0  # at 2 s
     seen = both.line_of_sight.cameras_of(np.array([1.94, 1.97, 2.0, 2.03, 2.06]), 0.04)[:, INDEX]
     assert seen.tolist() == [0, 1, 1, 1, 0]
 
@@ -191,7 +191,7 @@ def test_a_finger_is_in_sight_around_the_frame_that_shows_it() -> None:
 def test_hand_overs_are_where_sight_changes() -> None:
     both = shown()
     for name in BOTH.markers.rig.cameras:
-        both.line_of_sight.paint_px2[name][180:, INDEX] = 0.0  # from 3 s on
+        both.line_of_sight.visible_px2[name][180:, INDEX] = 0.0  # from 3 s on
     sighted = Sighted.of(both, solved(), None)
     near = sighted.hand_over[:, INDEX]
     assert near[np.abs(T_S - 3.04) < 0.45].all()

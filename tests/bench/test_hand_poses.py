@@ -98,7 +98,7 @@ def test_a_hand_that_is_not_found_is_counted_and_spoils_no_other() -> None:
     assert found.joints_mm.max() < 1e-9
 
 
-def test_a_palm_beside_the_truth_moves_every_joint_and_misses_every_tip() -> None:
+def test_a_palm_off_the_truth_moves_every_joint_and_misses_every_tip() -> None:
     T, angles = perfect(TRUTH)
     T[:, 0, 3] += 2e-3
     found = score(MODEL, TRUTH, T, angles, TRUTH.caps_m)

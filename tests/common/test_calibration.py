@@ -102,7 +102,7 @@ def hands(draw: st.DrawFn) -> HandProfile:
 
 
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-BESIDE = ((1.0, 0.0, 0.0, 0.075), *IDENTITY[1:])
+SHIFTED = ((1.0, 0.0, 0.0, 0.075), *IDENTITY[1:])
 CAMERA: dict[str, Any] = {
     "version": 1,
     "name": "left",
@@ -128,7 +128,7 @@ RIG: dict[str, Any] = {
     "kind": "markers",
     "cameras": ["left", "right"],
     "markers": ["thumb", "index"],
-    "T_rig_camera": {"left": IDENTITY, "right": BESIDE},
+    "T_rig_camera": {"left": IDENTITY, "right": SHIFTED},
     "depth_model": "power_law",
     "power_law": {"k_m": 45.433, "z": -1.035},
     "hand": "default-right",
@@ -195,7 +195,7 @@ def test_a_rig_is_loaded_equal(x0: float, k: float, z: float, imu: ImuCalibratio
         kind="markers",
         cameras=("left", "right"),
         hand="me",
-        T_rig_camera={"left": IDENTITY, "right": BESIDE},
+        T_rig_camera={"left": IDENTITY, "right": SHIFTED},
         depth_model="affine_disparity",
         power_law=PowerLawCalibration(k_m=k, z=z),
         affine_disparity=AffineDisparityCalibration(a_m_px=k, x0_px=x0),

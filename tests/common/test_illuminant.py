@@ -14,7 +14,7 @@ from common.sim.illuminant import CALIBRATED_KELVIN, ROOM, Light, LightCourse, p
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from common.sim.scenes import scene_by_name
-from common.srgb import relit_bytes, to_linear, to_srgb
+from common.srgb import gain_tables, to_linear, to_srgb
 
 ROOT = Path(__file__).resolve().parents[2]
 RIG = load(ROOT / "calib_json/rigs/desk.json", RigCalibration)
@@ -90,7 +90,7 @@ def test_an_impossible_light_is_refused(make: object, says: str) -> None:
 
 
 def test_bytes_change_in_linear_light_and_clip() -> None:
-    tables = relit_bytes([1.0, 0.5, 2.0])
+    tables = gain_tables([1.0, 0.5, 2.0])
     np.testing.assert_array_equal(tables[0], np.arange(256))
     # sRGB 188 is half the light of 255 (IEC 61966-2-1: 0.5 -> 0.7354).
     assert tables[1][255] == 188

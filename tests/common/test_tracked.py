@@ -16,12 +16,12 @@ from common.frame_recording import open_recording
 from common.geometry import axis_rotation, invert, rigid, transform
 from common.object_profile import ObjectProfile, TagFamily, Tags, tag_corners
 from common.sim.motion import PERIOD_S, HandState
-from common.sim.paint import MarkerView, Painter
+from common.sim.painter import MarkerView, Painter
 from common.sim.record import record_scene
 from common.sim.render import Renderer
 from common.sim.scene import Card, Scene
 from common.sim.scenes import scene_by_name
-from common.sim.tag_paint import INK, PAPER, TEXELS, printed
+from common.sim.tag_painter import INK, PAPER, TEXELS, printed
 from common.sim.tracked import facing
 from common.sim.travel import SHUTTLE_M_S
 from common.sim.view import View
@@ -101,7 +101,7 @@ def test_the_object_travels_turns_rests_and_comes_back(seed: int) -> None:
     assert np.linalg.norm(other[:3, 3] - poses[150, :3, 3]) > 1e-3
 
 
-def test_the_taken_thing_is_the_object_and_one_that_nothing_moves_rests_beside() -> None:
+def test_the_taken_thing_is_the_object_and_one_that_nothing_moves_rests() -> None:
     plain, held = scene_of("grasp", "desk"), scene_of("grasp", "desk-cube")
     for t in (0.0, 5.0, 8.0):
         (bar,) = plain.truth(t).things

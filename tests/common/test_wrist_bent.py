@@ -169,7 +169,7 @@ def test_the_round_ends_hold_as_much_as_flat_ones_and_a_disc_is_refused() -> Non
         bodies_of([Cylinder(ACROSS, 0.05, 0.02, False)], T_camera_rig)
 
 
-def test_an_imu_beside_the_camera_feels_the_forearm_and_not_the_palm() -> None:
+def test_an_imu_next_to_the_camera_feels_the_forearm_and_not_the_palm() -> None:
     @dataclass(frozen=True)
     class Nodding:
         """The palm stands in the room while the wrist bends by 0.5 rad/s: it is the forearm that turns."""

@@ -12,7 +12,7 @@ from common.calibration import ImuCalibration
 from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
 from common.hand_model import WRIST
 from common.messages import HandPose, ImuSample, MarkerDetections, Told
-from master.app import Beside, Observed, RunFigures, health, run
+from master.app import AuxiliaryMessage, Observed, RunFigures, health, run
 from master.live import cameras_line
 from master.rig_pipeline import pipeline_of
 from master.rig_setup import RigSetup
@@ -25,10 +25,12 @@ from tests.synthetic_run import SyntheticRun, hand_at, setup_of, synthetic_run
 class ScriptedSource:
     """Gives messages in turn, with pauses (None), then sets `stop`."""
 
-    def __init__(self, messages: Sequence[MarkerDetections | Beside | None], stop: threading.Event) -> None:
+    def __init__(
+        self, messages: Sequence[MarkerDetections | AuxiliaryMessage | None], stop: threading.Event
+    ) -> None:
         self._messages, self._stop = iter(messages), stop
 
-    def get(self, timeout_s: float) -> MarkerDetections | Beside | None:
+    def get(self, timeout_s: float) -> MarkerDetections | AuxiliaryMessage | None:
         assert timeout_s > 0
         try:
             return next(self._messages)

@@ -205,7 +205,7 @@ def test_a_master_that_has_no_time_but_for_messages_tells_some_instants() -> Non
     assert [shedding() for _ in range(2 * MOST + 2)] == 2 * [*[True] * MOST, False]
 
 
-def test_what_is_solved_beside_what_is_left_out_is_as_right_as_ever() -> None:
+def test_what_is_solved_next_to_rejected_frames_is_as_right_as_ever() -> None:
     run, queue = synthetic_run(24), MessageQueue(2)
     hurry = Hurry([run.setup])
     hurry.waiting, shed = queue.frame_spans, Shedding(hurry)

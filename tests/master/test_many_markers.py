@@ -140,7 +140,7 @@ def test_a_marker_on_no_hand_must_be_said_to_be_free() -> None:
 
 
 @pytest.mark.parametrize("solver", ["estimator", "fabrik"])
-def test_a_marker_on_a_bone_beside_that_of_the_finger_tip_counts_for_the_hand(solver: str) -> None:
+def test_a_marker_on_a_bone_next_to_that_of_the_finger_tip_counts_for_the_hand(solver: str) -> None:
     bone = MarkerMount("index-finger-phalanx-intermediate", (0.0, 0.009, -0.01), 0.012)
     knuckle = MarkerMount("middle-finger-metacarpal", (0.0, 0.01, -0.02), 0.012)
     profile = msgspec.structs.replace(

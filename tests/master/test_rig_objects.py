@@ -105,7 +105,7 @@ def test_rigs_of_two_hands_do_not_both_have_an_object(tree: Path) -> None:
 
 def test_merged_rigs_have_the_objects_of_all_in_the_shared_frame(tree: Path) -> None:
     rig = load(tree / "rigs/desk-cube.json", RigCalibration)
-    beside = msgspec.structs.replace(
+    neighbour = msgspec.structs.replace(
         rig,
         name="side",
         cameras=("left2", "right2"),
@@ -114,10 +114,10 @@ def test_merged_rigs_have_the_objects_of_all_in_the_shared_frame(tree: Path) -> 
         T_world_rig=rows(ASIDE),
         T_rig_tracking=rows(np.eye(4)),
     )
-    both = merged_rig([rig, beside])
+    both = merged_rig([rig, neighbour])
     assert both.objects == ("cube", "box")
     np.testing.assert_allclose(np.array(both.T_rig_tracking), ASIDE, atol=1e-12)
-    assert in_world(beside).T_world_rig is None
+    assert in_world(neighbour).T_world_rig is None
 
 
 def test_objects_of_a_recording_go_before_those_of_the_tree(tree: Path) -> None:

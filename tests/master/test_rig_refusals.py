@@ -115,7 +115,7 @@ def test_what_does_not_fit_is_refused_with_its_reason_and_what_to_do(
     assert "Traceback" not in ended.text
 
 
-def test_fabrik_beside_a_wrist_device_is_refused(tree: Path) -> None:
+def test_fabrik_with_a_wrist_device_is_refused(tree: Path) -> None:
     ended = started(tree, "desk-fabrik", "wrist")
     assert ended.code == 1, ended.text
     assert "solver 'fabrik' knows markers alone, but a wrist device watches this hand too" in ended.err

@@ -143,7 +143,7 @@ def test_a_triple_of_which_nothing_was_made_is_missed_with_all_its_points() -> N
     assert tips["tip_false"] == 0.0
 
 
-def test_poses_of_the_frames_beside_are_not_taken_for_those_of_the_triple() -> None:
+def test_poses_of_adjacent_frames_are_not_taken_for_those_of_the_cycle() -> None:
     exact = truth()
     late = replace(poses(exact), t_ns=exact.t_ns + 11_111_111)
     assert triples_missed(late, exact) == N

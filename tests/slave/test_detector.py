@@ -128,7 +128,7 @@ def test_a_rival_of_the_same_colour_within_reach_is_named() -> None:
 @pytest.mark.parametrize("radius", [5.0, 7.0])
 @pytest.mark.parametrize("gap", [6.0, 9.0, 12.0])
 @pytest.mark.parametrize("turn", [-2.8, 3.6, 4.2])
-def test_a_thing_beside_a_marker_never_seen_before_is_its_rival_not_a_part_of_it(
+def test_a_thing_near_a_marker_never_seen_before_is_an_alternative_not_a_part_of_it(
     radius: float, gap: float, turn: float
 ) -> None:
     away = 7.0 + gap + radius
@@ -173,7 +173,7 @@ def test_a_frame_of_another_size_or_kind_is_refused() -> None:
         DETECTOR.fresh().push(np.zeros((480, 640, 3), np.float32), 0)  # pyright: ignore[reportArgumentType]
 
 
-def test_a_free_marker_is_found_wherever_it_lies_beside_a_hand_or_alone() -> None:
+def test_a_free_marker_is_found_wherever_it_lies_next_to_a_hand_or_alone() -> None:
     ranges = {**RANGES, "puck": HsvRange(hsv_low=(0, 150, 40), hsv_high=(4, 255, 255))}
     names = (*NAMES, "puck")
     puck = (2, 230, 180)

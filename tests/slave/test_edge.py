@@ -90,7 +90,7 @@ def test_moments_of_nothing_are_refused(shape: Ellipse) -> None:
     assert centre_of(shares, shape, u, v) is None
 
 
-def test_a_crescent_whose_centroid_lies_beside_its_paint_is_no_answer() -> None:
+def test_a_crescent_whose_centroid_lies_next_to_its_marker_is_no_answer() -> None:
     y, x = np.mgrid[0:48, 0:48]
     far = np.hypot(x - 24.0, y - 24.0)
     shares = ((far > 9.0) & (far < 11.0) & (x > 24)).astype(np.float32)

@@ -21,7 +21,7 @@ class Detector:
         self.warnings: list[ColourWarning] = []
         self.log_gains: Float = np.log([0.5, 1.25, 2.5])
         self.refused = 3
-        self.follows = True
+        self.adapts = True
         self.tables = 4
 
 
@@ -73,5 +73,5 @@ def test_the_gauges_are_the_light_against_calibration() -> None:
 
 def test_of_a_light_that_is_not_followed_nothing_is_said() -> None:
     detector, light = report()
-    detector.follows = False
+    detector.adapts = False
     assert light.gauges() == {"rate_hz": 60.0}

@@ -19,11 +19,11 @@ from common.sim.illuminant import LightCourse
 from common.sim.render import Renderer
 from slave.cameras.replay import read_png
 from slave.markers.blobs import MAX_CANDIDATES, SCALE, Blob
-from slave.markers.changing import plain_of
 from slave.markers.classify import ColourTable
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.engine import NUMPY, Engine, engine_named
-from slave.markers.following import FollowingDetector, detector_for
+from slave.markers.light_adaptive import LightAdaptiveDetector, detector_for
+from slave.markers.reloadable import plain_of
 from slave.markers.roi import Window
 from slave.markers.scan import STRIPS, Scanner, merged
 from slave.markers.workers import Inline
@@ -141,7 +141,7 @@ def test_the_standard_scene_is_the_same_and_its_light_is_followed_alike() -> Non
     scene = replace(standard_scene(7), light=course)
     markers = scene.rig.markers
     renderer = Renderer(scene, "left")
-    whole, windows = (FollowingDetector(scene.cameras["left"], markers, Inline()) for _ in range(2))
+    whole, windows = (LightAdaptiveDetector(scene.cameras["left"], markers, Inline()) for _ in range(2))
     windows.plain.windows_only = True
     same = 0
     for k in range(30):
@@ -160,7 +160,7 @@ def test_a_rival_in_the_window_is_seen_and_one_beyond_it_is_not() -> None:
         frames = push_all(detector, [render(hand())] * 2 + [render([*hand(), thing])] * 3)
         assert all(seen(frames[-1]))
         assert math.isfinite(frames[-1].alternative_uv[1, 0]) is there
-        assert detector.beside.frames["index"] == (3 if there else 0)
+        assert detector.ambiguity.frames["index"] == (3 if there else 0)
 
 
 # What is lost

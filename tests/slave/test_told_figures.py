@@ -9,7 +9,7 @@ from common.bus import LoopbackBus
 from common.camera_settings import WANTED, figures
 from common.clock import SystemClock
 from common.messages import Command, Health, decode, encode
-from master.checklist.slave_rules import BESIDE, OFF, OVERLAP, UNCOLOURED
+from master.checklist.slave_rules import AMBIGUOUS, OFF, OVERLAP, UNCOLOURED
 from master.checklist.unseen import COLOUR, SEEN
 from slave import live
 from slave.markers.engine import NUMPY
@@ -25,7 +25,7 @@ GAUGES = {
     *(COLOUR + marker for marker in RIG.markers),
     *("width_px", "height_px", "light_exposure", "disk_free_mb"),
 }
-COUNTS = {"frames", "uncalibrated", *(kind + marker for kind in (SEEN, BESIDE) for marker in RIG.markers)}
+COUNTS = {"frames", "uncalibrated", *(kind + marker for kind in (SEEN, AMBIGUOUS) for marker in RIG.markers)}
 
 
 class Camera(Knobs):
@@ -48,7 +48,7 @@ def test_a_slave_tells_what_the_checklist_judges(tmp_path: Path) -> None:
         line = live._marker_line(
             "left", files, nothing, nothing, clock, "follow", "full", NUMPY, stop, workers, Service({})
         )
-    tuning = CameraTuning(files, Camera(), line.prepare, lambda: True, line.picker)
+    tuning = CameraTuning(files, Camera(), line.prepare, lambda: True, line.sampler)
     reporter = Reporter(
         "left", Alone(), line.numbers, clock, lambda _: LoopbackBus(), stop.set, 0.01, camera=tuning
     )

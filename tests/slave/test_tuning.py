@@ -22,8 +22,8 @@ from common.sim.scene import Scene
 from slave.app import run
 from slave.cameras.source import Frame
 from slave.cameras.synthetic import SyntheticCamera
-from slave.markers.changing import ChangingDetector, marker_changes
-from slave.markers.following import detector_for
+from slave.markers.light_adaptive import detector_for
+from slave.markers.reloadable import ReloadableDetector, marker_changes
 from slave.markers.scan_choice import Scan, ScanChoice
 from slave.markers.workers import Inline
 from slave.report import Reporter
@@ -259,7 +259,7 @@ class Slave:
         def make(camera: CameraCalibration, rig: RigCalibration) -> Any:
             return detector_for(camera, rig.markers, Inline(), free=rig.free_markers)
 
-        self.detector = ChangingDetector(make(FILE, RIG), ScanChoice(scan, FILE))
+        self.detector = ReloadableDetector(make(FILE, RIG), ScanChoice(scan, FILE))
         tally = Tally(RIG.markers)
         changes = marker_changes(self.detector, make)
         self.tuning = CameraTuning(files, self.source, changes, lambda: tally.counts()["frames"] > 0)
@@ -373,7 +373,10 @@ def test_a_changed_file_brightens_the_picture_and_a_broken_one_is_reported(files
 
 def replaced(make: Callable[[], Any]) -> list[int]:
     """Markers seen in each frame while the detector is replaced in the middle."""
-    renderer, detector = Renderer(SCENE, "left"), ChangingDetector(detector_for(FILE, RIG.markers, Inline()))
+    renderer, detector = (
+        Renderer(SCENE, "left"),
+        ReloadableDetector(detector_for(FILE, RIG.markers, Inline())),
+    )
     images = [(renderer.render(k / 60.0), round(k * 1e9 / 60.0)) for k in range(20)]
     counts: list[int] = []
     for k, (image, t_ns) in enumerate(images):
@@ -421,7 +424,7 @@ def test_a_wrist_device_keeps_its_rate(files: CameraFiles, knobs: Knobs) -> None
         tuning.commands()["set"]('{"frame_rate_hz": 30}')
 
 
-def test_what_others_write_into_the_file_and_what_was_set_here_stay_beside_each_other(
+def test_what_others_write_into_the_file_and_what_was_set_here_are_both_kept(
     tuning: CameraTuning, files: CameraFiles
 ) -> None:
     """A lens is calibrated by the master, which writes it into the file, while colours are set here."""

@@ -17,7 +17,7 @@ from common.messages import HandPose, ImuSample
 
 _NEAR_S = 0.08  # of an instant: fingers move smoothly for twice as long
 _SUPPORT = 10  # frames to either side
-_TERMS, _BESIDE = 4, 2  # of a cubic; frames to each side that it needs
+_TERMS, _NEIGHBOURS = 4, 2  # of a cubic; frames to each side that it needs
 _POOR_M = 0.03  # a cap of which so little is seen that its place is off by as much as this
 GAP_S = 0.06  # between samples of an IMU
 _EYE = np.eye(3)
@@ -105,7 +105,7 @@ class HandTrack:
         normal = np.einsum("tkm,tki,tkj->tmij", weight, power, power)
         pull = np.einsum("tkm,tki,tkmd->tmid", weight, power, np.where(seen[..., None], points, 0.0))
         before, after = ((seen & side[..., None]).sum(axis=1) for side in (off <= 0.0, off >= 0.0))
-        told = (before >= _BESIDE) & (after >= _BESIDE) & np.isfinite(self.cov_m2[near][..., 0, 0])
+        told = (before >= _NEIGHBOURS) & (after >= _NEIGHBOURS) & np.isfinite(self.cov_m2[near][..., 0, 0])
         solvable = np.where(told[..., None, None], normal, np.eye(_TERMS))
         taylor = np.asarray(np.linalg.solve(solvable, pull), np.float64)
         taylor[~told] = np.nan

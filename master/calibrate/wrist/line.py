@@ -169,8 +169,8 @@ def _profiles(
         centre = np.where(total > 0, (weight * d).sum(axis=1) / np.where(total > 0, total, 1.0), np.nan)
     height = light[np.arange(len(s)), np.abs(d - np.nan_to_num(centre)[:, None]).argmin(axis=1)]
     # A line stands out from what is beside it; an even light, as that of the LEDs, does not.
-    beside = np.abs(light[:, np.abs(d) > 0.6 * _REACH_PX]).max(axis=1, initial=0.0)
-    good = (np.abs(centre) < 0.5 * _REACH_PX) & (height > _NOISE_TIMES * noise) & (height > 3.0 * beside)
+    flank = np.abs(light[:, np.abs(d) > 0.6 * _REACH_PX]).max(axis=1, initial=0.0)
+    good = (np.abs(centre) < 0.5 * _REACH_PX) & (height > _NOISE_TIMES * noise) & (height > 3.0 * flank)
     s, centre = s[good], centre[good]
     if len(s) < _MIN_PROFILES or np.ptp(s) < side:
         raise FitError(_TOO_SHORT)

@@ -74,7 +74,7 @@ class Bench:
         self._add(name, "received", dt_s * rate * (1.0 - lost))
         self._add(name, "lost", dt_s * rate * lost)
         typical = {f"seen.{marker}": rate for marker in MARKERS} | {
-            f"beside.{marker}": 0.0 for marker in MARKERS
+            f"ambiguous.{marker}": 0.0 for marker in MARKERS
         }
         if name == "wrist":
             typical = dict.fromkeys(("strobe.out_of_step", "strobe.unlit"), 0.0)

@@ -145,8 +145,8 @@ CASES = [
     Case(
         "background_in_range",
         "left.back",
-        _event("left", "beside.back", 60.0),
-        _event("left", "beside.back", 0.0),
+        _event("left", "ambiguous.back", 60.0),
+        _event("left", "ambiguous.back", 0.0),
         "colour of marker back",
         "cover it",
     ),
@@ -361,7 +361,7 @@ def test_causes_silence_what_follows_from_them_and_nothing_else() -> None:
     bench = Bench()
     bench.seconds(8.0)
     bench.gauges["left"] = {"overlap.index..back": 3.0}
-    bench.per_s["left"] = {"beside.back": 60.0, "beside.ring": 60.0}
+    bench.per_s["left"] = {"ambiguous.back": 60.0, "ambiguous.ring": 60.0}
     bench.loss["right"] = 0.2
     bench.apart = 0.9
     items = bench.seconds(4.0)[-1][1]
@@ -389,5 +389,5 @@ def test_what_a_slave_reports_of_invented_markers_costs_nothing_and_hides_nothin
     assert not any(items for _, items in bench.seconds(12.0))
     bench.gauges["left"] = {f"overlap.a{k}..b{k}": 1.0 for k in range(250)}
     bench.counts["left"] = {f"uncalibrated.m{k}": 1 for k in range(100)}
-    bench.per_s["left"] = {f"beside.m{k}": 60.0 for k in range(100)}
+    bench.per_s["left"] = {f"ambiguous.m{k}": 60.0 for k in range(100)}
     assert not any(items for _, items in bench.seconds(3.0))

@@ -44,7 +44,7 @@ def test_what_is_lifted_and_turned_is_carried_and_stays_so_at_rest() -> None:
     assert all(said[60 + 30 :])  # half a second after it begins to move
 
 
-def test_a_hand_that_rests_beside_what_others_move_carries_nothing() -> None:
+def test_a_hand_that_rests_next_to_what_others_move_carries_nothing() -> None:
     assert not any(told(5.0, lambda t_s: transform(object_at(0.0), PALM_M)))
 
 

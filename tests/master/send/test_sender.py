@@ -18,7 +18,7 @@ from master.outputs.bus import BusSink
 from master.send import outputs as registry
 from master.send.line import DEPTH, OutputLine, Tally
 from master.send.outputs import OUTPUTS, Output
-from master.send.sender import NAME, Beside, Sender, run_sender, settings_of
+from master.send.sender import NAME, Housekeeping, Sender, run_sender, settings_of
 from master.send.times import MasterTimes
 from tests.master.send.hands import hand_pose
 
@@ -267,10 +267,10 @@ def test_the_clock_of_a_master_on_another_machine_is_learned(tmp_path: Path) -> 
     ahead_ns = 3_600 * 10**9
     bus.serve(MASTER, lambda command: Health(MASTER, 1, time.monotonic_ns() + ahead_ns, {}, {}))
     one, _ = sender(default_outputs())
-    beside = Beside(one, bus, tmp_path / "default.json", [])
+    housekeeping = Housekeeping(one, bus, tmp_path / "default.json", [])
     assert one.times.offset_ns == 0
     for _ in range(8):
-        beside.step(print)
+        housekeeping.step(print)
     assert one.times.offset_ns == pytest.approx(ahead_ns, abs=1_000_000)
     now = time.monotonic_ns()
     assert one.times.local_ns(now + ahead_ns) == pytest.approx(now, abs=1_000_000)

@@ -90,9 +90,9 @@ def test_cameras_can_be_named_and_the_rig_keeps_those_that_there_are(tmp_path: P
     assert "rig 'desk' has right, too, of which there is nothing" in said
 
 
-@pytest.mark.parametrize("beside", [False, True])
+@pytest.mark.parametrize("sidecar", [False, True])
 def test_a_table_of_times_is_kept_to_the_nanosecond_and_frames_without_one_are_left_out(
-    tmp_path: Path, beside: bool
+    tmp_path: Path, sidecar: bool
 ) -> None:
     left, right = (write_video(tmp_path / f"{name}.avi") for name in ("left", "right"))
     base = 1_760_000_000_000_000_000  # since 1970, beyond what a float keeps
@@ -102,7 +102,7 @@ def test_a_table_of_times_is_kept_to_the_nanosecond_and_frames_without_one_are_l
         name: [f"{k},{t // 10**9}.{t % 10**9:09d}" for k, t in enumerate(own)] for name, own in taken.items()
     }
     table = None
-    if beside:
+    if sidecar:
         for name, own in lines.items():
             (tmp_path / f"{name}.csv").write_text("\n".join(["frame,time", *own]))
     else:

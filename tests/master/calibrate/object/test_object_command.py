@@ -77,8 +77,8 @@ def shown(recorded: Path, tree: Path) -> tuple[object, ...]:
 
 def test_rendered_beads_are_measured_and_the_file_tracks(run: Run, recorded: Path, tree: Path) -> None:
     beads = ("--markers", ",".join(BEADS), "--radius-mm", 9, "--add-to-rig")
-    beside = ("--json", tree / "told.json", "--picture", tree / "wand.png")
-    assert run(*shown(recorded, tree), *beads, *beside) == 0
+    outputs = ("--json", tree / "told.json", "--picture", tree / "wand.png")
+    assert run(*shown(recorded, tree), *beads, *outputs) == 0
     profile = load(tree / "objects" / "wand.json", ObjectProfile)
     places = np.array([profile.markers[name].position_m for name in BEADS])
     T_true_own = fit_rigid(TRUE_M, places)

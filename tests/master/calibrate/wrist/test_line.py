@@ -46,7 +46,7 @@ def test_points_lie_on_the_laser_and_within_the_squares() -> None:
     assert np.abs(on_board[:, 2]).max() < 1e-6
 
 
-def test_a_brighter_line_on_the_table_beside_the_board_is_not_taken() -> None:
+def test_a_brighter_line_on_the_table_next_to_the_board_is_not_taken() -> None:
     frames, placed = first()
     laser = frames[LASER].copy()
     corners = OPTICS.project(placed.T_camera_board[:3, 3] + np.zeros((1, 3)))

@@ -17,19 +17,19 @@ import numpy as np
 
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration
-from common.srgb import relit_bytes
+from common.srgb import gain_tables
 from slave.markers.classify import ColourTable, table_of
 from slave.markers.colour_watch import ColourWarning, ColourWatch
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.engine import NUMPY, Engine
-from slave.markers.light import CameraLight, apart
+from slave.markers.white_balance import WhiteBalance, apart
 from slave.markers.workers import Workers
 
 STEP = 0.08  # log gains of red or blue against green from which a new table is made: one or two hues
 REFUSE = 0.2  # and from which the old one may take one marker for another: three to six hues
 
 
-class FollowingDetector:
+class LightAdaptiveDetector:
     """Detects with colours that follow the light. Holds the light, the table in use and the one being made.
 
     Attributes:
@@ -58,13 +58,13 @@ class FollowingDetector:
 
         Raises:
             CalibrationError: The camera has no colour range for a marker.
-            ValueError: A range has no reference colour; see `can_follow`.
+            ValueError: A range has no reference colour; see `can_adapt`.
         """
         self._table = table_of(markers, camera.markers, f"camera {camera.name!r}")
         ranges = camera.markers or {}
         reference = np.array([ranges[name].reference_bgr_linear or (np.nan,) * 3 for name in markers])
         self._detector = MarkerDetector(camera, markers, seeds, self._table, engine, free)
-        self._light = CameraLight(self._table, reference, (camera.width_px, camera.height_px), workers)
+        self._light = WhiteBalance(self._table, reference, (camera.width_px, camera.height_px), workers)
         self._watch = ColourWatch(markers, ranges)
         self._workers, self._engine = workers, engine
         self._in_use = np.zeros(3)  # log gains of the table in use
@@ -90,7 +90,7 @@ class FollowingDetector:
         """What detects, with the colours of the light as far as they are followed."""
         return self._detector
 
-    def adopt(self, other: "FollowingDetector") -> None:
+    def adopt(self, other: "LightAdaptiveDetector") -> None:
         """Go on with the tracks and counts of another detector, under the light that this one knows."""
         self._detector.adopt(other._detector)
         self.refused, self.tables = other.refused, other.tables + self.tables
@@ -99,7 +99,7 @@ class FollowingDetector:
         """As of `MarkerDetector`; what an exposure does to the colours is seen as a change of the light."""
         self._detector.tune(camera)
 
-    def fresh(self, seeds: Mapping[str, tuple[float, float]] | None = None) -> "FollowingDetector":
+    def fresh(self, seeds: Mapping[str, tuple[float, float]] | None = None) -> "LightAdaptiveDetector":
         """A detector of the same camera, under the same light, that has seen no marker yet."""
         other = copy(self)
         other._detector = self._detector.fresh(seeds)
@@ -117,7 +117,7 @@ class FollowingDetector:
         """
         image = np.ascontiguousarray(image)
         self._light.look(image, t_ns)
-        self._follow()
+        self._adapt()
         found = self._detector.push(image, t_ns)
         stale = apart(self.log_gains, self._in_use) > REFUSE
         if self._light.proven and not stale:
@@ -137,13 +137,13 @@ class FollowingDetector:
         else:
             self._look_next = self._light.learn(found.colour, found.clarity, t_ns) is not None
 
-    def _follow(self) -> None:
+    def _adapt(self) -> None:
         """Have a table made where the light has moved; use the one that is ready."""
         if self._making is None and apart(self.log_gains, self._in_use) > STEP:
             gains = self.log_gains
             self._making = (
                 gains,
-                self._workers.submit(partial(_relit, self._table, gains, self._engine)),
+                self._workers.submit(partial(_white_balanced, self._table, gains, self._engine)),
             )
         if self._making is not None and self._making[1].done():
             (self._in_use, job), self._making = self._making, None
@@ -152,11 +152,11 @@ class FollowingDetector:
             self.tables += 1
 
 
-def _relit(table: ColourTable, log_gains: Float, engine: Engine) -> ColourTable:
+def _white_balanced(table: ColourTable, log_gains: Float, engine: Engine) -> ColourTable:
     """A table for pictures under a light of these log gains (3,), ready for use."""
-    relit = table.relit(relit_bytes(np.exp(-log_gains)))
-    engine.prepare(relit)
-    return relit
+    white_balanced = table.white_balanced(gain_tables(np.exp(-log_gains)))
+    engine.prepare(white_balanced)
+    return white_balanced
 
 
 def detector_for(
@@ -166,18 +166,18 @@ def detector_for(
     seeds: Mapping[str, tuple[float, float]] | None = None,
     engine: Engine = NUMPY,
     free: Collection[str] = (),
-) -> FollowingDetector | MarkerDetector:
+) -> LightAdaptiveDetector | MarkerDetector:
     """A detector that follows the light where the camera file allows it, else one with fixed colours.
 
     Raises:
         CalibrationError: The camera has no colour range for a marker.
     """
-    if can_follow(camera, markers):
-        return FollowingDetector(camera, markers, workers, seeds, engine, free)
+    if can_adapt(camera, markers):
+        return LightAdaptiveDetector(camera, markers, workers, seeds, engine, free)
     return MarkerDetector(camera, markers, seeds, None, engine, free)
 
 
-def can_follow(camera: CameraCalibration, markers: tuple[str, ...]) -> bool:
+def can_adapt(camera: CameraCalibration, markers: tuple[str, ...]) -> bool:
     """Whether the camera file says what every marker looked like at calibration."""
     ranges = camera.markers or {}
     return all(name in ranges and ranges[name].reference_bgr_linear is not None for name in markers)

@@ -16,7 +16,7 @@ from common.geometry import cross
 from common.sim import light, raster
 from common.sim.before import NO_PHALANX, REACH_PX, Places, hand_before, things_before
 from common.sim.desk import LENS_SIGMA_PX
-from common.sim.object_paint import ObjectPainter, ObjectView, PaintedFeature
+from common.sim.object_painter import ObjectPainter, ObjectView, PaintedFeature
 from common.sim.objects_seen import SeenBead
 from common.sim.raster import Coverage, Shape
 from common.sim.surface import unit
@@ -79,12 +79,14 @@ class Painter:
         self._size = (view.optics.width_px, view.optics.height_px)
         self._tables = light.SrgbTables.make()
         rig = view.scene.rig
-        self._paint = {m: light.paint(n) for m, n in enumerate(rig.markers) if n not in rig.free_markers}
-        self._shades = {
-            m: (*light.shades(paint, gloss=0.02), light.bgr_bytes(np.array(paint) + 0.10))
-            for m, paint in self._paint.items()
+        self._colours = {
+            m: light.marker_colour(n) for m, n in enumerate(rig.markers) if n not in rig.free_markers
         }
-        self._sides = {m: light.face_shade(paint, 0.25) for m, paint in self._paint.items()}
+        self._shades = {
+            m: (*light.shades(marker_colour, gloss=0.02), light.bgr_bytes(np.array(marker_colour) + 0.10))
+            for m, marker_colour in self._colours.items()
+        }
+        self._sides = {m: light.face_shade(marker_colour, 0.25) for m, marker_colour in self._colours.items()}
         self._caps = {cap.marker: c for c, cap in enumerate(view.surface.caps)}
         self._boxes = {box.marker: box.corners for box in view.surface.boxes}
         self._objects = ObjectPainter(view, self._tables)
@@ -194,7 +196,7 @@ class Painter:
         normal = unit(cross(top[1] - top[0], top[3] - top[0]))
         facing = float(normal @ self._view.to_light) * (-1.0 if float(normal @ top[0]) > 0.0 else 1.0)
         corners = raster.fixed(snapshot.uv[side][:4] - (x0, y0))
-        raster.fill(appearance, corners, light.face_shade(self._paint[item.marker], facing))
+        raster.fill(appearance, corners, light.face_shade(self._colours[item.marker], facing))
         return appearance
 
     def clusters(self, painted: Covered) -> list[list[AnyPainted]]:

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from common.arrays import Bool, Float, Image
 from common.calibration import HsvRange
 from common.errors import FitError
-from common.srgb import relit_bytes
+from common.srgb import gain_tables
 from slave.markers.classify import HUES, SKIN, in_range
 from slave.markers.colour_watch import hsv as hsv_of_light
 from slave.markers.colours import (
@@ -44,7 +44,7 @@ PIXELS_MOST = 4000  # of one paint that are kept
 
 
 @dataclass(frozen=True, slots=True)
-class Pick:
+class ColourSample:
     """What came of one click.
 
     Attributes:
@@ -56,24 +56,24 @@ class Pick:
     row: ColourRow
 
 
-class PickedColours:
+class SampledColours:
     """Holds the pixels of the paints that were picked since the start, as under the light of calibration, and what was
     made of them: a range that was changed since counts as one of the file.
     """
 
     def __init__(self) -> None:
         """Nothing was picked yet."""
-        self._paint: dict[str, Image] = {}
+        self._samples: dict[str, Image] = {}
         self._made: dict[str, HsvRange] = {}
 
-    def pick(
+    def sample(
         self,
         image: Image,
         log_gains: Float,
         marker: str,
         uv: tuple[float, float],
         ranges: Mapping[str, HsvRange],
-    ) -> Pick:
+    ) -> ColourSample:
         """Make the range of a marker.
 
         Args:
@@ -88,41 +88,41 @@ class PickedColours:
                 marker; the text says what to do.
         """
         hsv = undone(image, log_gains)
-        mask = paint_at(hsv, marker, uv)
+        mask = colour_region(hsv, marker, uv)
         pixels = hsv[mask]
-        picked = {name: self._paint[name] for name, made in self._made.items() if ranges.get(name) == made}
+        picked = {name: self._samples[name] for name, made in self._made.items() if ranges.get(name) == made}
         picked[marker] = pixels
-        paint = {
-            name: picked[name] if name in picked else _paint_of(ranges[name]) for name in (*ranges, marker)
+        samples = {
+            name: picked[name] if name in picked else _sample_of(ranges[name]) for name in (*ranges, marker)
         }
-        _refuse_like(marker, paint)
+        _refuse_like(marker, samples)
         masks = {name: in_range(hsv, colour) & ~mask for name, colour in ranges.items()} | {marker: mask}
         skin, background = surroundings(hsv, masks)
-        rows = {row.name: row for row in rows_of(paint, hsv[skin], hsv[background])}
+        rows = {row.name: row for row in rows_of(samples, hsv[skin], hsv[background])}
         _refuse_poor(rows[marker])
         made = {name: rows[name].range for name in picked}
         kept = {
-            name: _apart(colour, circular_median(paint[name][:, 0]), made)
+            name: _apart(colour, circular_median(samples[name][:, 0]), made)
             for name, colour in ranges.items()
             if name not in picked
         }
         picked[marker] = pixels[:: max(len(pixels) // PIXELS_MOST, 1)]
-        self._paint, self._made = picked, made
-        return Pick(kept | made, rows[marker])
+        self._samples, self._made = picked, made
+        return ColourSample(kept | made, rows[marker])
 
 
 def undone(image: Image, log_gains: Float) -> Image:
     """HSV (H, W, 3) of a picture as it would be under the light of calibration."""
     if np.any(log_gains):
-        image = np.asarray(cv2.LUT(image, relit_bytes(np.exp(-log_gains)).T[None]), np.uint8)
+        image = np.asarray(cv2.LUT(image, gain_tables(np.exp(-log_gains)).T[None]), np.uint8)
     return cast(Image, cv2.cvtColor(image, cv2.COLOR_BGR2HSV))
 
 
-def paint_at(hsv: Image, marker: str, uv: tuple[float, float]) -> Bool:
+def colour_region(hsv: Image, marker: str, uv: tuple[float, float]) -> Bool:
     """The paint (H, W) at or near a pixel (u, v) [px].
 
     Raises:
-        FitError: As `PickedColours.pick`.
+        FitError: As `SampledColours.sample`.
     """
     where = f"pick {marker}: ({uv[0]:.0f}, {uv[1]:.0f})"
     height, width = hsv.shape[:2]
@@ -185,7 +185,7 @@ def _core(hsv: Image, uv: tuple[float, float]) -> tuple[float, float] | None:
     return float(column + u0), float(row + v0)
 
 
-def _paint_of(colour: HsvRange) -> Image:
+def _sample_of(colour: HsvRange) -> Image:
     """One HSV pixel (1, 3) that stands for a paint of which only the range is known."""
     if colour.reference_bgr_linear is not None:
         return np.rint(hsv_of_light(np.array([colour.reference_bgr_linear]))).astype(np.uint8)
@@ -194,9 +194,9 @@ def _paint_of(colour: HsvRange) -> Image:
     return np.array([[hue, (low[1] + high[1]) // 2, (low[2] + high[2]) // 2]], np.uint8)
 
 
-def _refuse_like(marker: str, paint: Mapping[str, Image]) -> None:
-    hue = circular_median(paint[marker][:, 0])
-    for name, pixels in paint.items():
+def _refuse_like(marker: str, samples: Mapping[str, Image]) -> None:
+    hue = circular_median(samples[marker][:, 0])
+    for name, pixels in samples.items():
         other = circular_median(pixels[:, 0])
         if name != marker and hue_separation(hue, other) < HUE_SEPARATION:
             raise FitError(

@@ -9,15 +9,15 @@ from common.calibration import CameraCalibration
 from common.camera_settings import ColourPick
 from common.errors import CameraError
 from slave.cameras.source import Frame
-from slave.markers.changing import ChangingDetector
-from slave.markers.picking import PickedColours
+from slave.markers.colour_sampling import SampledColours
+from slave.markers.reloadable import ReloadableDetector
 
 
-class LivePicker:
+class ColourSampler:
     """Holds what was picked since the start. Its callers take turns."""
 
     def __init__(
-        self, detector: ChangingDetector, shown: Callable[[int], Frame | None], markers: tuple[str, ...]
+        self, detector: ReloadableDetector, shown: Callable[[int], Frame | None], markers: tuple[str, ...]
     ) -> None:
         """Pick colours of `markers`, those of the rig.
 
@@ -27,7 +27,7 @@ class LivePicker:
             markers: Others in a camera file belong to other rigs, and collide with nothing here.
         """
         self._detector, self._shown, self._markers = detector, shown, markers
-        self._picked = PickedColours()
+        self._picked = SampledColours()
 
     def pick(
         self, wish: ColourPick, camera: CameraCalibration
@@ -36,12 +36,12 @@ class LivePicker:
 
         Raises:
             CameraError: No frame was read yet.
-            FitError: As `PickedColours.pick`.
+            FitError: As `SampledColours.sample`.
         """
         every = camera.markers or {}
         ranges = {name: every[name] for name in self._markers if name in every}
         light = self._detector.log_gains
-        done = self._picked.pick(self._image(wish.t_ns), light, wish.marker, wish.uv, ranges)
+        done = self._picked.sample(self._image(wish.t_ns), light, wish.marker, wish.uv, ranges)
         told = {
             "pick.pixels": float(done.row.pixels),
             "pick.own_share": done.row.own,

@@ -13,7 +13,7 @@ import numpy as np
 
 from bench.cap_image import Rgb
 from common.calibration import CameraCalibration, HsvRange
-from common.sim.light import PAINT_LINEAR_RGB, bgr_bytes, to_linear
+from common.sim.light import MARKER_LINEAR_RGB, bgr_bytes, to_linear
 
 MORE_HUES: Final = (30, 55, 80, 102, 124, 150)  # between those of the six
 MANY: Final = 24
@@ -24,16 +24,16 @@ SATURATION_SHARE, SATURATION_LEAST = 0.45, 50
 VALUE_SHARE, VALUE_LEAST = 0.3, 25
 
 
-def paints(count: int) -> dict[str, Rgb]:
+def marker_rgb(count: int) -> dict[str, Rgb]:
     """Marker -> linear RGB reflectance.
 
     Raises:
         ValueError: Not 6, 12 or 24 markers.
     """
     if count == 6:
-        return dict(PAINT_LINEAR_RGB)
+        return dict(MARKER_LINEAR_RGB)
     if count == 12:
-        return dict(PAINT_LINEAR_RGB) | {f"hue_{h}": _of_hsv(h, 0.8, 0.72) for h in MORE_HUES}
+        return dict(MARKER_LINEAR_RGB) | {f"hue_{h}": _of_hsv(h, 0.8, 0.72) for h in MORE_HUES}
     if count == MANY:
         return {f"hue_{h:.0f}": _of_hsv(h, 0.85, 0.75) for h in np.linspace(*MANY_HUES, MANY)}
     raise ValueError(f"{count} paints: there are sets of 6, 12 and {MANY}")
@@ -41,7 +41,7 @@ def paints(count: int) -> dict[str, Rgb]:
 
 def camera_file(count: int, size: tuple[int, int]) -> CameraCalibration:
     """The camera of `size` (width, height) [px] with the ranges of `count` markers."""
-    named = paints(count)
+    named = marker_rgb(count)
     hsv = {name: _hsv(colour) for name, colour in named.items()}
     return CameraCalibration(
         version=1,

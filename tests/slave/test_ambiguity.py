@@ -13,7 +13,7 @@ from common.errors import CameraError
 from slave.cameras.faulty import FaultyCamera
 from slave.cameras.synthetic import SyntheticCamera
 from slave.colours_in_use import in_use, overlap
-from slave.markers.beside import Beside, told_frames, told_places
+from slave.markers.ambiguity import ColourAmbiguityMonitor, told_frames, told_places
 from slave.markers.blobs import Blob
 from slave.simulated import FrameClock, scene_of
 
@@ -27,18 +27,18 @@ def _blob(u: float, v: float, side: float) -> Blob:
 
 
 def test_only_things_apart_from_the_hand_count() -> None:
-    beside = Beside(("index", "back"))
+    ambiguity = ColourAmbiguityMonitor(("index", "back"))
     index, back = _blob(100, 100, 12), _blob(150, 150, 20)
     near = _blob(112, 100, 11)  # a piece of the marker
     rim = _blob(150, 150, 10)  # the hue runs through another range on the rim of the other marker
     speck = _blob(400, 300, 4)
-    beside.push([[index, near, rim, speck], [back]], {0: index, 1: back})
-    assert beside.frames == {"index": 0, "back": 0}
-    beside.push([[index, _blob(400, 300, 12)], [back]], {0: index, 1: back})
-    beside.push([[_blob(400, 310, 12)], [back]], {1: back})  # the marker itself is hidden
-    beside.push([[_blob(400, 320, 12)], []], {})  # no hand to be beside of
-    assert beside.frames == {"index": 2, "back": 0}
-    assert beside.places == {"index": (400, 310)}
+    ambiguity.push([[index, near, rim, speck], [back]], {0: index, 1: back})
+    assert ambiguity.frames == {"index": 0, "back": 0}
+    ambiguity.push([[index, _blob(400, 300, 12)], [back]], {0: index, 1: back})
+    ambiguity.push([[_blob(400, 310, 12)], [back]], {1: back})  # the marker itself is hidden
+    ambiguity.push([[_blob(400, 320, 12)], []], {})  # no hand to be beside of
+    assert ambiguity.frames == {"index": 2, "back": 0}
+    assert ambiguity.places == {"index": (400, 310)}
 
 
 def test_ranges_overlap_by_the_hues_that_they_share() -> None:

@@ -1,6 +1,6 @@
 """Know the light of one camera at every frame, from three sources that differ in what they can tell.
 
-    first_light   the first picture: all colours together prove one light      at the start, and after doubt
+    initial_white_balance   the first picture: all colours together prove one light      at the start, and after doubt
     light_meter   what stands still: how the light changes, at once             every frame
     drift         the markers: where the light stands, slowly but for certain   10 times a second
 
@@ -18,7 +18,16 @@ from common.arrays import Float, Image
 from slave.markers.classify import ColourTable
 from slave.markers.colour_watch import ColourWarning
 from slave.markers.drift import ColourDrift, GainFit, at_bound
-from slave.markers.first_light import AHEAD, FITS, PROOF, STRIDE, Evidence, different, evidence, first_light
+from slave.markers.initial_white_balance import (
+    AHEAD,
+    FITS,
+    PROOF,
+    STRIDE,
+    Evidence,
+    different,
+    evidence,
+    initial_white_balance,
+)
 from slave.markers.light_meter import Change, LightMeter
 from slave.markers.workers import Workers
 
@@ -31,7 +40,7 @@ AGAIN_NS = 500_000_000  # between two attempts to prove the light
 MISFITS = 5  # looks in a row, half a second, in which the markers fit badly and put the light in doubt
 
 
-class CameraLight:
+class WhiteBalance:
     """The light of one camera. Holds its estimate, whether it is proven, and the proof under way."""
 
     def __init__(self, table: ColourTable, reference: Float, size: tuple[int, int], workers: Workers) -> None:
@@ -139,7 +148,7 @@ class CameraLight:
         if self._proof is None and (self._tried_ns is None or t_ns - self._tried_ns >= AGAIN_NS):
             self._tried_ns = t_ns
             job = self._workers.submit(
-                partial(first_light, image.copy(), self._table, self._reference, self.log_gains)
+                partial(initial_white_balance, image.copy(), self._table, self._reference, self.log_gains)
             )
             self._proof = np.zeros(3), job
         if self._proof is not None and self._proof[1].done():

@@ -1,6 +1,6 @@
 """Beads and tags of tracked objects: what each covers of the image, how it looks there, and the truth of it.
 
-As with the markers of a hand (`paint`), everything nearer is cut out of the coverage, and the same coverage blends the
+As with a hand's markers (`painter`), everything nearer is cut out of the coverage, and the same coverage blends the
 paint into the image.
 """
 
@@ -15,7 +15,7 @@ from common.sim import light, raster
 from common.sim.before import NO_PHALANX, REACH_PX, Places, hand_before, things_before
 from common.sim.objects_seen import SeenBead, SeenPart, SeenSheet
 from common.sim.raster import Coverage, Shape
-from common.sim.tag_paint import sheet_appearance
+from common.sim.tag_painter import sheet_appearance
 from common.sim.view import Snapshot, View
 
 Float32 = npt.NDArray[np.float32]
@@ -60,9 +60,16 @@ class ObjectPainter:
         self._view, self._tables = view, tables
         self._size = (view.optics.width_px, view.optics.height_px)
         names = view.scene.rig.markers
-        paints = {b.marker: light.paint(names[b.marker]) for b in view.objects.beads if b.marker is not None}
-        self._shades = {marker: light.shades(paint, gloss=0.02) for marker, paint in paints.items()}
-        self._shine = {marker: light.bgr_bytes(np.array(paint) + 0.10) for marker, paint in paints.items()}
+        colours = {
+            b.marker: light.marker_colour(names[b.marker]) for b in view.objects.beads if b.marker is not None
+        }
+        self._shades = {
+            marker: light.shades(marker_colour, gloss=0.02) for marker, marker_colour in colours.items()
+        }
+        self._shine = {
+            marker: light.bgr_bytes(np.array(marker_colour) + 0.10)
+            for marker, marker_colour in colours.items()
+        }
 
     def cover(
         self, snapshot: Snapshot, cards: tuple[Shape, ...], hand: Sequence[tuple[Shape, float]]

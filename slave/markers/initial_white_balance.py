@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from common.arrays import Float, Image
-from common.srgb import relit_bytes, to_linear
+from common.srgb import gain_tables, to_linear
 from slave.markers.classify import ColourTable
 from slave.markers.drift import bounded, fit_gains
 
@@ -67,7 +67,7 @@ class Evidence:
     beyond: bool = False
 
 
-def first_light(image: Image, table: ColourTable, reference: Float, expected: Float) -> Evidence:
+def initial_white_balance(image: Image, table: ColourTable, reference: Float, expected: Float) -> Evidence:
     """The light that explains most of a picture, and whether the picture proves it.
 
     Args:
@@ -122,7 +122,7 @@ def evidence(half: Image, table: ColourTable, reference: Float, log_gains: Float
         reference: (M, 3) linear light of each marker's core at calibration, blue first.
         log_gains: (3,) of the light, blue, green, red.
     """
-    undone = np.asarray(cv2.LUT(half, relit_bytes(np.exp(-log_gains)).T[None]), np.uint8)
+    undone = np.asarray(cv2.LUT(half, gain_tables(np.exp(-log_gains)).T[None]), np.uint8)
     codes = table.codes(undone)
     colour = np.full(reference.shape, np.nan)
     for m, bit in enumerate(table.bits):

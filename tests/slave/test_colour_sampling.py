@@ -15,17 +15,17 @@ from common.camera_settings import ColourPick
 from common.errors import CameraError, FitError
 from common.sim.render import Renderer
 from common.sim.scene import Scene
-from common.srgb import relit_bytes
+from common.srgb import gain_tables
 from slave.cameras.source import Frame
-from slave.markers.changing import ChangingDetector, marker_changes
+from slave.colour_sampler import ColourSampler
+from slave.markers.calibrated import CalibratedDetector
 from slave.markers.classify import in_range
+from slave.markers.colour_sampling import SampledColours, undone
 from slave.markers.colours import calibrate, hue_separation
 from slave.markers.detector import MarkerDetector
-from slave.markers.following import FollowingDetector
-from slave.markers.known import KnownDetector
-from slave.markers.picking import PickedColours, undone
+from slave.markers.light_adaptive import LightAdaptiveDetector
+from slave.markers.reloadable import ReloadableDetector, marker_changes
 from slave.markers.workers import Inline
-from slave.picker import LivePicker
 from slave.tuning import CameraTuning
 from tests.slave import painted
 from tests.slave.painted import HUE, NAMES
@@ -39,7 +39,7 @@ SAME = np.zeros(3)
 def picked(
     image: Image, *names: str, ranges: dict[str, HsvRange] | None = None, log_gains: np.ndarray = SAME
 ) -> dict[str, HsvRange]:
-    colours, found = PickedColours(), dict(ranges or {})
+    colours, found = SampledColours(), dict(ranges or {})
     for name in names:
         found = colours.pick(image, log_gains, name, AT[name], found).ranges
     return found
@@ -51,7 +51,7 @@ def test_six_clicks_detect_as_well_as_the_calibrated_ranges() -> None:
     for camera in RIG.cameras:
         renderer = Renderer(scene, camera)
         image, truth = renderer.render(0.3), renderer.markers(0.3)
-        colours, ranges = PickedColours(), dict[str, HsvRange]()
+        colours, ranges = SampledColours(), dict[str, HsvRange]()
         for name, uv in zip(RIG.markers, truth.uv, strict=True):
             pick = colours.pick(image, SAME, name, (uv[0] + 2.0, uv[1] - 2.0), ranges)
             ranges = pick.ranges
@@ -83,12 +83,12 @@ def test_in_whatever_order_the_ranges_are_those_of_six_clicks_in_one_picture() -
             )
 
 
-def test_a_click_beside_a_small_marker_is_meant_for_it() -> None:
+def test_a_click_next_to_a_small_marker_is_meant_for_it() -> None:
     straight = picked(PICTURE, "index")["index"]
     u, v = AT["index"]
     for du, dv in ((7.0, -6.0), (0.0, -15.0), (-6.9, 0.0)):  # in the picture, beside it, on its rim
-        beside = PickedColours().pick(PICTURE, SAME, "index", (u + du, v + dv), {}).ranges["index"]
-        np.testing.assert_allclose(beside.hsv_low, straight.hsv_low, atol=2)
+        off_centre = SampledColours().sample(PICTURE, SAME, "index", (u + du, v + dv), {}).ranges["index"]
+        np.testing.assert_allclose(off_centre.hsv_low, straight.hsv_low, atol=2)
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_a_click_that_makes_no_colour_says_what_to_do(
     image[400:440, 70:130] = cv2.cvtColor(across, cv2.COLOR_HSV2BGR)
     image[29:31, 599:601] = (20, 160, 20)
     with pytest.raises(FitError, match=says):
-        PickedColours().pick(image, SAME, marker, uv, picked(PICTURE, "index"))
+        SampledColours().sample(image, SAME, marker, uv, picked(PICTURE, "index"))
 
 
 def test_a_range_of_the_file_gives_up_the_hues_that_a_picked_one_needs() -> None:
@@ -137,7 +137,7 @@ def test_a_range_of_the_file_gives_up_the_hues_that_a_picked_one_needs() -> None
 
 
 def test_a_range_that_was_set_by_hand_since_is_not_made_again() -> None:
-    colours = PickedColours()
+    colours = SampledColours()
     ranges = colours.pick(PICTURE, SAME, "index", AT["index"], {}).ranges
     mine = replace(ranges["index"], hsv_low=(60, 111, 99))
     again = colours.pick(PICTURE, SAME, "little", AT["little"], {"index": mine}).ranges
@@ -146,7 +146,7 @@ def test_a_range_that_was_set_by_hand_since_is_not_made_again() -> None:
 
 def test_under_another_light_a_colour_is_picked_as_under_that_of_calibration() -> None:
     gains = np.log([0.7, 1.0, 1.3])
-    other = np.asarray(cv2.LUT(PICTURE, relit_bytes(np.exp(gains)).T[None]), np.uint8)
+    other = np.asarray(cv2.LUT(PICTURE, gain_tables(np.exp(gains)).T[None]), np.uint8)
     plain, back = (
         picked(image, "ring", log_gains=g)["ring"] for image, g in ((PICTURE, SAME), (other, gains))
     )
@@ -160,18 +160,18 @@ def test_from_no_colour_at_all_to_a_slave_that_follows_the_light(tmp_path: Path)
     """What the commands do: nothing is seen, each pick adds its marker, with the last all are followed; then saved."""
     rig = replace(RIG, markers=NAMES)
     bare = replace(painted.camera(), markers=None)
-    detector = ChangingDetector(KnownDetector(bare, NAMES))
+    detector = ReloadableDetector(CalibratedDetector(bare, NAMES))
 
-    def make(camera: CameraCalibration, _rig: object) -> KnownDetector | FollowingDetector:
+    def make(camera: CameraCalibration, _rig: object) -> CalibratedDetector | LightAdaptiveDetector:
         whole = set(NAMES) <= set(camera.markers or {})
-        return FollowingDetector(camera, NAMES, Inline()) if whole else KnownDetector(camera, NAMES)
+        return LightAdaptiveDetector(camera, NAMES, Inline()) if whole else CalibratedDetector(camera, NAMES)
 
     files = dataclasses.replace(tree(tmp_path), camera=bare, rig=rig)
     save(files.camera_path, bare)
     knobs = Knobs()
     shown: dict[int, Frame] = {}
-    picker = LivePicker(detector, shown.get, NAMES)
-    tuning = CameraTuning(files, knobs, marker_changes(detector, make), lambda: True, picker)
+    sampler = ColourSampler(detector, shown.get, NAMES)
+    tuning = CameraTuning(files, knobs, marker_changes(detector, make), lambda: True, sampler)
     commands = tuning.commands()
 
     def pick(name: str, t_ns: int | None = None) -> dict[str, float]:
@@ -193,7 +193,7 @@ def test_from_no_colour_at_all_to_a_slave_that_follows_the_light(tmp_path: Path)
         detector.push(moved, (2 * k + 1) * 16_666_667)
         found = detector.push(moved, (2 * k + 2) * 16_666_667).uv
         assert np.isfinite(found[:, 0]).sum() == k + 1
-    assert detector.follows
+    assert detector.adapts
     assert load(files.camera_path, CameraCalibration) == bare, "not asked to save"
     commands["save"]("")
     saved = load(files.camera_path, CameraCalibration)

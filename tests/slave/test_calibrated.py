@@ -9,11 +9,11 @@ from msgspec.structs import replace
 
 from common.calibration import CameraCalibration
 from slave import live
-from slave.markers.changing import ChangingDetector
+from slave.markers.calibrated import CalibratedDetector
 from slave.markers.detector import MarkerDetector
 from slave.markers.engine import NUMPY
-from slave.markers.following import FollowingDetector
-from slave.markers.known import KnownDetector
+from slave.markers.light_adaptive import LightAdaptiveDetector
+from slave.markers.reloadable import ReloadableDetector
 from tests.slave import painted
 from tests.slave.test_tuning import FILE, RIG, tree
 
@@ -27,7 +27,7 @@ def knowing(*names: str) -> CameraCalibration:
 
 def test_those_that_are_known_are_seen_as_ever_and_the_others_never() -> None:
     every = MarkerDetector(painted.camera(), painted.NAMES)
-    some = KnownDetector(knowing("index", "back", "ring", "middle"), painted.NAMES)
+    some = CalibratedDetector(knowing("index", "back", "ring", "middle"), painted.NAMES)
     assert some.missing == ("thumb", "little")
     for k in range(3):
         of_all, found = every.push(PICTURE, k * FRAME_NS), some.push(PICTURE, k * FRAME_NS)
@@ -37,10 +37,10 @@ def test_those_that_are_known_are_seen_as_ever_and_the_others_never() -> None:
 
 
 def test_without_any_colour_nothing_is_seen_and_with_the_last_one_all_are() -> None:
-    detector = ChangingDetector(KnownDetector(replace(painted.camera(), markers=None), painted.NAMES))
+    detector = ReloadableDetector(CalibratedDetector(replace(painted.camera(), markers=None), painted.NAMES))
     assert np.isnan(detector.push(PICTURE, 0).uv).all()
     assert (detector.missing, detector.plain, detector.log_gains.tolist()) == (painted.NAMES, None, [0, 0, 0])
-    some = KnownDetector(knowing("thumb", "index", "middle"), painted.NAMES)
+    some = CalibratedDetector(knowing("thumb", "index", "middle"), painted.NAMES)
     detector.replace(some)
     assert np.isfinite(detector.push(PICTURE, FRAME_NS).uv[:, 0]).tolist() == 3 * [True] + 3 * [False]
     assert some.plain is not None
@@ -66,8 +66,8 @@ def test_what_is_made_of_a_file_says_what_is_missing(
     make = live._maker(files, "follow", NUMPY, None)  # type: ignore[arg-type]
     with caplog.at_level(logging.WARNING):
         made = make(replace(FILE, markers=None), RIG)
-    assert isinstance(made, KnownDetector)
+    assert isinstance(made, CalibratedDetector)
     assert f"{files.camera_path}: markers: no colour for thumb, index, " in caplog.text
     assert live._uncalibrated(("ring",)) == {"uncalibrated": 1, "uncalibrated.ring": 1}
     assert live._uncalibrated(()) == {"uncalibrated": 0}
-    assert isinstance(make(FILE, RIG), FollowingDetector)
+    assert isinstance(make(FILE, RIG), LightAdaptiveDetector)

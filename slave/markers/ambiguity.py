@@ -16,7 +16,7 @@ SHARE = 0.3  # of the marker's area
 APART = 1.0  # of the marker's size between the two: what is nearer may be a piece of it
 
 
-class Beside:
+class ColourAmbiguityMonitor:
     """Push machine. Holds in how many frames each marker had company, and where it was last.
 
     Attributes:
@@ -75,22 +75,24 @@ def _whole(blob: Blob, others: Sequence[Blob]) -> bool:
     )
 
 
-class Beholder(Protocol):
+class MarkerSource(Protocol):
     """What sees things beside the hand; a `MarkerDetector`."""
 
-    beside: Beside
+    ambiguity: ColourAmbiguityMonitor
 
 
-def told_frames(detector: Beholder | None) -> dict[str, int]:
+def told_frames(detector: MarkerSource | None) -> dict[str, int]:
     """What `Health` counts: beside.<marker>, frames with something else in its colour."""
-    return {} if detector is None else {f"beside.{name}": n for name, n in detector.beside.frames.items()}
+    return (
+        {} if detector is None else {f"ambiguous.{name}": n for name, n in detector.ambiguity.frames.items()}
+    )
 
 
-def told_places(detector: Beholder | None) -> dict[str, float]:
+def told_places(detector: MarkerSource | None) -> dict[str, float]:
     """Gauges of `Health`: beside.<marker>.u and .v, where that was last [px]."""
     if detector is None:
         return {}
-    places = list(detector.beside.places.items())  # the loop may add one
+    places = list(detector.ambiguity.places.items())  # the loop may add one
     return {
-        f"beside.{name}.{axis}": value for name, at in places for axis, value in zip("uv", at, strict=True)
+        f"ambiguous.{name}.{axis}": value for name, at in places for axis, value in zip("uv", at, strict=True)
     }

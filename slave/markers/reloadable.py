@@ -16,33 +16,33 @@ from common.arrays import Float, Image
 from common.calibration import CameraCalibration, RigCalibration
 from common.errors import CalibrationError, CameraError
 from slave.cameras.passing import Passing
+from slave.markers.calibrated import CalibratedDetector
 from slave.markers.colour_watch import ColourWarning
 from slave.markers.detector import Detections, MarkerDetector
-from slave.markers.following import FollowingDetector
-from slave.markers.known import KnownDetector
+from slave.markers.light_adaptive import LightAdaptiveDetector
 from slave.markers.scan_choice import ScanChoice
 from slave.tuning import CameraFiles, Prepare
 
 LOOKS = 60  # a first light takes some tens of frames to be proven, or is not there to be proven
 TIMEOUT_S = 0.5
 RECENT = 8  # frames whose detections are kept for whoever shows one of them
-Changeable: TypeAlias = MarkerDetector | FollowingDetector | KnownDetector
+AnyDetector: TypeAlias = MarkerDetector | LightAdaptiveDetector | CalibratedDetector
 
 
-class ChangingDetector:
+class ReloadableDetector:
     """Holds the detector in use, the one that takes over with the next frame, that frame's predecessor, and what was
     found of late. Attribute `choice`: whether whole frames are scanned; None: they are."""
 
     def __init__(
         self,
-        detector: Changeable,
+        detector: AnyDetector,
         choice: ScanChoice | None = None,
         processor_ns: Callable[[], int] = time.thread_time_ns,
     ) -> None:
         """Begin with `detector`; `processor_ns` says what time [ns] this thread has had of the processor."""
         self._detector = detector
         self.choice, self._processor_ns = choice, processor_ns
-        self._next: deque[Changeable] = deque(maxlen=1)  # one thread fills it, another empties it
+        self._next: deque[AnyDetector] = deque(maxlen=1)  # one thread fills it, another empties it
         self._frames = Passing[tuple[Image, int]]()
         self._found: deque[tuple[int, Float]] = deque(maxlen=RECENT)
 
@@ -73,9 +73,9 @@ class ChangingDetector:
         if self.choice is not None:
             self.choice.tune(camera)
 
-    def replace(self, detector: Changeable) -> None:
+    def replace(self, detector: AnyDetector) -> None:
         """Let `detector`, of the same markers, take over. Not from the loop's thread: it may take a second."""
-        if isinstance(detector, FollowingDetector):
+        if isinstance(detector, LightAdaptiveDetector):
             try:
                 for image, t_ns in self._frames.following(LOOKS, TIMEOUT_S):
                     detector.push(image, t_ns)
@@ -104,36 +104,36 @@ class ChangingDetector:
         """Markers without a colour, which are not sought, or will not be from the next frame on. From any thread."""
         coming = tuple(self._next)
         latest = coming[-1] if coming else self._detector
-        return latest.missing if isinstance(latest, KnownDetector) else ()
+        return latest.missing if isinstance(latest, CalibratedDetector) else ()
 
     @property
-    def follows(self) -> bool:
+    def adapts(self) -> bool:
         """Whether it follows the light."""
-        return isinstance(self._detector, FollowingDetector)
+        return isinstance(self._detector, LightAdaptiveDetector)
 
     @property
     def warnings(self) -> list[ColourWarning]:
-        """As of `FollowingDetector`; none where the colours are fixed."""
-        return self._detector.warnings if isinstance(self._detector, FollowingDetector) else []
+        """As of `LightAdaptiveDetector`; none where the colours are fixed."""
+        return self._detector.warnings if isinstance(self._detector, LightAdaptiveDetector) else []
 
     @property
     def log_gains(self) -> Float:
         """Log gains (3,) of the light, blue, green, red; 0 where the colours are fixed."""
-        return self._detector.log_gains if isinstance(self._detector, FollowingDetector) else np.zeros(3)
+        return self._detector.log_gains if isinstance(self._detector, LightAdaptiveDetector) else np.zeros(3)
 
     @property
     def refused(self) -> int:
         """Frames in which nothing was reported because the colours were not fit for the light."""
-        return self._detector.refused if isinstance(self._detector, FollowingDetector) else 0
+        return self._detector.refused if isinstance(self._detector, LightAdaptiveDetector) else 0
 
     @property
     def tables(self) -> int:
         """Colour tables made for another light."""
-        return self._detector.tables if isinstance(self._detector, FollowingDetector) else 0
+        return self._detector.tables if isinstance(self._detector, LightAdaptiveDetector) else 0
 
 
 def marker_changes(
-    detector: ChangingDetector, make: Callable[[CameraCalibration, RigCalibration], Changeable]
+    detector: ReloadableDetector, make: Callable[[CameraCalibration, RigCalibration], AnyDetector]
 ) -> Prepare:
     """How changed files reach `detector`: what `make` makes of them takes over, where colours or markers changed."""
 
@@ -160,21 +160,21 @@ def marker_changes(
     return prepare
 
 
-def _refuse_blinding(old: ChangingDetector, made: Changeable) -> None:
-    if old.follows and isinstance(made, MarkerDetector):
+def _refuse_blinding(old: ReloadableDetector, made: AnyDetector) -> None:
+    if old.adapts and isinstance(made, MarkerDetector):
         raise CalibrationError(
             "markers: reference_bgr_linear: the colours in use have it for every marker, and the light is followed: "
             "restart the slave to change that"
         )
 
 
-def plain_of(detector: Changeable) -> MarkerDetector | None:
+def plain_of(detector: AnyDetector) -> MarkerDetector | None:
     """What detects; None: nothing does."""
     return detector if isinstance(detector, MarkerDetector) else detector.plain
 
 
-def _hand_over(old: Changeable, new: Changeable) -> None:
-    if isinstance(old, FollowingDetector) and isinstance(new, FollowingDetector):
+def _hand_over(old: AnyDetector, new: AnyDetector) -> None:
+    if isinstance(old, LightAdaptiveDetector) and isinstance(new, LightAdaptiveDetector):
         new.adopt(old)
         return
     before, after = plain_of(old), plain_of(new)

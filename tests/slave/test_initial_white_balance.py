@@ -13,19 +13,19 @@ from common.sim.grasp import Grasp
 from common.sim.illuminant import Light
 from common.sim.render import Renderer
 from common.sim.scene import Scene, view_centre
-from common.srgb import relit_bytes
+from common.srgb import gain_tables
 from slave.markers.classify import ColourTable
-from slave.markers.first_light import OTHER, first_light, lights
+from slave.markers.initial_white_balance import OTHER, initial_white_balance, lights
 from tests.slave import painted
-from tests.slave.painted import NAMES, SKIN, Disc, linear, paint
+from tests.slave.painted import NAMES, SKIN, Disc, linear, marker_hsv
 
 TABLE = ColourTable([painted.RANGES[name] for name in NAMES])
-REFERENCE = np.array([linear(paint(m)) for m in range(len(NAMES))])
+REFERENCE = np.array([linear(marker_hsv(m)) for m in range(len(NAMES))])
 GREEN_MUG = (62, 170, 120)
 
 
 def under(image: Image, gains: Float, seed: int = 0) -> Image:
-    lit = np.asarray(cv2.LUT(image, relit_bytes(gains).T[None]), dtype=np.int16)
+    lit = np.asarray(cv2.LUT(image, gain_tables(gains).T[None]), dtype=np.int16)
     noise = np.random.default_rng(seed).normal(0.0, 2.0, lit.shape).round()
     return np.clip(lit + noise, 0, 255).astype(np.uint8)
 
@@ -50,7 +50,7 @@ def separated_hues(a: Float, b: Float) -> float:
 @pytest.mark.parametrize("exposure", [0.7, 1.0, 1.3])
 def test_a_whole_hand_proves_its_light(kelvin: float, exposure: float) -> None:
     gains = Light(kelvin, exposure).gains_bgr()
-    found = first_light(under(painted.render(painted.hand()), gains), TABLE, REFERENCE, np.zeros(3))
+    found = initial_white_balance(under(painted.render(painted.hand()), gains), TABLE, REFERENCE, np.zeros(3))
     assert found.proven
     assert found.matched == 6
     assert separated_hues(found.log_gains, np.log(gains)) < 0.06
@@ -64,7 +64,7 @@ def test_a_whole_hand_proves_its_light(kelvin: float, exposure: float) -> None:
 def test_a_few_markers_prove_the_right_light_or_none(shown: tuple[int, ...], kelvin: float) -> None:
     discs = [d for k, m in enumerate(shown) for d in painted.finger(m, 200.0 + 50 * k, 200.0)]
     gains = Light(kelvin).gains_bgr()
-    found = first_light(under(painted.render(discs), gains), TABLE, REFERENCE, np.zeros(3))
+    found = initial_white_balance(under(painted.render(discs), gains), TABLE, REFERENCE, np.zeros(3))
     if found.proven:
         assert separated_hues(found.log_gains, np.log(gains)) < OTHER
 
@@ -77,7 +77,9 @@ def test_skin_of_a_closed_hand_is_no_paint_under_a_light_that_no_lamp_gives(seed
     ranges = shown.cameras["left"].markers or {}
     colours = [ranges[name] for name in shown.rig.markers]
     reference = np.array([colour.reference_bgr_linear for colour in colours])
-    found = first_light(Renderer(shown, "left").render(t_s), ColourTable(colours), reference, np.zeros(3))
+    found = initial_white_balance(
+        Renderer(shown, "left").render(t_s), ColourTable(colours), reference, np.zeros(3)
+    )
     assert not found.excluded
     assert separated_hues(found.log_gains, np.zeros(3)) < OTHER
 
@@ -85,7 +87,7 @@ def test_skin_of_a_closed_hand_is_no_paint_under_a_light_that_no_lamp_gives(seed
 def test_clutter_in_a_marker_colour_does_not_bend_the_light() -> None:
     discs = [*painted.hand(), Disc(GREEN_MUG, 560.0, 380.0, 30.0), Disc((110, 200, 140), 80.0, 420.0, 5.0)]
     gains = Light(3200.0).gains_bgr()
-    found = first_light(under(painted.render(discs), gains), TABLE, REFERENCE, np.zeros(3))
+    found = initial_white_balance(under(painted.render(discs), gains), TABLE, REFERENCE, np.zeros(3))
     assert found.proven
     assert separated_hues(found.log_gains, np.log(gains)) < 0.1
 
@@ -102,7 +104,7 @@ def test_clutter_in_a_marker_colour_does_not_bend_the_light() -> None:
 @pytest.mark.parametrize("kelvin", [3000.0, 4300.0, 6500.0])
 def test_one_marker_proves_nothing(discs: list[Disc], kelvin: float) -> None:
     picture = under(painted.render(discs), Light(kelvin).gains_bgr())
-    assert not first_light(picture, TABLE, REFERENCE, np.zeros(3)).proven
+    assert not initial_white_balance(picture, TABLE, REFERENCE, np.zeros(3)).proven
 
 
 def test_without_it_the_same_picture_is_misread() -> None:
@@ -131,8 +133,15 @@ def test_the_lights_tried_lie_along_the_locus_of_black_bodies() -> None:
 
 
 def test_no_simulator_is_imported_to_know_the_light() -> None:
-    folder = Path(first_light.__code__.co_filename).parent
-    for name in ("first_light", "drift", "light_meter", "light", "colour_watch", "following"):
+    folder = Path(initial_white_balance.__code__.co_filename).parent
+    for name in (
+        "initial_white_balance",
+        "drift",
+        "light_meter",
+        "white_balance",
+        "colour_watch",
+        "light_adaptive",
+    ):
         assert "common.sim" not in (folder / f"{name}.py").read_text(), name
 
 
@@ -140,7 +149,7 @@ def test_no_simulator_is_imported_to_know_the_light() -> None:
 def test_the_light_that_is_expected_is_kept_until_the_picture_excludes_it(kelvin: float) -> None:
     there, elsewhere = np.log(Light(kelvin).gains_bgr()), np.zeros(3)
     single = under(painted.render(painted.finger(5, 300.0, 200.0)), np.exp(there))
-    assert not first_light(single, TABLE, REFERENCE, there).excluded
+    assert not initial_white_balance(single, TABLE, REFERENCE, there).excluded
     whole = under(painted.render(painted.hand()), np.exp(there))
-    assert not first_light(whole, TABLE, REFERENCE, there).excluded
-    assert first_light(whole, TABLE, REFERENCE, elsewhere).excluded
+    assert not initial_white_balance(whole, TABLE, REFERENCE, there).excluded
+    assert initial_white_balance(whole, TABLE, REFERENCE, elsewhere).excluded

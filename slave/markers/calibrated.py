@@ -15,7 +15,7 @@ from slave.markers.engine import NUMPY, Engine
 from slave.markers.null_detector import NullDetector
 
 
-class KnownDetector:
+class CalibratedDetector:
     """Holds the detector of the markers that have a colour, if any has.
 
     Attributes:
@@ -30,15 +30,15 @@ class KnownDetector:
         free: Collection[str] = (),
     ) -> None:
         """Build the detector; arguments as of `MarkerDetector`, but the camera may lack colours."""
-        known = tuple(name for name in markers if name in (camera.markers or {}))
-        self.missing = tuple(name for name in markers if name not in known)
-        self._rows = [markers.index(name) for name in known]
+        calibrated = tuple(name for name in markers if name in (camera.markers or {}))
+        self.missing = tuple(name for name in markers if name not in calibrated)
+        self._rows = [markers.index(name) for name in calibrated]
         self._count = len(markers)
         self._nothing = NullDetector(len(markers))
         self._plain = None
-        if known:
-            mine = [name for name in free if name in known]
-            self._plain = MarkerDetector(camera, known, engine=engine, free=mine)
+        if calibrated:
+            mine = [name for name in free if name in calibrated]
+            self._plain = MarkerDetector(camera, calibrated, engine=engine, free=mine)
 
     @property
     def plain(self) -> MarkerDetector | None:
