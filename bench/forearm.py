@@ -27,10 +27,10 @@ from common.messages import ImuSample
 from common.sim.imu import SimulatedImu
 from common.sim.motion import HandState, smooth_step
 from common.wrist_bend import STRAIGHT, forearm_palm
+from master.estimator.cycle_reader import CycleReader
 from master.estimator.epoch import Epoch, Fitted
 from master.estimator.estimator import Estimator
 from master.estimator.fused import WristSide
-from master.estimator.triple_reader import TripleReader
 from master.estimator.wrist_device import BEND, HEADING
 from master.estimator.wrist_model import WristModel, loosened
 from master.rig import load_setup
@@ -103,7 +103,7 @@ class Line:
             [NO_RAY], loosened(markers.hand), self._names, self._names, continuous=True, wrist=model
         )
         counts = Counter[str]()
-        self.side = WristSide(wrist, TripleReader(wrist, None, counts), counts, continuous=True)
+        self.side = WristSide(wrist, CycleReader(wrist, None, counts), counts, continuous=True)
 
     def push(self, t_ns: int, points_m: Float) -> Fitted:
         """Fit one epoch with markers (M, 3) [m], which may be NaN."""

@@ -79,8 +79,8 @@ def shown_of(both: Both, seconds: float, every: int = 1) -> Shown:
         messages += found
     frame_s = 1.0 / both.wrist.cameras[both.wrist.rig.cameras[0]].frame_rate_hz
     line_t = np.arange(1.0, seconds / frame_s - 1.0, 3.0) * frame_s
-    triples, line, tip = _triples(both, line_t, frame_s)
-    return Shown(both, seconds, in_order(messages + triples), Sight(times, visible_area, line_t, line, tip))
+    cycles, line, tip = _cycles(both, line_t, frame_s)
+    return Shown(both, seconds, in_order(messages + cycles), Sight(times, visible_area, line_t, line, tip))
 
 
 def markers_shown(
@@ -124,7 +124,7 @@ def _marker_message(
     )
 
 
-def _triples(both: Both, times_s: Float, frame_s: float) -> tuple[list[Observed], Float, Bool]:
+def _cycles(both: Both, times_s: Float, frame_s: float) -> tuple[list[Observed], Float, Bool]:
     """The triples with laser frames at these times, and of line [m] and tips (K, 5) what is in sight."""
     report = _WristErrors(both, 3.0 * frame_s)
     out: list[Observed] = []

@@ -26,8 +26,8 @@ def watched(both: Both, seconds: float) -> Shown:
         times[camera] = times_of(both.scene, camera, seconds, rate)
         found, visible_area[camera] = _markers(both, camera, times[camera])
         messages += found
-    triples, line_t, line, tip = triples_of(both, seconds)
-    return Shown(both, seconds, in_order(messages + triples), Sight(times, visible_area, line_t, line, tip))
+    cycles, line_t, line, tip = cycles_of(both, seconds)
+    return Shown(both, seconds, in_order(messages + cycles), Sight(times, visible_area, line_t, line, tip))
 
 
 def _markers(both: Both, camera: str, times_s: Float) -> tuple[list[Observed], Float]:
@@ -45,7 +45,7 @@ def _markers(both: Both, camera: str, times_s: Float) -> tuple[list[Observed], F
     return out, np.array(visible_area)
 
 
-def triples_of(both: Both, seconds: float) -> tuple[list[Observed], Float, Float, Bool]:
+def cycles_of(both: Both, seconds: float) -> tuple[list[Observed], Float, Float, Bool]:
     """The wrist device's triples; when its laser frames were, what of line [m] and tips (K, 5) was in sight."""
     name = both.wrist.rig.cameras[0]
     own = both.wrist.cameras[name]
@@ -55,7 +55,7 @@ def triples_of(both: Both, seconds: float) -> tuple[list[Observed], Float, Float
     for frame in _frames(both, name, seconds):
         if (found := detector.push(frame)) is not None:
             out.append(found.message(name, session=1))
-            times.append(1e-9 * (found.triple.laser.t_ns - START_NS))
+            times.append(1e-9 * (found.cycle.laser.t_ns - START_NS))
     truths = [(both.wrist_scene.truth(t), both.wrist_scene.truth(t + 1.0 / own.frame_rate_hz)) for t in times]
     line = np.array([laser.laser_len_vis[1:6] for laser, _ in truths])
     return out, np.array(times), line, np.array([led.tip_visible for _, led in truths])

@@ -18,7 +18,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from bench.fusion_scene import Both, Observed, in_order, orientations
-from bench.fusion_watched import triples_of
+from bench.fusion_watched import cycles_of
 from bench.gesture_told import Told, told_of
 from bench.played import START_NS, message_of, times_of
 from bench.row import Row
@@ -82,7 +82,7 @@ def by_both(number: int, seconds: float = SECONDS) -> dict[str, Told]:
     wrist = RigSetup.of(file, wrist_setup.cameras, alone.hand)
     both = Both("both-poses", seed, scene, device, alone, wrist)
     markers = _watched(scene, seconds)
-    everything = in_order([*markers, *orientations(both, seconds), *triples_of(both, seconds)[0]])
+    everything = in_order([*markers, *orientations(both, seconds), *cycles_of(both, seconds)[0]])
     return {
         "desk-back3": _told(alone, markers, posed),
         "desk-back3 + wrist-back3": _told(both.fused, everything, posed),

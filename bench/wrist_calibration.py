@@ -174,7 +174,7 @@ def _subjects() -> Iterator[Row]:
 
 def _pip_errors(person: Person, found: Subject) -> list[Float]:
     """Errors [deg] with the old, the new and the true files."""
-    triples, true = person.detected("curl", np.linspace(0.3, 3.6, 24))
+    cycles, true = person.detected("curl", np.linspace(0.3, 3.6, 24))
     out: list[Float] = []
     for rig, hand in (
         (person.rig, person.hand),
@@ -182,7 +182,7 @@ def _pip_errors(person: Person, found: Subject) -> list[Float]:
         (person.true_rig, person.true_hand),
     ):
         line = WristPipeline(WristSetup.of(rig, person.camera, HandModel.of(hand)), continuous=False)
-        angles = np.array([line.push(triple)[0].pose.angles_rad for triple in triples])
+        angles = np.array([line.push(cycle)[0].pose.angles_rad for cycle in cycles])
         error = np.degrees(angles[:, 1:, 2] - true[:, 1:, 2])
         out.append(error[np.isfinite(error)])
     return out

@@ -35,7 +35,7 @@ from common.sim.wrist.scene import WristScene
 from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.mounting.command import imu_samples, marker_poses
 from master.calibrate.mounting.mounting import Mounting, calibrate_mounting
-from master.recorded import recorded_triples
+from master.recorded import recorded_cycles
 from master.rig import load_setup
 from master.rig_pipeline import build_pipeline
 from master.rig_setup import RigSetup
@@ -64,7 +64,7 @@ class Seen:
     both: Both
     rig: RigCalibration
     poses: Sequence[HandPose]
-    triples: Sequence[WristDetections]
+    cycles: Sequence[WristDetections]
     samples: Sequence[ImuSample]
 
     def calibrated(self) -> Mounting:
@@ -75,7 +75,7 @@ class Seen:
         """
         markers, camera = self.both.markers, self.both.wrist.cameras[self.rig.cameras[0]]
         return calibrate_mounting(
-            self.poses, markers.markers, markers.hand, self.triples, self.samples, self.rig, camera
+            self.poses, markers.markers, markers.hand, self.cycles, self.samples, self.rig, camera
         )
 
 
@@ -123,9 +123,9 @@ def seen_noisy(rig: str, seed: int, pace: float = 1.0, seconds: float = SECONDS)
     pipeline = build_pipeline(both.markers, StageTimes())
     solved = [one for m in messages if isinstance(m, MarkerDetections) for one in pipeline.push(m)]
     poses = [one.pose for one in [*solved, *pipeline.flush()]]
-    triples = [_stamped(one, CAMERA_LATE_S) for one in messages if isinstance(one, WristDetections)]
+    cycles = [_stamped(one, CAMERA_LATE_S) for one in messages if isinstance(one, WristDetections)]
     samples = [_stamped(one, IMU_LATE_S) for one in messages if isinstance(one, ImuSample)]
-    return Seen(both, guessed(both.wrist.rig, seed), poses, triples, samples)
+    return Seen(both, guessed(both.wrist.rig, seed), poses, cycles, samples)
 
 
 def _stamped(message: M, late_s: float) -> M:
@@ -167,7 +167,7 @@ def seen_rendered(rig: str, seed: int, folder: Path, pace: float = 1.0, seconds:
         both,
         wrong,
         marker_poses(both.markers, folder),
-        list(recorded_triples(folder, wrong.cameras[0])),
+        list(recorded_cycles(folder, wrong.cameras[0])),
         [_stamped(one, IMU_LATE_S) for one in samples],
     )
 

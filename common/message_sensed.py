@@ -125,7 +125,7 @@ class WristDetections(Message, frozen=True, eq=False, tag=True):
     exposure_us: Annotated[float, Meta(ge=0.0, le=1e7)] = 0.0
 
     def __post_init__(self) -> None:
-        _TRIPLE_ARRAYS.freeze(self)
+        _CYCLE_ARRAYS.freeze(self)
         for uv, sigma in (("laser_uv", "laser_sigma_px"), ("tip_uv", "tip_sigma_px")):
             refuse_sigma(self, sigma, uv)
 
@@ -245,7 +245,7 @@ def _tag_arrays(n: int) -> Layout:
     return Layout(TagDetections, ids=(n,), uv=(n, 4, 2), sigma_px=(n,))
 
 
-_TRIPLE_ARRAYS = Layout(
+_CYCLE_ARRAYS = Layout(
     WristDetections,
     laser_uv=(FINGER_COUNT, 2),
     laser_sigma_px=(FINGER_COUNT,),

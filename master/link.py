@@ -60,7 +60,7 @@ from common.streams import sender_of
 from master.admission import SenderLimits
 from master.link_senders import ASKED, Sender, Session, Taken, not_admitted, on_master_clock
 from master.quarantine import Quarantine
-from master.sequence import TRIPLE, CameraCounts
+from master.sequence import CYCLE_FRAMES, CameraCounts
 from master.turned_away import TurnedAway
 
 BEACON_NS = 100_000_000
@@ -127,7 +127,7 @@ class MasterLink:
         self._sealer = self._keys.sealer(new_process_id(random(8)))
         kinds: tuple[tuple[tuple[str, ...], dict[type[Taken], int | None]], ...] = (
             (cameras, {MarkerDetections: 1, TagDetections: None}),
-            (wrists, {WristDetections: TRIPLE}),
+            (wrists, {WristDetections: CYCLE_FRAMES}),
             (imus, {ImuSample: 1}),
             (trackers, {TrackerPose: 1}),
         )

@@ -9,7 +9,7 @@ from common.arrays import Float, Int
 from common.errors import RecordingError
 from common.messages import FINGER_COUNT, MarkerDetections, WristDetections
 from common.npz import read_npz
-from master.sequence import TRIPLE
+from master.sequence import CYCLE_FRAMES
 
 # Sigma of detections that state none: of full quality, and added where it is 0.
 _CLEAR_PX, _DOUBT_PX = 0.1, 0.6
@@ -63,7 +63,7 @@ def recorded_detections(folder: Path, camera: str, count: int) -> Iterator[Marke
             raise RecordingError(f"{path}: row {row}: {error}: {fix}") from error
 
 
-def recorded_triples(folder: Path, camera: str) -> Iterator[WristDetections]:
+def recorded_cycles(folder: Path, camera: str) -> Iterator[WristDetections]:
     """The rows of detections_<camera>.npz of the camera of a wrist device.
 
     Raises:
@@ -76,7 +76,7 @@ def recorded_triples(folder: Path, camera: str) -> Iterator[WristDetections]:
         t_ns = data["t_ns"].astype(np.int64, casting="same_kind")
         laser, tip = (data[name].astype(np.float64) for name in ("laser_uv", "tip_uv"))
         typical = {
-            "seq": TRIPLE * np.arange(len(laser)),
+            "seq": CYCLE_FRAMES * np.arange(len(laser)),
             "laser_sigma_px": _where_seen(laser, _LASER_PX),
             "laser_px": np.full(laser.shape[:2], np.nan),
             "tip_sigma_px": _where_seen(tip, _TIP_PX),

@@ -13,13 +13,13 @@ from common.geometry import cross
 from common.messages import Detections
 from master.estimator.cameras import CameraArrays
 from master.estimator.cubic import CubicLaw
+from master.estimator.cycle_reader import CycleReader
 from master.estimator.estimator import Estimator
 from master.estimator.fused import FusedPipeline, WristSide
 from master.estimator.gate import rehearse
 from master.estimator.pipeline import MarkerPipeline, SolvedPose, Stage
 from master.estimator.settings import Settings
 from master.estimator.smooth import HandOneEuro
-from master.estimator.triple_reader import TripleReader
 from master.estimator.wrist_model import WristModel, loosened
 from master.estimator.wrist_pipeline import WristPipeline
 from master.fabrik.caps import CapTables
@@ -230,7 +230,7 @@ def pipeline_of(
         if setup.has_markers:
             counts = Counter[str]()
             cubic = CubicLaw(setup.wrist) if setup.wrist.cubic else None
-            reader = TripleReader(setup.wrist, cubic, counts)
+            reader = CycleReader(setup.wrist, cubic, counts)
             side = WristSide(setup.wrist, reader, counts, continuous=continuous)
             markers = build_pipeline(setup, stage, continuous=continuous, side=side, counts=counts, shed=shed)
             return FusedPipeline(

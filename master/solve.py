@@ -33,18 +33,18 @@ from master.outputs.files import RunFiles, path_of_hand
 from master.outputs.poses import Poses
 from master.outputs.told_files import ObjectPoses
 from master.rates import CameraRates
-from master.recorded import recorded_detections, recorded_triples
+from master.recorded import recorded_cycles, recorded_detections
 from master.recorded_imu import recorded_samples
 from master.recorded_tags import recorded_tags
 from master.rig_pipeline import pipeline_of
 from master.rig_setup import RigSetup
 from master.score import load_truth, score, score_hidden
-from master.sequence import TRIPLE
+from master.sequence import CYCLE_FRAMES
 from master.sequence import Sequence as FrameSequence
 from master.stages import StageTimes
 from master.summary import write_summary
 from master.world import World
-from master.wrist_score import load_wrist_truth, score_tips, score_triples, score_wrist, triples_missed
+from master.wrist_score import cycles_missed, load_wrist_truth, score_cycles, score_tips, score_wrist
 
 
 def rigs_to_solve(
@@ -228,11 +228,11 @@ def _score_wrist(
     exact = load_wrist_truth(recording, setup.wrist_cameras[0])
     if exact is None:
         return {}
-    triples = [message for message in messages if isinstance(message, WristDetections)]
+    cycles = [message for message in messages if isinstance(message, WristDetections)]
     if setup.has_markers:
-        return score_triples(setup.wrist, triples, exact) | score_tips(triples, exact)
-    missed = float(triples_missed(poses, exact))
-    return {"triples_missed": missed} | score_wrist(poses, exact) | score_tips(triples, exact)
+        return score_cycles(setup.wrist, cycles, exact) | score_tips(cycles, exact)
+    missed = float(cycles_missed(poses, exact))
+    return {"cycles_missed": missed} | score_wrist(poses, exact) | score_tips(cycles, exact)
 
 
 def fingers_of(setup: RigSetup) -> tuple[int, ...]:
@@ -255,7 +255,7 @@ def _messages(
                 continue  # it watches two hands
             order[camera] = len(order)
             if camera in setup.wrist_cameras:
-                messages += recorded_triples(folder, camera)
+                messages += recorded_cycles(folder, camera)
             else:
                 messages += recorded_detections(folder, camera, shown.get(camera, len(setup.markers)))
     tagged = [setup for setup in setups if any(one.tags is not None for one in setup.objects)]
@@ -266,7 +266,9 @@ def _messages(
 
 def _lost(setup: RigSetup, messages: Sequence[Detections]) -> int:
     """Frames, or triples, that a camera skipped: lost before they were recorded, or none was made of them."""
-    numbers = {name: FrameSequence(TRIPLE if name in setup.wrist_cameras else 1) for name in setup.cameras}
+    numbers = {
+        name: FrameSequence(CYCLE_FRAMES if name in setup.wrist_cameras else 1) for name in setup.cameras
+    }
     for message in messages:
         numbers[message.camera].take(message.session, message.seq)
     return sum(sequence.counts.lost for sequence in numbers.values())

@@ -154,24 +154,24 @@ def score_wrist(poses: Poses, truth: WristTruth) -> dict[str, float]:
     return out
 
 
-def triples_missed(poses: Poses, truth: WristTruth) -> int:
+def cycles_missed(poses: Poses, truth: WristTruth) -> int:
     """Triples of a recording without a pose."""
     return int((rows_at(truth.t_ns, poses.t_ns) < 0).sum())
 
 
-def score_triples(
+def score_cycles(
     setup: WristSetup, messages: Sequence[WristDetections], truth: WristTruth
 ) -> dict[str, float]:
     """Errors of the laser points of triples, whatever hand is made of them.
 
     Returns:
-        triples: How many there are; triples_missed: how many of the truth's are missing. Of the laser points as
+        triples: How many there are; cycles_missed: how many of the truth's are missing. Of the laser points as
         `score_wrist`.
     """
     at_ns = np.array([message.t_ns for message in messages], np.int64)
     uv = np.array([message.laser_uv for message in messages]).reshape(-1, FINGER_COUNT, 2)
     row = rows_at(truth.t_ns, at_ns)
-    counted = {"triples": float(len(messages)), "triples_missed": float((row < 0).sum())}
+    counted = {"cycles": float(len(messages)), "cycles_missed": float((row < 0).sum())}
     return counted | score_laser(at_rows(setup.on_plane(uv), row), truth)
 
 

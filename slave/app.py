@@ -164,7 +164,7 @@ def run_wrist(
             sender.send(found.message(camera, sender.session))
             tally.frame(frame.seq, sum(took_ns), np.vstack([found.laser.uv, found.tips.uv]))
             parts = 0
-            show(found.triple.led)
+            show(found.cycle.led)
         alive()
 
     _each_frame(source, stop, tally, work)

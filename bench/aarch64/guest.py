@@ -194,7 +194,7 @@ def _run_strobed(case: str, folder: Path, marks: Marks) -> str:
     told: list[WristDetections] = []
 
     def step(k: int) -> None:
-        for seq, image in enumerate(frames.triple(k), 3 * k):
+        for seq, image in enumerate(frames.cycle(k), 3 * k):
             t_ns = frames.t_ns(seq)
             if (found := detector.push(Frame(seq, t_ns, t_ns, image))) is not None:
                 told.append(found.message(frames.camera.name, 7))

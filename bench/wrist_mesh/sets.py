@@ -109,9 +109,9 @@ def write_set(one: Set, datasets: Path, folder: Path, seed: int) -> None:
     write_frames(
         folder, manifest, _frames(one, device, room, folder, truths, np.random.default_rng(seed + 1))
     )
-    three = np.array([[moment.angles_rad for moment in triple] for triple in one.moments])
+    three = np.array([[moment.angles_rad for moment in cycle] for cycle in one.moments])
     truth: Arrays = {"angles": three[:, 1], "angles_3frames": three}
-    truth["bend"] = np.array([triple[1].bend_rad for triple in one.moments])
+    truth["bend"] = np.array([cycle[1].bend_rad for cycle in one.moments])
     truth["ambient"] = np.array([one.light] * len(three))
     truth |= {key: np.array([row[key] for row in truths]) for key in truths[0]}
     write_truth(folder, truth, _meta(one, device, manifest, seed))
@@ -121,9 +121,9 @@ def _frames(
     one: Set, device: Device, room: Room, folder: Path, truths: list[Arrays], rng: np.random.Generator
 ) -> Iterator[TakenFrame]:
     """All frames; beside them the label pictures are written and the truths are gathered, of the laser's moment."""
-    for k, triple in enumerate(one.moments):
+    for k, cycle in enumerate(one.moments):
         last: View | None = None
-        for i, (moment, lit) in enumerate(zip(triple, ORDER, strict=True)):
+        for i, (moment, lit) in enumerate(zip(cycle, ORDER, strict=True)):
             if last is None or one.continuous:
                 last = device.view(moment)
             if i == 1:

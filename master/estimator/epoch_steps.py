@@ -88,7 +88,7 @@ class EpochSteps:
         self._rays = bound(observe_rays, nothing, nothing[..., 0].copy(), own, self.on_hand, observed)
         self._points = bound(observe_points, room[2], own[self.on_hand], 0.0, observed)
         self._count = bound(count_rows, mounts, observed, self._ground)
-        self._triple = bound(
+        self._cycle = bound(
             observe_wrist, device, none, each, each, none, each, each, 0.0, 0.0, 0.0, self._lines_of_sight
         )
         self._pose = bound(pose, hand, mounts, _AT_ORIGIN, np.zeros(20), self._work, *room)
@@ -118,7 +118,7 @@ class EpochSteps:
             lines_of_sight.lit[:] = lines_of_sight.shown[:] = 0.0
         else:
             self.at.prior.law[:] = at.wrist.law
-            self._triple(
+            self._cycle(
                 self._model.device,
                 at.wrist.laser,
                 at.wrist.laser_sigma_px,

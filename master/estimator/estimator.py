@@ -196,7 +196,7 @@ class Estimator:
         if self.wrist:
             told = zip(self._now.level.tolist(), self._now.told_ns.tolist(), strict=False)  # of fingers alone
             for f, (level, told_ns) in enumerate(told):
-                if (at.t_ns - told_ns) * 1e-9 <= self.settings.tracked_triple_s:
+                if (at.t_ns - told_ns) * 1e-9 <= self.settings.tracked_cycle_s:
                     sources[f] += ON_OTHERS * level
         if not palm_shown:
             sources[5] = 0

@@ -14,12 +14,12 @@ import numpy as np
 from common.arrays import Bool, Code, Float
 from common.hand_model import FINGERS
 from common.messages import Detections, HandPose, WristDetections
+from master.estimator.cycle_reader import CycleReader
 from master.estimator.epoch import Fitted, Turn, WristRows
 from master.estimator.estimator import Estimator
 from master.estimator.forearm import LOST_RAD, Forearm
 from master.estimator.observation_sources import ON_MARKERS
 from master.estimator.pipeline import MarkerPipeline, SolvedPose
-from master.estimator.triple_reader import TripleReader
 from master.estimator.wrist_device import BEND, HEADING
 from master.wrist_setup import WristSetup
 
@@ -37,7 +37,7 @@ class WristSide:
     """
 
     def __init__(
-        self, setup: WristSetup, reader: TripleReader, counts: Counter[str], *, continuous: bool
+        self, setup: WristSetup, reader: CycleReader, counts: Counter[str], *, continuous: bool
     ) -> None:
         """Join the parts.
 

@@ -151,7 +151,7 @@ class Settings(NamedTuple):
     tracked_age_s: Annotated[
         float, Range("s", 0.0, 1.0, "how old the newest measurement of a TRACKED finger may be")
     ] = 0.03
-    tracked_triple_s: Annotated[
+    tracked_cycle_s: Annotated[
         float, Range("s", 0.0, 1.0, "the same where a wrist device told it, of which triples come at 30 Hz")
     ] = 0.055
     # What is shown.

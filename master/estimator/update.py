@@ -119,7 +119,7 @@ def _judge(
         f = hand.finger[joint]
         part = f if f >= 0 else PALM_PART
         by_wrist = f >= 0 and state.level[f] > 0
-        most_s = settings.tracked_triple_s if by_wrist else settings.tracked_age_s
+        most_s = settings.tracked_cycle_s if by_wrist else settings.tracked_age_s
         measured_lately = (t_ns - state.told_ns[part]) * 1e-9 <= most_s
         sure = f < 0 or not state.vague[f]
         out.tracked[joint] = measured_lately and sure and is_small(hand, out.cov, joint, settings.tracked_m)

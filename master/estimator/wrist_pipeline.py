@@ -15,13 +15,13 @@ from common.arrays import Bool, Float
 from common.hand_model import CHAINS, FINGERS
 from common.kernels import bound
 from common.messages import HandPose, Source, WristDetections
+from master.estimator.cycle_reader import CycleReader
 from master.estimator.epoch import Epoch, Fitted, Turn
 from master.estimator.estimator import Estimator
 from master.estimator.forearm import NO_WORLD, Forearm
 from master.estimator.kinematics import quaternions
 from master.estimator.pipeline import SolvedPose, Stage
 from master.estimator.settings import DEFAULT, Settings
-from master.estimator.triple_reader import TripleReader
 from master.estimator.wrist_model import WristModel, loosened
 from master.volume import inside
 from master.wrist_setup import WristSetup
@@ -60,7 +60,7 @@ class WristPipeline:
             (setup.optics,), self._hand, (), (), continuous=continuous, settings=settings, wrist=self._model
         )
         self._quaternions = bound(quaternions, np.empty((26, 3, 3)), np.empty((26, 4)))
-        self._reader = TripleReader(setup, self._model.cubic, self.counts)
+        self._reader = CycleReader(setup, self._model.cubic, self.counts)
         T = setup.T_camera_palm
         self._turn = Turn(np.ascontiguousarray(T[:3, :3]), _TURN_INFO, sure=True, axes=_NO_AXES)
         self._place = np.ascontiguousarray(T[:3, 3])

@@ -46,10 +46,7 @@ def _expected(
         had_previous = measured_lately and told_s <= settings.forget_s
         prior.had_previous[f] = 1.0 if had_previous else 0.0
         known = (
-            had_previous
-            and state.level[f] > 0
-            and state.vague[f] == 0
-            and told_s <= settings.tracked_triple_s
+            had_previous and state.level[f] > 0 and state.vague[f] == 0 and told_s <= settings.tracked_cycle_s
         )
         state.searched[f] = state.searched[f] + 1 if known else 0
         known = known and state.searched[f] % settings.search_again != 0

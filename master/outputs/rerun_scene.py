@@ -133,10 +133,10 @@ class RerunScene:
     def log_detections(self, detections: Iterable[Detections]) -> None:
         """Log what one camera saw, in its image; frames in the order of time."""
         frames = list(detections)
-        triples = [frame for frame in frames if isinstance(frame, WristDetections)]
+        cycles = [frame for frame in frames if isinstance(frame, WristDetections)]
         for hand, device in self._devices.items():
-            if triples and triples[0].camera in self._setups[hand].wrist_cameras:
-                device.log_detections(triples)
+            if cycles and cycles[0].camera in self._setups[hand].wrist_cameras:
+                device.log_detections(cycles)
         markers = [frame for frame in frames if isinstance(frame, MarkerDetections)]
         if not markers:
             return

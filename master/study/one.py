@@ -15,7 +15,7 @@ from common.errors import FitError, RecordingError
 from common.frame_recording import open_recording
 from common.geometry import transform
 from master.calibrate.wrist.subject import calibrate_subject
-from master.recorded import recorded_triples
+from master.recorded import recorded_cycles
 from master.study.line import Inputs, Level, claim, detect, solved, write_exact
 from master.study.participant import Known, Participant, about, participant
 from master.study.session import TRIAL_S, record_guided, record_trials
@@ -214,7 +214,7 @@ def _calibrated(
     save(there / "measured.json", hand)
     detect(guided, task.camera.name, there / "measured.json", there)
     try:
-        found = calibrate_subject(list(recorded_triples(there, task.camera.name)), rig, task.camera, hand)
+        found = calibrate_subject(list(recorded_cycles(there, task.camera.name)), rig, task.camera, hand)
         rig, hand, said = found.rig, found.hand, tuple(found.report)
     except FitError as error:
         said, refused = (str(error),), True

@@ -46,7 +46,7 @@ class Trial(Struct, frozen=True, kw_only=True):
     ambiguous: Flags
     laser_seen: Flags
     tip_seen: Flags
-    triples: int
+    cycles: int
 
 
 def trials_of(recording: FrameRecording, camera: str, name: str, poses: Poses) -> list[Trial]:
@@ -100,7 +100,7 @@ def trials_of(recording: FrameRecording, camera: str, name: str, poses: Poses) -
                 ambiguous=_most(ambiguous[own] & sure, sure),
                 laser_seen=_most(line[own]),
                 tip_seen=_most(truth.tip_visible[own]),
-                triples=len(own),
+                cycles=len(own),
             )
         )
     return out

@@ -49,7 +49,7 @@ def test_everything_a_slave_needs_imports(both: tuple[Told, Told, bytes]) -> Non
 
 
 @pytest.mark.parametrize(
-    ("what", "seen", "least"), [("markers", "markers_seen", 40), ("triples", "laser_seen", 6)]
+    ("what", "seen", "least"), [("markers", "markers_seen", 40), ("cycles", "laser_seen", 6)]
 )
 def test_detections_are_equal_bit_by_bit(
     both: tuple[Told, Told, bytes], what: str, seen: str, least: int

@@ -68,7 +68,7 @@ def markers(folder: Path) -> list[MarkerDetections]:
     return messages
 
 
-def triples(folder: Path) -> list[WristDetections]:
+def cycles(folder: Path) -> list[WristDetections]:
     """What a wrist device sees in rendered strobed frames, as messages."""
     rig = load(CALIBRATION / "rigs/wrist.json", RigCalibration)
     camera = load(CALIBRATION / "cameras/wrist.json", CameraCalibration)
@@ -126,7 +126,7 @@ def _hash(messages: list[MarkerDetections] | list[WristDetections]) -> str:
 
 def told(folder: Path) -> dict[str, object]:
     """All of it; numbers of what was really seen, so that nothing equal can be empty."""
-    seen, strobed = markers(folder), triples(folder)
+    seen, strobed = markers(folder), cycles(folder)
     messages: list[Message] = [*seen, *strobed, *others()]
     theirs = json.loads((folder / "sealed.json").read_text())
     bodies = opened([bytes.fromhex(one) for one in theirs])
@@ -135,7 +135,7 @@ def told(folder: Path) -> dict[str, object]:
         "absent": absent(),
         "markers": _hash(seen),
         "markers_seen": int(sum(np.isfinite(one.uv).all(axis=1).sum() for one in seen)),
-        "triples": _hash(strobed),
+        "cycles": _hash(strobed),
         "laser_seen": int(sum(np.isfinite(one.laser_uv).all(axis=1).sum() for one in strobed)),
         "sealed": [one.hex() for one in sealed(messages)],
         "opened": hashlib.sha256(b"".join(bodies)).hexdigest(),

@@ -55,9 +55,9 @@ def test_markers_are_reported_near_the_truth_and_only_where_paint_is_in_sight(ma
 
 
 def test_lines_and_tips_are_reported_only_where_they_are_in_sight(made: Shown) -> None:
-    triples = [message for message in made.messages if isinstance(message, WristDetections)]
-    line = np.array([np.isfinite(message.laser_uv[:, 0]) for message in triples])
-    tip = np.array([np.isfinite(message.tip_uv[:, 0]) for message in triples])
+    cycles = [message for message in made.messages if isinstance(message, WristDetections)]
+    line = np.array([np.isfinite(message.laser_uv[:, 0]) for message in cycles])
+    tip = np.array([np.isfinite(message.tip_uv[:, 0]) for message in cycles])
     assert line.any()
     assert not (line & (made.line_of_sight.line_m < 2e-3)).any()
     assert not (tip & ~made.line_of_sight.tip).any()

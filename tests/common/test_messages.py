@@ -100,7 +100,7 @@ def detections(draw: st.DrawFn) -> MarkerDetections:
 
 
 @st.composite
-def triples(draw: st.DrawFn) -> WristDetections:
+def cycles(draw: st.DrawFn) -> WristDetections:
     kind, size = WristDetections, FINGER_COUNT
     laser, tip = (draw(rows(kind, name, size, 2)) for name in ("laser_uv", "tip_uv"))
     return WristDetections(
@@ -277,7 +277,7 @@ def sample_detections(markers: int = 6, alternatives: Float | None = None) -> Ma
     )
 
 
-def sample_triple() -> WristDetections:
+def sample_cycle() -> WristDetections:
     """The little finger's laser and the thumb's tip are not seen."""
     laser, tip = np.arange(10.0).reshape(5, 2), np.arange(20.0, 30.0).reshape(5, 2)
     laser[4], tip[0] = np.nan, np.nan
@@ -305,7 +305,7 @@ def sample_contact() -> Contact:
 
 SAMPLES: tuple[Message, ...] = (
     sample_detections(),
-    sample_triple(),
+    sample_cycle(),
     sample_tags(),
     TrackerPose("tracker", 1, 2, 3, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])),
     sample_object(),
@@ -339,7 +339,7 @@ def as_map(message: Message) -> dict[str, object]:
 
 
 EVERY = (
-    *(detections(), triples(), tags(), trackers, imu_samples, hand_poses(), objects, contacts, gestures),
+    *(detections(), cycles(), tags(), trackers, imu_samples, hand_poses(), objects, contacts, gestures),
     *(healths, commands, backlogs, previews),
 )
 
@@ -433,9 +433,9 @@ def longest(markers: int) -> MarkerDetections:
     )
 
 
-def test_a_triple_is_far_below_one_ethernet_packet() -> None:
-    longest_triple = msgspec.structs.replace(
-        sample_triple(),
+def test_a_cycle_is_far_below_one_ethernet_packet() -> None:
+    longest_cycle = msgspec.structs.replace(
+        sample_cycle(),
         camera="x" * 64,
         session=2**63 - 1,
         seq=2**63 - 1,
@@ -443,7 +443,7 @@ def test_a_triple_is_far_below_one_ethernet_packet() -> None:
         ready_t_ns=-MAX_TIME_NS,
     )
     # 5 * (2 + 1 + 1 + 2 + 1 + 1) * 8 bytes of numbers; names and keys come on top.
-    assert 320 < len(encode(sample_triple())) < len(encode(longest_triple)) < 640
+    assert 320 < len(encode(sample_cycle())) < len(encode(longest_cycle)) < 640
 
 
 def test_the_most_tags_are_one_ethernet_packet() -> None:

@@ -57,10 +57,10 @@ def test_a_recording_of_both_has_all_frames_on_one_clock_and_both_truths(tmp_pat
     assert set(manifest.clicks) == {"left", "right"}
     stamps = [row.t_ns for row in recording.rows]
     assert stamps == sorted(stamps)
-    triples = recording.frames_of("wrist")
-    assert [row.illumination.value for row in triples] == ["ambient", "laser", "led"] * 2
-    assert triples[0].t_ns == recording.frames_of("left")[0].t_ns == 21_500_000_000
-    image = cv2.imread(str(tmp_path / "r" / triples[4].file), cv2.IMREAD_UNCHANGED)
+    cycles = recording.frames_of("wrist")
+    assert [row.illumination.value for row in cycles] == ["ambient", "laser", "led"] * 2
+    assert cycles[0].t_ns == recording.frames_of("left")[0].t_ns == 21_500_000_000
+    image = cv2.imread(str(tmp_path / "r" / cycles[4].file), cv2.IMREAD_UNCHANGED)
     drawn = WristRenderer(device, "wrist", 4).render(START_S + 4 / 90, Illumination.LASER)
     np.testing.assert_array_equal(image, drawn)
 
@@ -68,7 +68,7 @@ def test_a_recording_of_both_has_all_frames_on_one_clock_and_both_truths(tmp_pat
     at_s = float(truth["t_ref"][1])
     np.testing.assert_array_equal(truth["bend"][1], seen.motion.at(at_s).bend_rad)
     np.testing.assert_array_equal(truth["T_palm"][1], seen.truth(at_s).T_rig_palm)
-    assert truth["wrist_t_ns"].tolist() == [triples[1].t_ns, triples[4].t_ns]
+    assert truth["wrist_t_ns"].tolist() == [cycles[1].t_ns, cycles[4].t_ns]
     of_wrist = device.truth(START_S + 4 / 90)
     np.testing.assert_array_equal(truth["wrist_laser_uv"][1], of_wrist.laser_uv)
     np.testing.assert_array_equal(truth["wrist_bend"][1], of_wrist.bend_rad)

@@ -19,7 +19,7 @@ from slave.link import SlaveLink
 from slave.uplink import Uplink
 from tests.loopback.test_handshake import BROADCAST, KEY, MASTER, S, Wires
 from tests.loopback.test_imu_link import sample
-from tests.network_helpers import PATIENCE_S, detections, free_udp_port, seeded, triple, until
+from tests.network_helpers import PATIENCE_S, cycle, detections, free_udp_port, seeded, until
 
 
 def tags(camera: str, session: int, seq: int, t_ns: int = 0, count: int = 3) -> TagDetections:
@@ -171,7 +171,7 @@ def test_who_sends_what_another_kind_of_sender_sends_is_an_impostor(
     assert master.refused == {Refusal.IMPOSTOR: 1}
     assert [*wires.got, *wires.tags, *wires.tracked, *wires.samples] == []
     wires.send(left, tags("left", left.process, 0))
-    wires.send(wrist, triple("wrist", wrist.process, 1))
+    wires.send(wrist, cycle("wrist", wrist.process, 1))
     wires.send(puck, tracker("puck", puck.process, 0))
     assert len(wires.got) == len(wires.tags) == len(wires.tracked) == 1, "the true ones are heard as before"
 

@@ -26,7 +26,7 @@ from tests.hand_helpers import MARKERS
 from tests.master.test_outputs_files import random_pose
 from tests.master.test_rig_merge import setups, two_hands
 from tests.synthetic_run import SyntheticRun, setup_of, synthetic_run
-from tests.wrist_run import START_NS, TRIPLE_NS, exact_triple, wrist_scene, wrist_setup
+from tests.wrist_run import CYCLE_NS, START_NS, exact_cycle, wrist_scene, wrist_setup
 
 
 class Told:
@@ -93,7 +93,7 @@ def test_messages_and_samples_go_to_their_own_hand(short_run: SyntheticRun, root
     left = load_setup(root / "calib_json", "wrist-left")
     lines = Told(), Told()
     hands = World((right, left), lines, StageTimes())
-    seen = exact_triple(left, wrist_scene(left).truth(0.5), 0)
+    seen = exact_cycle(left, wrist_scene(left).truth(0.5), 0)
     samples = [sample(source, t_ns) for source, t_ns in (("palm", 1), (left.imus[0], 2), ("another", 3))]
     for message in (short_run.messages[0], seen, *samples):
         assert not list(hands.push(message))
@@ -134,8 +134,8 @@ def test_a_joined_hand_follows_all_its_files(root: Path, tmp_path: Path) -> None
     tuning = RigTuning(files, [setup], [pipeline], lines.append)
     scene = wrist_scene(wrist_setup(root))
     for k in range(6):
-        pipeline.push_orientation(START_NS + k * TRIPLE_NS - 1, np.eye(4)[0])
-        pipeline.push(exact_triple(wrist_setup(root), scene.truth(0.1 * k), k))
+        pipeline.push_orientation(START_NS + k * CYCLE_NS - 1, np.eye(4)[0])
+        pipeline.push(exact_cycle(wrist_setup(root), scene.truth(0.1 * k), k))
     path = files.calibration / "rigs/wrist.json"
     rig = load(path, RigCalibration)
     save(path, msgspec.structs.replace(rig, level="fk"))
@@ -144,7 +144,7 @@ def test_a_joined_hand_follows_all_its_files(root: Path, tmp_path: Path) -> None
     [new] = tuning.setups
     assert new.wrist is not None
     assert new.wrist.level == "fk"
-    pipeline.push(exact_triple(wrist_setup(root), scene.truth(0.6), 6))
+    pipeline.push(exact_cycle(wrist_setup(root), scene.truth(0.6), 6))
     save(path, msgspec.structs.replace(rig, hand="default-left"))
     with pytest.raises(
         CalibrationError, match="hand: default-right cannot become default-right, default-left"

@@ -16,7 +16,7 @@ from master.rig_pipeline import build_pipeline
 from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from tests.hand_helpers import MARKERS, RIGHT, camera_file, rig_file
-from tests.network_helpers import detections, triple
+from tests.network_helpers import cycle, detections
 from tests.synthetic_run import hand_at, synthetic_run
 
 MS = 1_000_000
@@ -193,7 +193,7 @@ def test_what_is_no_frame_and_who_is_not_known_change_nothing() -> None:
     hurry = Hurry([SETUP])
     hurry.waiting = lambda: waits(left=(1, 1), right=(1, 1))
     hurry.look(detections("third", 1, 0, 0))
-    hurry.look(triple("wrist", 1, 0, 0))
+    hurry.look(cycle("wrist", 1, 0, 0))
     assert hurry.reject == 0
     hurry.look(detections("left", 1, 0, 0))
     assert hurry.reject == MOST

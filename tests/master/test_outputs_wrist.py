@@ -22,7 +22,7 @@ from master.outputs.truth import PosesTruth
 from master.rig_setup import RigSetup
 from master.wrist_report import lit_view
 from tests.master.test_outputs_rerun import column, rows_of
-from tests.wrist_run import exact_triple, true_poses, wrist_scene, wrist_setup
+from tests.wrist_run import exact_cycle, true_poses, wrist_scene, wrist_setup
 
 
 @pytest.fixture(scope="module", params=["wrist", "wrist-left"])
@@ -74,7 +74,7 @@ def test_the_fan_lies_in_the_laser_plane_about_the_camera_view(setup: RigSetup) 
 def test_a_wrist_run_is_all_there(setup: RigSetup, truths: list[WristTruth], tmp_path: Path) -> None:
     path, camera = tmp_path / "run.rrd", setup.rig.cameras[0]
     poses = true_poses(setup, truths)
-    seen = [exact_triple(setup, now, k) for k, now in enumerate(truths)]
+    seen = [exact_cycle(setup, now, k) for k, now in enumerate(truths)]
     frames = [(camera, int(t), np.full((48, 64), 90, np.uint8)) for t in poses.t_ns]
     write_rrd(path, poses, setup, {camera: seen}, ghost_of(poses, 0.002), frames)
     rows, n = rows_of(path), len(truths)
@@ -105,7 +105,7 @@ def test_laser_points_stand_where_they_are_and_where_the_camera_saw_them(
 ) -> None:
     path, camera = tmp_path / "run.rrd", setup.rig.cameras[0]
     poses = true_poses(setup, truths)
-    seen = [exact_triple(setup, now, k) for k, now in enumerate(truths)]
+    seen = [exact_cycle(setup, now, k) for k, now in enumerate(truths)]
     write_rrd(path, poses, setup, {camera: seen})
     _, points = column(path, "/world/laser/points", "positions")
     _, detected = column(path, f"/world/cameras/{camera}/detections/laser", "positions")

@@ -28,7 +28,7 @@ from tests.hand_helpers import LEFT
 
 SECONDS = 0.4
 MARKERS = ("t_ns", "seq", "uv", "quality", "sigma_px", "alternative_uv")
-TRIPLES = ("t_ns", "seq", "laser_uv", "laser_sigma_px", "laser_px", "tip_uv", "tip_sigma_px", "tip_depth")
+CYCLES = ("t_ns", "seq", "laser_uv", "laser_sigma_px", "laser_px", "tip_uv", "tip_sigma_px", "tip_depth")
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def write_detections(folder: Path, messages: Sequence[Observed]) -> None:
         if not isinstance(message, ImuSample):
             cameras.setdefault(message.camera, []).append(message)
     for camera, seen in cameras.items():
-        names = MARKERS if isinstance(seen[0], MarkerDetections) else TRIPLES
+        names = MARKERS if isinstance(seen[0], MarkerDetections) else CYCLES
         arrays = {name: np.array([getattr(one, name) for one in seen]) for name in names}
         arrays |= {"area_px2": np.array([one.area for one in seen if isinstance(one, MarkerDetections)])}
         np.savez(folder / f"detections_{camera}.npz", **arrays)  # pyright: ignore[reportArgumentType]
@@ -100,11 +100,11 @@ def test_both_streams_make_one_hand_that_is_scored_against_both_truths(
     assert len(poses) > 15
     assert poses.marker_count == 6
     assert np.isfinite(poses.laser_m).any()
-    assert set(summary) >= {"joint_mm", "pip_deg", "joint_mm_visible", "laser_mm", "laser_right", "triples"}
+    assert set(summary) >= {"joint_mm", "pip_deg", "joint_mm_visible", "laser_mm", "laser_right", "cycles"}
     assert summary["joint_mm"] < 6.0  # type: ignore[operator]
     assert summary["laser_mm"] < 2.0  # type: ignore[operator]
-    assert summary["triples"] == len(np.load(recorded.opened.folder / "detections_wrist.npz")["t_ns"])
-    assert summary["triples_missed"] <= 1.0  # type: ignore[operator]
+    assert summary["cycles"] == len(np.load(recorded.opened.folder / "detections_wrist.npz")["t_ns"])
+    assert summary["cycles_missed"] <= 1.0  # type: ignore[operator]
     assert summary["lost"] == 0
     assert summary["camera_hz"] == pytest.approx({"left": 60.0, "right": 60.0, "wrist": 90.0}, rel=1e-3)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
@@ -120,8 +120,8 @@ def test_either_stream_is_solved_alone_from_the_same_detections(
     markers = recorded.solve(tmp_path / "markers", "markers")
     wrist = recorded.solve(tmp_path / "wrist", "wrist", "fk")
     assert "not used" not in caplog.text  # the IMU is of a rig that is left out
-    assert set(markers) & {"joint_mm", "laser_mm", "triples_missed"} == {"joint_mm"}
-    assert set(wrist) & {"marker_mm", "laser_mm", "triples_missed"} == {"laser_mm", "triples_missed"}
+    assert set(markers) & {"joint_mm", "laser_mm", "cycles_missed"} == {"joint_mm"}
+    assert set(wrist) & {"marker_mm", "laser_mm", "cycles_missed"} == {"laser_mm", "cycles_missed"}
     assert load_poses(tmp_path / "wrist/poses.npz").marker_count == 0
     for name in ("left", "right"):
         assert name not in wrist["camera_hz"]  # type: ignore[operator]

@@ -17,7 +17,7 @@ from master.rig import load_setups
 from master.rig_setup import RigSetup
 from master.wrist_report import forearm_tilt, laser_scores, lit_view
 from tests.master.test_outputs_rerun import rows_of
-from tests.wrist_run import START_NS, TRIPLE_NS, true_poses, wrist_scene, wrist_setup
+from tests.wrist_run import CYCLE_NS, START_NS, true_poses, wrist_scene, wrist_setup
 
 N = 40
 
@@ -38,7 +38,7 @@ def test_the_forearm_is_scored_against_the_vertical_whatever_its_heading(
     imu = setup.rig.imu
     assert imu is not None
     assert imu.q_rig_world is not None
-    poses = true_poses(setup, [scene.truth(k * TRIPLE_NS * 1e-9) for k in range(N)])
+    poses = true_poses(setup, [scene.truth(k * CYCLE_NS * 1e-9) for k in range(N)])
     assert forearm_tilt(poses, scene, START_NS) == {}
     rig_world = quaternion_to_matrix(np.array(imu.q_rig_world))
     times = (poses.t_ns - START_NS) * 1e-9
@@ -54,7 +54,7 @@ def test_the_forearm_is_scored_against_the_vertical_whatever_its_heading(
 def test_a_run_is_scored_at_the_times_of_its_poses(
     setup: RigSetup, scene: WristScene, tmp_path: Path, late_ms: int
 ) -> None:
-    poses = true_poses(setup, [scene.truth(k * TRIPLE_NS * 1e-9 + 1.5) for k in range(N)])
+    poses = true_poses(setup, [scene.truth(k * CYCLE_NS * 1e-9 + 1.5) for k in range(N)])
     save_poses(tmp_path / "poses.npz", poses)
     epoch_ns = START_NS - 1_500_000_000 - late_ms * 1_000_000
     told: list[str] = []
@@ -123,8 +123,8 @@ def test_a_hand_before_both_kinds_of_rig_is_played_by_one_motion(root: Path) -> 
     assert [Played.of(desk, name, 5).together for name in ("grasp", "poses")] == [True, False]
 
 
-def test_laser_points_count_once_for_each_triple(setup: RigSetup, scene: WristScene) -> None:
-    poses = true_poses(setup, [scene.truth(k * TRIPLE_NS * 1e-9 + 1.5) for k in range(6)])
+def test_laser_points_count_once_for_each_cycle(setup: RigSetup, scene: WristScene) -> None:
+    poses = true_poses(setup, [scene.truth(k * CYCLE_NS * 1e-9 + 1.5) for k in range(6)])
     twice = replace(poses, laser_m=np.repeat(poses.laser_m[::2], 2, axis=0))
     told: list[int] = []
     epoch_ns = START_NS - 1_500_000_000

@@ -11,7 +11,7 @@ from common.errors import RecordingError
 from common.frame_recording import FrameRecording, FrameRow, Illumination, Manifest
 from common.messages import Level, WristDetections
 from master.outputs.poses import Poses
-from master.wrist_score import GROUPS, WristTruth, load_wrist_truth, score_tips, score_wrist, triples_missed
+from master.wrist_score import GROUPS, WristTruth, cycles_missed, load_wrist_truth, score_tips, score_wrist
 from tests.hand_helpers import camera_file
 
 PERIOD_NS = 33_333_333
@@ -80,7 +80,7 @@ def test_an_errorless_device_has_no_errors() -> None:
     assert got["laser_mm"] == got["laser_mm_thumb"] == got["laser_mm_little"] == 0.0
     assert got["laser_right"] == 1.0
     assert got["laser_missed"] == got["pip_untracked"] == 0.0
-    assert triples_missed(poses(exact), exact) == 0
+    assert cycles_missed(poses(exact), exact) == 0
     assert got["pip_rms_deg"] == got["pip_deg"] == got["joint_mm"] == 0.0
     assert (got["tip_px"], got["tip_within_6px"], got["tip_false"]) == (0.0, 1.0, 0.0)
 
@@ -131,11 +131,11 @@ def test_little_line_and_no_line_are_not_scored() -> None:
     assert got["laser_missed"] == 0.0
 
 
-def test_a_triple_of_which_nothing_was_made_is_missed_with_all_its_points() -> None:
+def test_a_cycle_of_which_nothing_was_made_is_missed_with_all_its_points() -> None:
     exact = truth()
     found = poses(exact)
     got = score_wrist(found.rows(1, N), exact)
-    assert triples_missed(found.rows(1, N), exact) == 1
+    assert cycles_missed(found.rows(1, N), exact) == 1
     assert got["laser_missed"] == 5.0
     assert got["laser_right"] == 0.75
     tips = score_tips(messages(exact, exact.tip_uv)[1:], exact)
@@ -146,10 +146,10 @@ def test_a_triple_of_which_nothing_was_made_is_missed_with_all_its_points() -> N
 def test_poses_of_adjacent_frames_are_not_taken_for_those_of_the_cycle() -> None:
     exact = truth()
     late = replace(poses(exact), t_ns=exact.t_ns + 11_111_111)
-    assert triples_missed(late, exact) == N
+    assert cycles_missed(late, exact) == N
     assert "laser_mm" not in score_wrist(late, exact)
     near = replace(poses(exact), t_ns=exact.t_ns + 4_000_000)  # the centre row of a rolling shutter
-    assert triples_missed(near, exact) == 0
+    assert cycles_missed(near, exact) == 0
 
 
 def test_the_pip_is_scored_up_to_85_degrees_where_it_is_tracked() -> None:
@@ -205,12 +205,12 @@ def test_a_tip_that_is_not_reported_is_missed_and_not_false() -> None:
     assert score_tips([], exact) == {"tip_within_6px": 0.0}
 
 
-def recording(folder: Path, triples: int) -> FrameRecording:
+def recording(folder: Path, cycles: int) -> FrameRecording:
     manifest = Manifest(version=1, kind="wrist", cameras={"wrist": camera_file("wrist", 90.0)})
     lit = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
     rows = [
         FrameRow("wrist", k, 1_000_000_000 + k * PERIOD_NS // 3, lit[k % 3], f"{k}.png")
-        for k in range(3 * triples)
+        for k in range(3 * cycles)
     ]
     return FrameRecording(folder, manifest, tuple(reversed(rows)))  # the table is in no order
 

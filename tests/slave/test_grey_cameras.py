@@ -288,7 +288,7 @@ def test_a_hand_before_a_real_camera_is_found_as_in_the_same_pictures_of_8_bits(
     taken = (frame for _ in range(12) if (frame := source.read()) is not None)
     run_wrist(Source(list(taken)), detector, wire, "wrist", Tally(NAMES), threading.Event())
     source.close()
-    assert detector.counts["triples"] >= 3
+    assert detector.counts["cycles"] >= 3
     plain = WristDetector(VIEW, RATE_HZ)
     found = [one for frame in strobed("curl", 8)[12:] if (one := plain.push(frame)) is not None]
     for message, one in zip(wire.sent, found, strict=True):

@@ -25,7 +25,7 @@ LIVE_STEP = 4
 LIVE_BEND_RAD = np.radians(
     0.25
 )  # the palm of a bent wrist is drawn anew by such steps: a tenth of a millimetre, twice
-_KINDS = tuple(Illumination)  # frames of one instant differ in their noise, too
+_ILLUMINATIONS = tuple(Illumination)  # frames of one instant differ in their noise, too
 SATURATED = np.float32(300.0)  # levels: more cannot be seen, but would widen edges
 
 
@@ -97,7 +97,7 @@ class WristRenderer:
         if self._gain != 1.0:
             level *= np.float32(self._gain)
         level += np.float32(light.BLACK_LEVEL)
-        return self._sensor.bytes_of(level, 4 * round(t_s * 1e6) + _KINDS.index(lit))
+        return self._sensor.bytes_of(level, 4 * round(t_s * 1e6) + _ILLUMINATIONS.index(lit))
 
     def _shaded(
         self, behind: Plane, surface: SurfaceView, lit: Illumination, things: Capsules | None = None

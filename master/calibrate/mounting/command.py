@@ -15,7 +15,7 @@ from common.imu_recording import IMU, read_imu
 from common.messages import HandPose, ImuSample
 from master.calibrate.wrist.device import device_of, say, write_device
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
-from master.recorded import recorded_detections, recorded_triples
+from master.recorded import recorded_cycles, recorded_detections
 from master.rig import load_hand
 from master.rig_pipeline import build_pipeline
 from master.rig_setup import RigSetup
@@ -82,10 +82,10 @@ def mounting(
     setup = RigSetup.of(markers, dict(opened.manifest.cameras), load_hand(calibration, markers.hand, hand))
     poses = marker_poses(setup, detections)
     samples = imu_samples(opened, device.rig.imu.name, device.rig.imu.rate_hz)
-    triples = list(recorded_triples(detections, device.camera.name))
+    cycles = list(recorded_cycles(detections, device.camera.name))
     try:
         found = calibrate_mounting(
-            poses, setup.markers, setup.hand, triples, samples, device.rig, device.camera, device.source
+            poses, setup.markers, setup.hand, cycles, samples, device.rig, device.camera, device.source
         )
     except FitError as error:
         raise FitError(f"{recording}: {error}") from error
@@ -145,7 +145,7 @@ def summary(found: "Mounting") -> dict[str, object]:
         "imu_late_ms": 1e3 * found.fit.unknown.imu_late_s,
         "sigma": found.sigma,
         "residual": left_of(found.fit),
-        "triples": len(found.triples.t_s),
+        "cycles": len(found.cycles.t_s),
         "bend_deg": _span(np.degrees(found.fit.bend_rad)),
     }
 

@@ -7,7 +7,7 @@ import numpy as np
 from common.hand_model import HandModel
 from master.calibrate.mounting.lines_of_sight import LinesOfSight
 from master.calibrate.mounting.problem import Problem
-from master.calibrate.mounting.seen import Fit, Triples
+from master.calibrate.mounting.seen import Fit, StrobeCycles
 from master.calibrate.mounting.tracks import HandTrack, ImuTrack
 from master.calibrate.mounting.unknown import Unknown
 
@@ -21,7 +21,7 @@ def fit_mounting(
     names: tuple[str, ...],
     hand: HandTrack,
     imu: ImuTrack,
-    triples: Triples,
+    cycles: StrobeCycles,
     px_per_m: float,
     firsts: Sequence[Unknown],
 ) -> Fit:
@@ -36,8 +36,8 @@ def fit_mounting(
         px_per_m: What a metre at the tips is in the image.
         firsts: First guesses, of which one is right to some 15 degrees, 15 mm and 20 ms.
     """
-    some = np.unique(np.linspace(0, len(triples.t_s) - 1, _COARSE).astype(np.int64))
-    coarse = triples.of(some)
+    some = np.unique(np.linspace(0, len(cycles.t_s) - 1, _COARSE).astype(np.int64))
+    coarse = cycles.of(some)
     best: tuple[float, Unknown] | None = None
     for first in firsts:
         problem = Problem(lines_of_sight, model, names, hand, imu, coarse, px_per_m, first)
@@ -45,5 +45,5 @@ def fit_mounting(
         if best is None or problem.cost(unknown, hands) < best[0]:
             best = problem.cost(unknown, hands), unknown
     first = firsts[0] if best is None else best[1]
-    problem = Problem(lines_of_sight, model, names, hand, imu, triples, px_per_m, first)
+    problem = Problem(lines_of_sight, model, names, hand, imu, cycles, px_per_m, first)
     return problem.result(*problem.followed(first, _ROUNDS))

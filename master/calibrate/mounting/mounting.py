@@ -21,7 +21,7 @@ from master.calibrate.mounting.fit import fit_mounting
 from master.calibrate.mounting.lines_of_sight import FINGERS as LASER_FINGERS
 from master.calibrate.mounting.lines_of_sight import LinesOfSight
 from master.calibrate.mounting.report import left_of, refuse, report_lines, sigmas
-from master.calibrate.mounting.seen import Fit, Triples
+from master.calibrate.mounting.seen import Fit, StrobeCycles
 from master.calibrate.mounting.start import started
 from master.calibrate.mounting.tracks import GAP_S, HandTrack, ImuTrack
 from master.calibrate.tree_files import provenance
@@ -54,7 +54,7 @@ class Mounting:
     rig: RigCalibration
     report: tuple[str, ...]
     fit: Fit
-    triples: Triples
+    cycles: StrobeCycles
     sigma: dict[str, float]
 
 
@@ -62,7 +62,7 @@ def calibrate_mounting(
     poses: Sequence[HandPose],
     markers: tuple[str, ...],
     model: HandModel,
-    triples: Sequence[WristDetections],
+    cycles: Sequence[WristDetections],
     samples: Sequence[ImuSample],
     rig: RigCalibration,
     camera: CameraCalibration,
@@ -86,13 +86,13 @@ def calibrate_mounting(
     """
     if rig.imu is None:
         raise CalibrationError(f"rig {rig.name!r}: imu: missing; nothing else tells how the wrist is bent")
-    if not (poses and triples and samples):
-        missing = "the markers" if not poses else "the wrist camera" if not triples else "the IMU"
+    if not (poses and cycles and samples):
+        missing = "the markers" if not poses else "the wrist camera" if not cycles else "the IMU"
         raise FitError(f"{missing} saw nothing: {MOTION}")
     setup = WristSetup.of(rig, camera, model)
-    lines_of_sight, zero_ns = LinesOfSight(setup), triples[0].t_ns
+    lines_of_sight, zero_ns = LinesOfSight(setup), cycles[0].t_ns
     hand, imu = HandTrack.of(poses, model, zero_ns), ImuTrack(samples, zero_ns)
-    seen = _triples(setup, lines_of_sight, camera, triples, zero_ns)
+    seen = _cycles(setup, lines_of_sight, camera, cycles, zero_ns)
     chosen = _chosen(hand, imu, seen)
     tips = hand.points_m[:, [_marker_of(model, markers, finger) for finger in FINGERS[LASER_FINGERS]]]
     start = started(hand, tips, imu, setup.optics, setup.T_camera_palm, seen)
@@ -107,7 +107,7 @@ def calibrate_mounting(
     sigma = sigmas(fit)
     refuse(fit, sigma)
     new = _documented(rig, camera, rig.imu, fit, imu, sigma, source)
-    return Mounting(new, report_lines(fit, sigma, len(triples)), fit, seen.of(chosen), sigma)
+    return Mounting(new, report_lines(fit, sigma, len(cycles)), fit, seen.of(chosen), sigma)
 
 
 def _marker_of(model: HandModel, markers: tuple[str, ...], finger: str) -> int:
@@ -123,13 +123,13 @@ def _marker_of(model: HandModel, markers: tuple[str, ...], finger: str) -> int:
     raise FitError(f"no marker sits on the tip of the {finger} finger, which the mounting is found by")
 
 
-def _triples(
+def _cycles(
     setup: WristSetup,
     lines_of_sight: LinesOfSight,
     camera: CameraCalibration,
     messages: Sequence[WristDetections],
     zero_ns: int,
-) -> Triples:
+) -> StrobeCycles:
     """What was seen of index ... little, on the laser plane and in the image."""
     laser, sigma, tips, tip_sigma = (list[Float]() for _ in range(4))
     for one in messages:
@@ -140,7 +140,7 @@ def _triples(
         shown = in_image(setup, one.tip_uv, one.tip_sigma_px)
         tips.append(np.where(shown[:, None], one.tip_uv, np.nan))
         tip_sigma.append(one.tip_sigma_px)
-    return Triples(
+    return StrobeCycles(
         np.array([1e-9 * (one.t_ns - zero_ns) for one in messages]),
         np.array(laser)[:, LASER_FINGERS],
         np.array(sigma)[:, LASER_FINGERS],
@@ -150,7 +150,7 @@ def _triples(
     )
 
 
-def _chosen(hand: HandTrack, imu: ImuTrack, seen: Triples) -> Bool:
+def _chosen(hand: HandTrack, imu: ImuTrack, seen: StrobeCycles) -> Bool:
     """(T,) which triples count: those whose hand both sensors see, at most 200.
 
     Raises:

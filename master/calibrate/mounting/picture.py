@@ -15,7 +15,7 @@ def draw_mounting(path: Path, found: Mounting, optics: CameraModel) -> None:
     Raises:
         RecordingError: The file cannot be written.
     """
-    fit, triples = found.fit, found.triples
+    fit, cycles = found.fit, found.cycles
     seen = fit.shown + fit.off * fit.sigma  # tips as they were when the laser shone
     figure = figure_of((17.0, 5.4))
     figure.suptitle(found.report[0] + "; " + found.report[1])
@@ -34,7 +34,7 @@ def draw_mounting(path: Path, found: Mounting, optics: CameraModel) -> None:
         (fit.bend_rad[:, 1], ORANGE, "deviation"),
         (fit.twist_rad, GREY, "twist, which no wrist has"),
     ):
-        wrist.plot(triples.t_s, np.degrees(values), ".", color=colour, label=name)
+        wrist.plot(cycles.t_s, np.degrees(values), ".", color=colour, label=name)
     wrist.set(title="the wrist [deg]", xlabel="time [s]")
     wrist.legend(fontsize=8)
     saved(figure, path)

@@ -30,7 +30,7 @@ from common.hand_model import HandModel
 from master.calibrate.mounting.hands import HandProblem, Hands
 from master.calibrate.mounting.lines_of_sight import FINGERS, SEEN, LinesOfSight
 from master.calibrate.mounting.normal import Normal
-from master.calibrate.mounting.seen import STRAYS, Fit, Triples
+from master.calibrate.mounting.seen import STRAYS, Fit, StrobeCycles
 from master.calibrate.mounting.tracks import HandTrack, ImuTrack, Markers, Turns
 from master.calibrate.mounting.unknown import (
     CAMERA_IMU,
@@ -83,20 +83,20 @@ class Problem:
         names: tuple[str, ...],
         hand: HandTrack,
         imu: ImuTrack,
-        triples: Triples,
+        cycles: StrobeCycles,
         px_per_m: float,
         first: Unknown,
     ) -> None:
-        self._lines_of_sight, self._hand, self._imu, self._triples, self._first = (
+        self._lines_of_sight, self._hand, self._imu, self._cycles, self._first = (
             lines_of_sight,
             hand,
             imu,
-            triples,
+            cycles,
             first,
         )
         model = replace(model, tolerance_rad=np.zeros((5, 4)))  # nothing here weighs what is beyond limits
         self._model, self._parameters = model, HandParameters.of(model)
-        count = len(triples.t_s)
+        count = len(cycles.t_s)
         self._hands = HandProblem(
             model,
             Attached.markers(model, self._parameters, names),
@@ -104,10 +104,10 @@ class Problem:
             np.zeros((count, len(names), 3)),
             np.zeros((count, len(names), 3, 3)),
         )
-        tip_px = np.hypot(np.nan_to_num(triples.tip_sigma_px), _TIP_M * px_per_m)
-        laser_m = np.hypot(np.nan_to_num(triples.laser_sigma_m), _SURFACE_M)
+        tip_px = np.hypot(np.nan_to_num(cycles.tip_sigma_px), _TIP_M * px_per_m)
+        laser_m = np.hypot(np.nan_to_num(cycles.laser_sigma_m), _SURFACE_M)
         self.sigma = np.concatenate([laser_m, np.repeat(tip_px[..., None], 2, axis=-1)], axis=-1)
-        last_s, first_s = triples.t_s[-1], triples.t_s[0]
+        last_s, first_s = cycles.t_s[-1], cycles.t_s[0]
         self._share = min(_PER_S * (last_s - first_s) / count, 1.0)
         self._bend_sigma = np.array([_BENT_RAD, _BENT_RAD, _TWIST_RAD])
         self._believed = believed()
@@ -123,14 +123,14 @@ class Problem:
 
     def guessed(self, unknown: Unknown) -> Hands:
         """The hands as the markers alone have them."""
-        near = self._hand.nearest(self._triples.t_s + unknown.camera_late_s)
+        near = self._hand.nearest(self._cycles.t_s + unknown.camera_late_s)
         x = np.array([self._parameters.of_angles(angles) for angles in self._hand.angles_rad[near]])
         return Hands(self._hand.T_rig_palm[near], x)
 
     def tell(self, unknown: Unknown, hands: Hands) -> None:
         """Ask the tracks where the clocks and the errors of the gyroscope are believed to be."""
         self._mended, self._mended_of = self._imu.mended(unknown.gyro), unknown.gyro
-        at = self._triples.t_s + unknown.camera_late_s
+        at = self._cycles.t_s + unknown.camera_late_s
         markers = self._hand.markers(at)
         turns = self._mended.at(at - unknown.imu_late_s)
         self._known = turns.known & (markers.seen.sum(axis=1) > 0)
@@ -150,12 +150,12 @@ class Problem:
             self._tips_with_the_laser(unknown, hands),
         )
         self._hands = replace(self._hands, whiten=whiten)
-        data = np.concatenate([self._triples.laser_m, self._told.tip_px], axis=-1)
+        data = np.concatenate([self._cycles.laser_m, self._told.tip_px], axis=-1)
         self._data = np.where(self._known[:, None, None], data, np.nan)
 
     def _tips_with_the_laser(self, unknown: Unknown, hands: Hands) -> Float:
         """Tips (T, 4, 2) [px] as they were when the laser shone: moved back by how the hand moved meanwhile."""
-        late_s, t_s = self._triples.tip_late_s, self._triples.t_s
+        late_s, t_s = self._cycles.tip_late_s, self._cycles.t_s
         at = t_s + unknown.camera_late_s
         turns = self._mended.at(at - unknown.imu_late_s)
         R = self._camera_rig(unknown, replace(turns, R_world_imu=np.nan_to_num(turns.R_world_imu)))
@@ -166,7 +166,7 @@ class Problem:
         speed = np.gradient(seen[..., 2:], t_s, axis=0)
         jump = np.diff(t_s, prepend=t_s[0]) > 0.2
         speed[jump | np.r_[jump[1:], False] | ~turns.known] = 0.0
-        return self._triples.tip_uv - late_s * np.nan_to_num(speed)
+        return self._cycles.tip_uv - late_s * np.nan_to_num(speed)
 
     def solved(self, unknown: Unknown, hands: Hands, rounds: int) -> tuple[Unknown, Hands, int]:
         """The least cost from a guess, and the steps taken."""

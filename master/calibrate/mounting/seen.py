@@ -11,7 +11,7 @@ STRAYS = 2.5  # standard deviations from which a sight is believed less
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Triples:
+class StrobeCycles:
     """What the device saw (T triples) of index ... little; NaN: not seen.
 
     Attributes:
@@ -29,9 +29,9 @@ class Triples:
     tip_sigma_px: Float
     tip_late_s: float
 
-    def of(self, rows: Int | Bool) -> "Triples":
+    def of(self, rows: Int | Bool) -> "StrobeCycles":
         """Some of them."""
-        return Triples(
+        return StrobeCycles(
             self.t_s[rows],
             self.laser_m[rows],
             self.laser_sigma_m[rows],

@@ -20,7 +20,7 @@ import numpy as np
 from common.arrays import Float
 from common.camera_model import CameraModel
 from common.geometry import cross, matrix_to_quaternion, quaternion_to_matrix
-from master.calibrate.mounting.seen import Triples
+from master.calibrate.mounting.seen import StrobeCycles
 from master.calibrate.mounting.tracks import HandTrack, ImuTrack
 from master.calibrate.mounting.unknown import Unknown
 
@@ -61,7 +61,12 @@ class Start:
 
 
 def started(
-    hand: HandTrack, tips_m: Float, imu: ImuTrack, optics: CameraModel, T_camera_palm: Float, triples: Triples
+    hand: HandTrack,
+    tips_m: Float,
+    imu: ImuTrack,
+    optics: CameraModel,
+    T_camera_palm: Float,
+    cycles: StrobeCycles,
 ) -> Start | None:
     """The first guess; None: hand and IMU were hardly seen at the same time.
 
@@ -80,7 +85,7 @@ def started(
     if best is None:
         return None
     start = Start(T_camera_palm, best[3].T, best[2], best[1], 0.0)
-    return replace(start, camera_late_s=_camera_late_s(hand, tips_m, imu, optics, start, triples))
+    return replace(start, camera_late_s=_camera_late_s(hand, tips_m, imu, optics, start, cycles))
 
 
 def _turns(hand: HandTrack, imu: ImuTrack, late_s: float) -> tuple[float, Float, Float] | None:
@@ -100,7 +105,7 @@ def _turns(hand: HandTrack, imu: ImuTrack, late_s: float) -> tuple[float, Float,
 
 
 def _camera_late_s(
-    hand: HandTrack, tips_m: Float, imu: ImuTrack, optics: CameraModel, first: "Start", triples: Triples
+    hand: HandTrack, tips_m: Float, imu: ImuTrack, optics: CameraModel, first: "Start", cycles: StrobeCycles
 ) -> float:
     """By the correlation of tips that are seen with where markers on them should be."""
     held = imu.held_at(hand.t_s - first.imu_late_s)
@@ -110,10 +115,10 @@ def _camera_late_s(
     expected = optics.project(arm @ np.swapaxes(R, 1, 2) + first.T_camera_palm[:3, 3])
     agree = np.zeros(len(_SEARCH_S))
     for f, axis in np.ndindex(tips_m.shape[1], 2):
-        known, seen = np.isfinite(expected[:, f, axis]), np.isfinite(triples.tip_uv[:, f, axis])
+        known, seen = np.isfinite(expected[:, f, axis]), np.isfinite(cycles.tip_uv[:, f, axis])
         if known.sum() < _FEWEST or seen.sum() < _FEWEST:
             continue
-        at, shown = triples.t_s[seen] + triples.tip_late_s, triples.tip_uv[seen, f, axis]
+        at, shown = cycles.t_s[seen] + cycles.tip_late_s, cycles.tip_uv[seen, f, axis]
         for k, late_s in enumerate(_SEARCH_S.tolist()):
             off = shown - np.interp(at + late_s, hand.t_s[known], expected[known, f, axis])
             agree[k] -= float(np.abs(off - np.median(off)).mean())

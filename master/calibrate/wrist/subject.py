@@ -72,7 +72,7 @@ class Subject:
 
 
 def calibrate_subject(
-    triples: Sequence[WristDetections],
+    cycles: Sequence[WristDetections],
     rig: RigCalibration,
     camera: CameraCalibration,
     hand: HandProfile,
@@ -93,17 +93,17 @@ def calibrate_subject(
     """
     setup = WristSetup.of(rig, camera, HandModel.of(hand))
     model = SubjectModel(setup)
-    laser = np.array([one.laser_uv for one in triples]).reshape(-1, 5, 2)
+    laser = np.array([one.laser_uv for one in cycles]).reshape(-1, 5, 2)
     points = model.flat(setup.on_plane(laser))[:, 1:]
     chosen = guided(points[..., 1])
-    tips = np.array([one.tip_uv for one in triples])[chosen.row, 1:]
-    doubt = np.array([one.tip_sigma_px for one in triples])[chosen.row, 1:]
+    tips = np.array([one.tip_uv for one in cycles])[chosen.row, 1:]
+    doubt = np.array([one.tip_sigma_px for one in cycles])[chosen.row, 1:]
     seen = ImageObservations(points[chosen.row], tips, doubt, chosen.bend)
     sigma = prior_sigma(_pose_sigma(rig), _length_sigma(hand))
     fit = fit_subject(model, seen, sigma)
     _check(fit, seen)
     unknown = Unknown.of(fit.x)
-    report = report_lines(setup, fit, len(triples))
+    report = report_lines(setup, fit, len(cycles))
     new_rig, new_hand = _documented(rig, fitted_profile(setup.model, unknown), fit, source)
     new_rig = replace(new_rig, T_camera_palm=matrix_of(model.palm(unknown)))
     return Subject(new_rig, new_hand, report, chosen, seen, fit, model)

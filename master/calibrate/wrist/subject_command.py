@@ -16,7 +16,7 @@ from master.calibrate.wrist.device import Device, device_of, say, write_device
 from master.calibrate.wrist.subject import Subject, calibrate_subject
 from master.calibrate.wrist.subject_model import Unknown
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
-from master.recorded import recorded_triples
+from master.recorded import recorded_cycles
 from master.summary import write_summary
 
 Recording = Annotated[
@@ -67,9 +67,9 @@ def subject(
             " or lay a board on the palm (calibrate palm)"
         )
     profile = load(hand or _hand_of(device.rig.hand, calibration, out), HandProfile)
-    triples = list(recorded_triples(detections, device.camera.name))
+    cycles = list(recorded_cycles(detections, device.camera.name))
     try:
-        found = calibrate_subject(triples, device.rig, device.camera, profile, device.source)
+        found = calibrate_subject(cycles, device.rig, device.camera, profile, device.source)
     except FitError as error:
         raise FitError(f"{recording}: {error}") from error
     say(found.report)
@@ -122,7 +122,7 @@ def summary(found: Subject) -> dict[str, object]:
         for f, name in enumerate(FINGERS[1:])
     }
     left = {"laser_mm": round(1e3 * found.fit.laser_m, 4), "tip_px": round(found.fit.tip_px, 4)}
-    return {**pose, "fingers": fingers, "residual": left, "triples": len(found.chosen.row)}
+    return {**pose, "fingers": fingers, "residual": left, "cycles": len(found.chosen.row)}
 
 
 def _numbers(values: Float) -> list[float]:

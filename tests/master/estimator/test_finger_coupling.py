@@ -10,7 +10,7 @@ from common.hand_model import CHAINS
 from common.messages import HandPose
 from master.estimator.settings import DEFAULT
 from master.estimator.wrist_pipeline import WristPipeline
-from tests.master.estimator.wrist_case import PIP, TRIPLE_NS, WristCase, bent, pipeline, pushed
+from tests.master.estimator.wrist_case import CYCLE_NS, PIP, WristCase, bent, pipeline, pushed
 
 CURL_DEG = np.linspace(25.0, 80.0, 120)
 SHOWN_PIP_DEG = 8.0
@@ -26,7 +26,7 @@ def learnt(wrist_case: WristCase, share: float, spread_deg: float = 0.0) -> Wris
     line, rng = pipeline(wrist_case, continuous=True), np.random.default_rng(5)
     for k, pip in enumerate(CURL_DEG):
         mcp = np.clip(share * pip + spread_deg * rng.normal(), 0.0, 90.0)
-        pushed(line, wrist_case.message(bent(float(mcp), float(pip)), (k + 1) * TRIPLE_NS))
+        pushed(line, wrist_case.message(bent(float(mcp), float(pip)), (k + 1) * CYCLE_NS))
     return line
 
 
@@ -40,7 +40,7 @@ def laser_alone(wrist_case: WristCase, line: WristPipeline) -> tuple[HandPose, F
     """The pose of a hand that opens until no tip is seen, and standard deviations (4,) [deg] of its PIPs."""
     angles, pose = bent(0.54 * SHOWN_PIP_DEG, SHOWN_PIP_DEG), None
     for k in range(12):
-        pose = pushed(line, wrist_case.message(angles, (len(CURL_DEG) + 30 + k) * TRIPLE_NS, tips=False))
+        pose = pushed(line, wrist_case.message(angles, (len(CURL_DEG) + 30 + k) * CYCLE_NS, tips=False))
     assert pose is not None
     return pose, np.degrees(np.sqrt(line._estimator._at.scan.pip2[1:]))
 

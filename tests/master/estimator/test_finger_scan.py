@@ -11,9 +11,9 @@ from common.messages import Level
 from master.estimator.finger_scan import NODES, Scan
 from master.estimator.wrist_pipeline import WristPipeline
 from tests.master.estimator.wrist_case import (
+    CYCLE_NS,
     DIP,
     PIP,
-    TRIPLE_NS,
     WristCase,
     bent,
     message,
@@ -126,7 +126,7 @@ def test_where_a_finger_was_decides_between_two_poses_that_look_alike(wrist_case
     t_ns = 0
     for mcp in (15.0, 20.0, 24.0, 27.0, 30.0):
         for pip in (50.0, 60.0, 70.0, 80.0):
-            t_ns += TRIPLE_NS
+            t_ns += CYCLE_NS
             pose = pushed(alone, wrist_case.message(bent(mcp, pip), t_ns))
             twins += [(mcp, pip, int(f)) for f in np.flatnonzero(pose.ambiguous)]
     assert twins
@@ -134,7 +134,7 @@ def test_where_a_finger_was_decides_between_two_poses_that_look_alike(wrist_case
     for mcp, pip, f in twins:
         line = pipeline(wrist_case, continuous=True)
         for k in range(1, 11):
-            pose = pushed(line, wrist_case.message(bent(mcp, pip + 10.0 - k), k * TRIPLE_NS, unit=0.5))
+            pose = pushed(line, wrist_case.message(bent(mcp, pip + 10.0 - k), k * CYCLE_NS, unit=0.5))
         kept += int(abs(np.degrees(pose.angles_rad[f, PIP]) - pip) < 12.0)
     assert kept >= 0.7 * len(twins)
 

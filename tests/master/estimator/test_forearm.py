@@ -21,11 +21,11 @@ from common.geometry import (
     rotation_vector_to_matrix,
 )
 from common.wrist_bend import forearm_palm
+from master.estimator.cycle_reader import CycleReader
 from master.estimator.epoch import Epoch, Fitted, Turn
 from master.estimator.estimator import Estimator
 from master.estimator.forearm import Forearm
 from master.estimator.fused import WristSide
-from master.estimator.triple_reader import TripleReader
 from master.estimator.wrist_device import BEND, HEADING, RATE
 from master.estimator.wrist_model import WristModel, loosened
 from tests.hand_helpers import any_rotation, small_cov
@@ -87,7 +87,7 @@ class WristCase:
         wrist_case = wrist_setup(root).wrist
         assert wrist_case is not None
         setup, counts = replace(wrist_case, model=RIGHT, imu=imu), Counter[str]()
-        side = WristSide(setup, TripleReader(setup, None, counts), counts, continuous=continuous)
+        side = WristSide(setup, CycleReader(setup, None, counts), counts, continuous=continuous)
         model = WristModel.of(setup, loose=True)
         estimator = Estimator(PAIR, loosened(RIGHT), MARKERS, MARKERS, continuous=continuous, wrist=model)
         return cls(side, estimator)

@@ -55,7 +55,7 @@ def away(cut: Solved) -> Bool:
     return (cut.t_s > GONE_S + 0.05) & (cut.t_s < BACK_S - 0.05)
 
 
-def test_poses_come_at_the_triples_while_the_cameras_are_silent(whole: Solved, cut: Solved) -> None:
+def test_poses_come_at_the_cycles_while_the_cameras_are_silent(whole: Solved, cut: Solved) -> None:
     assert (np.diff(cut.poses.t_ns) > 0).all()
     alone = cut.t_s[away(cut)]
     assert np.diff(alone) == pytest.approx(1.0 / 30.0, abs=2e-3)
@@ -136,7 +136,7 @@ def pushed(pipeline: FusedPipeline, messages: list[Observed]) -> list[HandPose]:
     return out
 
 
-def test_late_and_doubled_triples_are_counted_and_change_nothing(seen: Seen) -> None:
+def test_late_and_doubled_cycles_are_counted_and_change_nothing(seen: Seen) -> None:
     some = [message for message in seen[1] if 1e-9 * (message.t_ns - START_NS) < 1.0]
     doubled: list[Observed] = []
     before: WristDetections | None = None

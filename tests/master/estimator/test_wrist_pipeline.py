@@ -22,9 +22,9 @@ from master.estimator.wrist_pipeline import WristPipeline
 from master.rig_setup import RigSetup
 from master.wrist_setup import WristSetup
 from tests.master.estimator.wrist_case import (
+    CYCLE_NS,
     DIP,
     PIP,
-    TRIPLE_NS,
     WristCase,
     bent,
     chi_square,
@@ -63,12 +63,12 @@ class Line:
 
     def sees(self, angles: Float, **changes: object) -> HandPose:
         """The pose of angles (5, 4), a triple later; keywords as of `WristCase.message`."""
-        self.t_ns += TRIPLE_NS
+        self.t_ns += CYCLE_NS
         return pushed(self.pipeline, self.wrist_case.message(angles, self.t_ns, **changes))  # pyright: ignore[reportArgumentType]
 
     def takes(self, laser: Float, tip: Float = NOTHING, **changes: object) -> HandPose:
         """The pose of pixels (5, 2), a triple later; keywords as of `message`."""
-        self.t_ns += TRIPLE_NS
+        self.t_ns += CYCLE_NS
         return pushed(self.pipeline, message(laser, tip, self.t_ns, **changes))  # pyright: ignore[reportArgumentType]
 
 
@@ -249,7 +249,7 @@ def test_the_cubic_is_a_preset(wrist_case: WristCase) -> None:
     line = WristPipeline(replace(wrist_case.setup, cubic=True, level="fk"), continuous=False)
     flexed: list[Float] = []
     for k, pip in enumerate((10.0, 40.0, 70.0), start=1):
-        seen = wrist_case.message(natural(pip), k * TRIPLE_NS, tips=False)
+        seen = wrist_case.message(natural(pip), k * CYCLE_NS, tips=False)
         flexed.append(np.degrees(pushed(line, seen).angles_rad[1:, PIP]))
     assert (np.diff(flexed, axis=0) > 2.0).all()  # it rises
     assert np.abs(np.array(flexed) - np.array([[10.0], [40.0], [70.0]])).max() > 5.0  # but is of no hand
@@ -267,7 +267,7 @@ def light(line: Line) -> tuple[float, float]:
 def tell_unit(line: Line, unit: float) -> None:
     """Poses whose PIP is sure without light, over three seconds."""
     for k in range(9):
-        line.t_ns += 10 * TRIPLE_NS
+        line.t_ns += 10 * CYCLE_NS
         line.sees(bent(*((30.0, 75.0), (38.0, 80.0), (20.0, 85.0))[k % 3]), unit=unit)
 
 
@@ -371,7 +371,7 @@ def test_a_finger_that_is_lost_is_held_for_half_a_second_with_growing_doubt(wris
     doubt = np.array([pose.cov_m2[10].trace() for pose in (first, *held)])
     assert (np.diff(doubt[1:]) > 0.0).all()
     assert doubt[1] > 0.95 * doubt[0]  # habits hold the first of them as they did while it was seen
-    line.t_ns += 3 * TRIPLE_NS
+    line.t_ns += 3 * CYCLE_NS
     gone = line.takes(laser)
     assert not gone.valid[CHAINS[1]].any()
     assert gone.tracked[CHAINS[2]].all()
@@ -398,7 +398,7 @@ def test_late_and_doubled_messages_are_counted_and_change_nothing(wrist_case: Wr
     sent: list[WristDetections] = []
     for k in range(6):
         laser, _ = pixels(wrist_case, natural(30.0 + k))
-        sent.append(message(laser + 0.2 * rng.normal(size=(5, 2)), NOTHING, (k + 1) * TRIPLE_NS))
+        sent.append(message(laser + 0.2 * rng.normal(size=(5, 2)), NOTHING, (k + 1) * CYCLE_NS))
     expected = [pose for one in sent for pose in plain.push(one)]
     got = [
         pose
@@ -427,15 +427,15 @@ def test_a_finger_at_rest_trembles_less_where_frames_follow_each_other(wrist_cas
 
 def test_a_clock_that_is_set_back_is_late_until_it_is_caught_up(wrist_case: WristCase) -> None:
     line = pipeline(wrist_case, continuous=True)
-    assert line.push(wrist_case.message(natural(40.0), 10 * TRIPLE_NS))
-    assert line.push(wrist_case.message(natural(40.0), 5 * TRIPLE_NS)) == []
+    assert line.push(wrist_case.message(natural(40.0), 10 * CYCLE_NS))
+    assert line.push(wrist_case.message(natural(40.0), 5 * CYCLE_NS)) == []
     assert line.counts["late"] == 1
-    assert line.push(wrist_case.message(natural(40.0), 11 * TRIPLE_NS))
+    assert line.push(wrist_case.message(natural(40.0), 11 * CYCLE_NS))
 
 
 def test_what_an_imu_says_that_nobody_mounted_is_counted_and_turns_no_palm(wrist_case: WristCase) -> None:
     line = WristPipeline(replace(wrist_case.setup, imu=None))
-    line.push_orientation(TRIPLE_NS, np.array([1.0, 0.0, 0.0, 0.0]))
+    line.push_orientation(CYCLE_NS, np.array([1.0, 0.0, 0.0, 0.0]))
     pose = pushed(line, wrist_case.message(natural(20.0)))
     assert line.counts["orientation.unplaced"] == 1
     assert np.isnan(pose.palm_world_wxyz).all()
@@ -506,8 +506,8 @@ def test_what_the_rig_says_of_stamps_and_volume_holds(rig: RigSetup, wrist_case:
         volume=Volume(low_m=(-1, -1, 0.15), high_m=(1, 1, 1)),
     )
     line = WristPipeline(WristSetup.of(stated, rig.cameras["wrist"], rig.hand), continuous=False)
-    pose = pushed(line, wrist_case.message(natural(20.0), TRIPLE_NS, tips=False))
-    assert pose.t_ns == TRIPLE_NS + 1_500_000
+    pose = pushed(line, wrist_case.message(natural(20.0), CYCLE_NS, tips=False))
+    assert pose.t_ns == CYCLE_NS + 1_500_000
     np.testing.assert_array_equal(pose.inside_volume, pose.position_m[:, 2] >= 0.15)
     assert 0 < pose.inside_volume.sum() < 26
 
@@ -531,7 +531,7 @@ def test_a_rendered_curl_from_exact_points(datasets: Path) -> None:
     truth = np.load(folder / "truth.npz")
     line = WristPipeline(replace(recorded, level="fk"), continuous=False)
     lasers = recorded.optics.project(truth["laser_pt"][:, 1:6])
-    poses = [pushed(line, message(uv, NOTHING, (k + 1) * TRIPLE_NS)) for k, uv in enumerate(lasers)]
+    poses = [pushed(line, message(uv, NOTHING, (k + 1) * CYCLE_NS)) for k, uv in enumerate(lasers)]
     pip = np.degrees(truth["angles"][:, [7, 11, 15, 19]])
     found = np.degrees([pose.angles_rad[1:, PIP] for pose in poses])
     tracked = np.array([pose.tracked[CHAINS[1:, 1]] for pose in poses])

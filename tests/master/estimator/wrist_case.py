@@ -21,7 +21,7 @@ from master.wrist_setup import WristSetup
 from tests.master.estimator.kernels import cut_at, look_at
 from tests.wrist_run import wrist_setup
 
-TRIPLE_NS = 33_333_333
+CYCLE_NS = 33_333_333
 PIP, DIP = 2, 3
 LIT_PX = 0.2
 NO_TWIST = np.zeros(5)
@@ -83,7 +83,7 @@ class WristCase:
     def message(
         self,
         angles: Float,
-        t_ns: int = TRIPLE_NS,
+        t_ns: int = CYCLE_NS,
         *,
         tips: Bool | bool = True,
         unit: float | None = None,
@@ -111,7 +111,7 @@ class WristCase:
 def message(
     laser: Float,
     tip: Float,
-    t_ns: int = TRIPLE_NS,
+    t_ns: int = CYCLE_NS,
     *,
     laser_px: float = LIT_PX,
     tip_px: float = 2.0,
@@ -122,7 +122,7 @@ def message(
     return WristDetections(
         camera="wrist",
         session=1,
-        seq=t_ns // TRIPLE_NS,
+        seq=t_ns // CYCLE_NS,
         t_ns=t_ns,
         ready_t_ns=t_ns + 1,
         laser_uv=laser,
@@ -141,9 +141,9 @@ def pipeline(
     return WristPipeline(replace(wrist_case.setup, level=level), continuous=continuous)
 
 
-def pushed(line: WristPipeline, triple: WristDetections) -> HandPose:
+def pushed(line: WristPipeline, cycle: WristDetections) -> HandPose:
     """The one pose of a triple."""
-    (only,) = line.push(triple)
+    (only,) = line.push(cycle)
     return only.pose
 
 

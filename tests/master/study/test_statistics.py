@@ -37,7 +37,7 @@ def trial(
         ambiguous=(False,) * 5,
         laser_seen=(seen,) * 5,
         tip_seen=(False,) * 5,
-        triples=6,
+        cycles=6,
     )
 
 

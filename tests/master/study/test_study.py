@@ -72,7 +72,7 @@ def test_every_trial_went_through_the_line(told: dict[str, Any]) -> None:
     for who in ("participant-01", "participant-02"):
         assert {one["pose"] for one in trials if one["participant"] == who} == set(POSES)
     for one in trials:
-        assert one["triples"] in (1, 2)
+        assert one["cycles"] in (1, 2)
         if one["pose"] == "open_palm":
             off = np.abs(np.array(one["pip_deg"]) - one["truth_deg"])[1:]
             assert off.max() < 35.0  # eight triples calibrate nothing: a device 5 degrees askew costs 20

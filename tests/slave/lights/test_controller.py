@@ -88,10 +88,10 @@ def test_who_wakes_up_late_leaves_frames_dark_and_lights_no_other(seed: int) -> 
     rng = np.random.default_rng(seed)
     stage = Stage(late=lambda: int(rng.exponential(0.8) * MS))
     stage.run(range(300))
-    kinds = [stage.kind(k) for k in range(20, 298)]
+    illuminations = [stage.kind(k) for k in range(20, 298)]
     wanted = [CYCLE[k % 3] for k in range(20, 298)]
-    assert all(kind in (AMBIENT, right) for kind, right in zip(kinds, wanted, strict=True))
-    dark = sum(kind is not right for kind, right in zip(kinds, wanted, strict=True))
+    assert all(kind in (AMBIENT, right) for kind, right in zip(illuminations, wanted, strict=True))
+    dark = sum(kind is not right for kind, right in zip(illuminations, wanted, strict=True))
     assert 10 < dark < 150
     assert (
         abs(stage.strober.counts["skipped"] - dark) <= 6

@@ -16,7 +16,7 @@ from slave.wrist.detector import WristDetector, WristFound
 from slave.wrist.fingertips import Fingertips
 from slave.wrist.laser import LaserLines
 from slave.wrist.null_detector import NullWristDetector
-from slave.wrist.strobe import Triple
+from slave.wrist.strobe import StrobeCycle
 from tests.slave.wrist.wrist_frames import CAMERA, ROOT, VIEW, strobed
 
 NAMES = tuple(f"{what}.{finger}" for what in ("laser", "tip") for finger in FINGERS)
@@ -64,15 +64,15 @@ class ByNumber:
         if frame.seq > 2:
             uv[1], sigma[1] = (3.0, 4.0), 0.5
         nowhere = Fingertips(np.full((5, 2), np.nan), nothing, nothing)
-        return WristFound(Triple(*self.frames), LaserLines(uv, sigma, sigma), nowhere)
+        return WristFound(StrobeCycle(*self.frames), LaserLines(uv, sigma, sigma), nowhere)
 
 
 def frames(numbers: list[int]) -> list[Frame]:
     return [Frame(seq, 11_000_000 * seq, 11_000_000 * seq + 5, GREY) for seq in numbers]
 
 
-def test_every_triple_is_sent_the_empty_ones_too_and_all_frames_are_counted() -> None:
-    wire, tally, shown = Wire(), Tally(NAMES, lambda: {"strobe.triples": 3}), list[int]()
+def test_every_cycle_is_sent_the_empty_ones_too_and_all_frames_are_counted() -> None:
+    wire, tally, shown = Wire(), Tally(NAMES, lambda: {"strobe.cycles": 3}), list[int]()
     source = Source(frames([0, 1, 2, 3, 4, 5, 9, 10, 11]))
     run_wrist(
         source, ByNumber(), wire, "wrist", tally, threading.Event(), lambda frame: shown.append(frame.seq)
@@ -85,12 +85,12 @@ def test_every_triple_is_sent_the_empty_ones_too_and_all_frames_are_counted() ->
     counts = tally.counts()
     assert (counts["frames"], counts["dropped"], counts["empty"]) == (9, 3, 1)
     assert (counts["seen.laser.index"], counts["seen.laser.thumb"], counts["seen.tip.index"]) == (2, 0, 0)
-    assert counts["strobe.triples"] == 3
+    assert counts["strobe.cycles"] == 3
     assert shown == [2, 5, 11]  # those under the LEDs
     assert tally.gauges()["detect_us"] > 0.0
 
 
-def test_while_there_are_no_triples_every_frame_is_shown_and_nothing_is_sent() -> None:
+def test_while_there_are_no_cycles_every_frame_is_shown_and_nothing_is_sent() -> None:
     wire, tally, shown = Wire(), Tally(()), list[int]()
     run_wrist(
         Source(frames(list(range(30)))),
@@ -106,7 +106,7 @@ def test_while_there_are_no_triples_every_frame_is_shown_and_nothing_is_sent() -
     assert (tally.counts()["frames"], tally.counts()["empty"]) == (30, 0)
 
 
-def test_the_time_of_a_triple_is_that_of_its_three_frames_however_long_there_was_none(
+def test_the_time_of_a_cycle_is_that_of_its_three_frames_however_long_there_was_none(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     ticks = iter(range(0, 10**9, 1_000_000))  # every look at the clock a millisecond later
@@ -130,7 +130,7 @@ def test_real_frames_go_through_the_loop_into_messages() -> None:
     wire, tally = Wire(), Tally(NAMES)
     detector = WristDetector(VIEW, CAMERA.frame_rate_hz)
     run_wrist(Source(strobed("curl", 6)), detector, wire, "wrist", tally, threading.Event())
-    assert len(wire.sent) == detector.counts["triples"] >= 4
+    assert len(wire.sent) == detector.counts["cycles"] >= 4
     counts = tally.counts()
     assert counts["frames"] == 18
     assert counts["seen.laser.middle"] == np.isfinite([m.laser_uv[2, 0] for m in wire.sent]).sum() >= 4

@@ -20,7 +20,7 @@ from slave.wrist.fingers import separate
 from slave.wrist.laser import laser_lines
 from slave.wrist.led_depth import shrink
 from slave.wrist.palm_turn import bend_seen, palm_turn, prepare, turned
-from slave.wrist.strobe import Triple
+from slave.wrist.strobe import StrobeCycle
 from tests.slave.wrist.wrist_frames import VIEW, scene
 
 BENDS = ((22.0, -8.0), (-16.0, 8.0), (0.0, 12.0), (0.0, -12.0), (12.0, 8.0), (-15.0, -8.0))
@@ -111,7 +111,7 @@ def test_no_tip_is_told_of_a_bent_wrist() -> None:
     assert not separate(one.led, VIEW).turn.straight
     dark = np.zeros_like(one.led)
     ambient, laser, led = (Frame(k, k, k, image) for k, image in enumerate((dark, one.laser, one.led)))
-    assert np.isnan(find(Triple(ambient, laser, led), VIEW).tips.uv).all()
+    assert np.isnan(find(StrobeCycle(ambient, laser, led), VIEW).tips.uv).all()
 
 
 def test_a_view_is_ready_for_every_bend() -> None:

@@ -14,7 +14,7 @@ from common.messages import HandPose, ImuSample, WristDetections
 from common.sim.imu import InertialPart, SimulatedImu
 from master.calibrate.cameras.lens_files import matrix_of
 
-SECONDS, PACE, HAND_HZ, TRIPLE_HZ = 6.4, 2.0, 60.0, 20.0
+SECONDS, PACE, HAND_HZ, CYCLE_HZ = 6.4, 2.0, 60.0, 20.0
 ZERO_NS = 1_000_000_000
 CAMERA_LATE_NS, IMU_LATE_NS = 6_000_000, -4_000_000
 PERFECT = InertialPart(0.0, 0.0, 0.0, 0.0)
@@ -27,7 +27,7 @@ class Moved:
     both: Both
     rig: RigCalibration
     poses: list[HandPose]
-    triples: list[WristDetections]
+    cycles: list[WristDetections]
     samples: list[ImuSample]
 
 
@@ -43,11 +43,11 @@ def moved() -> Moved:
         rig, T_camera_palm=matrix_of(palm), imu=replace(rig.imu, q_palm_imu=None, q_rig_world=None)
     )
     poses = [pose_at(both, t) for t in np.arange(0.0, SECONDS, 1.0 / HAND_HZ).tolist()]
-    triples = [triple_at(both, t) for t in np.arange(0.1, SECONDS - 0.1, 1.0 / TRIPLE_HZ).tolist()]
+    cycles = [cycle_at(both, t) for t in np.arange(0.1, SECONDS - 0.1, 1.0 / CYCLE_HZ).tolist()]
     sensor = SimulatedImu(SimulatedImu.of(both.wrist_scene)._motion, rig.imu, 3, PERFECT)
     fusion = OrientationFilter(sensor.rate_hz)
     samples = [fusion.push(one) for one in sensor.around(0.0, SECONDS, ZERO_NS - IMU_LATE_NS)]
-    return Moved(both, wrong, poses, triples, samples)
+    return Moved(both, wrong, poses, cycles, samples)
 
 
 def pose_at(both: Both, t_s: float) -> HandPose:
@@ -72,7 +72,7 @@ def pose_at(both: Both, t_s: float) -> HandPose:
     )
 
 
-def triple_at(both: Both, t_s: float) -> WristDetections:
+def cycle_at(both: Both, t_s: float) -> WristDetections:
     """What the wrist camera would see in the triple whose laser shines at scene time `t_s` [s], stamped too early."""
     camera = both.wrist.rig.cameras[0]
     frame_s = 1.0 / both.wrist.cameras[camera].frame_rate_hz
@@ -83,7 +83,7 @@ def triple_at(both: Both, t_s: float) -> WristDetections:
     return WristDetections(
         camera=camera,
         session=1,
-        seq=3 * round(t_s * TRIPLE_HZ),
+        seq=3 * round(t_s * CYCLE_HZ),
         t_ns=t_ns,
         ready_t_ns=t_ns,
         laser_uv=line,

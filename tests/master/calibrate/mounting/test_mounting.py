@@ -39,7 +39,7 @@ def calibrated(seen: Moved, **other: object) -> mounting.Mounting:
         "poses": seen.poses,
         "markers": markers.markers,
         "model": markers.hand,
-        "triples": seen.triples,
+        "cycles": seen.cycles,
         "samples": seen.samples,
         "rig": seen.rig,
         "camera": seen.both.wrist.cameras[seen.rig.cameras[0]],
@@ -57,7 +57,7 @@ def recorded(seen: Moved, folder: Path) -> Path:
     )
     (folder / FRAMES).write_text(",".join(COLUMNS) + "\n")
     write_imu(folder, seen.samples)
-    write_detections(folder, seen.triples)
+    write_detections(folder, seen.cycles)
     return folder
 
 
@@ -106,7 +106,7 @@ def test_the_command_writes_the_true_mounting_into_a_tree(
 
 def test_what_was_not_seen_together_is_refused() -> None:
     seen = moved()
-    for nothing, what in (("poses", "markers"), ("triples", "wrist camera"), ("samples", "IMU")):
+    for nothing, what in (("poses", "markers"), ("cycles", "wrist camera"), ("samples", "IMU")):
         with pytest.raises(FitError, match=f"the {what} saw nothing: for ten seconds bend"):
             calibrated(seen, **{nothing: []})
     with pytest.raises(FitError, match=r"saw the hand together in \d+ triples, at least 60"):

@@ -10,7 +10,7 @@ from common.geometry import quaternion_to_matrix, rotation_vector_to_matrix
 from common.wrist_bend import forearm_palm
 from master.calibrate.mounting.hands import Hands
 from master.calibrate.mounting.lines_of_sight import LinesOfSight
-from master.calibrate.mounting.mounting import _triples
+from master.calibrate.mounting.mounting import _cycles
 from master.calibrate.mounting.problem import Problem
 from master.calibrate.mounting.tracks import HandTrack, ImuTrack
 from master.calibrate.mounting.unknown import UNKNOWN, Unknown, believed
@@ -25,12 +25,12 @@ def problem() -> tuple[Problem, Unknown, Hands]:
     """Twelve instants by tips alone (the laser's line jumps where a finger hides it), somewhat away from the truth."""
     seen, rng = moved(), np.random.default_rng(4)
     setup = WristSetup.of(seen.both.wrist.rig, seen.both.wrist.cameras["wrist"], seen.both.markers.hand)
-    lines_of_sight, zero_ns = LinesOfSight(setup), seen.triples[0].t_ns
+    lines_of_sight, zero_ns = LinesOfSight(setup), seen.cycles[0].t_ns
     imu = seen.both.wrist.rig.imu
     assert imu is not None
     assert imu.q_palm_imu is not None
     R = quaternion_to_matrix(np.array(imu.q_palm_imu))
-    chosen = _triples(setup, lines_of_sight, seen.both.wrist.cameras["wrist"], seen.triples[20:80:5], zero_ns)
+    chosen = _cycles(setup, lines_of_sight, seen.both.wrist.cameras["wrist"], seen.cycles[20:80:5], zero_ns)
     chosen = replace(chosen, laser_m=np.full_like(chosen.laser_m, np.nan))
     track = ImuTrack(seen.samples, zero_ns)
     middle = seen.samples[len(seen.samples) // 2]

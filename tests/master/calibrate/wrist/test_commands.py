@@ -135,7 +135,7 @@ def test_the_flat_field_names_the_corner_that_was_not_shown(tree: Path, boards: 
 
 def test_the_flat_field_of_a_board_shown_everywhere(tree: Path, tmp_path: Path) -> None:
     scene = scene_of(31, 24, anywhere=True)
-    record_wrist_board(tmp_path / "white", scene, kinds=(Illumination.AMBIENT, Illumination.LED))
+    record_wrist_board(tmp_path / "white", scene, illuminations=(Illumination.AMBIENT, Illumination.LED))
     said = run(
         "flat-field", tmp_path / "white", *BOARD, "--rig", "wrist", "--calibration", tree, "--out", tree,
         "--picture", tmp_path / "flat.png",
@@ -152,7 +152,7 @@ def test_the_palm_from_a_board_that_lies_on_it(tree: Path, tmp_path: Path) -> No
     board = Checkerboard(7, 4, 0.010)
     T = np.array(RIG.T_camera_palm) @ Mounting(0.085, 0.004, 0.022, 1.0).T_palm_board(board)
     scene = WristBoardScene(RIG, CAMERA, 7, 4, 0.010, np.stack([T, T]))
-    record_wrist_board(tmp_path / "palm", scene, kinds=(Illumination.AMBIENT, Illumination.LED))
+    record_wrist_board(tmp_path / "palm", scene, illuminations=(Illumination.AMBIENT, Illumination.LED))
     said = run("palm", tmp_path / "palm", *PALM_BOARD, "--rig", "wrist", "--calibration", tree, "--out", tree)
     np.testing.assert_allclose(np.array(rig_of(tree).T_camera_palm), np.array(RIG.T_camera_palm), atol=2e-3)
     assert "mm above the wrist joint" in said

@@ -9,14 +9,14 @@ from common.errors import FitError
 from common.frame_recording import Illumination
 from master.calibrate.wrist.board_pose import BoardPose, board_pose
 from master.calibrate.wrist.line import line_on_board
-from tests.master.calibrate.wrist.devices import BOARD, OPTICS, plane_of, scene_of, triples_of, view_of
+from tests.master.calibrate.wrist.devices import BOARD, OPTICS, cycles_of, plane_of, scene_of, view_of
 
 SEED, VIEWS = 11, 6
 AMBIENT, LASER, LED = Illumination.AMBIENT, Illumination.LASER, Illumination.LED
 
 
 def first() -> tuple[dict[Illumination, Image], BoardPose]:
-    frames = triples_of(SEED, VIEWS)[0]
+    frames = cycles_of(SEED, VIEWS)[0]
     return dict(frames), board_pose(view_of("0", frames), BOARD, OPTICS)
 
 

@@ -14,8 +14,8 @@ from tests.master.calibrate.wrist.devices import (
     FOCAL_PX,
     OPTICS,
     angle_deg,
+    cycles_of,
     plane_of,
-    triples_of,
     view_of,
 )
 
@@ -58,7 +58,7 @@ GOOD = (
 
 @pytest.mark.parametrize("seed", [11, 12, 13])
 def test_rendered_views_give_the_plane_to_a_tenth_of_a_degree_and_millimetre(seed: int) -> None:
-    views = tuple(view_of(str(k), frames) for k, frames in enumerate(triples_of(seed, 6)))
+    views = tuple(view_of(str(k), frames) for k, frames in enumerate(cycles_of(seed, 6)))
     fit = fit_plane(lines_of(views, BOARD, OPTICS).lines)
     true = plane_of(seed)
     off_deg = angle_deg(np.array(fit.plane.normal), np.array(true.normal))

@@ -82,13 +82,13 @@ def test_knuckles_5_mm_off_and_a_palm_askew_are_found_within_stated_sigma(
 def test_what_the_laser_cannot_tell_keeps_its_belief_and_says_so(
     people: dict[int, Person], motions: dict[int, list[WristDetections]], subjects: dict[int, Subject]
 ) -> None:
-    person, triples, found = people[40], motions[40], subjects[40]
+    person, cycles, found = people[40], motions[40], subjects[40]
     told = Unknown.of(np.sqrt(np.diag(found.fit.covariance)) / found.fit.prior_sigma)
     assert told.knuckle_m[:, 0].max() < 0.7  # across
     assert told.thick.min() > 0.8  # a thicker finger looks like a knuckle farther away
     # With a palm that a board has placed, knuckles are known better.
     rig = replace(person.true_rig, provenance={"T_camera_palm": provenance("calibrate palm", (), {})})
-    placed = calibrate_subject(triples, rig, person.camera, person.hand)
+    placed = calibrate_subject(cycles, rig, person.camera, person.hand)
     surer = Unknown.of(np.sqrt(np.diag(placed.fit.covariance)) / placed.fit.prior_sigma)
     assert (surer.knuckle_m[:, :2] < told.knuckle_m[:, :2]).all()  # across and up
     assert np.sqrt(np.mean(person.errors(placed.rig, placed.hand)[1] ** 2)) < 3.0
@@ -184,12 +184,12 @@ def test_a_motion_without_its_parts_is_refused(seen: Float, match: str) -> None:
 def test_what_tells_nothing_or_a_lie_is_refused(
     people: dict[int, Person], motions: dict[int, list[WristDetections]], what: str, match: str
 ) -> None:
-    person, triples = people[40], motions[40]
+    person, cycles = people[40], motions[40]
     rig, hand = person.rig, person.hand
     if what == "half":  # back from where the knuckles are bent by 40 degrees
-        triples = triples[:10] + triples[10:13] + triples[27:]
+        cycles = cycles[:10] + cycles[10:13] + cycles[27:]
     elif what == "fists":
-        triples = triples[40:] + triples[40:]
+        cycles = cycles[40:] + cycles[40:]
     elif what == "hand":
         hand = load(CALIB / "hands" / "default-left.json", HandProfile)
     else:
@@ -198,7 +198,7 @@ def test_what_tells_nothing_or_a_lie_is_refused(
         x, y, z = turned.tolist()
         rig = replace(rig, laser_plane=replace(rig.laser_plane, normal=(x, y, z)))
     with pytest.raises(FitError, match=match):
-        calibrate_subject(triples, rig, person.camera, hand)
+        calibrate_subject(cycles, rig, person.camera, hand)
 
 
 def test_a_hand_file_says_how_thick_its_fingers_are(people: dict[int, Person]) -> None:

@@ -20,7 +20,7 @@ from master.wrist_setup import WristSetup
 _NO_LAW = np.full(5, nan)
 
 
-class TripleReader:
+class CycleReader:
     """Makes rows of the triples of one device; counts what it leaves out: `outside`, `no_plane`, by finger."""
 
     def __init__(self, setup: WristSetup, cubic: CubicLaw | None, counts: Counter[str]) -> None:

@@ -10,14 +10,14 @@ import pytest
 
 from bench.wrist_strobe import Shown, rendered
 from common.arrays import Bool, Image
-from slave.wrist.kinds import LED_LEAST, Evidence, brighter, coarse, evidence, unlit
+from slave.wrist.illumination import LED_LEAST, Evidence, brighter, coarse, evidence, unlit
 
 LIGHTS = ("dark", "indoor", "bright")
 
 
 @cache
 def shown(ambient: str) -> list[Shown]:
-    return rendered(ambient, triples=6, seed=11)
+    return rendered(ambient, cycles=6, seed=11)
 
 
 def cells(ambient: str) -> list[Image]:
@@ -25,14 +25,14 @@ def cells(ambient: str) -> list[Image]:
 
 
 @pytest.mark.parametrize("ambient", LIGHTS)
-def test_every_triple_is_known_by_its_content(ambient: str) -> None:
+def test_every_cycle_is_known_by_its_content(ambient: str) -> None:
     found = cells(ambient)
     for dark, laser, led in zip(found[::3], found[1::3], found[2::3], strict=True):
         assert evidence(dark, laser, led).margin > 0.25
 
 
 @pytest.mark.parametrize("ambient", [*LIGHTS, "sun"])
-def test_no_other_three_kinds_are_taken_for_a_triple(ambient: str) -> None:
+def test_no_other_three_kinds_are_taken_for_a_cycle(ambient: str) -> None:
     """All 26 other choices of three kinds, within one pose and over two."""
     found = cells(ambient)
     tried = 0
@@ -70,7 +70,7 @@ def swinging(share: float) -> Callable[[Image], Image]:
 
 
 @pytest.mark.parametrize("share", [-0.1, 0.1])
-def test_lamps_that_swing_neither_hide_a_triple_nor_make_one(share: float) -> None:
+def test_lamps_that_swing_neither_hide_a_cycle_nor_make_one(share: float) -> None:
     dark, laser, led = (one.image for one in shown("indoor")[:3])
     swung = swinging(share)
     assert evidence(coarse(swung(dark)), coarse(laser), coarse(led)).margin > 0.25
