@@ -13,7 +13,6 @@ from common.arrays import Float
 from common.messages import WristDetections
 from slave.cameras.source import Frame
 from slave.wrist.background import lit, lit_line
-from slave.wrist.corridors import corridors_of
 from slave.wrist.engine import NUMPY, Engine
 from slave.wrist.fingers import separate
 from slave.wrist.fingertips import NO_TIPS, Fingertips, fingertips
@@ -21,6 +20,7 @@ from slave.wrist.laser import LaserLines, laser_lines
 from slave.wrist.palm_turn import prepare
 from slave.wrist.postures import postures_of
 from slave.wrist.reach import reach_of
+from slave.wrist.search_bands import search_bands_of
 from slave.wrist.strobe import Strobe, StrobeCycle
 from slave.wrist.view import WristView
 
@@ -114,7 +114,7 @@ def prepared(view: WristView, engine: Engine = NUMPY) -> WristView:
     """
     postures_of(view)
     for turned in prepare(view):
-        corridors_of(turned)
+        search_bands_of(turned)
         reach_of(turned)
     dark = Frame(0, 0, 0, np.zeros((view.optics.height_px, view.optics.width_px), np.uint8))
     find(StrobeCycle(dark, dark, dark), view, engine)

@@ -21,8 +21,8 @@ from common.geometry import rigid
 from common.hand_model import CHAINS, METACARPALS
 from common.wrist_bend import STRAIGHT, forearm_palm
 from slave.wrist.led_depth import SHRINK, Float32, shrink
-from slave.wrist.sweep import NEAREST_M, in_image
 from slave.wrist.view import WristView
+from slave.wrist.workspace_samples import NEAREST_M, in_image
 
 STEP_RAD = float(np.radians(4.0))
 _MOST_STEPS = np.array([8, 4])  # of flexion, deviation: 32 and 16 degrees
@@ -30,7 +30,7 @@ _TYPICAL_RAD = np.radians((15.0, 8.0))  # standard deviations of the prior
 _EVIDENCE = 14.0  # logarithm of probability per unit of E
 _TOP = 0.4  # contrast that an open gap exceeds: a deeper one says no more
 _DARK = np.float32(2.0)  # root of grey levels: noise
-_WEB = 0.4  # of the proximal phalanx: where the webs end (`corridors`)
+_WEB = 0.4  # of the proximal phalanx: where the webs end (`search_bands`)
 _BELOW_M = (-16e-3, -11e-3, -6e-3, -1e-3)  # of that: whole skin
 _BEYOND_M = (5.5e-3, 9e-3, 12.5e-3, 16e-3)  # a gap
 _INSIDE_M, _OUTSIDE_M = 3.5e-3, 5e-3  # of the skin's edge

@@ -22,8 +22,8 @@ from common.geometry import rotation_vector_to_matrix
 from common.hand_model import CHAINS, FINGER_JOINTS
 from common.tapered_capsules import Capsules, first_hits, terms
 from slave.wrist.led_depth import Float32
-from slave.wrist.sweep import NEAREST_M, thumb_postures
 from slave.wrist.view import WristView
+from slave.wrist.workspace_samples import NEAREST_M, thumb_postures
 
 MCP_RAD = np.radians(np.arange(-10.0, 111.0, 6.0))
 PIP_RAD = np.radians(np.arange(0.0, 121.0, 6.0))

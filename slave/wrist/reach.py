@@ -16,8 +16,15 @@ from common.camera_model import CameraModel
 from common.geometry import intersect_plane
 from common.hand_model import CHAINS
 from slave.wrist.palm_turn import PalmTurn
-from slave.wrist.sweep import NEAREST_M, PER_BONE, along_bones, finger_postures, radius_along, thumb_postures
 from slave.wrist.view import WristView
+from slave.wrist.workspace_samples import (
+    NEAREST_M,
+    PER_BONE,
+    along_bones,
+    finger_postures,
+    radius_along,
+    thumb_postures,
+)
 
 Float32 = npt.NDArray[np.float32]
 

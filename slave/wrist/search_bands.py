@@ -15,8 +15,15 @@ from common.arrays import Float, Int
 from common.errors import CalibrationError
 from common.hand_limits import ABDUCTION
 from common.hand_model import CHAINS, METACARPALS
-from slave.wrist.sweep import NEAREST_M, PER_BONE, along_bones, finger_postures, in_image, thumb_postures
 from slave.wrist.view import WristView
+from slave.wrist.workspace_samples import (
+    NEAREST_M,
+    PER_BONE,
+    along_bones,
+    finger_postures,
+    in_image,
+    thumb_postures,
+)
 
 Float32 = npt.NDArray[np.float32]
 
@@ -37,7 +44,7 @@ _UNSEEN = "T_camera_palm: the camera does not see the {} of this hand; calibrate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Corridors:
+class SearchBands:
     """The corridors of the four seams, in the order of `LATERAL`; S stations.
 
     Attributes:
@@ -104,7 +111,7 @@ class Corridors:
 
 
 @lru_cache(maxsize=128)  # one for each way the palm may lie
-def corridors_of(view: WristView) -> Corridors:
+def search_bands_of(view: WristView) -> SearchBands:
     """The corridors of one wrist rig and hand.
 
     Raises:
@@ -117,7 +124,7 @@ def corridors_of(view: WristView) -> Corridors:
     stations = int((view.optics.height_px - _UNUSED_PX) // STATION_PX)
     row = view.optics.height_px - STATION_PX * stations
     empty = np.empty((4, stations))
-    still = Corridors(
+    still = SearchBands(
         row, _FIRST_RADIUS_PX, root, up, thumb_side, empty, empty, _NO_MAP, 0, _NO_MAP, _NO_MAP, _palm(view)
     )
     *reach, crossed = _thumb_reach(view, still, stations)
@@ -156,12 +163,12 @@ def _between_fingers(view: WristView, rows: Float) -> tuple[Float, Float]:
         free = scale * np.linalg.norm((mid - mid[:, :1])[..., ::2], axis=-1) * np.sin(lean)
         free = np.minimum(np.maximum(free, _LEAST_OF_SPACING * spacing), _MOST_OF_SPACING * spacing)
         seen = (depth > NEAREST_M) & np.isfinite(uv).all(axis=-1)
-        out[:, seam] = _strip(uv[..., 1][seen], (uv[..., 0] - free)[seen], (uv[..., 0] + free)[seen], rows)
+        out[:, seam] = _band(uv[..., 1][seen], (uv[..., 0] - free)[seen], (uv[..., 0] + free)[seen], rows)
     return out[0], out[1]
 
 
 def _weight(view: WristView, rows: Float) -> Float32:
-    """`Corridors.weight` of stations at the given rows (S,)."""
+    """`SearchBands.weight` of stations at the given rows (S,)."""
     knuckles, ends = (view.model.rest_position_m[CHAINS[1:, k]] for k in (0, 1))
     along = ends - knuckles
     off = _WEB + _WEB_OFF_M / np.linalg.norm(along, axis=1, keepdims=True)
@@ -170,7 +177,7 @@ def _weight(view: WristView, rows: Float) -> Float32:
     return np.where(rows[:, None] < np.concatenate(columns), 1.0, _OF_PALM).astype(np.float32)
 
 
-def _strip(at: Float, low: Float, high: Float, stations: Float) -> tuple[Float, Float]:
+def _band(at: Float, low: Float, high: Float, stations: Float) -> tuple[Float, Float]:
     """Middle and half width (S,) of the intervals low ... high (N,) that lie near each station."""
     near = np.abs(at[None] - stations[:, None]) <= STATION_PX
     known = near.any(axis=1)
@@ -183,7 +190,7 @@ def _strip(at: Float, low: Float, high: Float, stations: Float) -> tuple[Float, 
     return (lows + highs) / 2.0, (highs - lows) / 2.0
 
 
-def _thumb_reach(view: WristView, still: Corridors, stations: int) -> tuple[float, float, int]:
+def _thumb_reach(view: WristView, still: SearchBands, stations: int) -> tuple[float, float, int]:
     """The thumb's corridor: middle and half width [rad] on the finger's side of all that its axis can reach; and how
     many stations the thumb crosses however it is held.
 

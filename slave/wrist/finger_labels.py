@@ -10,7 +10,7 @@ what lies as near to its root is its own, and what lies before the knuckles and 
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from slave.wrist.pieces import NONE
+from slave.wrist.finger_lines import NONE
 from slave.wrist.reach import Reach
 from slave.wrist.runs import SHORT, Runs
 
@@ -27,7 +27,7 @@ _ASIDE = (0.3, 0.7)  # place: by less it is folded fingers; farther the palm has
 _CREASE_PX = 20  # columns on either side of a seam in which the crease may be
 
 
-def owners(finger: Int, runs: Runs, points: Float, reach: Reach) -> Int:
+def finger_labels(finger: Int, runs: Runs, points: Float, reach: Reach) -> Int:
     """Fingers (N,) of runs at pixels (N, 2), from those that seams say (N,), `NONE` where there is no line."""
     beyond, place = reach.on_plane(points)
     on = finger != NONE

@@ -18,7 +18,7 @@ _MOVES = ((-1, TURN), (1, TURN), (-2, 2 * TURN), (2, 2 * TURN))  # samples aside
 _Float32 = npt.NDArray[np.float32]
 
 
-def least_paths(energy: _Float32, widths: tuple[int, ...]) -> Int:
+def minimum_cost_paths(energy: _Float32, widths: tuple[int, ...]) -> Int:
     """Path (C, S) of least energy through each corridor, as its sample at every station; at most two aside a step.
 
     Args:

@@ -9,10 +9,10 @@ from common.geometry import rotation_vector_to_matrix
 from common.sim.wrist.render import WristRenderer
 from slave.cameras.synthetic import STROBE
 from slave.wrist.background import lit
+from slave.wrist.finger_labels import finger_labels
+from slave.wrist.finger_lines import NONE
 from slave.wrist.fingers import separate
 from slave.wrist.laser import laser_lines
-from slave.wrist.owners import owners
-from slave.wrist.pieces import NONE
 from slave.wrist.reach import reach_of
 from slave.wrist.runs import line_runs
 from slave.wrist.view import WristView
@@ -55,13 +55,13 @@ def test_seams_that_lie_one_finger_aside_do_not_move_the_line() -> None:
     runs = line_runs(lit(laser, ambient), reach.first_row)
     points = np.stack([runs.column, runs.row], axis=-1, dtype=np.float64)
     finger = separate(lit(led, ambient), VIEW).finger_of(points)
-    whose = owners(finger, runs, points, reach)
+    whose = finger_labels(finger, runs, points, reach)
     assert np.unique(whose[whose > 0]).tolist() == [1, 2, 3, 4]
     aside = np.where(finger > 0, finger + 1, finger)
     aside[finger == 4] = NONE
     assert (aside != whose)[whose > 0].mean() > 0.9
     kept = (whose > 0) & (finger != 4)
-    assert (owners(aside, runs, points, reach) == whose)[kept].mean() > 0.9
+    assert (finger_labels(aside, runs, points, reach) == whose)[kept].mean() > 0.9
 
 
 @pytest.mark.parametrize("t", [4.9, 5.1, 17.0])

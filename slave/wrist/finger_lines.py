@@ -16,7 +16,7 @@ STEEPEST = 8.0  # px of row per root of a column: how fast a line goes round the
 LONG = 5  # columns from one end of a line to the other, from which on its ends are drawn straight
 
 
-class Pieces(NamedTuple):
+class FingerLines(NamedTuple):
     """The line of each finger, thumb ... little.
 
     Attributes:
@@ -34,7 +34,7 @@ class Pieces(NamedTuple):
     brightest: Float
 
 
-def measure(runs: Runs, finger: Int, width_px: int) -> Pieces:
+def measure(runs: Runs, finger: Int, width_px: int) -> FingerLines:
     """Of the pieces of line of each finger.
 
     Args:
@@ -54,25 +54,25 @@ def measure(runs: Runs, finger: Int, width_px: int) -> Pieces:
     # Pieces from run to run, of which those beyond `inner` are none: from there a line is drawn straight to its end.
     u, v = runs.column.astype(np.float64), runs.row
     down = v[1:] - v[:-1]
-    piece = np.sqrt(down * down + 1.0) * goes_on
+    segment = np.sqrt(down * down + 1.0) * goes_on
     bent = np.flatnonzero(inner[: len(left)] != left)
     for k in (left[bent], left[bent] + 1, right[bent] - 1, right[bent] - 2):
-        piece[k] = 0.0
+        segment[k] = 0.0
     last = np.concatenate([left, right])
     to_end = outer - points[inner]
     # No hypot, no products of matrices: this way the bits are the same on every processor.
-    piece = np.concatenate([piece, np.sqrt((to_end * to_end).sum(axis=1))])
+    segment = np.concatenate([segment, np.sqrt((to_end * to_end).sum(axis=1))])
     middle_u = np.concatenate([u[:-1] + 0.5, (outer[:, 0] + u[inner]) / 2.0])
     middle_v = np.concatenate([(v[1:] + v[:-1]) / 2.0, (outer[:, 1] + v[inner]) / 2.0])
     of = np.concatenate([finger[:-1], finger[last]]) + 1
-    line = _of_fingers(of, piece)
+    line = _of_fingers(of, segment)
     with np.errstate(divide="ignore", invalid="ignore"):
-        uv = np.stack([_of_fingers(of, piece * m) / line for m in (middle_u, middle_v)], axis=-1)
+        uv = np.stack([_of_fingers(of, segment * m) / line for m in (middle_u, middle_v)], axis=-1)
     cut = np.zeros(5, dtype=np.bool_)
     cut[finger[on & ((u < 1.0) | (u > width_px - 2.0))]] = True
     brightest = np.zeros(6)
     np.maximum.at(brightest, finger, runs.peak)  # those of no finger come last
-    return Pieces(line, uv, _apart(points, finger, left, right), cut, brightest[:5])
+    return FingerLines(line, uv, _apart(points, finger, left, right), cut, brightest[:5])
 
 
 def _of_fingers(of: Int, weight: Float) -> Float:

@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from slave.wrist.paths import FENCE, least_paths
+from slave.wrist.seams import FENCE, minimum_cost_paths
 
 TURN = 0.02
 
@@ -30,17 +30,17 @@ def test_of_all_paths_it_is_the_cheapest(stations: int) -> None:
         energy = fenced(rng, stations, 8)
         every = product(range(2, 6), repeat=stations)
         least = min(energy_of(energy, path) for path in every)
-        (found,) = least_paths(energy, (8,))
+        (found,) = minimum_cost_paths(energy, (8,))
         assert energy_of(energy, tuple(found.tolist())) == pytest.approx(least, abs=1e-5)
 
 
-def test_corridors_side_by_side_are_as_each_alone() -> None:
+def test_bands_side_by_side_are_as_each_alone() -> None:
     rng = np.random.default_rng(7)
     widths = (20, 9, 33)
     each = [fenced(rng, 15, width) for width in widths]
-    together = least_paths(np.concatenate(each, axis=1), widths)
+    together = minimum_cost_paths(np.concatenate(each, axis=1), widths)
     for path, energy, width in zip(together, each, widths, strict=True):
-        np.testing.assert_array_equal(path, least_paths(energy, (width,))[0])
+        np.testing.assert_array_equal(path, minimum_cost_paths(energy, (width,))[0])
 
 
 def test_a_valley_is_followed_as_steeply_as_two_samples_a_station() -> None:
@@ -48,4 +48,4 @@ def test_a_valley_is_followed_as_steeply_as_two_samples_a_station() -> None:
     valley = 6 + 2 * np.arange(12)
     energy[np.arange(12), valley] = 0.0
     energy[:, :2] = energy[:, -2:] = FENCE
-    np.testing.assert_array_equal(least_paths(energy, (40,))[0], valley)
+    np.testing.assert_array_equal(minimum_cost_paths(energy, (40,))[0], valley)
