@@ -107,14 +107,14 @@ class Line:
 
     def push(self, t_ns: int, points_m: Float) -> Fitted:
         """Fit one epoch with markers (M, 3) [m], which may be NaN."""
-        turn = self.side.turn_at(t_ns, self.estimator)
+        orientation = self.side.orientation_at(t_ns, self.estimator)
         cov = np.tile(_SIGMA_M**2 * np.eye(3), (len(points_m), 1, 1))
-        hand = self.estimator.push(Epoch(t_ns, points_m, TOWARDS, cov_m2=cov, turn=turn))
-        self.side.solved(t_ns, hand, self.estimator, turned=turn is not None)
+        hand = self.estimator.push(Epoch(t_ns, points_m, TOWARDS, cov_m2=cov, orientation=orientation))
+        self.side.solved(t_ns, hand, self.estimator, oriented=orientation is not None)
         return hand
 
 
-class TurnedArm(Gestures):
+class RotatedArm(Gestures):
     """Those gestures of a forearm that lies any way. Pure in time: holds how."""
 
     def __init__(self, seed: int) -> None:
@@ -132,14 +132,14 @@ class Arm:
     """One recording: who moves how, and the samples of its IMU with the filter's orientation."""
 
     seed: int
-    forearm: TurnedArm
+    forearm: RotatedArm
     wrist: BentWrist
     samples: list[ImuSample]
 
     @classmethod
     def of(cls, seed: int, imu: ImuCalibration, seconds: float) -> "Arm":
         """Simulate."""
-        forearm, fusion = TurnedArm(seed), OrientationFilter(imu.rate_hz)
+        forearm, fusion = RotatedArm(seed), OrientationFilter(imu.rate_hz)
         samples = [fusion.push(one) for one in SimulatedImu(forearm, imu, seed).around(0.0, seconds)]
         return cls(seed, forearm, BentWrist(seed), samples)
 

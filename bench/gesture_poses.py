@@ -75,11 +75,11 @@ def people(numbers: Sequence[int] | range, seconds: float = 15.0) -> Told:
             caps = true.marker_points(true.forward(state.T_rig_palm, state.angles_rad), MARKERS)
             caps = caps + rng.normal(0.0, SIGMA_M, caps.shape)
             cov = np.tile(SIGMA_M**2 * np.eye(3), (len(MARKERS), 1, 1))
-            facing = -state.T_rig_palm[:3, 3] / np.linalg.norm(state.T_rig_palm[:3, 3])
-            solved = smooth.push(t_ns, solver.push(t_ns, caps, cov, facing), cov).solution
+            back_normal = -state.T_rig_palm[:3, 3] / np.linalg.norm(state.T_rig_palm[:3, 3])
+            solved = smooth.push(t_ns, solver.push(t_ns, caps, cov, back_normal), cov).solution
             assert solved is not None
-            place, turned = solved.joints.position_m, matrix_to_quaternion(solved.joints.rotation)
-            poses.append(pose_of(known, t_ns, place, turned, solved.angles_rad))
+            place, orientation = solved.joints.position_m, matrix_to_quaternion(solved.joints.rotation)
+            poses.append(pose_of(known, t_ns, place, orientation, solved.angles_rad))
         out.add([motion.held(1e-9 * pose.t_ns) for pose in poses], told_of(poses, known))
     return out
 

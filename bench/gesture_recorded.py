@@ -140,8 +140,8 @@ def _solved(model: HandModel, t_ns: list[int], points: Float, towards: Float, se
         cov = np.where(np.isfinite(seen[:, :1, None]), SIGMA_M**2 * np.eye(3), np.nan)
         hand = smooth.push(t, solver.push(t, seen, cov, towards), cov).solution
         assert hand is not None
-        turned = matrix_to_quaternion(hand.joints.rotation)
-        out.append(pose_of(model, t, hand.joints.position_m, turned, hand.angles_rad))
+        orientation = matrix_to_quaternion(hand.joints.rotation)
+        out.append(pose_of(model, t, hand.joints.position_m, orientation, hand.angles_rad))
     return out
 
 

@@ -34,7 +34,7 @@ from master.rig import load_setup
 from master.rig_pipeline import pipeline_of
 from master.rig_setup import RigSetup
 from master.stages import StageTimes
-from master.study.participant import Participant, participant, turned
+from master.study.participant import Participant, participant, rotated
 from slave.markers.light_adaptive import detector_for
 from slave.markers.workers import Inline
 
@@ -42,7 +42,7 @@ CALIBRATION = Path(__file__).parent.parent / "calib_json"
 RATE_HZ, SECONDS = 30.0, 15.0  # one round of the six poses
 PEOPLE = (20,)  # a minute or two each; more by the command line
 _SEED, _MOTION = 1, 100
-_TURN_RAD, _SHIFT_M = np.radians(0.75), 0.65e-3  # per axis, what a calibrated mounting is off by
+_ROTATION_RAD, _SHIFT_M = np.radians(0.75), 0.65e-3  # per axis, what a calibrated mounting is off by
 
 
 def rows(people: Sequence[int] = PEOPLE) -> Iterator[Row]:
@@ -76,7 +76,7 @@ def by_both(number: int, seconds: float = SECONDS) -> dict[str, Told]:
     scene = Scene.of_motion(marked.rig, marked.cameras, who.hand, motion, seed)
     rng = np.random.default_rng([number, 77])
     true = replace(wrist_setup.rig, T_camera_palm=who.rig.T_camera_palm)
-    file = turned(true, rng.normal(0.0, _TURN_RAD, 3), rng.normal(0.0, _SHIFT_M, 3))
+    file = rotated(true, rng.normal(0.0, _ROTATION_RAD, 3), rng.normal(0.0, _SHIFT_M, 3))
     device = WristScene(true, wrist_setup.cameras, model, motion, seed=seed, reflectance=who.reflectance)
     alone = _known(marked, who)
     wrist = RigSetup.of(file, wrist_setup.cameras, alone.hand)

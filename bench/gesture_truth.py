@@ -98,9 +98,9 @@ class GestureTruth:
 
     def _gripped(self, said: Said, settings: GestureSettings) -> tuple[Bool, Bool]:
         """Whether the tips are about the knob (T,), and whether they have not let it go (T,)."""
-        turned = np.array([self.motion.dial_rad(float(t)) for t in self.t_s])
+        rotated = np.array([self.motion.dial_rad(float(t)) for t in self.t_s])
         start = int(np.searchsorted(self.t_s, said.start_s))
-        turns = start + int(np.argmax(np.abs(turned[start:] - turned[start]) > 1e-6))
+        turns = start + int(np.argmax(np.abs(rotated[start:] - rotated[start]) > 1e-6))
         tips = self.joints_m[:, TIPS]
         away = np.linalg.norm(tips - tips.mean(axis=1, keepdims=True), axis=-1)
         off = away - away[turns]

@@ -111,8 +111,8 @@ class Score:
             if one.kind == "pinch":
                 self.pinch_mm.append(1e3 * (one.distance_m - truth.pinch_at(t_s, one.name)))
             elif one.kind == "dial":
-                turned = truth.motion.dial_rad(t_s) - truth.motion.dial_rad(first_s)
-                self.dial_deg.append(float(np.degrees(one.angle_rad - turned)))
+                rotated = truth.motion.dial_rad(t_s) - truth.motion.dial_rad(first_s)
+                self.dial_deg.append(float(np.degrees(one.angle_rad - rotated)))
             elif one.kind == "point":
                 off = one.direction - truth.ray_at(t_s)
                 self.ray_deg.append(float(np.degrees(np.linalg.norm(off))))

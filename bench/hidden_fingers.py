@@ -76,7 +76,7 @@ def growth_deg(model: HandModel, angles_rad: Float, *, alike: bool) -> Float:
     palm = rigid(FACING_ROTATION, np.array([0.0, 0.08, 0.5]))
     places = model.marker_points(model.forward(np.tile(palm, (len(angles_rad), 1, 1)), angles_rad), MARKERS)
     cov = np.tile(_SIGMA_M**2 * np.eye(3), (len(MARKERS), 1, 1))
-    turn = palm[:3, :3], _SIGMA_RAD**2 * np.eye(3)
+    orientation = palm[:3, :3], _SIGMA_RAD**2 * np.eye(3)
     off: list[list[Float]] = [[] for _ in HIDDEN_S]
     for finger in range(1, 5):
         solver = PointHand(model, MARKERS, settings=settings)
@@ -84,7 +84,7 @@ def growth_deg(model: HandModel, angles_rad: Float, *, alike: bool) -> Float:
             points, hidden = places[k].copy(), k % _CYCLE - _SEEN + 1
             if hidden > 0:
                 points[finger] = np.nan
-            hand = solver.push(round(k * 1e9 / _RATE_HZ), points, cov, turn=turn).solution
+            hand = solver.push(round(k * 1e9 / _RATE_HZ), points, cov, orientation=orientation).solution
             if hidden in _STEPS:
                 assert hand is not None
                 error = (hand.angles_rad - angles_rad[k])[finger, 1:3]

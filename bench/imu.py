@@ -31,7 +31,7 @@ from common.sim.imu import ICM20948, LSM6DSO, InertialPart, SimulatedImu
 from common.sim.motion import HandState
 
 _DATASETS = Path(os.environ.get("PHALANX_DATASETS", Path(__file__).parents[2] / "shared/datasets")).resolve()
-_NOTHING, _NO_TURN = np.full(3, np.nan), np.full(4, np.nan)
+_NOTHING, _NO_QUATERNION = np.full(3, np.nan), np.full(4, np.nan)
 _PARTS: dict[str, InertialPart] = {"LSM6DSO": LSM6DSO, "ICM-20948": ICM20948}
 _SEEDS = range(8)
 _STATED_DEG = (0.0, 0.4, 0.6, 0.8, 1.0, 1.5, 2.0, 3.0, 6.0)
@@ -61,7 +61,7 @@ class Recording:
                 data["movement"][::every].astype(np.bool_),
             )
         samples = [
-            ImuSample("broad", 0, k, round(k * 1e9 / rate_hz), gyro[k], accel[k], _NOTHING, _NO_TURN)
+            ImuSample("broad", 0, k, round(k * 1e9 / rate_hz), gyro[k], accel[k], _NOTHING, _NO_QUATERNION)
             for k in range(len(gyro))
         ]
         return cls(samples, rate_hz, truth, moving & np.isfinite(truth).all(axis=1))
@@ -220,8 +220,8 @@ class Gestures:
         """Its pose; the fingers do not matter."""
         t = max(t_s - self.rest_s, 0.0)
         swing = self._grown(t) * self._amplitude * np.sin(self._rate * t + self._phase)
-        turn = axis_rotation(2, 2.0 * swing[0]) @ axis_rotation(1, swing[1]) @ axis_rotation(0, swing[2])
-        return HandState(rigid(turn, 0.15 * swing[3:]), np.zeros((5, 4)))
+        rotation = axis_rotation(2, 2.0 * swing[0]) @ axis_rotation(1, swing[1]) @ axis_rotation(0, swing[2])
+        return HandState(rigid(rotation, 0.15 * swing[3:]), np.zeros((5, 4)))
 
     @staticmethod
     def _grown(t: float) -> float:

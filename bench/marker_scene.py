@@ -121,7 +121,7 @@ def _hand(
     Neighbours are 6 to 8 radii apart, so that no cap lies on another's finger.
     """
     size = scale * rng.uniform(RADIUS[0], largest)
-    turn = rng.uniform(0.0, 2.0 * math.pi)
+    angle = rng.uniform(0.0, 2.0 * math.pi)
     spread = [(k - 2) * math.radians(30.0) for k in range(5)]
     polar = [(16.0, t) for t in spread] + [(4.5 if count == 6 else 2.5, 0.0)]
     if count == 12:
@@ -129,7 +129,7 @@ def _hand(
     places: list[tuple[float, float, float]] = []
     for away, t in polar:
         away *= size * rng.uniform(0.95, 1.05)
-        t += turn + math.radians(rng.uniform(-3.0, 3.0))
+        t += angle + math.radians(rng.uniform(-3.0, 3.0))
         places.append((away * math.cos(t), away * math.sin(t), t + math.pi))
     points = np.array(places)[:, :2]
     margin = 2.5 * size

@@ -32,13 +32,13 @@ class Noise:
         return float(np.hypot(self.correlated_px, self.independent_px))
 
 
-def wander(seed: int, centre_m: Float, speed_m_s: float, turn_rad_s: float) -> Where:
+def wander(seed: int, centre_m: Float, speed_m_s: float, rotation_rad_s: float) -> Where:
     """A smooth way about a place (3,) [m], whose greatest speeds are about these; any turn to begin with."""
     rng = np.random.default_rng([seed, 5])
     first = rotation_vector_to_matrix(rng.normal(0.0, 0.5, 3))
     pace = 2.0 * np.pi * rng.uniform(0.35, 0.8, (2, 3))
     phase = rng.uniform(0.0, 2.0 * np.pi, (2, 3))
-    size = np.array([[speed_m_s], [turn_rad_s]]) / np.sqrt(2.0) / pace
+    size = np.array([[speed_m_s], [rotation_rad_s]]) / np.sqrt(2.0) / pace
     size = size * np.array([[1.0, 1.0, 0.6], [1.0, 1.0, 1.0]])
 
     def where(t_s: float) -> Float:

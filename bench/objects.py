@@ -62,7 +62,7 @@ def _rows_of(title: str, found: list[Outcome]) -> Iterable[Row]:
         np.concatenate([getattr(one, key) for one in found]) for key in ("mm", "deg", "sigmas_2")
     )
     frames = sum(one.frames for one in found)
-    for what, values, unit, goal in (("place", mm, "mm", 3), ("turn", deg, "deg", 2)):
+    for what, values, unit, goal in (("place", mm, "mm", 3), ("rotation", deg, "deg", 2)):
         if len(values):  # a stretch in which it is never tracked has no error
             most, middle = np.percentile(values, [95, 50])
             note = f"median {middle:.2f}; goal {goal}"
@@ -143,10 +143,10 @@ def _judged(
             flags[least < _HIDDEN][1] += 1
         if not pose.tracked:
             continue
-        turn = matrix_to_rotation_vector(T[:3, :3] @ quaternion_to_matrix(pose.orientation_wxyz).T)
-        off = np.concatenate([T[:3, 3] - pose.position_m, turn])
+        rotation = matrix_to_rotation_vector(T[:3, :3] @ quaternion_to_matrix(pose.orientation_wxyz).T)
+        off = np.concatenate([T[:3, 3] - pose.position_m, rotation])
         mm.append(1e3 * float(np.linalg.norm(off[:3])))
-        deg.append(float(np.degrees(np.linalg.norm(turn))))
+        deg.append(float(np.degrees(np.linalg.norm(rotation))))
         sigmas.append(float(off @ np.linalg.solve(pose.cov, off)) / 6.0)
     hidden, clear = flags[True], flags[False]
     return Outcome(

@@ -84,11 +84,11 @@ def _planes(camera: CameraCalibration, rig: RigCalibration) -> Iterator[Row]:
 
 
 def _errors(name: str, found: list[tuple[PlaneFit, LaserPlane]], note: str) -> Iterator[Row]:
-    turn = [_angle_deg(np.array(fit.plane.normal), np.array(true.normal)) for fit, true in found]
+    rotation = [_angle_deg(np.array(fit.plane.normal), np.array(true.normal)) for fit, true in found]
     shift = [1e3 * abs(fit.plane.offset_m - true.offset_m) for fit, true in found]
     sigma = [np.degrees(fit.normal_sigma_rad) for fit, _ in found]
-    told = f"largest {max(turn):.4f}, stated sigma {np.median(sigma):.4f}; goal 0.1; {note}"
-    yield Row(f"{name}: normal, median", float(np.median(turn)), "deg", told)
+    told = f"largest {max(rotation):.4f}, stated sigma {np.median(sigma):.4f}; goal 0.1; {note}"
+    yield Row(f"{name}: normal, median", float(np.median(rotation)), "deg", told)
     sigma_mm = np.median([1e3 * fit.offset_sigma_m for fit, _ in found])
     told = f"largest {max(shift):.4f}, stated sigma {sigma_mm:.4f}; goal 0.1"
     yield Row(f"{name}: offset, median", float(np.median(shift)), "mm", told)
@@ -135,7 +135,7 @@ def _palms(camera: CameraCalibration, rig: RigCalibration) -> Iterator[Row]:
 
 def _subjects() -> Iterator[Row]:
     """Mounting and knuckles before and after a guided motion, and the PIP of a natural curl with the files of each."""
-    turn: list[tuple[Float, Float]] = []
+    rotation: list[tuple[Float, Float]] = []
     knuckle: list[tuple[Float, Float]] = []
     unlikely: list[Float] = []
     refused = 0
@@ -147,13 +147,13 @@ def _subjects() -> Iterator[Row]:
             refused += 1
             continue
         before, after = person.errors(person.rig, person.hand), person.errors(found.rig, found.hand)
-        turn.append((before[0], after[0]))
+        rotation.append((before[0], after[0]))
         knuckle.append((before[1], after[1]))
         unlikely.append(1e-3 * after[1] / found.knuckle_sigma_m)
         people.append((person, found))
     note = f"{len(people)} people, {refused} refused; palm 3 deg, 2 mm, knuckles 5 mm off per axis"
     for k, axis in enumerate(("x, the pitch of the hand", "y", "z")):
-        was, now = (_rms(np.array([one[side][k] for one in turn])) for side in (0, 1))
+        was, now = (_rms(np.array([one[side][k] for one in rotation])) for side in (0, 1))
         yield Row(f"subject: palm's turn about {axis}, rms", now, "deg", f"before {was:.2f}; {note}")
     for k, axis in enumerate(("across", "away from the lens, down", "away from the lens, ahead")):
         was, now = (_rms(np.array([one[side][:, k] for one in knuckle])) for side in (0, 1))
@@ -193,8 +193,10 @@ def _rms(values: Float) -> float:
 
 
 def _palm_rows(name: str, found: list[tuple[float, float]], note: str) -> Iterator[Row]:
-    turn, shift = np.array(found).T
-    yield Row(f"{name}: turn, median", float(np.median(turn)), "deg", f"largest {turn.max():.2f}; {note}")
+    rotation, shift = np.array(found).T
+    yield Row(
+        f"{name}: turn, median", float(np.median(rotation)), "deg", f"largest {rotation.max():.2f}; {note}"
+    )
     yield Row(f"{name}: knuckles, median", float(np.median(shift)), "mm", f"largest {shift.max():.2f}")
 
 
@@ -243,8 +245,8 @@ def _wrong_lens(camera: CameraCalibration, seed: int) -> CameraModel:
 
 def _palm_error(T: Float, true: Float) -> tuple[float, float]:
     """Turn [deg], and how far the knuckles are off [mm]."""
-    turn = float(np.degrees(np.linalg.norm(matrix_to_rotation_vector(T[:3, :3] @ true[:3, :3].T))))
-    return turn, float(1e3 * np.linalg.norm(transform(T, KNUCKLES) - transform(true, KNUCKLES)))
+    rotation = float(np.degrees(np.linalg.norm(matrix_to_rotation_vector(T[:3, :3] @ true[:3, :3].T))))
+    return rotation, float(1e3 * np.linalg.norm(transform(T, KNUCKLES) - transform(true, KNUCKLES)))
 
 
 def _angle_deg(a: Float, b: Float) -> float:

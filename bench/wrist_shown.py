@@ -20,7 +20,7 @@ from slave.wrist.view import WristView
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORDINGS = ("curl", "mcp", "spread", "left_small")
-_TURN_RAD, _SHIFT_M = np.radians(3.0), 3e-3
+_ROTATION_RAD, _SHIFT_M = np.radians(3.0), 3e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +67,7 @@ def recorded(data: Path, name: str) -> Recorded:
 def other_palm(rig: RigCalibration, rng: np.random.Generator) -> RigCalibration:
     """The rig before a palm that lies a little differently."""
     palm = np.array(rig.T_camera_palm)
-    palm[:3, :3] = cv2.Rodrigues(rng.normal(0.0, _TURN_RAD, 3))[0] @ palm[:3, :3]
+    palm[:3, :3] = cv2.Rodrigues(rng.normal(0.0, _ROTATION_RAD, 3))[0] @ palm[:3, :3]
     palm[:3, 3] += rng.normal(0.0, _SHIFT_M, 3)
     rows = [tuple(row) for row in palm.tolist()]
     return replace(rig, T_camera_palm=(rows[0], rows[1], rows[2], (0.0, 0.0, 0.0, 1.0)))

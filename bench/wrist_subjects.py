@@ -78,8 +78,8 @@ class Person:
     def errors(self, rig: RigCalibration, hand: HandProfile) -> tuple[Float, Float]:
         """Turn of the palm (3,) [deg], camera axes, and where knuckles are beside the true ones (4, 3) [mm]."""
         pose, true = (np.array(one.T_camera_palm) for one in (rig, self.true_rig))
-        turn = np.degrees(matrix_to_rotation_vector(pose[:3, :3] @ true[:3, :3].T))
-        return turn, 1e3 * (transform(pose, knuckles(hand)) - transform(true, knuckles(self.true_hand)))
+        rotation = np.degrees(matrix_to_rotation_vector(pose[:3, :3] @ true[:3, :3].T))
+        return rotation, 1e3 * (transform(pose, knuckles(hand)) - transform(true, knuckles(self.true_hand)))
 
 
 def detections(camera: str, k: int, laser: Float, tip: Float) -> WristDetections:

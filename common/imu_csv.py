@@ -19,7 +19,7 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.errors import RecordingError
-from common.imu_csv_columns import ACCEL, AXES, GYRO, MAG, TIME, TURN, UNITS, Columns, find_columns
+from common.imu_csv_columns import ACCEL, AXES, GYRO, MAG, QUATERNION, TIME, UNITS, Columns, find_columns
 from common.recorded_files import read_table
 
 _PREAMBLE = 30  # lines in which the header must stand
@@ -98,10 +98,12 @@ def _read(lines: Sequence[str], given: Mapping[str, str], rate_hz: float | None)
         for what, axes in AXES.items()
         if all((what, axis) in columns for axis in axes)
     }
-    scaled[TURN][~(np.abs(np.linalg.norm(scaled[TURN], axis=1) - 1.0) < _UNIT_WITHIN)] = nan  # no rotation
+    scaled[QUATERNION][~(np.abs(np.linalg.norm(scaled[QUATERNION], axis=1) - 1.0) < _UNIT_WITHIN)] = (
+        nan  # no rotation
+    )
     t_ns, incomplete = np.array(ns, np.int64), int((~measured).sum())
     return Table(
-        t_ns, scaled[GYRO], scaled[ACCEL], scaled[MAG], scaled[TURN], names, said, late, incomplete
+        t_ns, scaled[GYRO], scaled[ACCEL], scaled[MAG], scaled[QUATERNION], names, said, late, incomplete
     )  # fmt: skip
 
 
@@ -197,7 +199,7 @@ def _scaled(
     places = {key: k for k, key in enumerate(columns)}
     scaled: dict[str, Float] = {}
     said: dict[str, str] = {}
-    for what in (GYRO, ACCEL, MAG, TURN):
+    for what in (GYRO, ACCEL, MAG, QUATERNION):
         keys = [(what, axis) for axis in AXES[what]]
         if not all(key in places for key in keys):
             scaled[what] = np.full((len(values), len(keys)), nan)
@@ -214,7 +216,7 @@ def _scaled(
             ),
             ("", ""),
         )
-        if not unit and what != TURN:
+        if not unit and what != QUATERNION:
             unit, who = _likely(what, raw), "not said"
         scaled[what] = raw * UNITS[what].get(unit, 1.0)
         if unit:

@@ -71,7 +71,7 @@ class ErrorState:
         """Standard deviation of the heading against that of the beginning."""
         return min(sqrt(float(self._variance[_HEADING])), _ANYWHERE_RAD)
 
-    def turned(self, step_s: float, world_sensor: Float, rate_rad_s: Float, *, felt: bool) -> None:
+    def propagate(self, step_s: float, world_sensor: Float, rate_rad_s: Float, *, felt: bool) -> None:
         """A step was summed up: at this rate (3,) of the sensor, which then lay so (3, 3), with a force or without."""
         change, fallen = -step_s * world_sensor, step_s * G_M_S2 if felt else 0.0
         self._transition[ATTITUDE, BIAS] = change

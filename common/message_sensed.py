@@ -24,9 +24,9 @@ from common.message_parts import (
     SigmaPx,
     TimeNs,
     TimeSigmaNs,
-    Turn,
+    UnitQuaternion,
+    refuse_bad_quaternion,
     refuse_beyond,
-    refuse_no_turn,
     refuse_parts,
     refuse_sigma,
     within,
@@ -184,12 +184,12 @@ class TrackerPose(Message, frozen=True, eq=False, tag=True):
     seq: Count
     t_ns: TimeNs
     position_m: SensedMetres
-    orientation_wxyz: Turn
+    orientation_wxyz: UnitQuaternion
 
     def __post_init__(self) -> None:
         _TRACKER_ARRAYS.freeze(self)
         refuse_parts(self, "position_m")
-        refuse_no_turn(self, "orientation_wxyz")
+        refuse_bad_quaternion(self, "orientation_wxyz")
 
 
 class ImuSample(Message, frozen=True, eq=False, tag=True):
@@ -215,12 +215,12 @@ class ImuSample(Message, frozen=True, eq=False, tag=True):
     gyro_rad_s: Annotated[Float, within(-200.0, 200.0)]
     accel_m_s2: Annotated[Float, within(-5000.0, 5000.0)]
     mag_ut: Annotated[Float, within(-1e5, 1e5)]
-    orientation_wxyz: Turn
+    orientation_wxyz: UnitQuaternion
     heading_sigma_rad: Annotated[float, within(0.0, 1e3)] = nan
 
     def __post_init__(self) -> None:
         _IMU_ARRAYS.freeze(self)
-        refuse_no_turn(self, "orientation_wxyz")
+        refuse_bad_quaternion(self, "orientation_wxyz")
         refuse_beyond(self, "heading_sigma_rad")
 
 

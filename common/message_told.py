@@ -21,7 +21,7 @@ from common.message_parts import (
     Name,
     Numbers,
     TimeNs,
-    Turn,
+    UnitQuaternion,
     refuse_beyond,
     within,
 )
@@ -105,7 +105,7 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
     hand: Name
     t_ns: TimeNs
     position_m: Metres
-    orientation_wxyz: Turn
+    orientation_wxyz: UnitQuaternion
     radius_m: Annotated[Float, within(0.0, 1.0)]
     valid: Bool
     tracked: Bool
@@ -120,7 +120,7 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
     laser_m: Metres = field(default_factory=lambda: _NO_LASER)
     level: Code = field(default_factory=lambda: _NO_LEVEL)
     ambiguous: Bool = field(default_factory=lambda: _NOT_AMBIGUOUS)
-    palm_world_wxyz: Turn = field(default_factory=lambda: _NO_ROTATION)
+    palm_world_wxyz: UnitQuaternion = field(default_factory=lambda: _NO_ROTATION)
     palm_world_sigma_rad: Numbers = field(default_factory=lambda: _NO_SIGMA)
     wrist_bend_rad: Annotated[Float, within(-10.0, 10.0)] = field(default_factory=lambda: _NO_SIGMA)
     wrist_bend_sigma_rad: Numbers = field(default_factory=lambda: _NO_SIGMA)
@@ -175,7 +175,7 @@ class ObjectPose(Message, frozen=True, eq=False, tag=True):
     object: Name
     t_ns: TimeNs
     position_m: Metres
-    orientation_wxyz: Turn
+    orientation_wxyz: UnitQuaternion
     cov: Numbers
     residual_m: Annotated[float, within(0.0, 1e4)]
     source: Annotated[int, Meta(ge=0, le=int(max(ObjectSource)))]
@@ -252,7 +252,7 @@ class Gesture(Message, frozen=True, eq=False, tag=True):
     strength: Annotated[float, within(0.0, 1.0)] = nan
     angle_rad: Annotated[float, within(-1e4, 1e4)] = nan
     origin_m: Metres = field(default_factory=lambda: _NO_POINT)
-    direction: Turn = field(default_factory=lambda: _NO_POINT)
+    direction: UnitQuaternion = field(default_factory=lambda: _NO_POINT)
 
     def __post_init__(self) -> None:
         _GESTURE_ARRAYS.freeze(self)

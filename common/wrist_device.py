@@ -109,10 +109,10 @@ def _palm(rig: RigCalibration, where: str) -> Float:
             f"{where}: T_camera_palm is missing, which `phalanx-master calibrate palm` measures"
         )
     palm = np.array(rig.T_camera_palm, dtype=np.float64)
-    turned = palm[:3, :3]
+    rotation = palm[:3, :3]
     if (
-        not np.allclose(turned @ turned.T, np.eye(3), atol=_ROTATION_WITHIN)
-        or np.linalg.det(turned) < 0.0
+        not np.allclose(rotation @ rotation.T, np.eye(3), atol=_ROTATION_WITHIN)
+        or np.linalg.det(rotation) < 0.0
         or not np.array_equal(palm[3], [0.0, 0.0, 0.0, 1.0])
     ):
         raise CalibrationError(f"{where}: T_camera_palm: not a rotation and a shift, last row 0 0 0 1")

@@ -160,8 +160,8 @@ def in_world(rig: RigCalibration) -> RigCalibration:
 def _imu(imu: ImuCalibration | None, T_world_rig: Float) -> ImuCalibration | None:
     if imu is None or imu.q_rig_world is None:
         return imu
-    turned = matrix_to_quaternion(T_world_rig[:3, :3] @ quaternion_to_matrix(np.array(imu.q_rig_world)))
-    return replace(imu, q_rig_world=_quaternion(turned))
+    rotated = matrix_to_quaternion(T_world_rig[:3, :3] @ quaternion_to_matrix(np.array(imu.q_rig_world)))
+    return replace(imu, q_rig_world=_quaternion(rotated))
 
 
 def _volume(volume: Volume | None, T_world_rig: Float) -> Volume | None:

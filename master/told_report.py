@@ -153,10 +153,10 @@ def judge_gestures(
     begun = [one for one in _beginnings(told) if one.kind != "pose"]
     first_s, end_s = (from_ns - epoch_ns) * 1e-9, (until_ns - epoch_ns) * 1e-9
     made = [
-        (one, turn * motion.period_s)
-        for turn in range(int(end_s // motion.period_s) + 1)
+        (one, cycle * motion.period_s)
+        for cycle in range(int(end_s // motion.period_s) + 1)
         for one in motion.said
-        if first_s <= one.start_s + turn * motion.period_s and one.stop_s + turn * motion.period_s <= end_s
+        if first_s <= one.start_s + cycle * motion.period_s and one.stop_s + cycle * motion.period_s <= end_s
     ]
     heard: set[int] = set()
     right = 0
@@ -172,11 +172,11 @@ def judge_gestures(
         "gestures_made": len(made),
         "gestures_false": len(begun) - len(heard) - len(cut),
     }
-    turned = [one for one in told if one.kind == "dial" and np.isfinite(one.angle_rad)]
-    began_s = [(one.began_t_ns - epoch_ns) * 1e-9 for one in turned]
+    dials = [one for one in told if one.kind == "dial" and np.isfinite(one.angle_rad)]
+    began_s = [(one.began_t_ns - epoch_ns) * 1e-9 for one in dials]
     error = [
         abs(one.angle_rad - motion.dial_rad(_seconds_of(one, epoch_ns)) + motion.dial_rad(t_s))
-        for one, t_s in zip(turned, began_s, strict=True)
+        for one, t_s in zip(dials, began_s, strict=True)
     ]
     return out | ({"dial_deg": round(float(np.degrees(np.median(error))), 2)} if error else {})
 

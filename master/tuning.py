@@ -53,7 +53,7 @@ class _WhenOpen:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Turn:
+class _OrientationSample:
     """What an IMU said of its orientation: the arguments of `Pipeline.push_orientation`."""
 
     t_ns: int
@@ -79,7 +79,9 @@ class LivePipeline:
         self._now = pipeline_of(setup, stage, shed=shed)
         per_frame = _told_per_frame(setup)
         self._close = _CLOSE_FRAMES * per_frame
-        self._recent: deque[tuple[int, Detections | _Turn]] = deque(maxlen=_WARM_FRAMES * per_frame)
+        self._recent: deque[tuple[int, Detections | _OrientationSample]] = deque(
+            maxlen=_WARM_FRAMES * per_frame
+        )
         self._number = 0
         self._last_ns = -(2**63)
         # And the number of the last message it has seen. One thread fills it, another empties it.
@@ -102,7 +104,7 @@ class LivePipeline:
     def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
         """Take what the hand's IMU says of its orientation (4,)."""
         self._number += 1
-        self._recent.append((self._number, _Turn(t_ns, orientation_wxyz, heading_sigma_rad)))
+        self._recent.append((self._number, _OrientationSample(t_ns, orientation_wxyz, heading_sigma_rad)))
         self._now.push_orientation(t_ns, orientation_wxyz, heading_sigma_rad)
 
     def flush(self) -> list[SolvedPose]:
@@ -190,7 +192,7 @@ class RigTuning:
         self._files, self._say, self._world = files, say, world
         self._setups, self._pipelines = tuple(setups), tuple(pipelines)
         self._watched = WatchedFiles()
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
         self._applied = self._refused = 0
 
     @property
@@ -204,7 +206,7 @@ class RigTuning:
 
     def look(self) -> None:
         """Use the files if they were changed; where that fails, say so once and go on as before."""
-        with self._turn:
+        with self._lock:
             changed = self._watched.changed(self._files.paths(self._setups))
         if not changed:
             return
@@ -219,7 +221,7 @@ class RigTuning:
         Raises:
             CalibrationError: One is broken, they contradict each other, or they need a restart. Nothing has changed.
         """
-        with self._turn:
+        with self._lock:
             changed = self._use(self._files.load)
         if changed:
             self._say("changed files are in use")
@@ -234,12 +236,12 @@ class RigTuning:
         """
         trial = parse(body.encode(), FilterTrial, "filter")
         self.look()
-        with self._turn:
+        with self._lock:
             self._use(lambda: _with_filter(self._setups, trial))
 
     def renew(self, sender: str) -> None:
         """As the function `renew`, of the setups in use."""
-        with self._turn:
+        with self._lock:
             renew(self._setups, self._pipelines, self._world, sender)
 
     def _use(self, get: Callable[[], Sequence[RigSetup]]) -> bool:
@@ -311,9 +313,9 @@ def _told_per_frame(setup: RigSetup) -> int:
     return len(setup.camera_names) + ceil(samples)
 
 
-def _show(pipeline: Pipeline, told: Detections | _Turn) -> list[SolvedPose]:
+def _show(pipeline: Pipeline, told: Detections | _OrientationSample) -> list[SolvedPose]:
     """Tell it what came; the poses that completes."""
-    if isinstance(told, _Turn):
+    if isinstance(told, _OrientationSample):
         pipeline.push_orientation(told.t_ns, told.orientation_wxyz, told.heading_sigma_rad)
         return []
     return pipeline.push(told)

@@ -137,7 +137,7 @@ class CameraTuning:
         self._used = self._on_disk = files
         self._source = source if isinstance(source, Tunable) else None
         self._prepare, self._running, self._sampler = prepare, running, sampler
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
         self._watched = WatchedFiles()
         self._applied = self._refused = 0
 
@@ -173,7 +173,7 @@ class CameraTuning:
 
     def look(self) -> None:
         """Apply the files if they were changed; where that fails, say so once and go on as before."""
-        with self._turn:
+        with self._lock:
             if not self._running() or not self._watched.changed(self._used.paths):
                 return
             try:
@@ -193,7 +193,7 @@ class CameraTuning:
         return self.figures() | range_figures(used.camera, used.rig.markers)
 
     def _set(self, body: str) -> dict[str, float]:
-        with self._turn:
+        with self._lock:
             wanted = parse(body.encode(), CameraSettings, "set")
             camera = wanted.over(self._used.camera)
             if wanted.markers is not None:
@@ -203,7 +203,7 @@ class CameraTuning:
         return self._settings("")
 
     def _pick(self, body: str) -> dict[str, float]:
-        with self._turn:
+        with self._lock:
             wish = parse(body.encode(), ColourPick, "pick")
             if self._sampler is None:
                 raise CalibrationError(
@@ -215,14 +215,14 @@ class CameraTuning:
         return self._settings("") | dict(told)
 
     def _load(self, body: str) -> dict[str, float]:
-        with self._turn:
+        with self._lock:
             self._apply(replace(self._used, camera=parse(body.encode(), CameraCalibration, "load")))
         return self._settings("")
 
     def _save(self, body: str) -> dict[str, float]:
         if body:
             raise CalibrationError("save: takes no body; what is in use is saved")
-        with self._turn:
+        with self._lock:
             path = self._used.camera_path
             camera = self._used.camera
             if path.exists():  # what somebody else has written there stays: a lens is calibrated elsewhere

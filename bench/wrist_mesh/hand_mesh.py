@@ -96,8 +96,8 @@ class HandMesh:
 
     def pose(self, angles_rad: Float, T_camera_palm: Float) -> Posed:
         """The hand with named angles (21,), its palm at `T_camera_palm` (4, 4)."""
-        at, turned = self.hinges.pose(angles_rad)
-        R = T_camera_palm[:3, :3] @ turned @ self.hinges.rest_rotation
+        at, rotated = self.hinges.pose(angles_rad)
+        R = T_camera_palm[:3, :3] @ rotated @ self.hinges.rest_rotation
         at = at @ T_camera_palm[:3, :3].T + T_camera_palm[:3, 3]
         each = np.einsum("vkij,vkj->vki", R[self.joints], self.bound) + at[self.joints]
         verts = np.einsum("vk,vki->vi", self.weights, each)

@@ -50,13 +50,15 @@ class HandRoutine:
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
         t = max(t_s, 0.0) % PERIOD_S
-        wobble, shift, turn = self._drift.at(t)
+        wobble, shift, rotation = self._drift.at(t)
         angles = angles_of(self._model, posture_at(self.script_s(t)), wobble)
-        return HandState(self._pose(self._rest * shift, self._rest * turn), angles)
+        return HandState(self._pose(self._rest * shift, self._rest * rotation), angles)
 
-    def _pose(self, shift_m: Float, turn_rad: Float) -> Float:
+    def _pose(self, shift_m: Float, rotation_rad: Float) -> Float:
         """`T_rig_palm` (4, 4): palm to the cameras, fingers up in the image."""
         to_cameras = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-        rotation = rotation_vector_to_matrix(turn_rad) @ axis_rotation(0, np.radians(TILT_DEG)) @ to_cameras
+        rotation = (
+            rotation_vector_to_matrix(rotation_rad) @ axis_rotation(0, np.radians(TILT_DEG)) @ to_cameras
+        )
         middle = np.array([0.0, 0.0, 0.5 * float(self._model.rest_position_m[:, 2].max())])
         return rigid(rotation, self._centre + shift_m - rotation @ middle)

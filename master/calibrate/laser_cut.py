@@ -116,9 +116,9 @@ class LaserCut:
     def _fan(self, spheres: Float, radius: Float, known: Float) -> Float:
         """Rays (3, R, N) in the laser plane from one tangent of each finger to the other."""
         low, high = self._tangents(spheres, radius, known)
-        turn = 0.5 * (low + high) + 0.5 * (high - low) * self._nodes[:, None]
+        angle = 0.5 * (low + high) + 0.5 * (high - low) * self._nodes[:, None]
         across, along = self._axes.axes[..., None, None]
-        return np.sin(turn) * across + np.cos(turn) * along
+        return np.sin(angle) * across + np.cos(angle) * along
 
     def _tangents(self, spheres: Float, radius: Float, known: Float) -> tuple[Float, Float]:
         """Turns (N,) [rad] of the first and the last ray of the plane that touches a finger; 0 where none does.
@@ -129,11 +129,11 @@ class LaserCut:
         flat = self._axes.flat(spheres)
         height = spheres @ self._setup.normal - self._setup.offset_m
         with np.errstate(invalid="ignore", divide="ignore"):
-            turn = np.arctan2(flat[..., 0], flat[..., 1])
+            angle = np.arctan2(flat[..., 0], flat[..., 1])
             room = np.arcsin(np.sqrt((radius**2 - height**2) / np.vecdot(flat, flat)))
             sides = self._sides(known)
-            low = np.fmin.reduce(np.concatenate([(turn - room).T, *sides]), axis=0)
-            high = np.fmax.reduce(np.concatenate([(turn + room).T, *sides]), axis=0)
+            low = np.fmin.reduce(np.concatenate([(angle - room).T, *sides]), axis=0)
+            high = np.fmax.reduce(np.concatenate([(angle + room).T, *sides]), axis=0)
         return np.nan_to_num(low), np.nan_to_num(high)
 
     def _sides(self, known: Float) -> tuple[Float, Float]:

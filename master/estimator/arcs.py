@@ -23,7 +23,7 @@ from math import sqrt
 
 from common.arrays import Bool, Float
 from common.kernels import constant, inlined, inner
-from master.estimator.certainty import MOST_TURNS, Certainty, joint_slopes
+from master.estimator.certainty import MOST_ROTATIONS, Certainty, joint_slopes
 from master.estimator.hand_tables import HandTables
 from master.estimator.kinematics import PLACE, Scratch, finger_slopes, marker_point, palm_slopes
 from master.estimator.matrices import cholesky, eigen
@@ -34,16 +34,16 @@ _NONE = constant(0)
 
 
 @inner
-def _turns(settings: Settings, cov: Float, room: Certainty) -> int:
+def _rotation_columns(settings: Settings, cov: Float, room: Certainty) -> int:
     """Write the turns that are not straight, as columns of a pivoted Cholesky factor; return how many.
 
-    One that is less sure than `turns_most_rad` leads nowhere farther.
+    One that is less sure than `rotation_most_rad` leads nowhere farther.
     """
     N, left = cov.shape[0], room.left
     for i in range(N):
         left[i] = 0.0 if 3 <= i < 6 else cov[i, i]
     count = 0
-    while count < MOST_TURNS:
+    while count < MOST_ROTATIONS:
         pivot = 0
         for i in range(3):
             if left[i] > left[pivot]:
@@ -58,27 +58,27 @@ def _turns(settings: Settings, cov: Float, room: Certainty) -> int:
         for i in range(N):
             value = 0.0 if 3 <= i < 6 else cov[i, pivot]
             for k in range(count):
-                value -= room.turns[k, i] * room.turns[k, pivot]
+                value -= room.rotations[k, i] * room.rotations[k, pivot]
             value = 0.0 if 3 <= i < 6 else value / root
-            room.turns[count, i] = value
+            room.rotations[count, i] = value
             squared += value * value
             left[i] = max(left[i] - value * value, 0.0)
         left[pivot] = 0.0
-        most = settings.turns_most_rad
+        most = settings.rotation_most_rad
         room.values[count] = min(most / sqrt(squared), 1.0)
         count += 1
     return count
 
 
 @inner
-def _bone_turns(hand: HandTables, T: Float, count: int, work: Scratch, room: Certainty) -> None:
+def _bone_rotations(hand: HandTables, T: Float, count: int, work: Scratch, room: Certainty) -> None:
     """Write how each turn turns each bone (5, 4, K, 3): the palm, and the axes of the joints before it."""
     for f in range(5):
         columns = hand.first[f + 1] - hand.first[f]
         for k in range(count):
             scale = room.values[k]
             for i in range(3):
-                room.w[f, 0, k, i] = scale * room.turns[k, i]
+                room.w[f, 0, k, i] = scale * room.rotations[k, i]
         for axis in range(4):
             ax, ay, az = -work.R[f, max(axis - 1, 0), 0, 0], -work.R[f, max(axis - 1, 0), 1, 0], 0.0
             az = -work.R[f, max(axis - 1, 0), 2, 0]
@@ -93,7 +93,7 @@ def _bone_turns(hand: HandTables, T: Float, count: int, work: Scratch, room: Cer
             for k in range(count):
                 rate = 0.0
                 for c in range(columns):
-                    rate += work.by[4 * f + axis, c] * room.turns[k, 6 + hand.first[f] + c]
+                    rate += work.by[4 * f + axis, c] * room.rotations[k, 6 + hand.first[f] + c]
                 rate *= room.values[k]
                 for i in range(3):
                     if axis != 1:
@@ -277,10 +277,10 @@ def add_arcs(
         work, room: Room.
         joint_cov: (26, 3, 3) [m^2], changed.
     """
-    count, N = _turns(settings, cov, room), cov.shape[0]
+    count, N = _rotation_columns(settings, cov, room), cov.shape[0]
     if count == 0:
         return
-    _bone_turns(rig.hand, T, count, work, room)
+    _bone_rotations(rig.hand, T, count, work, room)
     pairs = _NONE
     for k in range(count):
         for m in range(k + 1):

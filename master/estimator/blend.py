@@ -15,7 +15,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from master.estimator.observation_sources import BY_MARKERS
 
-PLACE, TURN, ANGLES = slice(0, 3), slice(3, 6), slice(6, 26)
+PLACE, ROTATION, ANGLES = slice(0, 3), slice(3, 6), slice(6, 26)
 PARTS: Int = np.repeat([5, 0, 1, 2, 3, 4], [6, 4, 4, 4, 4, 4])  # signal -> finger, or 5: the palm
 _SUDDEN_M = 3e-3  # from one instant to the next, beside motion
 _SPEED_S = 0.03  # of the shown hand, which is smooth

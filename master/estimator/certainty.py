@@ -21,7 +21,7 @@ from master.estimator.state import Hidden
 
 _QUANTILE_95 = 7.815  # chi square of three numbers
 _LAST = constant(3)  # joint of a finger: its tip
-MOST_TURNS = 12  # turns that count in arcs: those of the palm, which moves all joints, then the largest
+MOST_ROTATIONS = 12  # turns that count in arcs: those of the palm, which moves all joints, then the largest
 
 
 class Certainty:
@@ -32,7 +32,7 @@ class Certainty:
     V: Float  # (N, N)
     work: Float  # (N, N)
     values: Float  # (N,)
-    turns: Float  # (12, N) columns of the factor, as rows
+    rotations: Float  # (12, N) columns of the factor, as rows
     left: Float  # (N,)
     w: Float  # (5, 4, 12, 3)
     joint: Float  # (78, 26, 3) arcs of joints, by pair
@@ -53,7 +53,7 @@ class Certainty:
     @classmethod
     def empty(cls, N: int, markers: int) -> "Certainty":
         """Allocate it."""
-        K, pairs = 3 * markers, MOST_TURNS * (MOST_TURNS + 1) // 2
+        K, pairs = 3 * markers, MOST_ROTATIONS * (MOST_ROTATIONS + 1) // 2
         room = record(
             cls,
             A=(N, N),
@@ -61,9 +61,9 @@ class Certainty:
             V=(N, N),
             work=(N, N),
             values=N,
-            turns=(MOST_TURNS, N),
+            rotations=(MOST_ROTATIONS, N),
             left=N,
-            w=(5, 4, MOST_TURNS, 3),
+            w=(5, 4, MOST_ROTATIONS, 3),
             joint=(pairs, 26, 3),
             marker=(pairs, K),
             Jm=(K, N),

@@ -29,12 +29,12 @@ class Epoch:
 
     t_ns: int
     points_m: Float
-    facing: Float
+    back_normal: Float
     cov_m2: Float | None = None
     uv: Float | None = None
     variance_px2: Float | None = None
     own_m2: Float | None = None
-    turn: "Turn | None" = None
+    orientation: "OrientationMeasurement | None" = None
     wrist: "WristRows | None" = None
     place: Float | None = None
     start: SolvedHand | None = None
@@ -42,7 +42,7 @@ class Epoch:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Turn:
+class OrientationMeasurement:
     """How other sensors have the palm turned.
 
     Attributes:
@@ -121,7 +121,7 @@ class Fitted:
         anew: The hand of a moment ago was wrong: nothing of it is in this one.
         level: (5,) `Level` codes of what a wrist device tells the fingers from, now.
         ambiguous: (5,) whether another pose of the finger explains that as well.
-        rotation_rejected: Whether the palm by markers contradicts how other sensors have it turned, which was left out.
+        rotation_rejected: Whether the palm by markers contradicts the measured orientation, which was left out.
         refused, off: (5,) fingertips and laser points that no pose explains.
     """
 

@@ -112,7 +112,7 @@ class EpochSteps:
         """Write the rows of an epoch, and count them."""
         task, lines_of_sight = self.at.task, self.at.belief.lines_of_sight
         task.t_ns[0], task.second_order[0], task.continuous[0] = at.t_ns, at.second_order, continuous
-        task.process_noise_rad2[0] = 0.0 if at.turn is None else at.turn.process_noise_rad2
+        task.process_noise_rad2[0] = 0.0 if at.orientation is None else at.orientation.process_noise_rad2
         if at.wrist is None:
             lines_of_sight.rows[0] = 0.0
             lines_of_sight.lit[:] = lines_of_sight.shown[:] = 0.0
@@ -156,20 +156,20 @@ class EpochSteps:
 
     def believe(self, at: Epoch, *, known: bool) -> None:
         """Write what is believed beside the past and habits; `known`: whether the past still says anything."""
-        belief, ground, turn = self.at.belief, self.at.ground, at.turn
-        belief.facing[:] = at.facing
-        belief.facing_w2[0] = self._settings.facing_rad**-2.0 if ground.back[0] else 0.0
+        belief, ground, orientation = self.at.belief, self.at.ground, at.orientation
+        belief.back_normal[:] = at.back_normal
+        belief.back_normal_w2[0] = self._settings.back_normal_rad**-2.0 if ground.back[0] else 0.0
         belief.depth_w2[0] = 0.0
         if known and ground.most[0] == 1:
             alone = self._rig.cameras.centre[(self.observed.weight > 0.0).sum(axis=1).argmax()]
             line_of_sight = self.now.palm[:3, 3] - alone
             belief.line_of_sight[:] = line_of_sight / np.sqrt(line_of_sight @ line_of_sight)
             belief.depth_w2[0] = self._settings.held_depth_m**-2.0
-        belief.turned[0] = turn is not None
-        if turn is not None:
-            belief.forearm[:3, :3], belief.turn_info[:] = turn.rotation, turn.information
-            belief.on_forearm[0] = turn.axes is not None
-            belief.axes[:] = 0.0 if turn.axes is None else turn.axes
+        belief.oriented[0] = orientation is not None
+        if orientation is not None:
+            belief.forearm[:3, :3], belief.orientation_info[:] = orientation.rotation, orientation.information
+            belief.on_forearm[0] = orientation.axes is not None
+            belief.axes[:] = 0.0 if orientation.axes is None else orientation.axes
         belief.place_w2[0] = 0.0
         if at.place is not None:
             belief.place[:], belief.place_w2[0] = at.place, _STANDS_M**-2.0
@@ -198,7 +198,7 @@ class EpochSteps:
         self._state[:] = state
 
     def enough(self, at: Epoch) -> bool:
-        """Tell whether the markers fix a hand: not in one line, or across `facing`.
+        """Tell whether the markers fix a hand: not in one line, or across `back_normal`.
 
         What faces the cameras turns the hand about a line of markers, but not about one that points at them. With an
         orientation that is known any one marker is enough.
@@ -206,7 +206,7 @@ class EpochSteps:
         if at.place is not None:
             return True
         points = at.points_m[self.on_hand][self.triangulated]
-        if at.turn is not None and at.turn.sure:
+        if at.orientation is not None and at.orientation.sure:
             return len(points) > 0
         if len(points) < 2:
             return False
@@ -220,7 +220,7 @@ class EpochSteps:
         if len(points) > 2 and extent[1] > _SPREAD_M:
             return True
         back = self.at.ground.back[0]
-        return bool(back and extent[0] > _LENGTH_M and abs(axes[0] @ at.facing) < _ACROSS)
+        return bool(back and extent[0] > _LENGTH_M and abs(axes[0] @ at.back_normal) < _ACROSS)
 
     def unexplained(self) -> bool:
         """Tell whether a marker is too far from what was found."""

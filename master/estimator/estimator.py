@@ -100,7 +100,7 @@ class Estimator:
         self._now.z[HEADING] = heading_rad
         self._now.z_cov[HEADING] = self._now.z_cov[:, HEADING] = 0.0
         self._now.z_cov[HEADING, HEADING] = variance_rad2
-        self._now.turn_known[0] = False
+        self._now.measured_rotation_known[0] = False
 
     def pose(self, T: Float, angles_rad: Float) -> tuple[HandJoints, Float]:
         """Place joints and markers (M, 3) [m], rig frame.
@@ -115,21 +115,21 @@ class Estimator:
         steps.observe(at, continuous=self._continuous)
         if self.wrist:
             steps.prepare()
-        sure = at.turn is not None and at.turn.sure
+        sure = at.orientation is not None and at.orientation.sure
         palm_shown = bool(ground.by_markers[0]) or (sure and ground.seen[0] > 0) or at.place is not None
         task.palm_shown[0] = palm_shown
         known = self.has_previous(at.t_ns)
         steps.believe(at, known=known)
-        doubtful = self.wrist and at.turn is not None and bool(ground.by_markers[0])
+        doubtful = self.wrist and at.orientation is not None and bool(ground.by_markers[0])
         before, rejected = steps.kept() if doubtful else None, False
         out, reinitialised = self._solve(at, known=known)
         if out is not None and before is not None and self._at.found.contrary[0] > self.settings.contrary:
             # What the IMU says is left out: it began anew, or the wrist was flicked. But not where it alone tells.
-            for turn in (None, at.turn):
+            for orientation in (None, at.orientation):
                 steps.put_back(before)
-                steps.believe(replace(at, turn=turn), known=known)
-                out, reinitialised = self._solve(replace(at, turn=turn), known=known)
-                rejected = turn is None
+                steps.believe(replace(at, orientation=orientation), known=known)
+                out, reinitialised = self._solve(replace(at, orientation=orientation), known=known)
+                rejected = orientation is None
                 if rejected and np.trace(self._at.found.cov[:3, :3]) < _SURE_RAD2:
                     break
         told = self.wrist and bool(task.level.any())

@@ -175,7 +175,7 @@ def keep_extras(
     first = cov.shape[0] - K
     for i in range(K):
         # What the palm tells and what fingers tell are two blocks: within one, as much is new of everything.
-        errs_s = settings.turn_errs_s if BEND <= i < LIGHT else settings.errs_s
+        errs_s = settings.wrist_errs_s if BEND <= i < LIGHT else settings.errs_s
         new[i] = 1.0 - exp(-min(dt_s, 10.0) / errs_s)
         for j in range(K):
             A[i, j] = cov[first + i, first + j] / scale

@@ -258,14 +258,14 @@ def cut(device: Any, f: int, work: Surface) -> float:
             by = S[k - 1, 1] + share * (S[k, 1] - S[k - 1, 1]) - laser[1]
             bz = S[k - 1, 2] + share * (S[k, 2] - S[k - 1, 2]) - laser[2]
             across, ahead = a0 * bx + a1 * by + a2 * bz, c0 * bx + c1 * by + c2 * bz
-            turn, thick = atan2(across, ahead), max(r, device.radius[f, k - 1])
+            angle, thick = atan2(across, ahead), max(r, device.radius[f, k - 1])
             wide = 1.3 * thick / sqrt(across * across + ahead * ahead)
-            low, high = min(low, turn - wide), max(high, turn + wide)
+            low, high = min(low, angle - wide), max(high, angle + wide)
         if abs(height) < r:
             across, ahead = a0 * x + a1 * y + a2 * z, c0 * x + c1 * y + c2 * z
             wide = sqrt(r * r - height * height) / sqrt(across * across + ahead * ahead)
-            turn = atan2(across, ahead)
-            low, high = min(low, turn - 1.1 * wide), max(high, turn + 1.1 * wide)
+            angle = atan2(across, ahead)
+            low, high = min(low, angle - 1.1 * wide), max(high, angle + 1.1 * wide)
         near = height
     if not low < high:
         return 0.0
@@ -276,8 +276,8 @@ def cut(device: Any, f: int, work: Surface) -> float:
     step = (high - low) / (RAYS - 1)
     first = _ROOT - 1 if f == 0 else 0
     for ray in range(RAYS):
-        turn = low + ray * step
-        s, c = sin(turn), cos(turn)
+        angle = low + ray * step
+        s, c = sin(angle), cos(angle)
         dx, dy, dz = s * a0 + c * c0, s * a1 + c * c1, s * a2 + c * c2
         far, body = inf, -1
         for k in range(7):

@@ -20,9 +20,9 @@ from common.arrays import Float
 from common.calibration import ImuCalibration
 from common.geometry import Wxyz, matrix_of, matrix_to_quaternion, quaternion_product
 from common.wrist_bend import bend_quaternion
-from master.estimator.epoch import Turn
+from master.estimator.epoch import OrientationMeasurement
 from master.estimator.imu_samples import Between, OrientationSamples
-from master.estimator.palm_imu import SURE_RAD, turn_of
+from master.estimator.palm_imu import SURE_RAD, rotation_of
 from master.estimator.settings import DEFAULT
 from master.estimator.wrist_device import BEND, HEADING, TILT
 
@@ -42,7 +42,7 @@ class Forearm:
     """Push machine. Holds the samples of an IMU, and since when palms contradict it.
 
     Attributes:
-        lost: Whether the IMU began anew since `turn_at` was asked.
+        lost: Whether the IMU began anew since `orientation_at` was asked.
         counts: `orientation.used`, epochs that had a sample, `orientation.absent`, those farther than 50 ms from any;
             samples left out, as of `OrientationSamples`; `forearm.begun`, how often the heading began anew, and
             `forearm.outlier`, palms that contradicted it.
@@ -55,8 +55,10 @@ class Forearm:
             CalibrationError: The file does not say how it is mounted.
         """
         self.counts: Counter[str] = Counter() if counts is None else counts
-        self._imu, self._imu_forearm = imu, _wxyz(turn_of("q_palm_imu", imu.q_palm_imu).T)
-        self._rig_world = None if imu.q_rig_world is None else _wxyz(turn_of("q_rig_world", imu.q_rig_world))
+        self._imu, self._imu_forearm = imu, _wxyz(rotation_of("q_palm_imu", imu.q_palm_imu).T)
+        self._rig_world = (
+            None if imu.q_rig_world is None else _wxyz(rotation_of("q_rig_world", imu.q_rig_world))
+        )
         self._samples = OrientationSamples(self.counts, imu.heading_drift_rad_s, imu.stamp_offset_us)
         self._sample_ns, self._sample_drift_rad = 0, nan
         self._asked_ns: int | None = None
@@ -80,7 +82,7 @@ class Forearm:
             self.lost, self._drift_rad = True, heading_sigma_rad
         self._sample_ns, self._sample_drift_rad = t_ns, heading_sigma_rad
 
-    def turn_at(self, t_ns: int, z: Float, z_cov: Float) -> Turn | None:
+    def orientation_at(self, t_ns: int, z: Float, z_cov: Float) -> OrientationMeasurement | None:
         """How the forearm turns the palm at an epoch; None: no sample is near, or the rig does not place its world.
 
         Args:
@@ -91,14 +93,16 @@ class Forearm:
         if found is None or self._rig_world is None:
             return None
         process_noise = self._process_noise_rad2(t_ns, found)
-        tilted, turned = self._tilted(self._rig_world, z), 0.5 * float(z[HEADING])
-        heading = cos(turned), 0.0, 0.0, sin(turned)
+        tilted, half_heading = self._tilted(self._rig_world, z), 0.5 * float(z[HEADING])
+        heading = cos(half_heading), 0.0, 0.0, sin(half_heading)
         rotation = matrix_of(quaternion_product(quaternion_product(tilted, heading), self._forearm(found)))
         sigma = hypot(DEFAULT.strap_rad, DEFAULT.palm_process_noise_rad_s * found.away_s)
         axes = matrix_of(self._rig_world).T.copy()  # about x and y of the world the forearm tilts,
         axes[2] = matrix_of(tilted)[:, 2]  # about the vertical that is believed it turns
         wide = z_cov[HEADING, HEADING] + process_noise + np.trace(z_cov[BEND : BEND + 2, BEND : BEND + 2])
-        return Turn(rotation, _EYE / sigma**2, bool(wide < SURE_RAD**2), axes, process_noise)
+        return OrientationMeasurement(
+            rotation, _EYE / sigma**2, bool(wide < SURE_RAD**2), axes, process_noise
+        )
 
     def heading_of(self, t_ns: int, R_rig_palm: Float, z: Float) -> float | None:
         """The heading that comes nearest to a palm (3, 3) [rad]; None: no sample is near."""
@@ -107,8 +111,8 @@ class Forearm:
             return None
         flexion, deviation = z[BEND : BEND + 2].tolist()
         palm = matrix_of(quaternion_product(self._forearm(found), bend_quaternion(flexion, deviation)))
-        turn = matrix_of(self._tilted(self._rig_world, z)).T @ R_rig_palm @ palm.T
-        return atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+        rotation = matrix_of(self._tilted(self._rig_world, z)).T @ R_rig_palm @ palm.T
+        return atan2(rotation[1, 0] - rotation[0, 1], rotation[0, 0] + rotation[1, 1])
 
     def contradicted(self, t_ns: int, *, by_palm: bool) -> bool:
         """Note whether the palm contradicts at an epoch; return whether it did so for long, and is right."""
@@ -134,15 +138,15 @@ class Forearm:
         found = self._between(t_ns)
         if found is None:
             return NO_WORLD
-        turned = DEFAULT.palm_process_noise_rad_s * found.away_s
+        half_heading = DEFAULT.palm_process_noise_rad_s * found.away_s
         forearm, (flexion, deviation) = self._forearm(found), bend_rad.tolist()
         (ff, fd), (_, dd) = bend_cov.tolist()
         c, s = cos(deviation), sin(deviation)
         # Along each axis of the world: what a flexion, about the forearm's x as it deviates, and a deviation leave.
         about = [(c * x - s * z, y) for x, y, z in matrix_of(forearm).tolist()]
         x, y, z = (u * u * ff + 2.0 * u * v * fd + v * v * dd for u, v in about)
-        tilt = hypot(self._imu.orientation_sigma_rad, turned, sqrt(0.5 * (x + y)))
-        heading = hypot(self._imu.heading_sigma_rad or 0.0, found.drift_rad, turned, sqrt(z))
+        tilt = hypot(self._imu.orientation_sigma_rad, half_heading, sqrt(0.5 * (x + y)))
+        heading = hypot(self._imu.heading_sigma_rad or 0.0, found.drift_rad, half_heading, sqrt(z))
         palm = np.array(quaternion_product(forearm, bend_quaternion(flexion, deviation)))
         return -palm if palm[0] < 0.0 else palm, np.array([tilt, min(heading, ANYWHERE_RAD)])
 

@@ -15,7 +15,7 @@ from common.arrays import Bool, Code, Float
 from common.hand_model import FINGERS
 from common.messages import Detections, HandPose, WristDetections
 from master.estimator.cycle_reader import CycleReader
-from master.estimator.epoch import Fitted, Turn, WristRows
+from master.estimator.epoch import Fitted, OrientationMeasurement, WristRows
 from master.estimator.estimator import Estimator
 from master.estimator.forearm import LOST_RAD, Forearm
 from master.estimator.observation_sources import ON_MARKERS
@@ -84,18 +84,18 @@ class WristSide:
         self.laser_ns = message.t_ns + late_ns
         return rows
 
-    def turn_at(self, t_ns: int, estimator: Estimator) -> Turn | None:
+    def orientation_at(self, t_ns: int, estimator: Estimator) -> OrientationMeasurement | None:
         """How the IMU has the palm turned at an epoch; None: it does not say, or its heading may be any."""
         if self.forearm is None:
             return None
         if self.forearm.lost:
             self.forearm.lost = False
             estimator.forget_heading()
-        turn = self.forearm.turn_at(t_ns, estimator.extras, estimator.extras_cov)
+        orientation = self.forearm.orientation_at(t_ns, estimator.extras, estimator.extras_cov)
         unknown = estimator.extras_cov[HEADING, HEADING] > LOST_RAD**2
-        return None if unknown else turn
+        return None if unknown else orientation
 
-    def solved(self, t_ns: int, hand: Fitted, estimator: Estimator, *, turned: bool) -> None:
+    def solved(self, t_ns: int, hand: Fitted, estimator: Estimator, *, oriented: bool) -> None:
         """Learn from an epoch that was solved.
 
         Args:
@@ -111,10 +111,10 @@ class WristSide:
         self._count("ambiguous", hand.ambiguous)
         if self.forearm is None or hand.solution is None or not hand.sources[5] & ON_MARKERS:
             return
-        if turned and self.forearm.contradicted(t_ns, by_palm=hand.rotation_rejected):
+        if oriented and self.forearm.contradicted(t_ns, by_palm=hand.rotation_rejected):
             estimator.forget_heading()
-            turned = False
-        if turned:
+            oriented = False
+        if oriented:
             return
         heading = self.forearm.heading_of(t_ns, hand.solution.T_rig_palm[:3, :3], estimator.extras)
         if heading is not None:

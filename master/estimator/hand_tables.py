@@ -18,7 +18,7 @@ class HandTables:
 
     Attributes:
         swing: (3, 5, 4, 3, 3) as `HandModel.swing`.
-        tip_turn: (5, 3, 3) rest rotation of the tip in the frame of the joint before it.
+        tip_rotation: (5, 3, 3) rest rotation of the tip in the frame of the joint before it.
         root_m: (5, 3) first joint of each chain, palm frame [m].
         bone_m: (5, 3, 3) bones in the frames of their joints [m].
         abduction_axis: (5, 3) palm frame.
@@ -43,7 +43,7 @@ class HandTables:
     """
 
     swing: Float
-    tip_turn: Float
+    tip_rotation: Float
     root_m: Float
     bone_m: Float
     abduction_axis: Float
@@ -68,7 +68,7 @@ class HandTables:
     twist: Float
     twist_axis: Float
     untwisted: Float
-    turned: Float
+    product: Float
 
     @classmethod
     def of(cls, model: HandModel, parameters: HandParameters) -> "HandTables":
@@ -91,7 +91,7 @@ class HandTables:
         first_bone = np.einsum("fij,fj->fi", model.swing[:2, :, 1].sum(axis=0), model.bone_m[:, 0])
         tables: dict[str, Float | Int | Bool] = {
             "swing": model.swing,
-            "tip_turn": model.turn[:, 2],
+            "tip_rotation": model.link_rotation[:, 2],
             "root_m": model.rest_position_m[CHAINS[:, 0]],
             "bone_m": model.bone_m,
             "abduction_axis": axis,
@@ -117,7 +117,7 @@ class HandTables:
             "twist": np.zeros(5),
             "twist_axis": first_bone / np.linalg.norm(first_bone, axis=1, keepdims=True),
             "untwisted": model.swing[:, :, 0],
-            "turned": np.zeros((3, 3)),
+            "product": np.zeros((3, 3)),
         }
         return filled(cls, tables)
 

@@ -20,7 +20,7 @@ from common.hand_model import HandModel
 from common.kernels import bound
 from common.messages import HandPose, MarkerDetections, restamped
 from master.estimator.cameras import CameraArrays
-from master.estimator.epoch import Epoch, Fitted, Turn, WristRows
+from master.estimator.epoch import Epoch, Fitted, OrientationMeasurement, WristRows
 from master.estimator.estimator import Estimator
 from master.estimator.gate import Prior, among, associate
 from master.estimator.hand_tables import Mounts
@@ -47,11 +47,11 @@ class WristSideOf(Protocol):
         """The rows of a triple that no epoch had; None: there is none."""
         ...
 
-    def turn_at(self, t_ns: int, estimator: Estimator) -> Turn | None:
+    def orientation_at(self, t_ns: int, estimator: Estimator) -> OrientationMeasurement | None:
         """How the IMU has the palm turned; None: it does not say."""
         ...
 
-    def solved(self, t_ns: int, hand: Fitted, estimator: Estimator, *, turned: bool) -> None:
+    def solved(self, t_ns: int, hand: Fitted, estimator: Estimator, *, oriented: bool) -> None:
         """Learn from an epoch that was solved."""
         ...
 
@@ -227,32 +227,32 @@ class MarkerPipeline:
             if isinstance(found, RayPositions):
                 uv, variance, own = found.uv, found.variance_px2, found.own_m2
             others = self._side is not None or self._orientation is not None
-            turn = self._turned(frames.t_ns, line) if others else None
+            orientation = self._measured_orientation(frames.t_ns, line) if others else None
             hand = estimator.push(
                 Epoch(
                     frames.t_ns,
                     found.points_m,
-                    line.facing,
+                    line.back_normal,
                     uv=uv,
                     variance_px2=variance,
                     own_m2=own,
-                    turn=turn,
+                    orientation=orientation,
                     wrist=None if self._side is None else self._side.rows_at(frames.t_ns),
                     start=line.solution if line.solved else None,
                 )
             )
             self._last = hand
             if self._side is not None:
-                self._side.solved(frames.t_ns, hand, estimator, turned=turn is not None)
+                self._side.solved(frames.t_ns, hand, estimator, oriented=orientation is not None)
             if self._smooth is not None:
                 on_hand = self._on_hand
                 hand = self._smooth.push(frames.t_ns, hand, found.noise_m2[on_hand], found.points_m[on_hand])
             return hand
 
-    def _turned(self, t_ns: int, line: HandEstimate) -> Turn | None:
+    def _measured_orientation(self, t_ns: int, line: HandEstimate) -> OrientationMeasurement | None:
         """How an IMU on the palm, or on the forearm, has the palm turned at an epoch."""
         if self._side is not None and self._estimator is not None:
-            return self._side.turn_at(t_ns, self._estimator)
+            return self._side.orientation_at(t_ns, self._estimator)
         if self._orientation is None:
             return None
         return self._orientation.at(t_ns, self._recent(t_ns) or line.solution)

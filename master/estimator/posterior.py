@@ -27,7 +27,7 @@ from math import exp, log
 from common.arrays import Float
 from common.kernels import constant, inlined, inner
 from master.estimator.hypotheses import Blank, Hypothesis, Posterior, Room, likelier
-from master.estimator.kinematics import markers_of, rotate_by, turn_between
+from master.estimator.kinematics import markers_of, rotate_by, rotation_between
 from master.estimator.matrices import cholesky, copy, half_log_determinant, inverse, substitute
 from master.estimator.priors import Habits
 from master.estimator.problem import Belief, Rig
@@ -191,7 +191,7 @@ def _mix(
         if share == 0.0:
             continue
         if h != best:
-            turn_between(one.palm, from_here.palm, room.search.J, one.off)
+            rotation_between(one.palm, from_here.palm, room.search.J, one.off)
             for i in range(3):
                 one.off[3 + i] = one.palm[i, 3] - from_here.palm[i, 3]
             for i in range(n):

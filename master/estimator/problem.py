@@ -29,9 +29,9 @@ class Belief:
         palm: (4, 4) the palm by the state before.
         palm_w2: (6,) inverse variances of turn [rad] and shift [m] from there; 0: nothing is believed.
         sight: (3,) unit vector along which depth is held, and `depth_w2` (1,) how firmly [1/m^2].
-        facing: (3,) unit vector along which the back looks, and `facing_w2` (1,).
+        facing: (3,) unit vector along which the back looks, and `back_normal_w2` (1,).
         z, z_info: (K,), (K, K) mean and information of the extra unknowns (`master.estimator.wrist_device`).
-        turn_info: (3, 3) [1/rad^2] information about the palm's turn by other sensors, rig axes; `turned` (1,) whether
+        orientation_info: (3, 3) [1/rad^2] information of the measured orientation, rig axes; `oriented` (1,) whether
             there is any.
         forearm: (4, 4) the palm by these in its first rows and columns; where `on_forearm` (1,) that of a straight
             wrist, and `axes` (3, 3) about which tilt and heading turn it, as rows, rig axes.
@@ -47,12 +47,12 @@ class Belief:
     palm_w2: Float
     line_of_sight: Float
     depth_w2: Float
-    facing: Float
-    facing_w2: Float
+    back_normal: Float
+    back_normal_w2: Float
     z: Float
     z_info: Float
-    turn_info: Float
-    turned: Float
+    orientation_info: Float
+    oriented: Float
     forearm: Float
     on_forearm: Float
     axes: Float
@@ -73,12 +73,12 @@ class Belief:
             palm_w2=6,
             line_of_sight=3,
             depth_w2=1,
-            facing=3,
-            facing_w2=1,
+            back_normal=3,
+            back_normal_w2=1,
             z=extras,
             z_info=(extras, extras),
-            turn_info=(3, 3),
-            turned=1,
+            orientation_info=(3, 3),
+            oriented=1,
             forearm=(4, 4),
             on_forearm=1,
             axes=(3, 3),
@@ -104,9 +104,9 @@ class Search:
     z: Float  # (K,)
     q: Float  # (3,)
     J: Float  # (3, 3)
-    turned: Float  # (4, 4)
+    palm_straight: Float  # (4, 4)
     slope: Float  # (5, 3)
-    by_turn: Float  # (8, 3)
+    by_rotation: Float  # (8, 3)
     palm_camera: Float  # (4, 4)
     bend_axes: Float  # (2, 3)
     twist: Float  # (5,)
@@ -141,9 +141,9 @@ class Search:
             z=extras,
             q=3,
             J=(3, 3),
-            turned=(4, 4),
+            palm_straight=(4, 4),
             slope=(5, 3),
-            by_turn=(8, 3),
+            by_rotation=(8, 3),
             palm_camera=(4, 4),
             bend_axes=(2, 3),
             twist=5,

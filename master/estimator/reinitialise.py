@@ -104,10 +104,10 @@ class Reinitialiser:
 
     def _starts(self, epoch: Epoch) -> list[tuple[Float, Float]]:
         """Three hands, open to closed, each laid on the markers as a rigid body; one where the palm is known."""
-        steps, turned = self._steps, self._turned(epoch)
-        if epoch.place is not None and turned is not None:
+        steps, measured = self._steps, self._measured_rotation(epoch)
+        if epoch.place is not None and measured is not None:
             T = np.eye(4)
-            T[:3, :3], T[:3, 3] = turned, epoch.place
+            T[:3, :3], T[:3, 3] = measured, epoch.place
             return [(T, self._as_told(self._natural.copy()))]
         triangulated = steps.triangulated
         weight = np.where(steps.finger[triangulated] >= 0, 1.0, _PALM_WEIGHT)
@@ -116,14 +116,14 @@ class Reinitialiser:
         for posture in self._postures:
             x = self._as_told(posture.copy())
             expected = steps.pose(_AT_ORIGIN, self._parameters.angles(x))[1][triangulated]
-            if turned is not None and epoch.turn is not None and epoch.turn.sure:
+            if measured is not None and epoch.orientation is not None and epoch.orientation.sure:
                 T = np.eye(4)
-                T[:3, :3] = turned
-                T[:3, 3] = np.average(observed - expected @ turned.T, axis=0, weights=weight)
-            elif steps.at.belief.facing_w2[0] > 0.0:
+                T[:3, :3] = measured
+                T[:3, 3] = np.average(observed - expected @ measured.T, axis=0, weights=weight)
+            elif steps.at.belief.back_normal_w2[0] > 0.0:
                 # A point above the wrist stands for "the back of the hand faces the cameras".
                 above = expected.mean(axis=0) + np.array([0.0, _ABOVE_M, 0.0])
-                towards = observed.mean(axis=0) + _ABOVE_M * epoch.facing
+                towards = observed.mean(axis=0) + _ABOVE_M * epoch.back_normal
                 T = fit_rigid(
                     np.vstack([observed, towards]),
                     np.vstack([expected, above]),
@@ -134,11 +134,11 @@ class Reinitialiser:
             starts.append((np.ascontiguousarray(T), x))
         return starts
 
-    def _turned(self, at: Epoch) -> Float | None:
+    def _measured_rotation(self, at: Epoch) -> Float | None:
         """How the palm is turned by other sensors (3, 3), with the bend that is believed; None: they do not say."""
-        if at.turn is None or at.turn.axes is None:
-            return None if at.turn is None else at.turn.rotation
-        return at.turn.rotation @ forearm_palm(self._steps.now.z[BEND : BEND + 2])
+        if at.orientation is None or at.orientation.axes is None:
+            return None if at.orientation is None else at.orientation.rotation
+        return at.orientation.rotation @ forearm_palm(self._steps.now.z[BEND : BEND + 2])
 
     def _as_told(self, x: Float) -> Float:
         """Free angles (n,) with those of fingers whose valley was searched."""

@@ -72,7 +72,7 @@ class Settings(NamedTuple):
         float, Range("rad", 0.1, 3.0, "a finger bent by less in all its joints shows its end from behind")
     ] = radians(45.0)
     # What is wrong with markers, bones and caps.
-    facing_rad: Annotated[
+    back_normal_rad: Annotated[
         float, Range("rad", 0.05, 1.5, "a marker on the back that is seen well faces the cameras")
     ] = radians(22.0)
     bones_m: Annotated[float, Range("m", 1e-4, 1e-2, "bones and caps are known to about 1 mm")] = 1.0e-3
@@ -101,7 +101,7 @@ class Settings(NamedTuple):
     alike: Annotated[float, Range("1", 0.0, 0.99, _COORDINATION)] = 0.7
     held_rad: Annotated[float, Range("rad", 0.001, 0.5, "a finger that was just lost")] = radians(3.0)
     # A palm without markers.
-    lost_turn_rad_s: Annotated[float, Range("rad/s", 0.01, 5.0, _HANDS)] = radians(20.0)
+    lost_rotation_rad_s: Annotated[float, Range("rad/s", 0.01, 5.0, _HANDS)] = radians(20.0)
     lost_shift_m_s: Annotated[float, Range("m/s", 0.001, 1.0, _HANDS)] = 0.02
     lost_goes_on: Annotated[float, Range("1", 0.0, 2.0, "share of its speed, along each axis")] = 0.35
     speed_memory_s: Annotated[
@@ -133,7 +133,9 @@ class Settings(NamedTuple):
     straight_rad: Annotated[
         float, Range("rad", 0.0, 1.0, "a turn by less is 0.2 mm off the tangent at the far end of a hand")
     ] = radians(3.0)
-    turns_most_rad: Annotated[float, Range("rad", 0.1, 3.0, "a turn less sure leads nowhere farther")] = 1.0
+    rotation_most_rad: Annotated[float, Range("rad", 0.1, 3.0, "a turn less sure leads nowhere farther")] = (
+        1.0
+    )
     # Gates.
     explained: Annotated[float, Range("chi square", 5.0, 50.0, _CHI + " of three numbers, 1 in 1000")] = 16.3
     misled: Annotated[
@@ -242,7 +244,7 @@ class Settings(NamedTuple):
     habit_s: Annotated[float, Range("s", 1.0, 600.0, "as long as a posture of the wrist is kept")] = 20.0
     tilt_s: Annotated[float, Range("s", 0.1, 600.0, "as long as an IMU has the vertical off")] = 5.0
     errs_s: Annotated[float, Range("s", 0.01, 60.0, "as long as errors of shape and skin stay")] = 0.5
-    turn_errs_s: Annotated[
+    wrist_errs_s: Annotated[
         float,
         Range(
             "s", 0.001, 60.0, "as long as errors of a palm by markers stay, of what a wrist moves meanwhile"

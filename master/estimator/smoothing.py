@@ -12,7 +12,7 @@ from common.records import record
 from master.estimator.blend import PARTS
 from master.estimator.certainty import is_small
 from master.estimator.hand_tables import HandTables
-from master.estimator.kinematics import Scratch, chains, clamp, joints, rotate_by, turn_between
+from master.estimator.kinematics import Scratch, chains, clamp, joints, rotate_by, rotation_between
 from master.estimator.matrices import copy
 from master.estimator.settings import Settings
 from master.estimator.state import NEVER_NS, PALM_PART
@@ -133,13 +133,13 @@ class Smoothing:
 def _write_signals(state: Smoothing, solved: Pose) -> None:
     """Write the signals of a solved hand."""
     T, angles = solved.palm, solved.angles
-    turn = state.work.g
-    turn_between(T, state.palm, state.work.K, turn)
+    rotation = state.work.g
+    rotation_between(T, state.palm, state.work.K, rotation)
     for i in range(3):
         state.signals[i] = T[i, 3]
         for j in range(3):
             state.signals[i] += T[i, j] * state.knuckle[j]
-        state.signals[3 + i] = state.values[3 + i] + state.across[0] * turn[i]
+        state.signals[3 + i] = state.values[3 + i] + state.across[0] * rotation[i]
     for f in range(5):
         for k in range(4):
             follows = state.dip_per_pip[0] * angles[f, 2] if f > 0 and k == 3 else 0.0
@@ -175,7 +175,7 @@ def _write_largest(state: Smoothing, sources: Int, cov: Float) -> None:
 
     A finger rests on its own and the palm's; NaN: on none.
     """
-    count, turn, place = 0, 0.0, state.work.g
+    count, rotation, place = 0, 0.0, state.work.g
     for i in range(3):
         place[i] = 0.0
     for m in range(cov.shape[0]):
@@ -185,17 +185,17 @@ def _write_largest(state: Smoothing, sources: Int, cov: Float) -> None:
                 place[i] += cov[m, i, i]
     for i in range(3):
         place[i] /= max(count, 1)
-        turn += place[i] / 3.0
+        rotation += place[i] / 3.0
     for i in range(26):
         p = state.part[i]
         state.largest[i] = nan
         if count == 0 or sources[p] == 0:
             continue
         if p == PALM_PART:
-            state.largest[i] = place[i] if i < 3 else turn
+            state.largest[i] = place[i] if i < 3 else rotation
         elif state.marker_of[p] >= 0:
             m = state.marker_of[p]
-            state.largest[i] = (cov[m, 0, 0] + cov[m, 1, 1] + cov[m, 2, 2]) / 3.0 + turn
+            state.largest[i] = (cov[m, 0, 0] + cov[m, 1, 1] + cov[m, 2, 2]) / 3.0 + rotation
 
 
 @inner
@@ -220,10 +220,10 @@ def _filter(state: Smoothing, t_ns: int, sources: Int, marker_cov: Float) -> Non
 @inner
 def _write_pose(hand: HandTables, state: Smoothing, shown: Pose) -> None:
     """Write palm, angles and joints of the filtered signals."""
-    T, turn, angles, work = state.work.palm, state.work.g, state.work.angles, state.work
+    T, rotation, angles, work = state.work.palm, state.work.g, state.work.angles, state.work
     for i in range(3):
-        turn[i] = (state.filtered[3 + i] - state.values[3 + i]) / state.across[0]
-    rotate_by(turn, state.palm, T)
+        rotation[i] = (state.filtered[3 + i] - state.values[3 + i]) / state.across[0]
+    rotate_by(rotation, state.palm, T)
     for i in range(3):
         T[i, 3] = state.filtered[i]
         for j in range(3):

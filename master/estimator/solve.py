@@ -29,7 +29,7 @@ from master.estimator.priors import Habits
 from master.estimator.problem import Belief, Rig, Search
 from master.estimator.residuals import Observations, marker_rows
 from master.estimator.wrist_device import BEND, EXTRAS, bent_palm
-from master.estimator.wrist_rows import finger_rows, turn_row
+from master.estimator.wrist_rows import finger_rows, orientation_row
 
 MAX_ITERATIONS = 25
 _ROLLED_RAD = 0.25  # no hinges are askew by more
@@ -41,10 +41,10 @@ def palm_off(T: Float, palm: Float, out: Float) -> None:
     """Write turn, as sine times axis, and shift from a palm (4, 4) to T: (6,)."""
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
-        turned = 0.0
+        skew_sum = 0.0
         for c in range(3):
-            turned += T[k, c] * palm[j, c] - T[j, c] * palm[k, c]
-        out[i] = 0.5 * turned
+            skew_sum += T[k, c] * palm[j, c] - T[j, c] * palm[k, c]
+        out[i] = 0.5 * skew_sum
         out[3 + i] = T[i, 3] - palm[i, 3]
 
 
@@ -144,14 +144,14 @@ def _beyond(hand: HandTables, x: Float, gradient: Float, normal: Float) -> float
 
 @inlined
 def _faced(belief: Belief, T: Float, gradient: Float, normal: Float) -> float:
-    """Add that the back (the palm's +y) looks along `facing`; return its cost."""
-    w2 = belief.facing_w2[0]
+    """Add that the back (the palm's +y) looks along `back_normal`; return its cost."""
+    w2 = belief.back_normal_w2[0]
     cost = 0.0
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
-        off = T[i, 1] - belief.facing[i]
+        off = T[i, 1] - belief.back_normal[i]
         cost += 0.5 * w2 * off * off
-        off_j, off_k = T[j, 1] - belief.facing[j], T[k, 1] - belief.facing[k]
+        off_j, off_k = T[j, 1] - belief.back_normal[j], T[k, 1] - belief.back_normal[k]
         gradient[i] += w2 * (T[j, 1] * off_k - T[k, 1] * off_j)
         normal[i, i] += w2 * (T[j, 1] * T[j, 1] + T[k, 1] * T[k, 1])
         normal[i, j] -= w2 * T[i, 1] * T[j, 1]
@@ -188,10 +188,10 @@ def linearise(
     work = search.rows
     cost = _believed(habits, belief, h, T, x, z, gradient, normal, search)
     cost += _beyond(rig.hand, x, gradient, normal)
-    if belief.facing_w2[0] > 0.0:
+    if belief.back_normal_w2[0] > 0.0:
         cost += _faced(belief, T, gradient, normal)
-    if belief.turned[0] > 0.0:
-        cost += turn_row(belief, T, z, x.shape[0], gradient, normal, search)
+    if belief.oriented[0] > 0.0:
+        cost += orientation_row(belief, T, z, x.shape[0], gradient, normal, search)
     hand, mounts = rig.hand, rig.mounts
     angles_of(hand, x, work.angles, work.by)
     if z.shape[0] == EXTRAS:

@@ -56,7 +56,7 @@ class HandState:
         hidden_ns: (5,) when each finger that was hidden at the last epoch was seen last; NEVER_NS: it was seen there.
         then, then_rates: (5, 20) the angles and rates of the whole hand at that time.
         then_alike: (5,) how neighbours correlated then.
-        turn: (3, 3) how other sensors had the palm turned, and `turn_known` (1,) whether they said so.
+        turn: (3, 3) how other sensors had the palm turned, and `measured_rotation_known` (1,) whether they said so.
     """
 
     t_ns: Int
@@ -85,8 +85,8 @@ class HandState:
     then: Float
     then_rates: Float
     then_alike: Float
-    turn: Float
-    turn_known: Bool
+    measured_rotation: Float
+    measured_rotation_known: Bool
 
     @classmethod
     def unknown(cls, n: int, extras: int) -> "HandState":
@@ -120,8 +120,8 @@ class HandState:
             then=(5, 20),
             then_rates=(5, 20),
             then_alike=5,
-            turn=(3, 3),
-            turn_known=("u1", 1),
+            measured_rotation=(3, 3),
+            measured_rotation_known=("u1", 1),
         )
         for never in (
             state.t_ns,
@@ -262,9 +262,9 @@ def predict(
             held = 0.0 if shown[f] else 1.0 / hidden.sigma[4 * f + c - hand.first[f]] ** 2
             belief.past_w2[c] = process_noise + held
             belief.past[c] = (process_noise * state.x[c] + held * hidden.x[c]) / (process_noise + held)
-    turns_rad_s = settings.palm_process_noise_rad_s if shown[0] else settings.palm_held_rad_s
+    rotation_rad_s = settings.palm_process_noise_rad_s if shown[0] else settings.palm_held_rad_s
     for i in range(3):
-        belief.palm_w2[i] = 1.0 / (turns_rad_s * age_s) ** 2
+        belief.palm_w2[i] = 1.0 / (rotation_rad_s * age_s) ** 2
         belief.palm_w2[3 + i] = 1.0 / (settings.palm_process_noise_m_s * age_s) ** 2
     copy(state.palm, belief.palm)
 
@@ -286,7 +286,7 @@ def grow(
     - a palm without markers: by a turn and a shift that grow with the time it is lost, the shift with its speed, too.
     """
     elapsed_noise_s = max(dt_s, settings.shortest_s)
-    turn2, shift2 = (
+    rotation2, shift2 = (
         (settings.palm_process_noise_rad_s * elapsed_noise_s) ** 2,
         (settings.palm_process_noise_m_s * elapsed_noise_s) ** 2,
     )
@@ -304,10 +304,10 @@ def grow(
         before = state.lost_s[0]
         state.lost_s[0] = before + dt_s
         longer = state.lost_s[0] ** 2 - before**2
-        turn2 = settings.lost_turn_rad_s**2 * longer
+        rotation2 = settings.lost_rotation_rad_s**2 * longer
         shift2 = (settings.lost_shift_m_s + settings.lost_goes_on * state.speed[0]) ** 2 * longer
     for i in range(3):
-        state.cov[i, i] += turn2
+        state.cov[i, i] += rotation2
         state.cov[3 + i, 3 + i] += shift2
     for f in range(5):
         gone_s = hidden.gone_s[f]

@@ -185,7 +185,7 @@ def predict_epoch(model: Model, boxed_state: Any, observed: Observations, boxed_
         if chi_square(rig, observed, state.palm, state.x, process_noise_m, room.search) > limit:
             return -1.0
     predict(rig.hand, settings, state, t_ns, space.ground.shown, space.hidden, belief)
-    _turn_on(state, belief, room.search)
+    _rotate_on(state, belief, room.search)
     task.natural[0], task.counts[0] = state.natural[0], exp(-dt_s / settings.habit_memory_s)
     copy(belief.palm, room.start_T)
     for c in range(state.x.shape[0]):
@@ -195,19 +195,19 @@ def predict_epoch(model: Model, boxed_state: Any, observed: Observations, boxed_
 
 
 @inner
-def _turn_on(state: HandState, belief: Belief, search: Search) -> None:
+def _rotate_on(state: HandState, belief: Belief, search: Search) -> None:
     """Write the palm of the state, turned on as other sensors say, to `belief.palm`."""
     by = search.J
     for i in range(3):
         for j in range(3):
             by[i, j] = 1.0 if i == j else 0.0
-    if belief.turned[0] > 0.0 and state.turn_known[0] > 0:
+    if belief.oriented[0] > 0.0 and state.measured_rotation_known[0] > 0:
         sensed_palm(belief, state.z, search)
         for i in range(3):
             for j in range(3):
                 by[i, j] = 0.0
                 for k in range(3):
-                    by[i, j] += search.palm[i, k] * state.turn[j, k]
+                    by[i, j] += search.palm[i, k] * state.measured_rotation[j, k]
     for i in range(3):
         for j in range(3):
             belief.palm[i, j] = 0.0
@@ -273,7 +273,7 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
         extras_alone(belief, found, search)
     if belief.lines_of_sight.rows[0] > 0.0:
         take_scanned(rig, space.ground, space.scan, found, search.rows)
-    found.contrary[0] = contrary(belief, found.palm, found.z, search) if belief.turned[0] > 0.0 else 0.0
+    found.contrary[0] = contrary(belief, found.palm, found.z, search) if belief.oriented[0] > 0.0 else 0.0
     return chi_square(rig, observed, found.palm, found.x, 0.0, search)
 
 
@@ -363,12 +363,12 @@ def take_over_epoch(
     since_s = dt_s if goes_on else _LONG_S  # what begins owes nothing to an epoch before
     keep_extras(settings, state, since_s, space.belief, found.z, found.cov, found.scale[0], space.extras)
     # With tilt and heading as this epoch leaves them, so that what is learnt of these is no motion.
-    state.turn_known[0] = space.belief.turned[0] > 0.0
-    if state.turn_known[0] > 0:
+    state.measured_rotation_known[0] = space.belief.oriented[0] > 0.0
+    if state.measured_rotation_known[0] > 0:
         sensed_palm(space.belief, state.z, space.room.search)
         for i in range(3):
             for j in range(3):
-                state.turn[i, j] = space.room.search.palm[i, j]
+                state.measured_rotation[i, j] = space.room.search.palm[i, j]
     for f in range(5):
         pip = 6 + hand.first[f] + 2
         bend_open = state.cov[pip, pip] > settings.tracked_pip_rad**2

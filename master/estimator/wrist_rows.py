@@ -16,7 +16,7 @@ from math import sqrt, tan
 from common.arrays import Float
 from common.kernels import inlined, inner
 from master.estimator.finger_surface import MOVES, look
-from master.estimator.kinematics import turn_between
+from master.estimator.kinematics import rotation_between
 from master.estimator.problem import Belief, Rig, Search
 from master.estimator.wrist_device import BEND, LIGHT, TILT, bent_palm
 
@@ -24,21 +24,21 @@ _SMALL_RAD = 1e-4  # below it a rotation vector counts as so long in the derivat
 
 
 @inlined
-def turn_slope(turn: Float, J: Float) -> None:
+def rotation_vector_jacobian(rotation: Float, J: Float) -> None:
     """Write the derivative (3, 3) of a rotation vector (3,) by a small turn in front of it.
 
     The inverse of the left Jacobian of SO(3) (Sola, Deray, Atchuthan 2018, "A micro Lie theory", eq. 146).
     """
-    squared = turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2]
+    squared = rotation[0] * rotation[0] + rotation[1] * rotation[1] + rotation[2] * rotation[2]
     angle = max(sqrt(squared), _SMALL_RAD)
     factor = 1.0 / (angle * angle) - 0.5 / (angle * tan(0.5 * angle))
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         for c in range(3):
-            J[i, c] = factor * turn[i] * turn[c]
+            J[i, c] = factor * rotation[i] * rotation[c]
         J[i, i] += 1.0 - factor * squared
-        J[i, j] += 0.5 * turn[k]
-        J[i, k] -= 0.5 * turn[j]
+        J[i, j] += 0.5 * rotation[k]
+        J[i, k] -= 0.5 * rotation[j]
 
 
 @inner
@@ -48,7 +48,7 @@ def sensed_palm(belief: Belief, z: Float, search: Search) -> None:
     By an IMU on the forearm it is  exp(axes . (tilt, heading less the believed)) forearm R_y(deviation) R_x(flexion),
     and extras are tilt 2, heading, flexion, deviation; by one on the palm itself it is `forearm`, which none turns.
     """
-    R, slope, F = search.turned, search.slope, belief.forearm
+    R, slope, F = search.palm_straight, search.slope, belief.forearm
     if belief.on_forearm[0] == 0.0:
         for i in range(3):
             for j in range(3):
@@ -63,18 +63,18 @@ def sensed_palm(belief: Belief, z: Float, search: Search) -> None:
         search.off[i] = 0.0
         for a in range(3):
             search.off[i] += belief.axes[a, i] * (z[TILT + a] - belief.z[TILT + a])
-    turn_by(search.off, R, search.palm)
+    rotate_by_vector(search.off, R, search.palm)
 
 
 @inner
 def contrary(belief: Belief, T: Float, z: Float, search: Search) -> float:
     """Chi square of a palm against how other sensors have it turned, and of what the extras gave in to it."""
     sensed_palm(belief, z, search)
-    turn_between(T, search.palm, search.J, search.q)
+    rotation_between(T, search.palm, search.J, search.q)
     total, q = 0.0, search.q
     for i in range(3):
         for j in range(3):
-            total += q[i] * belief.turn_info[i, j] * q[j]
+            total += q[i] * belief.orientation_info[i, j] * q[j]
     for i in range(z.shape[0]):
         for j in range(z.shape[0]):
             total += (z[i] - belief.z[i]) * belief.z_info[i, j] * (z[j] - belief.z[j])
@@ -82,22 +82,22 @@ def contrary(belief: Belief, T: Float, z: Float, search: Search) -> float:
 
 
 @inner
-def turn_row(
+def orientation_row(
     belief: Belief, T: Float, z: Float, n: int, gradient: Float, normal: Float, search: Search
 ) -> float:
     """Add the TURN row; return its cost."""
     J, q, slope = search.J, search.q, search.slope
     K = 5 if belief.on_forearm[0] > 0.0 else 0
     sensed_palm(belief, z, search)
-    turn_between(T, search.palm, J, q)
-    turn_slope(q, J)
-    L, w = belief.turn_info, search.off
+    rotation_between(T, search.palm, J, q)
+    rotation_vector_jacobian(q, J)
+    L, w = belief.orientation_info, search.off
     cost = 0.0
     for i in range(3):
         w[i] = L[i, 0] * q[0] + L[i, 1] * q[1] + L[i, 2] * q[2]
         cost += 0.5 * w[i] * q[i]
     # Rows of the unknowns: the palm's turn in front of T by J, the sensed palm's by -J' (from behind).
-    D = search.by_turn
+    D = search.by_rotation
     for i in range(3):
         for c in range(3):
             D[i, c] = J[c, i]
@@ -124,9 +124,9 @@ def _column(n: int, a: int) -> int:
 
 
 @inlined
-def turn_by(turn: Float, R: Float, out: Float) -> None:
+def rotate_by_vector(rotation: Float, R: Float, out: Float) -> None:
     """Write R (3, 3) turned in front by a rotation vector (3,) that is small: to second order."""
-    x, y, z = turn[0], turn[1], turn[2]
+    x, y, z = rotation[0], rotation[1], rotation[2]
     for j in range(3):
         a, b, c = R[0, j], R[1, j], R[2, j]
         u, v, w = y * c - z * b, z * a - x * c, x * b - y * a

@@ -91,7 +91,7 @@ def seen_shift(caps: CapTables, row: int, ahead: Float, back: Float, out: Float)
 
 
 @kernel
-def tilted(row: int, R: Float, tilt_rad2: Float, turned_rad2: float, out: Float) -> None:
+def tilted(row: int, R: Float, tilt_rad2: Float, rotation_rad2: float, out: Float) -> None:
     """Write the direction of a cap, and six tilted as far as it is uncertain.
 
     The six are sigma points of two uncertain numbers: the mean square of what differs between them and the first is
@@ -102,10 +102,10 @@ def tilted(row: int, R: Float, tilt_rad2: Float, turned_rad2: float, out: Float)
         row: Which.
         R: (K, 3, 3) rotations of the tip joints, rig frame; -z is the finger's direction.
         tilt_rad2: (K, 3, 3) covariance of these directions; only that across them counts.
-        turned_rad2: Variance that their age adds.
+        rotation_rad2: Variance that their age adds.
         out: Written: (TILTED, 3) unit vectors.
     """
-    xx, xy, yy = turned_rad2, 0.0, turned_rad2
+    xx, xy, yy = rotation_rad2, 0.0, rotation_rad2
     for a in range(3):
         for b in range(3):
             xx += R[row, a, 0] * tilt_rad2[row, a, b] * R[row, b, 0]

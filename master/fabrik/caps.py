@@ -33,7 +33,7 @@ class CapSettings(NamedTuple):
         reach: Least hidden part by the largest of all cameras. What hides a part from one is near the line of sight of
             the others, and none of them can measure what is hidden from all: of 20 rendered caps the lesser hidden
             part by the larger is 0.16 in the mean, 0.28 rms.
-        turn_rad_s: [rad/s] standard deviation of how fast a finger end turns: a fist closes in a second.
+        rotation_rad_s: [rad/s] standard deviation of how fast a finger end turns: a fist closes in a second.
         radius_share: Relative error of a profile's radii: 0.8 mm.
         relief_m: [m] of a flat marker on a back that is not flat: 16 mm of paint on a radius of curvature of 50 mm
             bulge by 0.6 mm.
@@ -45,7 +45,7 @@ class CapSettings(NamedTuple):
     least_share: float = 0.8
     alike_share: float = 0.9
     reach: float = 0.2
-    turn_rad_s: float = 2.0
+    rotation_rad_s: float = 2.0
     radius_share: float = 0.1
     relief_m: float = 0.4e-3
     most_tilt: float = 2.0
@@ -97,8 +97,8 @@ class CapTables(NamedTuple):
         ahead, tilt = np.full((len(self.row), 3), np.nan), np.zeros((len(self.row), 3, 3))
         caps = self.row >= 0
         ahead[caps] = -hand.joints.rotation[self.joint, :, 2]
-        turned = (CAPS.turn_rad_s * age_s) ** 2 * np.eye(3)
-        tilt[caps] = hand.tilt_cov_rad2[self.finger] + turned
+        rotation_m2 = (CAPS.rotation_rad_s * age_s) ** 2 * np.eye(3)
+        tilt[caps] = hand.tilt_cov_rad2[self.finger] + rotation_m2
         return ahead, tilt
 
 
@@ -137,9 +137,9 @@ def _appearances(points: Float, normals: Float, areas: Float) -> Float:
     """
     angle = np.arange(_ANGLES + 1) * (np.pi / _ANGLES)
     eye = np.stack([np.sin(angle), np.zeros_like(angle), -np.cos(angle)], axis=1)
-    facing = np.maximum(eye @ normals.T, 0.0) * areas
-    shown = facing.sum(axis=1)
-    seen = facing @ points / np.maximum(shown, _LEAST_AREA_M2)[:, None]
+    visible_m2 = np.maximum(eye @ normals.T, 0.0) * areas
+    shown = visible_m2.sum(axis=1)
+    seen = visible_m2 @ points / np.maximum(shown, _LEAST_AREA_M2)[:, None]
     return np.stack([-seen[:, 2], seen[:, 0], shown], axis=1)
 
 

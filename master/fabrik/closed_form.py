@@ -26,8 +26,8 @@ from master.fabrik.chain_arrays import (
     BONE,
     REST,
     ROOT,
+    ROTATION,
     SIGN,
-    TURN,
     ChainArrays,
     clamp_angles,
     end_of,
@@ -82,7 +82,7 @@ def closed_form(
     Returns:
         Distance of the point to the target [m]; infinite: no such pose is legal.
     """
-    local = rotate_back(matrix_at(chain.links, ROOT, TURN), goal)
+    local = rotate_back(matrix_at(chain.links, ROOT, ROTATION), goal)
     distance2, branches = dot(local, local), len(edges) - 1
     penalties, trial = np.full(2, inf), np.empty(4)
     best, residual = inf, inf
@@ -109,13 +109,17 @@ def distance2_of(chain: ChainArrays, ratio: float, pip: float) -> tuple[float, f
     """Squared distance |w|^2 [m^2] at a PIP [rad], and its derivative [m^2/rad]."""
     led = ratio * pip
     dip = min(max(led, chain.spans[3, 0]), chain.spans[3, 1])
-    slope, turn = ratio if dip == led else 0.0, matrix_at(chain.links, DIP, TURN)
+    slope, link_rotation = ratio if dip == led else 0.0, matrix_at(chain.links, DIP, ROTATION)
     tip = _flexed(dip, vector_at(chain.links, DIP, BONE))
-    turning = rotate(turn, (0.0, slope * tip[2], -slope * tip[1]))
-    end = plus(rotate(turn, tip), vector_at(chain.links, PIP, BONE))
-    end, turning, turn = _flexed(pip, end), _flexed(pip, turning), matrix_at(chain.links, PIP, TURN)
-    w = plus(rotate(turn, end), vector_at(chain.links, ROOT, BONE))
-    return dot(w, w), 2.0 * dot(w, rotate(turn, plus(turning, (0.0, end[2], -end[1]))))
+    rotating = rotate(link_rotation, (0.0, slope * tip[2], -slope * tip[1]))
+    end = plus(rotate(link_rotation, tip), vector_at(chain.links, PIP, BONE))
+    end, rotating, link_rotation = (
+        _flexed(pip, end),
+        _flexed(pip, rotating),
+        matrix_at(chain.links, PIP, ROTATION),
+    )
+    w = plus(rotate(link_rotation, end), vector_at(chain.links, ROOT, BONE))
+    return dot(w, w), 2.0 * dot(w, rotate(link_rotation, plus(rotating, (0.0, end[2], -end[1]))))
 
 
 @kernel
@@ -129,8 +133,8 @@ def distances2(chain: ChainArrays, ratio: float, pips: Float, squares: Float) ->
 def _point(chain: ChainArrays, pip: float, dip: float) -> Vector:
     """The point w [m] in the root joint's frame at PIP and DIP [rad]."""
     tip = _flexed(dip, vector_at(chain.links, DIP, BONE))
-    end = plus(rotate(matrix_at(chain.links, DIP, TURN), tip), vector_at(chain.links, PIP, BONE))
-    end = rotate(matrix_at(chain.links, PIP, TURN), _flexed(pip, end))
+    end = plus(rotate(matrix_at(chain.links, DIP, ROTATION), tip), vector_at(chain.links, PIP, BONE))
+    end = rotate(matrix_at(chain.links, PIP, ROTATION), _flexed(pip, end))
     return plus(end, vector_at(chain.links, ROOT, BONE))
 
 
@@ -259,7 +263,7 @@ def nearest_pose(chain: ChainArrays, goal: Vector, warm_start: Float, seeds: Flo
         Distance of the point to the target [m].
     """
     best, trial = inf, np.empty(4)
-    local = rotate_back(matrix_at(chain.links, ROOT, TURN), goal)
+    local = rotate_back(matrix_at(chain.links, ROOT, ROTATION), goal)
     starts = len(seeds) if chain.follower >= 0 else _STARTS
     for start in range(starts + 1):
         steps = _FIRST_STEPS

@@ -71,7 +71,7 @@ class HandEstimate:
     t_ns: int
     markers: MarkerPositions
     smooth_m: Float
-    facing: Float
+    back_normal: Float
     solution: SolvedHand | None
     valid: Bool
     tracked: Bool
@@ -83,13 +83,15 @@ class HandEstimate:
     solved: bool = False
 
     @classmethod
-    def unseen(cls, t_ns: int, markers: MarkerPositions, smooth_m: Float, facing: Float) -> "HandEstimate":
+    def unseen(
+        cls, t_ns: int, markers: MarkerPositions, smooth_m: Float, back_normal: Float
+    ) -> "HandEstimate":
         """One of which nothing is known yet."""
         return cls(
             t_ns=t_ns,
             markers=markers,
             smooth_m=smooth_m,
-            facing=facing,
+            back_normal=back_normal,
             solution=None,
             valid=np.zeros(26, np.bool_),
             tracked=np.zeros(26, np.bool_),

@@ -150,10 +150,10 @@ class Fabrik:
             chain.arrays, goal, self.tolerance_m, self.max_iterations, restarts, angles
         )
         positions, orientations = chain.forward_flat(angles)
-        turn = np.array(frame)
+        rotation = np.array(frame)
         return ChainResult(
-            positions=positions @ turn.T + np.array(root),
-            orientations=turn @ orientations,
+            positions=positions @ rotation.T + np.array(root),
+            orientations=rotation @ orientations,
             angles=chain.pose(angles),
             residual_m=residual,
             iterations=iterations,

@@ -259,7 +259,7 @@ def finger_chain(model: HandModel, finger: int, offset_m: Float, *, coupled: boo
     """
     limits = [(float(low), float(high)) for low, high in model.limits_rad[finger]]
     rest = as_matrix(model.rest_rotation[CHAINS[finger, 0]])
-    turn, bone = model.turn[finger], model.bone_m[finger]
+    link_rotation, bone = model.link_rotation[finger], model.bone_m[finger]
     thumb = finger == THUMB
     root = Rotor(
         limits[0],
@@ -268,11 +268,11 @@ def finger_chain(model: HandModel, finger: int, offset_m: Float, *, coupled: boo
         sign=model.side_sign,
         rest=IDENTITY if thumb else rest,
     )
-    last = bone[2] + turn[2] @ np.asarray(offset_m, dtype=np.float64)
+    last = bone[2] + link_rotation[2] @ np.asarray(offset_m, dtype=np.float64)
     links = (
         Link(rest if thumb else IDENTITY, root, as_vector(bone[0])),
-        Link(as_matrix(turn[0]), Hinge(*limits[2]), as_vector(bone[1])),
-        Link(as_matrix(turn[1]), Hinge(*limits[3]), as_vector(last)),
+        Link(as_matrix(link_rotation[0]), Hinge(*limits[2]), as_vector(bone[1])),
+        Link(as_matrix(link_rotation[1]), Hinge(*limits[3]), as_vector(last)),
     )
     ratio = model.dip_per_pip
     if not coupled or thumb or ratio is None or model.dip_spread_rad > 0.0:

@@ -61,7 +61,7 @@ class _Hand(NamedTuple):
         as_seen: What is seen of a marker is taken for its centroid, and the whole correction for uncertainty.
         R: (K, 3, 3) rotations of the tip joints, rig frame.
         tilt_rad2: (K, 3, 3) covariance of their directions.
-        turned_rad2: Variance that their age adds.
+        rotation_rad2: Variance that their age adds.
         at: (K, 3) [m] about where they are.
         walked: (K,) by how much more their tilt may have grown to a fit that starts there; as a share of its variance.
     """
@@ -70,7 +70,7 @@ class _Hand(NamedTuple):
     as_seen: bool
     R: Float
     tilt_rad2: Float
-    turned_rad2: float
+    rotation_rad2: float
     at: Float
     process_noise: Float
 
@@ -145,7 +145,7 @@ def _correct(
     if row < 0:
         count = 1
     elif hand.known:
-        tilted(row, hand.R, hand.tilt_rad2, hand.turned_rad2, views.aim)
+        tilted(row, hand.R, hand.tilt_rad2, hand.rotation_rad2, views.aim)
     else:
         any_direction(cameras, rays.point, views.aim)
     appearance(cameras, caps, row, count, rays, views)
@@ -230,7 +230,7 @@ def correct_centres(
     as_seen: bool,
     R: Float,
     tilt_rad2: Float,
-    turned_rad2: float,
+    rotation_rad2: float,
     at: Float,
     process_noise: Float,
     observed: Float,
@@ -251,7 +251,7 @@ def correct_centres(
         cameras, caps: Of the rig.
         rays_px: Standard deviation per axis that the calibration leaves.
         limits: (C + 1,) most chi-square by the number of cameras.
-        known, as_seen, R, tilt_rad2, turned_rad2, at, walked: Directions of the caps, as of `_Hand`.
+        known, as_seen, R, tilt_rad2, rotation_rad2, at, walked: Directions of the caps, as of `_Hand`.
         observed: (C, M, 4) u, v, sigma [px], area [px^2]; NaN: not seen.
         rays, views: Room.
         points, cov, noise: (M, 3), (M, 3, 3), (M, 3, 3) written as of `MarkerPositions`.
@@ -259,7 +259,7 @@ def correct_centres(
         rejected: (C, M) written: outliers, without which they do.
         uv, variance, own: Written, as of `RayPositions`.
     """
-    hand = _Hand(known, as_seen, R, tilt_rad2, turned_rad2, at, process_noise)
+    hand = _Hand(known, as_seen, R, tilt_rad2, rotation_rad2, at, process_noise)
     for m in range(observed.shape[1]):
         for c in range(observed.shape[0]):
             rejected[c, m] = False
@@ -365,9 +365,9 @@ class RayTriangulator:
             at = hand.joints.position_m[self._caps.joint]
             # A fit believes that fingers move as fast as its priors allow. Told of less than it believes itself, it
             # would follow its own error, and finger and cap would drag each other away.
-            turned = 2.0 * (CAPS.turn_rad_s * age_s) ** 2
-            grown = hand.tilt_process_noise_rad2_s2[self._caps.finger] * age_s**2 - turned
-            ours = tilt[:, 0, 0] + tilt[:, 1, 1] + tilt[:, 2, 2] + turned
+            rotation_rad2 = 2.0 * (CAPS.rotation_rad_s * age_s) ** 2
+            grown = hand.tilt_process_noise_rad2_s2[self._caps.finger] * age_s**2 - rotation_rad2
+            ours = tilt[:, 0, 0] + tilt[:, 1, 1] + tilt[:, 2, 2] + rotation_rad2
             process_noise = np.maximum(grown, 0.0) / np.maximum(ours, 1e-12)
         points, cov = np.empty((count, 3)), np.empty((count, 3, 3))
         noise, outliers = np.empty((count, 3, 3)), np.empty(count, np.bool_)
@@ -383,7 +383,7 @@ class RayTriangulator:
             as_seen,
             R,
             tilt,
-            (CAPS.turn_rad_s * age_s) ** 2,
+            (CAPS.rotation_rad_s * age_s) ** 2,
             np.ascontiguousarray(at),
             np.ascontiguousarray(process_noise),
             observed,

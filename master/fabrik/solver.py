@@ -24,7 +24,7 @@ from master.fabrik.estimate import HandEstimate, SolvedHand
 from master.fabrik.finger import Finger
 from master.fabrik.one_euro import PointFilter
 from master.fabrik.sync import FrameSet, FrameSync
-from master.fabrik.targets import facing_of, targets_of
+from master.fabrik.targets import back_normal_of, targets_of
 from master.fabrik.triangulate import Triangulate
 
 Stage = Callable[[str], AbstractContextManager[None]]
@@ -118,10 +118,12 @@ class FabrikSolver:
             if self._one_euro is not None:
                 smooth = self._one_euro.push(frames.t_ns, smooth, markers.noise_m2)
         with self._stage("fabrik"):
-            facing = self.towards(smooth[self.on_hand], frames.area)
-            out = HandEstimate.unseen(frames.t_ns, markers, smooth, facing)
+            back_normal = self.towards(smooth[self.on_hand], frames.area)
+            out = HandEstimate.unseen(frames.t_ns, markers, smooth, back_normal)
             palm = self._palm.push(
-                Epoch(frames.t_ns, smooth, facing, cov_m2=markers.cov_m2, second_order=warm_start is None)
+                Epoch(
+                    frames.t_ns, smooth, back_normal, cov_m2=markers.cov_m2, second_order=warm_start is None
+                )
             )
             return self._estimate(out, smooth[self.on_hand], markers.cov_m2[self.on_hand], palm)
 
@@ -137,8 +139,8 @@ class FabrikSolver:
         Returns:
             The hand; None: the points are too few.
         """
-        facing = self.towards(points[self.on_hand], area_px2)
-        return self._once.push(Epoch(0, points, facing, cov_m2=cov)).solution
+        back_normal = self.towards(points[self.on_hand], area_px2)
+        return self._once.push(Epoch(0, points, back_normal, cov_m2=cov)).solution
 
     def rehearse(self) -> None:
         """Call every kernel once, so that none is compiled while a hand is tracked."""
@@ -166,7 +168,7 @@ class FabrikSolver:
         Of the hand's points (H, 3) [m], by the areas of all markers (C, M) [px^2].
         """
         out = self._ahead.copy()
-        facing_of(points, area_px2[:, self._back], self._centres, self._focal_px, out)
+        back_normal_of(points, area_px2[:, self._back], self._centres, self._focal_px, out)
         return out
 
     def _estimate(self, out: HandEstimate, points: Float, cov: Float, palm: Fitted) -> HandEstimate:

@@ -33,7 +33,7 @@ from master.fabrik.estimate import MarkerPositions, SolvedHand
 
 GRID = 48  # cells of the table along each side of the image
 _DEPTHS_M = np.array([0.35, 0.45, 0.6, 0.8, 1.1])
-_LAW_TURNS = 3  # each leaves a thousandth of the correction off the axis
+_LAW_ROUNDS = 3  # each leaves a thousandth of the correction off the axis
 _ANYHOW_RAD = (
     1.0  # standard deviation of the direction of a finger that shows its end, from that to the cameras
 )
@@ -165,7 +165,7 @@ def place_centroids(
         cell[c] = (1.0 - p) * upper + p * lower
     disparity = u - right_u
     z = depth(tables, disparity)
-    for _ in range(_LAW_TURNS):
+    for _ in range(_LAW_ROUNDS):
         z = depth(tables, disparity - cell[0] - cell[1] / z)
     if not np.isfinite(z):
         return np.nan, np.nan

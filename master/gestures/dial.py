@@ -10,7 +10,7 @@ Tips that stand still to each other are a grip where most instants of the hold h
 decides some of that, and cameras that see no more than fingertips doubt it from instant to instant.
 
 The axis begins as that of the circle through the tips; a turn tells its own axis the better the farther it goes, and
-what is known of it is the mean of both (`_turn`).
+what is known of it is the mean of both (`_rotate`).
 
 Where all that sees is worn on the arm (no markers, and the palm stands still in the camera's frame) it is the palm in
 the world of the IMU that turns.
@@ -25,7 +25,7 @@ from common.gesture_actions import DialSettings
 from common.messages import Gesture, Phase
 from master.gestures.course import Course
 from master.gestures.features import HandFeatures
-from master.gestures.grip import Tips, axis_of, is_grip, may_grip, spread_m, turned_by, widened_m
+from master.gestures.grip import Tips, axis_of, is_grip, may_grip, rotation_between, spread_m, widened_m
 from master.gestures.lasting import Lasting
 
 _AXIS_RAD = radians(15.0)  # how well the circle of the tips tells the axis of the knob
@@ -162,7 +162,7 @@ class DialWatch:
         wide = widened_m(tips, grip.tips)
         loosened = grip.course.loosens
         if grip.course.sound(t_ns, wide, own.loose_m):
-            self._turn(t_ns, tips, grip, wide)
+            self._rotate(t_ns, tips, grip, wide)
         elif (ahead := grip.course.ahead_rad(t_ns)) is not None:
             self._angle = ahead
         if not abs(wide) > own.open_m:
@@ -170,19 +170,19 @@ class DialWatch:
         elif loosened:
             self._grip, self._before = None, grip.tips
 
-    def _turn(self, t_ns: int, tips: Tips, grip: _Grip, wide_m: float) -> None:
+    def _rotate(self, t_ns: int, tips: Tips, grip: _Grip, wide_m: float) -> None:
         """The angle of tips that turn the knob.
 
         Its axis is that of most weight: that of the tips' circle as sure as it is, that of the turn as sure as it is
         far. A turn r sways by `_SWAY_RAD` about other axes, so it tells its axis to `_SWAY_RAD` / |r|: the weights of
         the two directions go with one over the square. The angle is the twist about it (Dobrowolski, 2015).
         """
-        turn = turned_by(tips, grip.tips)
-        far = sqrt(turn @ turn)
+        rotation = rotation_between(tips, grip.tips)
+        far = sqrt(rotation @ rotation)
         if far > grip.farthest_rad:
             grip.farthest_rad = far
-            grip.axis = axis_of(grip.circle_axis, (_SWAY_RAD / _AXIS_RAD) ** 2, turn)
-        along = float(turn @ grip.axis) / max(far, 1e-12)
+            grip.axis = axis_of(grip.circle_axis, (_SWAY_RAD / _AXIS_RAD) ** 2, rotation)
+        along = float(rotation @ grip.axis) / max(far, 1e-12)
         twist = 2.0 * atan2(along * sin(0.5 * far), cos(0.5 * far)) + grip.base_rad
         self._angle = twist + 2.0 * pi * round((self._angle - twist) / (2.0 * pi))
         grip.course.push(t_ns, wide_m, self._angle)

@@ -74,8 +74,8 @@ class PinchWatch:
         clear_m = min(gaps[k] for k in others) - gap
         if clear_m >= own.away_m:
             return finger
-        turned_rad = float(touch.apart_rad[finger] + touch.apart_sigma_rad[finger])
-        if clear_m < own.clear_m or turned_rad > own.apart_rad:
+        opening_rad = float(touch.apart_rad[finger] + touch.apart_sigma_rad[finger])
+        if clear_m < own.clear_m or opening_rad > own.apart_rad:
             return None
         return finger if min(float(seen.curl[1 + k]) for k in others) < own.fist_curl else None
 

@@ -67,7 +67,7 @@ def _write(joints: Float, cov: Float, pads: Float, radius: Float, out: ThumbTouc
     """Write a touch; arguments as of `HandFeatures`."""
     thumb, tip = CHAINS[0, 2], CHAINS[0, 3]
     thumb_side = _palmar(_THUMB, _SIDE, joints, pads)
-    thumb_turned = _turned_rad(_THUMB, joints, cov)
+    thumb_sigma_rad = _direction_sigma_rad(_THUMB, joints, cov)
     for k in range(4):
         for s in range(3):
             a, b = CHAINS[k + 1, s], CHAINS[k + 1, s + 1]
@@ -88,7 +88,7 @@ def _write(joints: Float, cov: Float, pads: Float, radius: Float, out: ThumbTouc
                     out.middle_m[k, i] = start[i] + (radius_a + 0.5 * out.gap_m[k]) * way[i]
                 face = min(dot(way, thumb_side), -dot(way, side))
                 out.apart_rad[k] = acos(min(max(face, -1.0), 1.0))
-        out.apart_sigma_rad[k] = hypot(thumb_turned, _turned_rad(k + 1, joints, cov))
+        out.apart_sigma_rad[k] = hypot(thumb_sigma_rad, _direction_sigma_rad(k + 1, joints, cov))
 
 
 @inner
@@ -129,7 +129,7 @@ def _shares(joints: Float, radius: Float, a: int, a_end: int, b: int, b_end: int
 
 
 @kernel
-def _turned_rad(f: int, joints: Float, cov: Float) -> float:
+def _direction_sigma_rad(f: int, joints: Float, cov: Float) -> float:
     """Return the standard deviation [rad] of the direction of a last bone.
 
     That of its ends, over its length.

@@ -164,8 +164,8 @@ class _Fit:
             middle = found[both].mean(axis=0)
             fit._normal(found, target, speed, both, part, middle)
             step = _solved(fit.normal.sum(axis=0), fit.gradient.sum(axis=0))
-            turned = rotation_vector_to_matrix(step[:3])
-            fit.T = rigid(turned, middle - turned @ middle + step[3:6]) @ fit.T
+            rotated = rotation_vector_to_matrix(step[:3])
+            fit.T = rigid(rotated, middle - rotated @ middle + step[3:6]) @ fit.T
             fit.offset_ns += float(np.clip(1e9 * step[6], -5e7, 5e7))
             if np.abs(step[:3]).max() < 1e-7 and np.abs(step[3:6]).max() < 1e-7 and abs(step[6]) < 1e-6:
                 break

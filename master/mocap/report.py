@@ -23,10 +23,11 @@ _COLUMNS = (
 
 def alignment_lines(alignment: Alignment) -> list[str]:
     """How frame and clock were brought together."""
-    turn, shift = _turn_deg(alignment), alignment.T_rig_file[:3, 3]
+    rotation, shift = _rotation_deg(alignment), alignment.T_rig_file[:3, 3]
     fitted = (
         f"clock {1e-9 * alignment.offset_ns:+.4f} s ± {1e3 * alignment.offset_sigma_s:.1f} ms (speeds correlate by"
-        f" {alignment.correlation:.2f}); frame turned by {turn:.1f}° ± {alignment.rotation_sigma_deg:.2f}°, moved by"
+        f" {alignment.correlation:.2f});"
+        f" frame turned by {rotation:.1f}° ± {alignment.rotation_sigma_deg:.2f}°, moved by"
         f" {1e3 * np.linalg.norm(shift):.0f} mm ± {1e3 * alignment.shift_sigma_m:.1f} mm;"
         f" {1e3 * alignment.residual_m:.1f} mm left in the median"
     )
@@ -77,7 +78,7 @@ def alignment_json(alignment: Alignment | None) -> dict[str, object]:
         "T_rig_file": [[round(float(value), 9) for value in row] for row in alignment.T_rig_file],
         "offset_ns": alignment.offset_ns,
         "offset_sigma_ms": 1e3 * alignment.offset_sigma_s,
-        "rotation_deg": _turn_deg(alignment),
+        "rotation_deg": _rotation_deg(alignment),
         "rotation_sigma_deg": alignment.rotation_sigma_deg,
         "shift_sigma_mm": 1e3 * alignment.shift_sigma_m,
         "residual_mm": 1e3 * alignment.residual_m,
@@ -87,7 +88,7 @@ def alignment_json(alignment: Alignment | None) -> dict[str, object]:
     }
 
 
-def _turn_deg(alignment: Alignment) -> float:
+def _rotation_deg(alignment: Alignment) -> float:
     linear = alignment.T_rig_file[:3, :3]
     linear = linear @ np.diag([1.0, 1.0, -1.0]) if alignment.mirrored else linear
     return float(np.degrees(np.linalg.norm(matrix_to_rotation_vector(linear))))

@@ -171,8 +171,8 @@ def _at(poses: Sequence[ObjectPose], t_ns: int) -> _PointEstimate | None:
     a, b = poses[max(after, 1) - 1], poses[max(after, 1)]
     share = (t_ns - a.t_ns) / (b.t_ns - a.t_ns)
     T_a, T_b = _pose_of(a), _pose_of(b)
-    turn = matrix_to_rotation_vector(T_b[:3, :3] @ T_a[:3, :3].T)
-    R = rotation_vector_to_matrix(share * turn) @ T_a[:3, :3]
+    rotation = matrix_to_rotation_vector(T_b[:3, :3] @ T_a[:3, :3].T)
+    R = rotation_vector_to_matrix(share * rotation) @ T_a[:3, :3]
     T = rigid(R, T_a[:3, 3] + share * (T_b[:3, 3] - T_a[:3, 3]))
     near = b if share > 0.5 else a
     beyond_s = max(t_ns - b.t_ns, a.t_ns - t_ns, 0) * 1e-9

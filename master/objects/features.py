@@ -134,7 +134,7 @@ class Features:
         corners, seen = self.points[self.beads :].reshape(count, 4, 3), uv[self.beads :].reshape(count, 4, 2)
         normal = self.normals[self.beads :]
         line_of_sight = eye - corners.mean(axis=1)
-        turned = np.vecdot(normal, line_of_sight) >= ease * _TAG_COSINE * np.linalg.norm(
+        facing_camera = np.vecdot(normal, line_of_sight) >= ease * _TAG_COSINE * np.linalg.norm(
             line_of_sight, axis=1
         )
         edges = np.linalg.norm(seen - np.roll(seen, 1, axis=1), axis=2).min(axis=1)
@@ -142,7 +142,11 @@ class Features:
         lifted = (
             np.concatenate([corners, corners.mean(axis=1, keepdims=True)], axis=1) + 1e-4 * normal[:, None]
         )
-        return turned & (edges >= ease * _CELL_PX * self.cells) & ~self.surface.hides(eye, lifted).any(axis=1)
+        return (
+            facing_camera
+            & (edges >= ease * _CELL_PX * self.cells)
+            & ~self.surface.hides(eye, lifted).any(axis=1)
+        )
 
     def _beads_show(self, eye: Float, focal_px: float, ease: float) -> Bool:
         """(B,) beads that are large enough for an eye (3,) [m], object frame, and not behind the object."""

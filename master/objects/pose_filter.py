@@ -38,8 +38,8 @@ class PoseFilter:
         if self._filter is None or (t_ns - self._t_ns) * 1e-9 > _RESET_S:
             self._filter, self._noise = OneEuro(self._parameters, (3, 3)), NoiseEstimator()
             self._R, self._values = T[:3, :3], np.zeros(6)
-        turn = _ARM_M * matrix_to_rotation_vector(T[:3, :3] @ self._R.T)
-        signals = np.concatenate([T[:3, :3] @ self._middle + T[:3, 3], self._values[3:] + turn])
+        rotation = _ARM_M * matrix_to_rotation_vector(T[:3, :3] @ self._R.T)
+        signals = np.concatenate([T[:3, :3] @ self._middle + T[:3, 3], self._values[3:] + rotation])
         noise = _INDEPENDENT_SHARE * np.concatenate([np.diagonal(cov)[:3], _ARM_M**2 * np.diagonal(cov)[3:]])
         values = self._filter.push(t_ns, signals, self._noise.push(t_ns, signals, noise))
         self._R = rotation_vector_to_matrix((values - self._values)[3:] / _ARM_M) @ self._R

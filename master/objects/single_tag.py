@@ -103,10 +103,10 @@ class SingleTag:
             camera = self._cameras[sighted.camera]
             for _, T in two_poses(own, camera.undistort(sighted.uv[0])):
                 there = camera.T_rig_camera @ T
-                if _turned(there, fitted.motion.T) < _FLIP_RAD:
+                if _rotated(there, fitted.motion.T) < _FLIP_RAD:
                     continue
                 other = self._fit(seen.seen, Motion.still(there), feature=seen.feature)
-                if other is None or _turned(other.motion.T, fitted.motion.T) < _FLIP_RAD:
+                if other is None or _rotated(other.motion.T, fitted.motion.T) < _FLIP_RAD:
                     continue
                 if best is None or other.cost < best.cost:
                     best = other
@@ -127,7 +127,7 @@ def _reaching(fitted: Fitted, other: Fitted, better: float) -> Fitted:
     return replace(fitted, cov=cov)
 
 
-def _turned(T: Float, other: Float) -> float:
+def _rotated(T: Float, other: Float) -> float:
     """Angle between two poses [rad]: the trace of a rotation is 1 + 2 cos."""
     cosine = 0.5 * (float(np.vdot(T[:3, :3], other[:3, :3])) - 1.0)
     return float(np.arccos(min(max(cosine, -1.0), 1.0)))

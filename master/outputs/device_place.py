@@ -64,8 +64,8 @@ class DevicePlace:
 
     def doubt_m(self, length_m: float) -> Float:
         """Rings (T, K, 3) [m] about the ends of `arm_m`: where these are at 2 sigma of the bend; NaN: not known."""
-        turn = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
-        around = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+        angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
+        around = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         bends = self.bend_rad[:, None] + _SIGMAS * self.sigma_rad[:, None] * around
         forearm = self.R_rig_palm[:, None] @ np.swapaxes(forearm_palm(bends), 2, 3)
         return self.wrist_m[:, None] + length_m * (forearm @ _ELBOW)

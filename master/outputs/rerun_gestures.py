@@ -109,8 +109,8 @@ class GesturesLayer:
         self._rec.log(path, thin)
         if not isfinite(one.angle_rad):
             return
-        turned = _DIAL_M * arc(one.direction, one.angle_rad) + one.origin_m
-        strip = np.concatenate([one.origin_m[None], turned, one.origin_m[None]])
+        rotated = _DIAL_M * arc(one.direction, one.angle_rad) + one.origin_m
+        strip = np.concatenate([one.origin_m[None], rotated, one.origin_m[None]])
         thick = rr.LineStrips3D(
             [strip], radii=2.0 * _LINE_M, colors=[colour], labels=[said(one)], show_labels=True
         )

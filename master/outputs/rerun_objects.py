@@ -162,26 +162,26 @@ def _parts(shapes: Sequence[Shape], colour: Rgb) -> dict[str, rr.AsComponents]:
     balls = [one for one in shapes if not isinstance(one, BoxShape | CylinderShape)]
     parts: dict[str, rr.AsComponents] = {}
     if boxes:
-        at, turned = _placed(boxes)
+        at, orientation = _placed(boxes)
         sizes = [one.size_m for one in boxes]
         parts["boxes"] = rr.Boxes3D(
-            sizes=sizes, centers=at, quaternions=turned, colors=[colour], fill_mode="solid"
+            sizes=sizes, centers=at, quaternions=orientation, colors=[colour], fill_mode="solid"
         )
     if cylinders:
-        at, turned = _placed(cylinders)
+        at, orientation = _placed(cylinders)
         parts["cylinders"] = rr.Cylinders3D(
             lengths=[one.length_m for one in cylinders],
             radii=[one.radius_m for one in cylinders],
             centers=at,
-            quaternions=turned,
+            quaternions=orientation,
             colors=[colour],
             fill_mode="solid",
         )
     if balls:
-        at, turned = _placed(balls)
+        at, orientation = _placed(balls)
         radii = [one.radius_m for one in balls]
         parts["balls"] = rr.Ellipsoids3D(
-            radii=radii, centers=at, quaternions=turned, colors=[colour], fill_mode="solid"
+            radii=radii, centers=at, quaternions=orientation, colors=[colour], fill_mode="solid"
         )
     return parts
 

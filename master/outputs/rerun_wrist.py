@@ -133,8 +133,8 @@ class WristLayer:
         )
         if self._level_world is None:
             self._level_world = _level(world_camera[0])
-        turned = matrix_to_quaternion(self._level_world @ world_camera)
-        columns = rr.Transform3D.columns(quaternion=turned[:, [1, 2, 3, 0]])
+        orientation = matrix_to_quaternion(self._level_world @ world_camera)
+        columns = rr.Transform3D.columns(quaternion=orientation[:, [1, 2, 3, 0]])
         self._rows.send(WORLD, poses.t_ns[known], columns, None)
 
     def log_detections(self, frames: Sequence[WristDetections]) -> None:

@@ -40,7 +40,7 @@ class Tap:
         self._bus, self._clock, self._always = bus, clock, always
         self._until_ns = 0
         self._queue: deque[Message] = deque()
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._hurry = threading.Event()
         self._busy = self._closed = False
@@ -99,7 +99,7 @@ class Tap:
 
     def close(self) -> None:
         """Show nothing any more. Safe to call twice."""
-        with self._turn:
+        with self._lock:
             self._closed, thread = True, self._thread
         self._queue.clear()
         self._hurry.set()
@@ -107,7 +107,7 @@ class Tap:
             thread.join(_DRAIN_S)
 
     def _start(self) -> None:
-        with self._turn:
+        with self._lock:
             if self._thread is None and not self._closed:
                 self._thread = threading.Thread(target=self._work, name="tap", daemon=True)
                 self._thread.start()
@@ -123,7 +123,7 @@ class Tap:
                 except BusError:
                     self._dropped += 1  # the bus is closed: the master ends
             self._busy = False
-            with self._turn:
+            with self._lock:
                 if self._closed or not (self._always or self._until_ns or self._queue):
                     self._thread = None
                     return

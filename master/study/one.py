@@ -78,15 +78,15 @@ class Calibrated(Struct, frozen=True, kw_only=True):
     Attributes:
         said: Its report; where it was refused, why, and the rig file's palm pose and the measured bones are used.
         refused: Whether it was.
-        turn_deg, shift_mm: How far the palm's pose is from the truth, at the knuckles.
-        nominal_turn_deg, nominal_shift_mm: The same of the rig file.
+        rotation_deg, shift_mm: How far the palm's pose is from the truth, at the knuckles.
+        nominal_rotation_deg, nominal_shift_mm: The same of the rig file.
     """
 
     said: tuple[str, ...]
     refused: bool
-    turn_deg: float
+    rotation_deg: float
     shift_mm: float
-    nominal_turn_deg: float
+    nominal_rotation_deg: float
     nominal_shift_mm: float
 
 
@@ -218,14 +218,14 @@ def _calibrated(
         rig, hand, said = found.rig, found.hand, tuple(found.report)
     except FitError as error:
         said, refused = (str(error),), True
-    turn, shift = _off(rig, who.rig)
-    nominal_turn, nominal_shift = _off(task.rig, who.rig)
+    rotation, shift = _off(rig, who.rig)
+    nominal_rotation, nominal_shift = _off(task.rig, who.rig)
     told = Calibrated(
         said=said,
         refused=refused,
-        turn_deg=round(turn, 3),
+        rotation_deg=round(rotation, 3),
         shift_mm=round(shift, 3),
-        nominal_turn_deg=round(nominal_turn, 3),
+        nominal_rotation_deg=round(nominal_rotation, 3),
         nominal_shift_mm=round(nominal_shift, 3),
     )
     return rig, hand, told

@@ -229,9 +229,9 @@ def _level_lines(result: Result) -> list[str]:
 
 
 def _calibration_lines(calibrated: Mapping[str, Calibrated]) -> list[str]:
-    turns = np.array([(one.nominal_turn_deg, one.turn_deg) for one in calibrated.values()])
+    rotations = np.array([(one.nominal_rotation_deg, one.rotation_deg) for one in calibrated.values()])
     shifts = np.array([(one.nominal_shift_mm, one.shift_mm) for one in calibrated.values()])
-    before, after = (f"{_rms(turns[:, k]):.1f}° and {_rms(shifts[:, k]):.1f} mm" for k in (0, 1))
+    before, after = (f"{_rms(rotations[:, k]):.1f}° and {_rms(shifts[:, k]):.1f} mm" for k in (0, 1))
     lines = [
         f"How far the palm's pose is off (shift at the knuckles): rms {before} in the rig file, {after} calibrated.",
         "",
@@ -241,8 +241,8 @@ def _calibration_lines(calibrated: Mapping[str, Calibrated]) -> list[str]:
     for name, one in calibrated.items():
         note = f"refused: {one.said[0]}" if one.refused else ""
         lines.append(
-            f"| {name} | {one.nominal_turn_deg:.1f}°, {one.nominal_shift_mm:.1f} mm"
-            f" | {one.turn_deg:.1f}°, {one.shift_mm:.1f} mm | {note} |"
+            f"| {name} | {one.nominal_rotation_deg:.1f}°, {one.nominal_shift_mm:.1f} mm"
+            f" | {one.rotation_deg:.1f}°, {one.shift_mm:.1f} mm | {note} |"
         )
     return lines
 

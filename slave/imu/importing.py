@@ -8,14 +8,14 @@ import numpy as np
 from common.arrays import Float
 from common.errors import RecordingError
 from common.imu_csv import Table
-from common.imu_csv_columns import TURN
+from common.imu_csv_columns import QUATERNION
 from common.imu_fusion import OrientationFilter
 from common.imu_recording import IMU, write_imu
 from common.imu_score import TiltErrors
 from common.messages import ImuSample
 
 _GAP = 1.5  # periods
-_NO_TURN = np.full(4, np.nan)
+_NO_QUATERNION = np.full(4, np.nan)
 
 
 def import_table(table: Table, source: str, folder: Path | None, say: Callable[[str], None]) -> None:
@@ -41,7 +41,7 @@ def import_table(table: Table, source: str, folder: Path | None, say: Callable[[
     for k, t_ns in enumerate(table.t_ns.tolist()):
         try:
             sample = ImuSample(
-                source, 0, k, t_ns, table.gyro_rad_s[k], table.accel_m_s2[k], table.mag_ut[k], _NO_TURN
+                source, 0, k, t_ns, table.gyro_rad_s[k], table.accel_m_s2[k], table.mag_ut[k], _NO_QUATERNION
             )
         except ValueError as error:
             raise RecordingError(f"sample {k + 1}, at {1e-9 * t_ns:.3f} s: {error}") from error
@@ -87,12 +87,12 @@ def _say_orientation(
         f"{np.degrees(fusion.heading_sigma_rad):.1f} deg (one sigma)"
     )
     errors = TiltErrors.of(found, table.truth_wxyz, sigma_rad)
-    if TURN not in table.columns:
+    if QUATERNION not in table.columns:
         return
     if not len(errors.sigma_rad):
         say("inclination: no sample has both an orientation and the table's quaternion")
         return
     say(
-        f"inclination: {errors.rms_deg:.2f} deg rms against {table.columns[TURN]}, taken for true (z axis up), "
+        f"inclination: {errors.rms_deg:.2f} deg rms against {table.columns[QUATERNION]}, taken for true (z axis up), "
         f"{len(errors.sigma_rad)} samples; stated {errors.stated_deg:.2f}, {100 * errors.within:.1f} % within 95 %"
     )

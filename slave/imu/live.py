@@ -69,8 +69,8 @@ def run(
     """
     while not stop.is_set() and (sample := source.read()) is not None:
         try:
-            turned = sample if orientation is None else orientation.push(sample)
-            sender.send(replace(turned, session=sender.session))
+            levelled = sample if orientation is None else orientation.push(sample)
+            sender.send(replace(levelled, session=sender.session))
             tally.sample(sample.seq)
             alive()
         except Exception as error:  # noqa: BLE001 - one sample; it is counted and logged

@@ -20,7 +20,7 @@ LARGEST = 4.0  # times the whole area
 SUDDEN = 2.5  # an area that changes by more between two frames is looked at closely
 COVERED = 0.06  # share of the usual area that is missing while something is in front
 COVERING = 0.08  # share of the area that must go from one frame to the next for that to begin, and
-TURNING_PER_S = 5.0  # what a finger that turns away loses: a radian in a fifth of a second
+ROTATING_PER_S = 5.0  # what a finger that turns away loses: a radian in a fifth of a second
 
 
 class Window(NamedTuple):
@@ -114,7 +114,7 @@ class Track(NamedTuple):
         if 1.0 - area / self.typical <= COVERED:
             return False
         lost = 1.0 - area / self.seen
-        return self.covered or lost > max(COVERING, TURNING_PER_S * (t_ns - self.t_ns) * 1e-9)
+        return self.covered or lost > max(COVERING, ROTATING_PER_S * (t_ns - self.t_ns) * 1e-9)
 
     def hidden(self, area: float) -> float:
         """Share of the usual area that is missing, 0..1."""

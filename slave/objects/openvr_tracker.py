@@ -122,8 +122,8 @@ class OpenVrTracker:
         else:
             self._lost = 0
         self._seq += 1
-        place, turn = _NOTHING if found is None else found
-        return TrackerPose(self._name, 0, self._seq, t_ns, place, turn)
+        place, quaternion = _NOTHING if found is None else found
+        return TrackerPose(self._name, 0, self._seq, t_ns, place, quaternion)
 
     def _found(self, system: VrSystem, now_ns: int) -> int | None:
         """The device's number, which stays while SteamVR runs; searched again once a second until it is there."""
@@ -189,7 +189,7 @@ def matrix34(matrix: object) -> tuple[Float, Float] | None:
     rows = np.array([list(row) for row in getattr(matrix, "m", ())], float)
     if rows.shape != (3, 4) or not np.isfinite(rows).all():
         return None
-    turned = rows[:, :3]
-    if not np.allclose(turned @ turned.T, np.eye(3), atol=_UNIT_WITHIN) or np.linalg.det(turned) < 0.0:
+    axes = rows[:, :3]
+    if not np.allclose(axes @ axes.T, np.eye(3), atol=_UNIT_WITHIN) or np.linalg.det(axes) < 0.0:
         return None
-    return rows[:, 3], matrix_to_quaternion(turned)
+    return rows[:, 3], matrix_to_quaternion(axes)

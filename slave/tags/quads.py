@@ -51,8 +51,8 @@ def _with_margin(corners: Float) -> Float:
 
 def _clockwise(corners: Float) -> Float:
     x, y = corners[..., 0], corners[..., 1]
-    turned = (x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y).sum(axis=1) < 0.0
-    return np.where(turned[:, None, None], corners[:, ::-1], corners)
+    upright = (x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y).sum(axis=1) < 0.0
+    return np.where(upright[:, None, None], corners[:, ::-1], corners)
 
 
 def _dark_inside(grey: Image, corners: Float) -> Float:

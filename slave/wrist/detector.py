@@ -17,7 +17,7 @@ from slave.wrist.engine import NUMPY, Engine
 from slave.wrist.fingers import separate
 from slave.wrist.fingertips import NO_TIPS, Fingertips, fingertips
 from slave.wrist.laser import LaserLines, laser_lines
-from slave.wrist.palm_turn import prepare
+from slave.wrist.palm_pose import prepare
 from slave.wrist.postures import postures_of
 from slave.wrist.reach import reach_of
 from slave.wrist.search_bands import search_bands_of
@@ -113,9 +113,9 @@ def prepared(view: WristView, engine: Engine = NUMPY) -> WristView:
     A triple in which all is dark goes through the whole line, so that the first real one takes no longer than others.
     """
     postures_of(view)
-    for turned in prepare(view):
-        search_bands_of(turned)
-        reach_of(turned)
+    for rotated_view in prepare(view):
+        search_bands_of(rotated_view)
+        reach_of(rotated_view)
     dark = Frame(0, 0, 0, np.zeros((view.optics.height_px, view.optics.width_px), np.uint8))
     find(StrobeCycle(dark, dark, dark), view, engine)
     return view
@@ -129,6 +129,6 @@ def find(cycle: StrobeCycle, view: WristView, engine: Engine = NUMPY) -> WristFo
     laser = laser_lines(lit_line(cycle.laser.image, ambient), fingers, view, engine)
     # A bent wrist turns fingers before the camera in ways that no posture of the tables has.
     tips = NO_TIPS
-    if fingers.turn.straight:
+    if fingers.palm_pose.straight:
         tips = fingertips(led, cycle.led.image, laser.uv, view, engine.candidates)
     return WristFound(cycle, laser, tips)

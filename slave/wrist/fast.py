@@ -18,12 +18,12 @@ from slave.wrist.search_bands import MARGIN, Float32
 def minimum_cost_paths(energy: Float32, widths: tuple[int, ...]) -> Int:
     """As `seams.minimum_cost_paths`; of paths of one energy it may take another."""
     out = np.empty((len(widths), len(energy)), dtype=np.int64)
-    _minimum_cost_paths(np.ascontiguousarray(energy), np.array(widths), seams.TURN, out)
+    _minimum_cost_paths(np.ascontiguousarray(energy), np.array(widths), seams.STEP_COST, out)
     return out
 
 
 @compiled
-def _minimum_cost_paths(energy: Float32, widths: Int, turn: np.float32, out: Int) -> None:
+def _minimum_cost_paths(energy: Float32, widths: Int, step_cost: np.float32, out: Int) -> None:
     stations = len(energy)
     begin = 0
     for band in range(len(widths)):
@@ -32,8 +32,8 @@ def _minimum_cost_paths(energy: Float32, widths: Int, turn: np.float32, out: Int
         for s in range(1, stations):
             before, here = cost[s - 1], cost[s]
             for k in range(2, width - 2):
-                near = min(before[k - 1], before[k + 1]) + turn
-                far = min(before[k - 2], before[k + 2]) + turn + turn
+                near = min(before[k - 1], before[k + 1]) + step_cost
+                far = min(before[k - 2], before[k + 2]) + step_cost + step_cost
                 here[k] += min(before[k], min(near, far))
         k = 2
         for j in range(2, width - 2):
@@ -43,7 +43,7 @@ def _minimum_cost_paths(energy: Float32, widths: Int, turn: np.float32, out: Int
         for s in range(stations - 2, -1, -1):
             best, to = cost[s, k], k
             for aside in (-1, 1, -2, 2):
-                other = cost[s, k + aside] + abs(aside) * turn
+                other = cost[s, k + aside] + abs(aside) * step_cost
                 if other < best:
                     best, to = other, k + aside
             k = to

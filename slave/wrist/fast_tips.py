@@ -429,8 +429,8 @@ def _open(
             u, v = u - end_u, v - end_v
             least = limits.side * math.hypot(u, v)
             for way in range(len(out)):
-                turn = way * (2.0 * math.pi / len(out))
-                if math.cos(turn) * u + math.sin(turn) * v > least:
+                angle = way * (2.0 * math.pi / len(out))
+                if math.cos(angle) * u + math.sin(angle) * v > least:
                     out[way] = 0.0
 
 
@@ -569,9 +569,9 @@ def _ends(found: _Found, count: int, table: Postures, limits: _Limits, circle: F
         row = int(found.row[k])
         size = table.end[row, 0]
         u, v = (x - found.at[k, 0]) / radius, (y - found.at[k, 1]) / radius
-        turned = _turned(found, k, table, limits, u, v, sure)
-        u = (found.at[k, 2] - found.at[k, 0]) / size + turned[0]
-        v = (found.at[k, 3] - found.at[k, 1]) / size + turned[1]
+        rotated = _rotated(found, k, table, limits, u, v, sure)
+        u = (found.at[k, 2] - found.at[k, 0]) / size + rotated[0]
+        v = (found.at[k, 3] - found.at[k, 1]) / size + rotated[1]
         total += weight
         out[0] += weight * u
         out[1] += weight * v
@@ -583,10 +583,10 @@ def _ends(found: _Found, count: int, table: Postures, limits: _Limits, circle: F
 
 
 @compiled
-def _turned(
+def _rotated(
     found: _Found, k: int, table: Postures, limits: _Limits, u: float, v: float, sure: float
 ) -> tuple[float, float]:
-    """As `fingertips._turned`, of one hypothesis."""
+    """As `fingertips._rotated`, of one hypothesis."""
     row, by = int(found.row[k]), found.abduction[k]
     size, uv, twist = table.end[row, 0], table.uv[row], table.twist[row]
     end, apex = limits.end, limits.apex

@@ -1,6 +1,6 @@
 """Which finger a pixel of the LED image belongs to: seams between neighbouring fingers, which never cross (D4).
 
-How the palm lies in the image is calibrated, and seen where the wrist is bent (`slave.wrist.palm_turn`), so what the
+How the palm lies in the image is calibrated, and seen where the wrist is bent (`slave.wrist.palm_pose`), so what the
 fingers of this hand can do says in which corridor each of the four seams runs (`slave.wrist.search_bands`). Along the
 stations of a corridor a seam is the path of least energy, found by dynamic programming: first the three among index
 ... little, side by side, then the thumb's, which lies over them where they meet. A pixel costs little where it is a
@@ -19,7 +19,7 @@ import numpy as np
 from common.arrays import Float, Image, Int
 from slave.wrist.engine import NUMPY, Engine
 from slave.wrist.finger_lines import NONE
-from slave.wrist.palm_turn import PalmTurn, palm_turn
+from slave.wrist.palm_pose import PalmPose, find_palm_pose
 from slave.wrist.search_bands import STATION_PX, Float32, SearchBands, search_bands_of
 from slave.wrist.valleys import DARK, STARTS, WIDTHS
 from slave.wrist.view import WristView
@@ -46,7 +46,7 @@ class Fingers:
     search_bands: SearchBands
     seams: Float
     shown: bool
-    turn: PalmTurn
+    palm_pose: PalmPose
 
     def finger_of(self, uv: Float) -> Int:
         """Finger (N,), 0 thumb ... 4 little, of pixels (N, 2); -1 where the pixel is NaN."""
@@ -68,8 +68,8 @@ class Fingers:
 
 def separate(led: Image, view: WristView, engine: Engine = NUMPY) -> Fingers:
     """Find the seams in the difference of LED and ambient frame."""
-    turn = palm_turn(led, view)
-    search_bands = search_bands_of(turn.view)
+    palm_pose = find_palm_pose(led, view)
+    search_bands = search_bands_of(palm_pose.view)
     dark = cv2.erode(led, _CREASE)
     palm = dark[search_bands.palm[:, 1], search_bands.palm[:, 0]] if len(search_bands.palm) else dark
     shown = bool(2 * np.count_nonzero(palm > _SHOWN) > palm.size)
@@ -93,7 +93,7 @@ def separate(led: Image, view: WristView, engine: Engine = NUMPY) -> Fingers:
         thumb = energy[:, STARTS[3] :]
         thumb += _TAKEN * (np.abs(np.arange(WIDTHS[3]) - taken[..., None]) < _VALLEY).any(axis=0)
         seams[3:] = search_bands.across(slice(3, 4), engine.minimum_cost_paths(thumb, WIDTHS[3:]))
-    return Fingers(search_bands, seams, shown, turn)
+    return Fingers(search_bands, seams, shown, palm_pose)
 
 
 def _part(

@@ -45,7 +45,7 @@ class LaserLines:
 
 def laser_lines(laser: Image, fingers: Fingers, view: WristView, engine: Engine = NUMPY) -> LaserLines:
     """Find the segments in the difference of laser and ambient frame."""
-    reach = reach_of(fingers.turn.view).turned(fingers.turn)
+    reach = reach_of(fingers.palm_pose.view).at_palm_pose(fingers.palm_pose)
     runs, on_line = engine.lines(laser, reach.first_row)
     if not len(runs.row):
         return LaserLines(np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan))

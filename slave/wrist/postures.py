@@ -45,7 +45,7 @@ SURFACE_SHARE = 0.8  # of the radius: where the middle of a visible line on a fi
 END, BONES, HIGHEST, ABOVE, APEX = 0, slice(0, 6), 6, slice(7, 13), 13
 SAMPLES = APEX + 1
 _ALONG = ((2, 0.35), (1, 0.75), (1, 0.3), (0, 0.75), (0, 0.5))  # bone, share of it
-_ABOVE = tuple((far, turn) for far in (1.4, 1.9) for turn in (-0.5, 0.0, 0.5))  # of the joint's radius, rad
+_ABOVE = tuple((far, angle) for far in (1.4, 1.9) for angle in (-0.5, 0.0, 0.5))  # of the joint's radius, rad
 _TWIST_RAD = 0.05  # for derivatives
 _CHUNK = 4096
 _ORIGIN = np.zeros(3)
@@ -164,9 +164,9 @@ def _postures(view: WristView, finger: int, angles: Float) -> _OfFinger:
     )
     twist = _twist(view, finger, angles[:, middle], bones, apex, radius)
     size = view.optics.matrix[0, 0] * radius[3] / np.maximum(bones[:, 3, 2], NEAREST_M)
-    turn = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
+    angle = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
     ring = uv[:, middle, END, None] + _AROUND * size[:, None, None] * np.stack(
-        [np.cos(turn), np.sin(turn)], axis=-1
+        [np.cos(angle), np.sin(angle)], axis=-1
     )
     near, first = _drawn(view, bones, radius, np.concatenate([uv[:, middle], ring], axis=1))
     distance = np.linalg.norm(apex, axis=-1)
@@ -191,14 +191,14 @@ def _twist(view: WristView, finger: int, angles: Float, bones: Float, apex: Floa
     straight[..., 1:] = 0.0
     chain = view.model.forward(view.T_camera_palm, straight).position_m[0, CHAINS[finger]]
     axis = chain[1] - chain[0]
-    turn = rotation_vector_to_matrix(_TWIST_RAD * axis / np.linalg.norm(axis))
+    rotation = rotation_vector_to_matrix(_TWIST_RAD * axis / np.linalg.norm(axis))
     moved: list[Float] = []
-    for by in (np.eye(3), turn):
-        turned, tip = ((each - chain[0]) @ by.T + chain[0] for each in (bones, apex))
-        laser = _on_plane(view, _surface_lines(turned, radius)) @ plane_axes(view)[0]
+    for by in (np.eye(3), rotation):
+        rotated, tip = ((each - chain[0]) @ by.T + chain[0] for each in (bones, apex))
+        laser = _on_plane(view, _surface_lines(rotated, radius)) @ plane_axes(view)[0]
         moved.append(
             np.concatenate(
-                [view.optics.project(turned[:, 3]), view.optics.project(tip), laser[:, None]], axis=1
+                [view.optics.project(rotated[:, 3]), view.optics.project(tip), laser[:, None]], axis=1
             )
         )
     return (moved[1] - moved[0]) / _TWIST_RAD
@@ -251,7 +251,10 @@ def _above(view: WristView, bones: Float, radius: Float, nodes: int) -> list[Flo
     highest = np.repeat(np.where(np.isfinite(tops), tops, np.inf)[:, 1:].argmin(axis=-1) + 1, nodes)
     at = np.arange(len(bones))
     middle, size = uv[at, highest], size[at, highest, None]
-    return [middle, *(middle + size * far * np.array([np.sin(turn), -np.cos(turn)]) for far, turn in _ABOVE)]
+    return [
+        middle,
+        *(middle + size * far * np.array([np.sin(angle), -np.cos(angle)]) for far, angle in _ABOVE),
+    ]
 
 
 def _drawn(view: WristView, bones: Float, radius: Float, uv: Float) -> tuple[Float, Float]:

@@ -1,6 +1,6 @@
 """Where in the image the laser can meet each finger, and where what it meets there is beside the palm.
 
-A known set, since the laser's plane stands still, and the palm lies as calibrated or as it was seen (`palm_turn`).
+A known set, since the laser's plane stands still, and the palm lies as calibrated or as it was seen (`find_palm_pose`).
 """
 
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ from common.arrays import Bool, Float, Image, Int
 from common.camera_model import CameraModel
 from common.geometry import intersect_plane
 from common.hand_model import CHAINS
-from slave.wrist.palm_turn import PalmTurn
+from slave.wrist.palm_pose import PalmPose
 from slave.wrist.view import WristView
 from slave.wrist.workspace_samples import (
     NEAREST_M,
@@ -62,9 +62,9 @@ class Reach:
     palm: "Palm"
     first_row: int
 
-    def turned(self, turn: PalmTurn) -> "Reach":
+    def at_palm_pose(self, palm_pose: PalmPose) -> "Reach":
         """The same where the palm lies just so."""
-        return replace(self, T_camera_palm=turn.T_camera_palm, bent=not turn.straight)
+        return replace(self, T_camera_palm=palm_pose.T_camera_palm, bent=not palm_pose.straight)
 
     def holds(self, finger: Int, uv: Float) -> Bool:
         """Whether the laser can be on these fingers (N,) at pixels (N, 2) of the image."""

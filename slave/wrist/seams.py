@@ -13,8 +13,13 @@ import numpy.typing as npt
 from common.arrays import Int
 
 FENCE = 1e6  # energy of samples between corridors, two or more: no path leaves its own
-TURN = np.float32(0.02)  # energy of a step aside between stations
-_MOVES = ((-1, TURN), (1, TURN), (-2, 2 * TURN), (2, 2 * TURN))  # samples aside, and what they cost
+STEP_COST = np.float32(0.02)  # energy of a step aside between stations
+_MOVES = (
+    (-1, STEP_COST),
+    (1, STEP_COST),
+    (-2, 2 * STEP_COST),
+    (2, 2 * STEP_COST),
+)  # samples aside, and what they cost
 _Float32 = npt.NDArray[np.float32]
 
 
@@ -52,10 +57,10 @@ def minimum_cost_paths(energy: _Float32, widths: tuple[int, ...]) -> Int:
 def _cheapest(cost: _Float32) -> _Float32:
     """The least cost (N - 4,) from which each sample but the outer two of `cost` (N,) can be reached, step included."""
     best = np.minimum(cost[:-4], cost[4:])
-    best += TURN
+    best += STEP_COST
     np.minimum(best, cost[1:-3], out=best)
     np.minimum(best, cost[3:-1], out=best)
-    best += TURN
+    best += STEP_COST
     np.minimum(best, cost[2:-2], out=best)
     return best
 

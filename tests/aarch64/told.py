@@ -86,8 +86,10 @@ def cycles(folder: Path) -> list[WristDetections]:
 
 def others() -> list[Message]:
     """A sample of an IMU, and a report with names, counts and odd floats."""
-    turn = np.array([0.5, -0.5, 0.5, -0.5])
-    sample = ImuSample("imu", 7, 3, -5, np.array([0.1, -0.0, 1e-310]), np.ones(3), np.full(3, np.nan), turn)
+    quaternion = np.array([0.5, -0.5, 0.5, -0.5])
+    sample = ImuSample(
+        "imu", 7, 3, -5, np.array([0.1, -0.0, 1e-310]), np.ones(3), np.full(3, np.nan), quaternion
+    )
     return [sample, Health("left", 2**63 - 1, 2**60, {"frames": 1}, {"rate_hz": 1 / 3}, "pi-left", "1.2")]
 
 

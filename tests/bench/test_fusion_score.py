@@ -134,20 +134,20 @@ def test_markers_alone_do_not_see_what_the_wrist_device_sees() -> None:
 
 def test_a_wrist_device_s_hand_is_put_where_it_truly_is() -> None:
     moved = poses()
-    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    elsewhere = [_moved(pose, turn, np.array([0.3, -0.1, 0.2])) for pose in moved]
+    R_extra = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    elsewhere = [_moved(pose, R_extra, np.array([0.3, -0.1, 0.2])) for pose in moved]
     alone = Solved.of(BOTH, elsewhere, BOTH.wrist)
     assert np.nanmax(alone.off_mm) == pytest.approx(0.0, abs=1e-6)
     strapped = figures(alone, shown(visible_area=0.0))
     assert strapped.false_tracked == 0.0  # its palm is where the strap has it
 
 
-def _moved(pose: HandPose, turn: Float, shift: Float) -> HandPose:
+def _moved(pose: HandPose, R_extra: Float, shift: Float) -> HandPose:
     t = 1e-9 * (pose.t_ns - START_NS)
-    rotation = turn @ BOTH.scene.truth(t).joints.rotation
+    rotation = R_extra @ BOTH.scene.truth(t).joints.rotation
     fields = {name: getattr(pose, name) for name in pose.__struct_fields__}
     fields |= {
-        "position_m": pose.position_m @ turn.T + shift,
+        "position_m": pose.position_m @ R_extra.T + shift,
         "orientation_wxyz": matrix_to_quaternion(rotation),
     }
     return HandPose(**fields)

@@ -61,9 +61,9 @@ def naive(profile: HandProfile, T_rig_palm: Float, angles: Float) -> dict[str, F
         names = [JOINTS[j] for j in joints][-4:]
         abduction, flexion, pip, dip = (float(a) for a in angles[f])
         root = rest[names[0]]
-        at, turn = rigid(np.eye(3), root[:3, 3]), rigid(root[:3, :3], np.zeros(3))
+        at, rotation = rigid(np.eye(3), root[:3, 3]), rigid(root[:3, :3], np.zeros(3))
         swing = about("y", sign * abduction)
-        now = at @ (turn @ swing if f == 0 else swing @ turn) @ about("x", -flexion)
+        now = at @ (rotation @ swing if f == 0 else swing @ rotation) @ about("x", -flexion)
         out[names[0]] = T_rig_palm @ now
         for before, name, bend in zip(names, names[1:], (pip, dip, 0.0), strict=False):
             now = now @ np.linalg.inv(rest[before]) @ rest[name] @ about("x", -bend)

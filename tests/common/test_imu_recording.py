@@ -15,11 +15,15 @@ ROW = "1000,0.1,0.2,0.3,0,0,9.81,20,0,-40,1,0,0,0"
 
 def samples(count: int = 20) -> list[ImuSample]:
     rng = np.random.default_rng(3)
-    nothing, turns = np.full(3, np.nan), rng.normal(size=(count, 4))
+    nothing, rotations = np.full(3, np.nan), rng.normal(size=(count, 4))
     return [
         ImuSample("imu", 0, k, 10**9 + 8_333_333 * k, gyro, accel, nothing, q, np.nan if k < 5 else 0.1 * k)
         for k, (gyro, accel, q) in enumerate(
-            zip(*rng.normal(size=(2, count, 3)), turns / np.linalg.norm(turns, axis=1)[:, None], strict=True)
+            zip(
+                *rng.normal(size=(2, count, 3)),
+                rotations / np.linalg.norm(rotations, axis=1)[:, None],
+                strict=True,
+            )
         )
     ]
 

@@ -72,7 +72,7 @@ def rows(kind: type[Message], field: str, *shape: int) -> st.SearchStrategy[Floa
     )
 
 
-def turns() -> st.SearchStrategy[Float]:
+def rotations() -> st.SearchStrategy[Float]:
     """Unit quaternions, and the one that is not known."""
     whole = arrays(np.float64, 4, elements=st.floats(-1.0, 1.0)).filter(lambda q: float(q @ q) > 0.01)
     return st.just(np.full(4, np.nan)) | whole.map(lambda q: q / np.linalg.norm(q))
@@ -145,7 +145,7 @@ trackers = st.builds(
     seq=counts,
     t_ns=times,
     position_m=rows(TrackerPose, "position_m", 3),
-    orientation_wxyz=turns(),
+    orientation_wxyz=rotations(),
 )
 objects = st.builds(
     ObjectPose,
@@ -229,7 +229,7 @@ imu_samples = st.builds(
     gyro_rad_s=rows(ImuSample, "gyro_rad_s", 3),
     accel_m_s2=rows(ImuSample, "accel_m_s2", 3),
     mag_ut=rows(ImuSample, "mag_ut", 3),
-    orientation_wxyz=turns(),
+    orientation_wxyz=rotations(),
     heading_sigma_rad=st.just(float("nan")) | st.floats(0.0, 10.0),
 )
 healths = st.builds(

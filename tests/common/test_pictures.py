@@ -102,11 +102,11 @@ def test_the_picture_of_a_device_has_the_size_of_its_camera_or_is_not_decoded() 
         picture(REAL["jpg"], (24, 32))
     with pytest.raises(PictureError, match="is cut or broken"):
         picture(REAL["jpg"][:-100], (32, 24))
-    turned = REAL["jpg"][:2] + EXIF_TURNED + REAL["jpg"][2:]
-    assert picture(turned, (32, 24)).shape == (24, 32, 3), "as the sensor has it, whatever its notes say"
+    rotated = REAL["jpg"][:2] + EXIF_ROTATED + REAL["jpg"][2:]
+    assert picture(rotated, (32, 24)).shape == (24, 32, 3), "as the sensor has it, whatever its notes say"
 
 
-EXIF_TURNED = b"\xff\xe1\0\x22Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+EXIF_ROTATED = b"\xff\xe1\0\x22Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
 
 
 @given(st.sampled_from(SIGNATURES), st.binary(max_size=300))

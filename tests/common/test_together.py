@@ -100,8 +100,8 @@ def test_travel_reaches_one_metre_per_second_and_moves_show_every_turn() -> None
     moved = states(motion_of("both-moves"))
     angles = np.degrees([s.angles_rad for s in moved])
     assert (np.ptp(angles[:, 1:, 2], axis=0) > 45.0).all()
-    turned = np.array([s.T_rig_palm[:3, :3] for s in moved])
-    rates = np.einsum("tji,tjk->tik", turned[:-1], turned[1:]) * RATE_HZ
+    rotated = np.array([s.T_rig_palm[:3, :3] for s in moved])
+    rates = np.einsum("tji,tjk->tik", rotated[:-1], rotated[1:]) * RATE_HZ
     about = np.stack([rates[:, 2, 1], rates[:, 0, 2], rates[:, 1, 0]])  # palm axes, rad/s
     assert (np.abs(about).max(axis=1) > 0.5).all()
 

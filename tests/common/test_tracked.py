@@ -178,8 +178,8 @@ def test_a_tag_is_read_at_half_a_metre_where_the_truth_has_it(family: TagFamily)
     known = OBJECTS["cube"].tags
     assert known is not None
     profile = msgspec.structs.replace(OBJECTS["cube"], tags=Tags(family, known.tags))
-    turned = rigid(axis_rotation(2, 0.4) @ facing(0.0), np.array([0.03, 0.0, 0.5]))
-    scene = placed("desk-cube", Placed(turned), {"cube": profile})
+    rotated = rigid(axis_rotation(2, 0.4) @ facing(0.0), np.array([0.03, 0.0, 0.5]))
+    scene = placed("desk-cube", Placed(rotated), {"cube": profile})
     found = dictionary(family, range(5))
     for name in CAMERAS:
         image, view = Renderer(scene, name).observe(0.0)

@@ -184,10 +184,10 @@ def test_an_imu_next_to_the_camera_feels_the_forearm_and_not_the_palm() -> None:
     assert imu.q_palm_imu is not None
     sensor = SimulatedImu.of(replace(SCENE, motion=Nodding()))
     half = SimulatedImu.of(replace(SCENE, motion=Doing(Nodding()))).sample(120, 1.0, 0)
-    turned = sensor.sample(120, 1.0, 0).gyro_rad_s - half.gyro_rad_s
+    rotated = sensor.sample(120, 1.0, 0).gyro_rad_s - half.gyro_rad_s
     # R_rig_forearm = R_rig_palm R_x(-bend): the forearm turns about the palm's x, the other way.
     expected = quaternion_to_matrix(np.array(imu.q_palm_imu)).T @ np.array([-0.5, 0.0, 0.0])
-    np.testing.assert_allclose(turned, expected, atol=0.02)  # its scale is off by 1 %
+    np.testing.assert_allclose(rotated, expected, atol=0.02)  # its scale is off by 1 %
 
 
 @pytest.mark.parametrize("name", TOGETHER)

@@ -73,12 +73,12 @@ def test_a_camera_without_intrinsics_is_refused(side: str) -> None:
 def test_slave_and_master_place_the_same_plane_and_palm_also_where_the_file_is_rounded() -> None:
     assert RIG.laser_plane is not None
     assert RIG.T_camera_palm is not None
-    turned = tuple(tuple(round(number, 3) for number in row) for row in RIG.T_camera_palm)
+    rotated = tuple(tuple(round(number, 3) for number in row) for row in RIG.T_camera_palm)
     normal = tuple(-1.005 * number for number in RIG.laser_plane.normal)  # and seen from its other side
     plane = LaserPlane(normal=(normal[0], normal[1], normal[2]), offset_m=-1.005 * RIG.laser_plane.offset_m)
-    rig = replace(RIG, T_camera_palm=turned, laser_plane=plane)
+    rig = replace(RIG, T_camera_palm=rotated, laser_plane=plane)
     slave, master = (make(rig, CAMERA) for make in SIDES.values())
-    assert slave.T_camera_palm.tolist() == master.T_camera_palm.tolist() == [list(row) for row in turned]
+    assert slave.T_camera_palm.tolist() == master.T_camera_palm.tolist() == [list(row) for row in rotated]
     assert slave.normal.tolist() == master.normal.tolist()
     assert slave.offset_m == master.offset_m
     assert abs(slave.offset_m + RIG.laser_plane.offset_m) < 1e-6

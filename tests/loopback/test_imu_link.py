@@ -20,9 +20,9 @@ from tests.network_helpers import PATIENCE_S, clock_known, detections, free_udp_
 
 
 def sample(source: str, session: int, seq: int, t_ns: int = 0) -> ImuSample:
-    turn = np.array([0.5, 0.5, 0.5, 0.5])
+    quaternion = np.array([0.5, 0.5, 0.5, 0.5])
     return ImuSample(
-        source, session, seq, t_ns, np.zeros(3), np.array([0, 0, 9.81]), np.full(3, np.nan), turn
+        source, session, seq, t_ns, np.zeros(3), np.array([0, 0, 9.81]), np.full(3, np.nan), quaternion
     )
 
 

@@ -87,9 +87,9 @@ def test_every_pose_reaches_every_sink_with_its_latency(short_run: SyntheticRun)
     assert last.latency_ns == 1_000_000  # handed over 2 ms after its capture, published after 3 ms
 
 
-def turned(t_ns: int, turn: Float) -> ImuSample:
-    """A sample of an IMU whose axes are the palm's and whose world is the rig's, `turn` (3, 3) off the truth."""
-    q = matrix_to_quaternion(turn @ hand_at(t_ns * 1e-9).T_rig_palm[:3, :3])
+def rotated(t_ns: int, rotation: Float) -> ImuSample:
+    """A sample of an IMU whose axes are the palm's and whose world is the rig's, `rotation` (3, 3) off the truth."""
+    q = matrix_to_quaternion(rotation @ hand_at(t_ns * 1e-9).T_rig_palm[:3, :3])
     return ImuSample("imu", 1, t_ns // 8_000_000, t_ns, np.zeros(3), np.zeros(3), np.full(3, np.nan), q)
 
 
@@ -100,7 +100,7 @@ def test_samples_of_an_imu_turn_the_palm_and_are_no_frames(short_run: SyntheticR
     )
     setup, off = setup_of(msgspec.structs.replace(short_run.setup.rig, imu=imu)), axis_rotation(0, 0.1)
     first, last = short_run.messages[0].t_ns, short_run.messages[-1].t_ns
-    samples = [turned(t_ns, off) for t_ns in range(first, last, 8_000_000)]
+    samples = [rotated(t_ns, off) for t_ns in range(first, last, 8_000_000)]
     script = sorted([*short_run.messages, *samples], key=lambda message: message.t_ns)
     stop, sink, figures = threading.Event(), Collector(), RunFigures()
     hands, watched = world_of(setup), list[MarkerDetections]()
@@ -118,7 +118,7 @@ def test_samples_of_an_imu_turn_the_palm_and_are_no_frames(short_run: SyntheticR
 def test_samples_of_an_imu_that_has_no_place_are_counted(short_run: SyntheticRun) -> None:
     unplaced = setup_of(msgspec.structs.replace(short_run.setup.rig, imu=ImuCalibration()))
     stop, hands = threading.Event(), world_of(unplaced)
-    run(ScriptedSource([turned(0, np.eye(3))], stop), hands, [], ScriptedClock(), RunFigures(), stop)
+    run(ScriptedSource([rotated(0, np.eye(3))], stop), hands, [], ScriptedClock(), RunFigures(), stop)
     assert hands.counts == {"orientation.unplaced": 1}
 
 

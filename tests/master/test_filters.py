@@ -185,9 +185,9 @@ def test_read_only_and_transposed_samples_are_taken_as_they_are() -> None:
     samples = np.random.default_rng(8).normal(0.0, 1.0, (20, 4, 3))
     ours, theirs = OneEuro(PAPER), OneEuro(PAPER)
     for k, sample in enumerate(samples):
-        turned = np.asfortranarray(sample)
-        turned.flags.writeable = False
-        np.testing.assert_array_equal(ours.push(k * 10_000_000, turned), theirs.push(k * 10_000_000, sample))
+        rotated = np.asfortranarray(sample)
+        rotated.flags.writeable = False
+        np.testing.assert_array_equal(ours.push(k * 10_000_000, rotated), theirs.push(k * 10_000_000, sample))
 
 
 def test_a_group_has_the_cut_off_of_its_fastest_signal_and_another_its_own() -> None:
@@ -301,9 +301,11 @@ def test_a_sample_far_less_sure_than_its_neighbours_is_ridden_over() -> None:
 
 def test_the_axes_are_those_of_the_view() -> None:
     rng = np.random.default_rng(4)
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     points, sd = np.cumsum(rng.normal(0.0, 1e-3, (100, 3)), axis=0), np.tile([3e-4, 1e-3, 5e-3], (100, 1))
-    np.testing.assert_allclose(_filtered(points @ turn, sd, turn), _filtered(points, sd) @ turn, atol=1e-9)
+    np.testing.assert_allclose(
+        _filtered(points @ rotation, sd, rotation), _filtered(points, sd) @ rotation, atol=1e-9
+    )
 
 
 def test_a_point_without_a_covariance_or_unseen_poisons_nothing() -> None:

@@ -28,12 +28,12 @@ HAND = "default-right"
 
 def object_pose(k: int, name: str = "cube") -> ObjectPose:
     rng = np.random.default_rng(k)
-    lost, turn = k % 4 == 3, rng.normal(size=4)
+    lost, quaternion = k % 4 == 3, rng.normal(size=4)
     return ObjectPose(
         object=name,
         t_ns=2**60 + k,
         position_m=np.full(3, nan) if lost else rng.normal(size=3),
-        orientation_wxyz=np.full(4, nan) if lost else turn / np.linalg.norm(turn),
+        orientation_wxyz=np.full(4, nan) if lost else quaternion / np.linalg.norm(quaternion),
         cov=rng.normal(size=(6, 6)),
         residual_m=nan if lost else float(rng.uniform()),
         source=int(ObjectSource.NONE if lost else ObjectSource.TAGS),

@@ -18,7 +18,7 @@ from common.geometry import (
     matrix_to_quaternion,
     quaternion_to_matrix,
 )
-from master.estimator.epoch import Turn
+from master.estimator.epoch import OrientationMeasurement
 from master.estimator.imu_samples import REACH_NS, slerp
 from master.estimator.palm_imu import OrientationTrack
 from master.fabrik.estimate import SolvedHand
@@ -52,13 +52,13 @@ def degrees(a: Float, b: Float) -> float:
     return float(np.degrees(Rotation.from_matrix(a @ b.T).magnitude()))
 
 
-def at(track: OrientationTrack, t_ns: int, near: SolvedHand | None = None) -> Turn:
+def at(track: OrientationTrack, t_ns: int, near: SolvedHand | None = None) -> OrientationMeasurement:
     found = track.at(t_ns, near)
     assert found is not None
     return found
 
 
-def covariance(found: Turn) -> Float:
+def covariance(found: OrientationMeasurement) -> Float:
     """Of the palm's turn (3, 3) [rad^2]."""
     return np.asarray(np.linalg.inv(found.information), np.float64)
 
@@ -118,9 +118,9 @@ def test_a_heading_drifts_until_nothing_is_known_of_it() -> None:
 def test_an_unknown_heading_is_that_of_the_hand_and_its_tilt_stays(wrong_rad: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     truth = any_rotation(rng)
-    turned = np.asarray(Rotation.from_rotvec(wrong_rad * UP).as_matrix(), np.float64)
+    rotated = np.asarray(Rotation.from_rotvec(wrong_rad * UP).as_matrix(), np.float64)
     track = OrientationTrack(TILT_ONLY)
-    track.push(0, said(turned @ truth))
+    track.push(0, said(rotated @ truth))
     assert track.at(0, None) is None  # nobody says where it points
     assert degrees(at(track, 0, solved(truth)).rotation, truth) < 1e-3
     off = np.asarray(Rotation.from_rotvec(rng.normal(0.0, 0.1, 3)).as_matrix(), np.float64)

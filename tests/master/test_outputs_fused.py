@@ -120,8 +120,8 @@ def test_a_fused_run_is_all_there_and_its_device_moves(setup: RigSetup, poses: P
     _, xyzw = column(path, "/world/laser", "Transform3D:quaternion")
     _, at = column(path, "/world/laser", "Transform3D:translation")
     T = DevicePlace.of(poses, setup.hand).cameras(setup.wrist.T_camera_palm)[[0, 1, 3, 4]]
-    turned = quaternion_to_matrix(np.array(xyzw, np.float64)[:, 0][:, [3, 0, 1, 2]])
-    np.testing.assert_allclose(turned, T[:, :3, :3], atol=1e-6)
+    rotated = quaternion_to_matrix(np.array(xyzw, np.float64)[:, 0][:, [3, 0, 1, 2]])
+    np.testing.assert_allclose(rotated, T[:, :3, :3], atol=1e-6)
     np.testing.assert_allclose(np.array(at, np.float64)[:, 0], T[:, :3, 3], atol=1e-6)
     _, arms = column(path, f"{hand}/forearm", "strips")
     assert [len(row) for row in arms] == [1, 1, 0, 1, 1]

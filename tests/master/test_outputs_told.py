@@ -18,15 +18,15 @@ from master.outputs.rerun_gestures import arc, said
 from tests.master.test_outputs_rerun import SETUP, STEP_NS, Viewing, moving_hand, rows_of
 
 START_NS = 10**15
-TURNED = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, 0.05), (0.0, 0.0, 0.0, 1.0))
+ROTATED = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, 0.05), (0.0, 0.0, 0.0, 1.0))
 BAR = ObjectProfile(
     version=1,
     name="bar",
     markers={f"b{i}": Bead(position_m=(0.01 * i, 0.02 * i * i, 0.0)) for i in range(3)},
-    tags=Tags(family="apriltag_36h11", tags=(Tag(id=3, edge_m=0.03, T_object_tag=TURNED),)),
+    tags=Tags(family="apriltag_36h11", tags=(Tag(id=3, edge_m=0.03, T_object_tag=ROTATED),)),
     shape=(
         CylinderShape(radius_m=0.012, length_m=0.18),
-        BoxShape(size_m=(0.04, 0.04, 0.02), T_object_part=TURNED),
+        BoxShape(size_m=(0.04, 0.04, 0.02), T_object_part=ROTATED),
         SphereShape(radius_m=0.01),
     ),
 )

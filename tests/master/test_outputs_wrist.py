@@ -171,9 +171,11 @@ def test_the_scene_is_turned_as_the_forearm_is_held(
     known = [k for k in range(len(poses)) if k != 3]
     assert times == poses.t_ns[known].tolist()
     xyzw = np.array(said, np.float64)[:, 0]
-    turned = quaternion_to_matrix(xyzw[:, [3, 0, 1, 2]])
+    rotated = quaternion_to_matrix(xyzw[:, [3, 0, 1, 2]])
     up = np.array([R[2] for R in world_camera])[known]  # in the camera's frame
-    np.testing.assert_allclose((turned @ up[..., None])[..., 0], np.tile([0.0, -1.0, 0.0], (7, 1)), atol=1e-6)
-    assert turned[0, 0, 2] == pytest.approx(
+    np.testing.assert_allclose(
+        (rotated @ up[..., None])[..., 0], np.tile([0.0, -1.0, 0.0], (7, 1)), atol=1e-6
+    )
+    assert rotated[0, 0, 2] == pytest.approx(
         0.0, abs=1e-6
     )  # what the camera looks along begins straight ahead

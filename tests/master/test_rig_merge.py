@@ -88,11 +88,11 @@ def test_what_lies_in_the_frame_of_a_rig_moves_with_it() -> None:
     moved = RigSetup.joined([aside(volume=volume, imu=imu, T_world_rig=rows(shifted))]).rig
     assert moved.volume is not None
     np.testing.assert_allclose((moved.volume.low_m, moved.volume.high_m), [(0.1, 0.0, 0.4), (0.2, 0.2, 0.8)])
-    turned = RigSetup.joined([aside(volume=volume, imu=imu)]).rig
-    assert turned.volume is None, "a box that stands askew is none along the axes"
-    assert turned.imu is not None
-    assert turned.imu.q_rig_world is not None
-    np.testing.assert_allclose(np.abs(matrix_to_quaternion(ASIDE[:3, :3]) @ turned.imu.q_rig_world), 1.0)
+    rotated = RigSetup.joined([aside(volume=volume, imu=imu)]).rig
+    assert rotated.volume is None, "a box that stands askew is none along the axes"
+    assert rotated.imu is not None
+    assert rotated.imu.q_rig_world is not None
+    np.testing.assert_allclose(np.abs(matrix_to_quaternion(ASIDE[:3, :3]) @ rotated.imu.q_rig_world), 1.0)
 
 
 def test_cameras_together_are_placed_as_well_as_the_worst(bench: RigSetup) -> None:

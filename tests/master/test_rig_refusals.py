@@ -48,7 +48,7 @@ def without_numbers(rig: dict[str, Any]) -> None:
     rig |= {"depth_model": "power_law", "power_law": None}
 
 
-def turned(rig: dict[str, Any]) -> None:
+def rotated(rig: dict[str, Any]) -> None:
     """The second camera looks four degrees more to the left."""
     pose = np.array(rig["T_rig_camera"]["right"])
     pose[:3, :3] = pose[:3, :3] @ axis_rotation(1, np.radians(-4.0))
@@ -79,7 +79,7 @@ def strange_solver(rig: dict[str, Any]) -> None:
             ),
         ),
         (
-            turned,
+            rotated,
             (
                 "rig 'desk': depth_model 'power_law' needs parallel cameras side by side, but the second is turned by",
                 "at most 3 are allowed: turn them, or use 'stereo'",

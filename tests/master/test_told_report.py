@@ -85,10 +85,10 @@ def test_too_late_is_not_right() -> None:
 
 def test_the_angle_is_judged_from_where_the_dial_began() -> None:
     began = told("dial", "dial", 3.0, angle_rad=0.0)
-    turned = Gesture(
+    rotated = Gesture(
         "h", began.t_ns + 2 * 10**9, "dial", "dial", "update", began.t_ns, 0.9, angle_rad=1.0 + 0.05
     )
-    assert judge_gestures([began, turned, turned], Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 10**10)[
+    assert judge_gestures([began, rotated, rotated], Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 10**10)[
         "dial_deg"
     ] == pytest.approx(np.degrees(0.05), abs=0.01)
 

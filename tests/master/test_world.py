@@ -359,12 +359,12 @@ def test_nonsense_that_is_sealed_rightly_ends_nothing(which: str, request: pytes
         ids = np.sort(rng.choice(8, count, replace=False)).astype(np.uint16)
         uv, sigma = rng.normal(size=(count, 4, 2)) * far, 10.0 ** rng.uniform(-5.0, 4.0, count)
         uv, place = np.clip(uv, -16384.0, 32768.0), np.clip(rng.normal(size=3) * far, -1e3, 1e3)
-        turn = rng.normal(size=4)
-        turn *= rng.uniform(0.95, 1.04) / np.linalg.norm(turn)
-        turn = np.clip(turn, -1.0, 1.0)
+        quaternion = rng.normal(size=4)
+        quaternion *= rng.uniform(0.95, 1.04) / np.linalg.norm(quaternion)
+        quaternion = np.clip(quaternion, -1.0, 1.0)
         for message in (
             TagDetections("left", 1, k, t_ns, t_ns, ids, uv, sigma),
-            TrackerPose("puck", 1, k, t_ns, place, turn),
+            TrackerPose("puck", 1, k, t_ns, place, quaternion),
             msgspec.structs.replace(base, t_ns=int(rng.integers(-(2**61), 2**61))),
             base,
         ):

@@ -44,8 +44,8 @@ def test_the_forearm_is_scored_against_the_vertical_whatever_its_heading(
     times = (poses.t_ns - START_NS) * 1e-9
     lies = np.array([rig_world.T @ scene.motion.at(float(t)).T_rig_palm[:3, :3] for t in times])
     for tilt_deg in (0.0, 5.0):
-        turned = axis_rotation(2, 1.0) @ axis_rotation(0, np.radians(tilt_deg)) @ lies
-        told = replace(poses, palm_world_wxyz=matrix_to_quaternion(turned))
+        rotated = axis_rotation(2, 1.0) @ axis_rotation(0, np.radians(tilt_deg)) @ lies
+        told = replace(poses, palm_world_wxyz=matrix_to_quaternion(rotated))
         told.palm_world_wxyz[:3] = np.nan
         assert forearm_tilt(told, scene, START_NS)["forearm_tilt_deg"] == pytest.approx(tilt_deg, abs=1e-4)
 

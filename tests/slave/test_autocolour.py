@@ -177,8 +177,8 @@ def test_a_few_frames_are_not_enough() -> None:
 def test_a_turned_and_scaled_hand_votes_for_its_order(
     order: list[int], angle: float, scale: float, hidden: int | None
 ) -> None:
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    uv = (scale * PATTERN @ turn.T + 300.0)[None, order].copy()
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    uv = (scale * PATTERN @ rotation.T + 300.0)[None, order].copy()
     if hidden is not None:
         uv[0, hidden] = np.nan
     votes, against = votes_of(uv, PATTERN, ORDERS)

@@ -93,10 +93,10 @@ def test_two_paints_of_one_hue_are_refused() -> None:
 
 
 @given(st.lists(st.integers(0, 20), min_size=1, max_size=30), st.integers(0, 179))
-def test_the_circular_median_turns_with_the_hues(values: list[int], turn: int) -> None:
+def test_the_circular_median_turns_with_the_hues(values: list[int], rotation: int) -> None:
     hues = np.array(values, np.uint8)
-    turned = ((np.array(values) + turn) % HUES).astype(np.uint8)
-    difference = (circular_median(turned) - circular_median(hues) - turn) % HUES
+    rotated = ((np.array(values) + rotation) % HUES).astype(np.uint8)
+    difference = (circular_median(rotated) - circular_median(hues) - rotation) % HUES
     assert min(difference, HUES - difference) == pytest.approx(0.0, abs=1e-6)
     assert circular_median(hues) % HUES == pytest.approx(float(np.median(values)) % HUES, abs=1e-6)
 

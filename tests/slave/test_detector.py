@@ -127,12 +127,12 @@ def test_a_rival_of_the_same_colour_within_reach_is_named() -> None:
 
 @pytest.mark.parametrize("radius", [5.0, 7.0])
 @pytest.mark.parametrize("gap", [6.0, 9.0, 12.0])
-@pytest.mark.parametrize("turn", [-2.8, 3.6, 4.2])
+@pytest.mark.parametrize("angle", [-2.8, 3.6, 4.2])
 def test_a_thing_near_a_marker_never_seen_before_is_an_alternative_not_a_part_of_it(
-    radius: float, gap: float, turn: float
+    radius: float, gap: float, angle: float
 ) -> None:
     away = 7.0 + gap + radius
-    thing = 265.0 + away * math.cos(turn), 110.0 + away * math.sin(turn)
+    thing = 265.0 + away * math.cos(angle), 110.0 + away * math.sin(angle)
     for found in push_all([render([*hand(), Disc(paint(1), *thing, radius)])] * 2):
         place, alternative = (np.hypot(*(uv[1] - (265.0, 110.0))) for uv in (found.uv, found.alternative_uv))
         assert min(place, alternative) < 0.3

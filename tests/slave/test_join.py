@@ -84,10 +84,13 @@ def test_frames_of_all_cameras_in_the_order_of_time(tmp_path: Path) -> None:
 def test_the_imu_of_one_part_comes_along_on_the_clock_of_the_first(tmp_path: Path) -> None:
     parts = [part(tmp_path, "left"), part(tmp_path, "right", 1050 - 7_000_000_250, clock=THERE)]
     nothing = np.full(3, np.nan)
-    turn = np.array([1.0, 0.0, 0.0, 0.0])
+    quaternion = np.array([1.0, 0.0, 0.0, 0.0])
     write_imu(
         parts[1],
-        [ImuSample("x", 0, k, 50 * k - 7_000_000_250, nothing, nothing, nothing, turn) for k in range(9)],
+        [
+            ImuSample("x", 0, k, 50 * k - 7_000_000_250, nothing, nothing, nothing, quaternion)
+            for k in range(9)
+        ],
     )
     join_recordings(parts, tmp_path / "wave", by_wall_clock=True)
     assert [one.t_ns for one in read_imu(tmp_path / "wave", "x")] == [50 * k for k in range(9)]

@@ -214,10 +214,10 @@ def test_a_hand_that_comes_back_is_whole_within_two_rounds_of_the_strips_and_a_m
     assert (np.hypot(*(frames[-1].uv - CENTRES - (300.0, 300.0)).T) < 0.3).all()
 
 
-@pytest.mark.parametrize("turned", [1.0, -1.0])
-def test_a_hand_that_enters_at_the_edge_of_the_frame_is_followed_into_it(turned: float) -> None:
+@pytest.mark.parametrize("rotated", [1.0, -1.0])
+def test_a_hand_that_enters_at_the_edge_of_the_frame_is_followed_into_it(rotated: float) -> None:
     us = [-90.0 + 12.0 * k for k in range(30)]
-    images = [render(hand(u if turned > 0 else 639.0 - u)) for u in us]
+    images = [render(hand(u if rotated > 0 else 639.0 - u)) for u in us]
     whole, frames = push_all(DETECTORS["numpy"].fresh(), images), push_all(windowed(), images)
     for one, other in zip(whole, frames, strict=True):
         near = np.isfinite(one.uv[:, 0]) & np.isfinite(other.uv[:, 0])

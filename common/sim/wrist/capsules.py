@@ -171,7 +171,7 @@ def _thenar(model: HandModel, radius: list[float], rng: np.random.Generator) -> 
 
 def _palm(model: HandModel, radius: list[float], rng: np.random.Generator) -> list[_Part]:
     """Metacarpals and what fills the gaps between them, the mounds before the fingers, the heel, the forearm."""
-    place, wrist_turn, s = model.rest_position_m, model.rest_rotation[WRIST], model.side_sign
+    place, wrist_rotation, s = model.rest_position_m, model.rest_rotation[WRIST], model.side_sign
     roots = CHAINS[1:, 0]
     heads, bases = place[roots], place[list(METACARPALS)]
     head_m, base_m = 1.15 * np.array(radius)[roots], np.array(radius)[list(METACARPALS)]
@@ -180,7 +180,9 @@ def _palm(model: HandModel, radius: list[float], rng: np.random.Generator) -> li
     def add(start: Float, stop: Float, r1: float, r2: float) -> None:
         # The frame of the wrist's joint is turned to the palm's, and does not move in it.
         out.append(
-            _Part(WRIST, wrist_turn.T @ start, wrist_turn.T @ stop, float(r1), float(r2), PALM_GROUP, 0)
+            _Part(
+                WRIST, wrist_rotation.T @ start, wrist_rotation.T @ stop, float(r1), float(r2), PALM_GROUP, 0
+            )
         )
 
     for k in range(4):

@@ -40,7 +40,7 @@ RANDOM_DEG, RANDOM_DIP = (
     ((-10.0, 10.0), (0.0, 80.0), (0.0, 100.0)),
     (0.5, 0.9),
 )  # abduction, MCP, PIP; DIP / PIP
-FOREARM_TURN = np.radians(12.0)
+FOREARM_ROTATION = np.radians(12.0)
 _HALF_BENT = ((8, 2, 6), (0, 22, 36), (0, 22, 36), (0, 22, 36), (0, 22, 36))
 _WIDE = ((24, -4, 0), (14, 8, 10), (0, 8, 10), (-12, 8, 10), (-15, 8, 10))
 _CLOSED = ((-6, 4, 6), (-6, 10, 14), (0, 10, 14), (4, 10, 14), (7, 10, 14))
@@ -121,8 +121,8 @@ class Stations:
         share = smooth_step((t - place * self._each_s) / self._move_s)
         before = self._postures[place - 1]  # that of the first is the last
         posture = before + share * (self._postures[place] - before)
-        wobble, shift, turn = self._drift.at(t)
-        return HandState(_forearm(self._model, t, shift, turn), angles_of(self._model, posture, wobble))
+        wobble, shift, rotation = self._drift.at(t)
+        return HandState(_forearm(self._model, t, shift, rotation), angles_of(self._model, posture, wobble))
 
 
 class GuidedCurl:
@@ -263,7 +263,9 @@ def wrist_motion(
     return None
 
 
-def _forearm(model: HandModel, t_s: float, shift_m: Float, turn_rad: Float) -> Float:
+def _forearm(model: HandModel, t_s: float, shift_m: Float, rotation_rad: Float) -> Float:
     """Palm pose in the room (4, 4): the forearm turns slowly while the fingers move."""
-    slow = FOREARM_TURN * np.sin(2.0 * np.pi * t_s / (PERIOD_S / 6) + np.array([0.0, 2.1, 4.2]))
-    return base_pose(model, np.zeros(3), shift_m, slow - FOREARM_TURN * np.sin([0.0, 2.1, 4.2]) + turn_rad)
+    slow = FOREARM_ROTATION * np.sin(2.0 * np.pi * t_s / (PERIOD_S / 6) + np.array([0.0, 2.1, 4.2]))
+    return base_pose(
+        model, np.zeros(3), shift_m, slow - FOREARM_ROTATION * np.sin([0.0, 2.1, 4.2]) + rotation_rad
+    )

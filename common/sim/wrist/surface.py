@@ -76,7 +76,7 @@ class HandSurface:
         forearm = scene.capsules.forearm.tolist()
         met = self._cast(self._straight_bodies, forearm, np.full(len(rays), np.inf, dtype=np.float32))
         outside = set(forearm) - set(np.unique(met).tolist())
-        self._turning = [body for body in range(scene.capsules.still) if body not in outside]
+        self._rotated = [body for body in range(scene.capsules.still) if body not in outside]
 
     def palm(self, bodies: Capsules, bend_rad: Float) -> Palm:
         """The palm of a hand whose flesh is at `bodies`, of a wrist bent by that (2,); `straight` itself while it is
@@ -84,11 +84,11 @@ class HandSurface:
         if self._scene.capsules.same_palm(bodies, self._straight_bodies):
             return self.straight
         if self._bend_step_rad <= 0.0:
-            return self._palm(bodies, self._turning)
+            return self._palm(bodies, self._rotated)
         steps = tuple(np.rint(bend_rad / self._bend_step_rad).astype(int).tolist())
         if self._bent is None or self._bent[0] != steps:
             rounded = self._scene.bent_bodies(self._bend_step_rad * np.array(steps))
-            self._bent = steps, self._palm(rounded, self._turning)
+            self._bent = steps, self._palm(rounded, self._rotated)
         return self._bent[1]
 
     def appearance(self, bodies: Capsules, palm: Palm) -> SurfaceView:

@@ -41,7 +41,7 @@ class Seen:
     """
 
     views: BoardViews
-    turned: Mapping[str, Mapping[str, Int]]
+    corner_order: Mapping[str, Mapping[str, Int]]
 
     def observations(self, shots: Sequence[Shot]) -> tuple[Observation, ...]:
         """The corners of the shots; views are numbered by the shots' places, in order of appearance."""
@@ -51,7 +51,7 @@ class Seen:
         found: list[Observation] = []
         for shot in shots:
             corners, uv = corners_seen(by_name[shot.view].observations[shot.camera])
-            true = self.turned[shot.view][shot.camera][corners]
+            true = self.corner_order[shot.view][shot.camera][corners]
             found.append(Observation(cameras.index(shot.camera), number[shot.place], true, uv))
         return tuple(found)
 

@@ -228,8 +228,9 @@ def _check_palm(problem: HandRoutineProblem, fit: ShapeFit) -> None:
     believed = np.repeat([beliefs.palm_rad_s, beliefs.palm_m_s], 3) * step_s
     wander = np.sqrt((np.diff(fit.palm, axis=0) ** 2).mean(axis=0)) / believed
     if wander.max() > _RESTLESS:
-        turn, shift = (float(np.ptp(part, axis=0).max()) for part in (fit.palm[:, :3], fit.palm[:, 3:]))
+        rotation, shift = (float(np.ptp(part, axis=0).max()) for part in (fit.palm[:, :3], fit.palm[:, 3:]))
         raise FitError(
-            f"the palm did not rest: it moved by {1e3 * shift:.0f} mm and turned by {np.degrees(turn):.0f} degrees; lay"
+            f"the palm did not rest: it moved by {1e3 * shift:.0f} mm and turned by {np.degrees(rotation):.0f} degrees;"
+            " lay"
             " the back of the hand on a table, or paint three markers on it and show them"
         )

@@ -14,7 +14,7 @@ from common.geometry import rotation_vector_to_matrix, skew, transform
 from common.hand_model import HandModel
 from master.calibrate.hand.beliefs import Beliefs, Course
 from master.calibrate.hand.curves import BorderedNormal, Knots
-from master.calibrate.hand.shape import BIAS, LENGTH, PER_FINGER, RATIO, ROOT, TURN, Shape, caps_of
+from master.calibrate.hand.shape import BIAS, LENGTH, PER_FINGER, RATIO, ROOT, ROTATION, Shape, caps_of
 
 CHANNELS = 26
 _PALM, _ANGLES = 6, 20
@@ -116,8 +116,8 @@ class HandRoutineProblem:
         caps = caps_of(self.model, self.cap_m, state.shape, curves[:, _PALM:].reshape(-1, 5, 4))
         back = np.broadcast_to(state.shape.back_m, (count, markers - 5, 3))
         palm = np.concatenate([caps.place_m, back], axis=1)
-        turn = rotation_vector_to_matrix(curves[:, :3])
-        rotation = turn @ self.start[:3, :3]
+        change = rotation_vector_to_matrix(curves[:, :3])
+        rotation = change @ self.start[:3, :3]
         middle = 0.5 * self.model.rest_position_m.max(axis=0) * [0.0, 0.0, 1.0]
         arm = (palm - middle) @ np.swapaxes(rotation, -1, -2)
         predicted = arm + (transform(self.start, middle) + curves[:, 3:6])[:, None]
@@ -198,8 +198,8 @@ class HandRoutineProblem:
         own_sd, own = (a[: 5 * PER_FINGER].reshape(5, PER_FINGER) for a in (sd, away))
         own_sd[:, LENGTH], own[:, LENGTH] = b.bone * prior.length_m, shape.length_m - prior.length_m
         own_sd[:, ROOT], own[:, ROOT] = b.root_m, shape.root_m - prior.root_m
-        own_sd[:, TURN] = np.array([b.thumb_rad, *[b.root_rad] * 4])[:, None]
-        own[:, TURN] = _turn_between(shape.root_rotation, prior.root_rotation)
+        own_sd[:, ROTATION] = np.array([b.thumb_rad, *[b.root_rad] * 4])[:, None]
+        own[:, ROTATION] = _rotation_between(shape.root_rotation, prior.root_rotation)
         own_sd[:, RATIO] = np.array([b.thumb_ratio[1], *[b.dip_ratio[1]] * 4])
         own[:, RATIO] = shape.dip_ratio - prior.dip_ratio
         own_sd[:, BIAS], own[:, BIAS] = b.dip_bias_rad, shape.dip_bias_rad - prior.dip_bias_rad
@@ -213,7 +213,7 @@ def weigh(whitened: Float) -> Float:
     return np.minimum(1.0, _OUTLIER / np.maximum(np.linalg.norm(whitened, axis=-1), 1e-12))
 
 
-def _turn_between(rotation: Float, other: Float) -> Float:
+def _rotation_between(rotation: Float, other: Float) -> Float:
     """(5, 3) small turns about the palm's axes from `other` to `rotation` (5, 3, 3)."""
     relative = rotation @ np.swapaxes(other, -1, -2)
     return 0.5 * np.stack(

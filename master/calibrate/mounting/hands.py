@@ -1,7 +1,7 @@
 """The hands of all instants: their cost and normal equations given markers and habits, batched over instants.
 
 The residuals are the markers' distances, whitened by their covariances; habits add a quadratic of the free angles.
-The Jacobian is closed form: turn, shift and angles move a marker on the hand as `master.estimator.attached` has it.
+The Jacobian is closed form: turn, shift and angles move a marker on the hand as `master.estimator.body_points` has it.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ import numpy as np
 from common.arrays import Float
 from common.geometry import rotation_vector_to_matrix, skew
 from common.hand_model import Chains, HandModel
-from master.estimator.attached import Attached
+from master.estimator.body_points import BodyPoints
 from master.estimator.priors import Habits
 
 
@@ -51,7 +51,7 @@ class HandProblem:
     """
 
     model: HandModel
-    markers: Attached
+    markers: BodyPoints
     habits: Habits
     points_m: Float
     whiten: Float
@@ -74,9 +74,11 @@ class HandProblem:
         R, chains = hands.T_rig_palm[:, :3, :3], self._chains(hands)
         local = self.markers.place(chains)
         arm = self._arm(hands, local)
-        by_turn = self.whiten @ skew(-arm)
+        by_rotation = self.whiten @ skew(-arm)
         by_x = (self.whiten @ R[:, None]) @ self.markers.jacobian(chains, local, hands.x)
-        J = np.concatenate([by_turn, self.whiten, by_x], axis=-1).reshape(len(R), -1, 6 + hands.x.shape[1])
+        J = np.concatenate([by_rotation, self.whiten, by_x], axis=-1).reshape(
+            len(R), -1, 6 + hands.x.shape[1]
+        )
         J_t = np.swapaxes(J, 1, 2)
         gradient, normal = (J_t @ self._residual(hands, arm)[..., None])[..., 0], J_t @ J
         gradient[:, 6:] += self._pushed(hands) - self.habits.pull

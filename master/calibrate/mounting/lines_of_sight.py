@@ -21,8 +21,8 @@ from master.wrist_setup import WristSetup
 FINGERS = slice(1, 5)
 SEEN = 4  # numbers of a finger: laser point across and along [m], tip [px]
 _RAYS = 16
-_TURN, _SHIFT_M, _THICK = np.radians(0.2), 2e-4, 0.01  # steps of differences
-_STEPS = np.repeat([_TURN, _SHIFT_M, _TURN, _THICK], (3, 3, 4, 1))
+_ROTATION_STEP, _SHIFT_M, _THICK = np.radians(0.2), 2e-4, 0.01  # steps of differences
+_STEPS = np.repeat([_ROTATION_STEP, _SHIFT_M, _ROTATION_STEP, _THICK], (3, 3, 4, 1))
 
 
 class LinesOfSight:
@@ -65,12 +65,12 @@ class LinesOfSight:
         surface, radius, _ = local = self._local(angles, thick, reach_m)
         all_of = [self._moved(R, shift_m, *local)]
         for k in range(3):
-            turn = rotation_vector_to_matrix(_TURN * np.eye(3)[k])
-            all_of.append(self._moved(turn @ R, shift_m, *local))
+            rotation = rotation_vector_to_matrix(_ROTATION_STEP * np.eye(3)[k])
+            all_of.append(self._moved(rotation @ R, shift_m, *local))
         for k in range(3):
             all_of.append(self._moved(R, shift_m + _SHIFT_M * np.eye(3)[k], *local))
         for k in range(4):
-            bent = self._local(angles + _TURN * np.eye(4)[k], thick, reach_m)
+            bent = self._local(angles + _ROTATION_STEP * np.eye(4)[k], thick, reach_m)
             all_of.append(self._moved(R, shift_m, *bent))
         all_of.append(self._moved(R, shift_m, *self._local(angles, thick + _THICK, reach_m)))
         seen = self._seen(all_of)
@@ -97,8 +97,8 @@ class LinesOfSight:
     @staticmethod
     def _moved(R: Float, shift_m: Float, spheres: Float, radius: Float, tips: Float) -> tuple[Float, ...]:
         """The same in the camera's frame."""
-        turned = np.swapaxes(R, 1, 2)
-        return spheres @ turned[:, None] + shift_m, radius, tips @ turned + shift_m
+        transposed = np.swapaxes(R, 1, 2)
+        return spheres @ transposed[:, None] + shift_m, radius, tips @ transposed + shift_m
 
     def _seen(self, hands: list[tuple[Float, ...]]) -> Float:
         """(P, T, 4, SEEN) of P hands."""

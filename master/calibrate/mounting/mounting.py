@@ -212,8 +212,8 @@ def _documented(
 
 def _rig_world(fit: Fit, imu: ImuTrack) -> Float:
     """R_rig_world (3, 3) of the world that the IMU's samples name: the mean of its vertical, the first heading."""
-    turns = imu.mended(fit.unknown.gyro).at(imu.t_s)
-    rig_world = fit.unknown.R_rig_world @ turns.R_world_imu @ np.swapaxes(imu.held_at(imu.t_s), 1, 2)
+    orientations = imu.mended(fit.unknown.gyro).at(imu.t_s)
+    rig_world = fit.unknown.R_rig_world @ orientations.R_world_imu @ np.swapaxes(imu.held_at(imu.t_s), 1, 2)
     known = np.isfinite(rig_world[:, 0, 0])
     rig_world = rig_world[known]
     up: Float = rig_world[..., 2].mean(axis=0)

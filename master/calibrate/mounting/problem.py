@@ -31,7 +31,7 @@ from master.calibrate.mounting.hands import HandProblem, Hands
 from master.calibrate.mounting.lines_of_sight import FINGERS, SEEN, LinesOfSight
 from master.calibrate.mounting.normal import Normal
 from master.calibrate.mounting.seen import STRAYS, Fit, StrobeCycles
-from master.calibrate.mounting.tracks import HandTrack, ImuTrack, Markers, Turns
+from master.calibrate.mounting.tracks import HandTrack, ImuOrientations, ImuTrack, Markers
 from master.calibrate.mounting.unknown import (
     CAMERA_IMU,
     CAMERA_LATE,
@@ -47,8 +47,8 @@ from master.calibrate.mounting.unknown import (
     Unknown,
     believed,
 )
-from master.calibrate.mounting.wrists import bends, bends_by_turn
-from master.estimator.attached import Attached
+from master.calibrate.mounting.wrists import bends, bends_by_rotation
+from master.estimator.body_points import BodyPoints
 from master.estimator.parameters import HandParameters
 from master.estimator.priors import Habits, habits_of
 
@@ -69,7 +69,7 @@ class _Told:
 
     about: Unknown
     markers: Markers
-    turns: Turns
+    orientations: ImuOrientations
     tip_px: Float
 
 
@@ -99,7 +99,7 @@ class Problem:
         count = len(cycles.t_s)
         self._hands = HandProblem(
             model,
-            Attached.markers(model, self._parameters, names),
+            BodyPoints.markers(model, self._parameters, names),
             _loosest(habits_of(model, self._parameters)),
             np.zeros((count, len(names), 3)),
             np.zeros((count, len(names), 3, 3)),
@@ -132,8 +132,8 @@ class Problem:
         self._mended, self._mended_of = self._imu.mended(unknown.gyro), unknown.gyro
         at = self._cycles.t_s + unknown.camera_late_s
         markers = self._hand.markers(at)
-        turns = self._mended.at(at - unknown.imu_late_s)
-        self._known = turns.known & (markers.seen.sum(axis=1) > 0)
+        orientations = self._mended.at(at - unknown.imu_late_s)
+        self._known = orientations.known & (markers.seen.sum(axis=1) > 0)
         seen = markers.seen & self._known[:, None]
         cov = np.where(seen[..., None, None], markers.cov_m2, 0.0) + _CAP_M**2 * _EYE
         whiten = np.linalg.inv(np.linalg.cholesky(cov)) * seen[..., None, None]
@@ -144,8 +144,10 @@ class Problem:
         self._told = _Told(
             unknown,
             Markers(told[0], told[1], told[2], markers.cov_m2),
-            Turns(
-                np.where(self._known[:, None, None], turns.R_world_imu, _EYE), turns.rate_rad_s, turns.drift
+            ImuOrientations(
+                np.where(self._known[:, None, None], orientations.R_world_imu, _EYE),
+                orientations.rate_rad_s,
+                orientations.drift,
             ),
             self._tips_with_the_laser(unknown, hands),
         )
@@ -157,15 +159,17 @@ class Problem:
         """Tips (T, 4, 2) [px] as they were when the laser shone: moved back by how the hand moved meanwhile."""
         late_s, t_s = self._cycles.tip_late_s, self._cycles.t_s
         at = t_s + unknown.camera_late_s
-        turns = self._mended.at(at - unknown.imu_late_s)
-        R = self._camera_rig(unknown, replace(turns, R_world_imu=np.nan_to_num(turns.R_world_imu)))
+        orientations = self._mended.at(at - unknown.imu_late_s)
+        R = self._camera_rig(
+            unknown, replace(orientations, R_world_imu=np.nan_to_num(orientations.R_world_imu))
+        )
         angles = self._parameters.angles(hands.x)
         seen = self._lines_of_sight(
             R @ hands.T_rig_palm[:, :3, :3], unknown.shift_m, angles, unknown.thick, unknown.reach_m
         )
         speed = np.gradient(seen[..., 2:], t_s, axis=0)
         jump = np.diff(t_s, prepend=t_s[0]) > 0.2
-        speed[jump | np.r_[jump[1:], False] | ~turns.known] = 0.0
+        speed[jump | np.r_[jump[1:], False] | ~orientations.known] = 0.0
         return self._cycles.tip_uv - late_s * np.nan_to_num(speed)
 
     def solved(self, unknown: Unknown, hands: Hands, rounds: int) -> tuple[Unknown, Hands, int]:
@@ -210,35 +214,35 @@ class Problem:
         points = told.points_m + late_s * (told.speed_m_s + 0.5 * late_s * told.bent_m_s2)
         return Markers(points, speed, told.bent_m_s2, told.cov_m2)
 
-    def _turned(self, unknown: Unknown) -> Turns:
+    def _orientations(self, unknown: Unknown) -> ImuOrientations:
         """The IMU when the frames were taken."""
-        about, told = self._told.about, self._told.turns
+        about, told = self._told.about, self._told.orientations
         late_s = unknown.camera_late_s - unknown.imu_late_s - about.camera_late_s + about.imu_late_s
         return replace(
             told, R_world_imu=told.R_world_imu @ rotation_vector_to_matrix(late_s * told.rate_rad_s)
         )
 
-    def _rig_imu(self, unknown: Unknown, turns: Turns) -> Float:
+    def _rig_imu(self, unknown: Unknown, orientations: ImuOrientations) -> Float:
         """(T, 3, 3) IMU axes -> rig axes."""
-        drift = rotation_vector_to_matrix(-(turns.drift @ (unknown.gyro - self._mended_of)))
-        return unknown.R_rig_world @ drift @ turns.R_world_imu
+        drift = rotation_vector_to_matrix(-(orientations.drift @ (unknown.gyro - self._mended_of)))
+        return unknown.R_rig_world @ drift @ orientations.R_world_imu
 
-    def _camera_rig(self, unknown: Unknown, turns: Turns) -> Float:
+    def _camera_rig(self, unknown: Unknown, orientations: ImuOrientations) -> Float:
         """(T, 3, 3) rig axes -> camera axes."""
-        return unknown.R_camera_imu @ np.swapaxes(self._rig_imu(unknown, turns), 1, 2)
+        return unknown.R_camera_imu @ np.swapaxes(self._rig_imu(unknown, orientations), 1, 2)
 
-    def _wrists(self, unknown: Unknown, hands: Hands, turns: Turns) -> Float:
+    def _wrists(self, unknown: Unknown, hands: Hands, orientations: ImuOrientations) -> Float:
         """R_forearm_palm (T, 3, 3)."""
-        palm = np.swapaxes(self._rig_imu(unknown, turns), 1, 2) @ hands.T_rig_palm[:, :3, :3]
+        palm = np.swapaxes(self._rig_imu(unknown, orientations), 1, 2) @ hands.T_rig_palm[:, :3, :3]
         return unknown.R_forearm_imu @ palm
 
     def _shown(self, unknown: Unknown, hands: Hands) -> tuple[Float, Float]:
         """LinesOfSight (T, 4, SEEN), and flexion, deviation and twist of the wrist (T, 3) [rad]."""
-        turns = self._turned(unknown)
-        R = self._camera_rig(unknown, turns) @ hands.T_rig_palm[:, :3, :3]
+        orientations = self._orientations(unknown)
+        R = self._camera_rig(unknown, orientations) @ hands.T_rig_palm[:, :3, :3]
         angles = self._parameters.angles(hands.x)
         seen = self._lines_of_sight(R, unknown.shift_m, angles, unknown.thick, unknown.reach_m)
-        return seen, bends(self._wrists(unknown, hands, turns))
+        return seen, bends(self._wrists(unknown, hands, orientations))
 
     def _off(self, shown: Float) -> Float:
         """Fitted minus seen (T, 4, SEEN) in standard deviations, 0 where not seen; what the laser misses is far."""
@@ -261,19 +265,24 @@ class Problem:
 
     def normal(self, unknown: Unknown, hands: Hands) -> Normal:
         """Normal equations about a place."""
-        turns, here = self._turned(unknown), self._here(unknown)
+        orientations, here = self._orientations(unknown), self._here(unknown)
         problem = replace(self._hands, points_m=here.points_m)
         linear = problem.linearise(hands)
         out = Normal.of_markers(problem, linear, hands, here.speed_m_s)
-        rows = self._line_of_sight_rows(unknown, hands, turns), self._wrist_rows(unknown, hands, turns)
+        rows = (
+            self._line_of_sight_rows(unknown, hands, orientations),
+            self._wrist_rows(unknown, hands, orientations),
+        )
         for residual, own, shared in rows:
             out = out.and_rows(residual, own, shared)
         out = out.shared_out(self._share, unknown.off(self._first), self._believed)
         return out.within(hands.x, self._parameters)
 
-    def _line_of_sight_rows(self, unknown: Unknown, hands: Hands, turns: Turns) -> tuple[Float, Float, Float]:
+    def _line_of_sight_rows(
+        self, unknown: Unknown, hands: Hands, orientations: ImuOrientations
+    ) -> tuple[Float, Float, Float]:
         """Residuals (T, 16), and derivatives by own (T, 16, 6 + n) and shared unknowns (T, 16, UNKNOWN)."""
-        camera_rig = self._camera_rig(unknown, turns)
+        camera_rig = self._camera_rig(unknown, orientations)
         R = camera_rig @ hands.T_rig_palm[:, :3, :3]
         angles = self._parameters.angles(hands.x)
         shown, by = self._lines_of_sight.derivatives(
@@ -285,9 +294,9 @@ class Problem:
         told = np.isfinite(self._data) & np.isfinite(shown)
         by = by * (np.where(told, root, 0.0) / self.sigma)[..., None]
         count, n = len(hands.x), hands.x.shape[1]
-        by_turn = by[..., :3].reshape(count, -1, 3)
+        by_rotation = by[..., :3].reshape(count, -1, 3)
         own = np.zeros((count, 4 * SEEN, 6 + n))
-        own[..., :3] = by_turn @ camera_rig
+        own[..., :3] = by_rotation @ camera_rig
         complete = self._parameters.complete.reshape(5, 4, n)[FINGERS]
         by_x = np.einsum("tfya,fan->tfyn", by[..., 6:10], complete)
         own[..., 6:] = self._parameters.by_parameters(by_x, hands.x).reshape(count, -1, n)
@@ -296,27 +305,31 @@ class Problem:
             shared[:, f, :, THICK.start + f] = by[:, f, :, 10]
             shared[:, f, :, REACH.start + f] = by[:, f, :, 11]
         shared = shared.reshape(count, -1, UNKNOWN)
-        shared[..., CAMERA_IMU] = by_turn
+        shared[..., CAMERA_IMU] = by_rotation
         shared[..., SHIFT] = by[..., 3:6].reshape(count, -1, 3)
-        self._world_columns(shared, -by_turn @ camera_rig, unknown, turns)
+        self._world_columns(shared, -by_rotation @ camera_rig, unknown, orientations)
         return (off * root).reshape(count, -1), own, shared
 
-    def _wrist_rows(self, unknown: Unknown, hands: Hands, turns: Turns) -> tuple[Float, Float, Float]:
+    def _wrist_rows(
+        self, unknown: Unknown, hands: Hands, orientations: ImuOrientations
+    ) -> tuple[Float, Float, Float]:
         """As `_line_of_sight_rows`, of flexion, deviation and twist."""
-        wrist = self._wrists(unknown, hands, turns)
+        wrist = self._wrists(unknown, hands, orientations)
         bent = bends(wrist) / self._bend_sigma
         root = (1.0 + np.vecdot(bent, bent) / STRAYS**2) ** -0.5  # where the hand itself was mistaken
         weight = (self._known * root)[:, None] / self._bend_sigma
-        by_turn = weight[..., None] * bends_by_turn(wrist)
-        forearm_rig = unknown.R_forearm_imu @ np.swapaxes(self._rig_imu(unknown, turns), 1, 2)
+        by_rotation = weight[..., None] * bends_by_rotation(wrist)
+        forearm_rig = unknown.R_forearm_imu @ np.swapaxes(self._rig_imu(unknown, orientations), 1, 2)
         own = np.zeros((len(wrist), 3, 6 + hands.x.shape[1]))
-        own[..., :3] = by_turn @ forearm_rig
+        own[..., :3] = by_rotation @ forearm_rig
         shared = np.zeros((len(wrist), 3, UNKNOWN))
-        shared[..., FOREARM_IMU] = by_turn
-        self._world_columns(shared, -by_turn @ forearm_rig, unknown, turns)
+        shared[..., FOREARM_IMU] = by_rotation
+        self._world_columns(shared, -by_rotation @ forearm_rig, unknown, orientations)
         return bends(wrist) * weight, own, shared
 
-    def _world_columns(self, shared: Float, by_imu: Float, unknown: Unknown, turns: Turns) -> None:
+    def _world_columns(
+        self, shared: Float, by_imu: Float, unknown: Unknown, orientations: ImuOrientations
+    ) -> None:
         """Fill what turns the IMU in the rig: its world, the errors of its gyroscope, and clocks.
 
         Args:
@@ -325,9 +338,9 @@ class Problem:
             unknown, turns: Where.
         """
         shared[..., RIG_WORLD] = by_imu
-        by_gyro = -by_imu @ (unknown.R_rig_world @ turns.drift)
+        by_gyro = -by_imu @ (unknown.R_rig_world @ orientations.drift)
         shared[..., ZERO], shared[..., GAIN] = by_gyro[..., :3], by_gyro[..., 3:]
-        rate = (self._rig_imu(unknown, turns) @ turns.rate_rad_s[..., None])[..., 0]
+        rate = (self._rig_imu(unknown, orientations) @ orientations.rate_rad_s[..., None])[..., 0]
         later = (by_imu @ rate[..., None])[..., 0]
         shared[..., CAMERA_LATE], shared[..., IMU_LATE] = later, -later
 

@@ -7,7 +7,7 @@ from common.errors import FitError
 from master.calibrate.mounting.seen import Fit
 from master.calibrate.mounting.unknown import CAMERA_IMU, CAMERA_LATE, FOREARM_IMU, IMU_LATE, SHIFT
 
-_TURN_RAD, _SHIFT_M, _CLOCK_S = np.radians(4.0), 4e-3, 8e-3  # standard deviations, at most
+_ROTATION_RAD, _SHIFT_M, _CLOCK_S = np.radians(4.0), 4e-3, 8e-3  # standard deviations, at most
 _MISFIT, _STRAYS = 1.8, 0.35
 
 
@@ -21,9 +21,9 @@ def sigmas(fit: Fit) -> dict[str, float]:
         return float(np.sqrt(np.linalg.eigvalsh(of)[-1]))
 
     return {
-        "turn_sigma_deg": float(np.degrees(worst(by @ cov @ by.T))),
+        "rotation_sigma_deg": float(np.degrees(worst(by @ cov @ by.T))),
         "shift_sigma_mm": 1e3 * worst(cov[SHIFT, SHIFT]),
-        "imu_turn_sigma_deg": float(np.degrees(worst(cov[FOREARM_IMU, FOREARM_IMU]))),
+        "imu_rotation_sigma_deg": float(np.degrees(worst(cov[FOREARM_IMU, FOREARM_IMU]))),
         "camera_imu_sigma_deg": float(np.degrees(worst(cov[CAMERA_IMU, CAMERA_IMU]))),
         "camera_clock_sigma_ms": 1e3 * float(np.sqrt(cov[CAMERA_LATE, CAMERA_LATE])),
         "imu_clock_sigma_ms": 1e3 * float(np.sqrt(cov[IMU_LATE, IMU_LATE])),
@@ -42,12 +42,15 @@ def refuse(fit: Fit, sigma: dict[str, float]) -> None:
             f" {100 * fit.strays:.0f} % of it strays. Is the hand file that of this hand and side, the laser plane"
             " measured, the first T_camera_palm right to a centimetre and ten degrees, and are both on one clock?"
         )
-    turn = max(sigma["turn_sigma_deg"], sigma["imu_turn_sigma_deg"], sigma["camera_imu_sigma_deg"])
+    rotation = max(
+        sigma["rotation_sigma_deg"], sigma["imu_rotation_sigma_deg"], sigma["camera_imu_sigma_deg"]
+    )
     clock = max(sigma["camera_clock_sigma_ms"], sigma["imu_clock_sigma_ms"])
     wanting: list[str] = []
-    if np.radians(turn) > _TURN_RAD:
+    if np.radians(rotation) > _ROTATION_RAD:
         wanting.append(
-            f"its turn is known to {turn:.1f} deg only: turn the forearm about another axis as well, and bend the wrist"
+            f"its turn is known to {rotation:.1f} deg only: turn the forearm about another axis as well,"
+            " and bend the wrist"
         )
     if 1e-3 * sigma["shift_sigma_mm"] > _SHIFT_M:
         wanting.append(
@@ -92,8 +95,8 @@ def report_lines(fit: Fit, sigma: dict[str, float], count: int) -> tuple[str, ..
     ]
     for name, value, key in (
         ("wrist joint, camera", f"{x:.1f} {y:.1f} {z:.1f} mm", "shift_sigma_mm"),
-        ("turn of the palm", "", "turn_sigma_deg"),
-        ("turn of the IMU", "", "imu_turn_sigma_deg"),
+        ("turn of the palm", "", "rotation_sigma_deg"),
+        ("turn of the IMU", "", "imu_rotation_sigma_deg"),
         ("IMU against camera", "", "camera_imu_sigma_deg"),
         ("camera later by", f"{1e3 * unknown.camera_late_s:+.2f} ms", "camera_clock_sigma_ms"),
         ("IMU later by", f"{1e3 * unknown.imu_late_s:+.2f} ms", "imu_clock_sigma_ms"),

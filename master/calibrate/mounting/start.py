@@ -79,7 +79,7 @@ def started(
     """
     best: tuple[float, float, Float, Float] | None = None
     for late_s in _SEARCH_S.tolist():
-        found = _turns(hand, imu, late_s)
+        found = _aligned(hand, imu, late_s)
         if found is not None and (best is None or found[0] > best[0]):
             best = (found[0], late_s, found[1], found[2])
     if best is None:
@@ -88,7 +88,7 @@ def started(
     return replace(start, camera_late_s=_camera_late_s(hand, tips_m, imu, optics, start, cycles))
 
 
-def _turns(hand: HandTrack, imu: ImuTrack, late_s: float) -> tuple[float, Float, Float] | None:
+def _aligned(hand: HandTrack, imu: ImuTrack, late_s: float) -> tuple[float, Float, Float] | None:
     """How well the tracks agree (1: exactly), R_rig_world and R_imu_palm, if the IMU's samples are so late."""
     held = imu.held_at(hand.t_s - late_s)
     known = np.isfinite(held[:, 0, 0])

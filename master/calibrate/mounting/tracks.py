@@ -69,8 +69,8 @@ class HandTrack:
         poor = ~(np.einsum("tmii->tm", cov) < _POOR_M**2)
         points = np.where(poor[..., None], np.nan, np.array([pose.markers_raw_m for pose in known]))
         T = np.tile(np.eye(4), (len(known), 1, 1))
-        turned = np.array([pose.orientation_wxyz[WRIST] for pose in known]).reshape(-1, 4)
-        T[:, :3, :3] = quaternion_to_matrix(turned) @ model.rest_rotation[WRIST].T
+        integrated = np.array([pose.orientation_wxyz[WRIST] for pose in known]).reshape(-1, 4)
+        T[:, :3, :3] = quaternion_to_matrix(integrated) @ model.rest_rotation[WRIST].T
         place = np.array([pose.position_m[WRIST] for pose in known]).reshape(-1, 3)
         T[:, :3, 3] = place - T[:, :3, :3] @ model.rest_position_m[WRIST]
         return cls(
@@ -114,7 +114,7 @@ class HandTrack:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Turns:
+class ImuOrientations:
     """The IMU at instants (T), in a world of its own.
 
     Attributes:
@@ -157,7 +157,7 @@ class ImuTrack:
         self._held = quaternion_to_matrix(held)
         step = np.diff(self.t_s)[:, None]
         self.gap_s = float(step.max(initial=0.0))
-        self._turned, self._drift = np.empty_like(self._held), np.zeros((len(self.t_s), 3, 12))
+        self._integrated, self._drift = np.empty_like(self._held), np.zeros((len(self.t_s), 3, 12))
         if len(told):
             self._sum_up()
 
@@ -165,7 +165,7 @@ class ImuTrack:
         """The same without errors (12,) of its gyroscope."""
         out = copy(self)
         out._rate = self._rate - errors[:3] - self._rate @ errors[3:].reshape(3, 3).T
-        out._turned = np.empty_like(self._turned)
+        out._integrated = np.empty_like(self._integrated)
         out._sum_up()
         return out
 
@@ -178,12 +178,12 @@ class ImuTrack:
         arcs = rotation_vector_to_matrix(step_s * self._rate[1:])
         now = np.eye(3)
         for k, arc in enumerate([np.eye(3), *arcs]):
-            self._turned[k] = now = now @ arc
+            self._integrated[k] = now = now @ arc
         middle = len(self.t_s) // 2
-        self._turned = self._held[middle] @ self._turned[middle].T @ self._turned
-        turned = 0.5 * (self._turned[1:] + self._turned[:-1])
-        by_gain = turned[..., None] * self._rate[1:, None, None]  # axis, row and column of the gain
-        mean = step_s[..., None] * np.concatenate([turned, by_gain.reshape(-1, 3, 9)], axis=-1)
+        self._integrated = self._held[middle] @ self._integrated[middle].T @ self._integrated
+        integrated = 0.5 * (self._integrated[1:] + self._integrated[:-1])
+        by_gain = integrated[..., None] * self._rate[1:, None, None]  # axis, row and column of the gain
+        mean = step_s[..., None] * np.concatenate([integrated, by_gain.reshape(-1, 3, 9)], axis=-1)
         drift = np.concatenate([np.zeros((1, 3, 12)), np.cumsum(mean, axis=0)])
         self._drift = drift - drift[middle]
 
@@ -191,14 +191,16 @@ class ImuTrack:
         """How many samples there are."""
         return len(self.t_s)
 
-    def at(self, t_s: Float) -> Turns:
+    def at(self, t_s: Float) -> ImuOrientations:
         """The IMU at times (T,) [s] by its stamps, by its rates."""
         after, share, known = self._between(t_s)
-        R = self._turned[after - 1] @ _share_of_arc(self._turned[after - 1], self._turned[after], share)
+        R = self._integrated[after - 1] @ _share_of_arc(
+            self._integrated[after - 1], self._integrated[after], share
+        )
         rate = self._rate[after]
         drift = (1.0 - share)[..., None] * self._drift[after - 1] + share[..., None] * self._drift[after]
         R[~known] = np.nan
-        return Turns(R, rate, drift)
+        return ImuOrientations(R, rate, drift)
 
     def held_at(self, t_s: Float) -> Float:
         """(T, 3, 3) IMU axes -> a world whose z axis is up, as the samples say themselves; NaN: none nearby."""

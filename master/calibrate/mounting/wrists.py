@@ -14,10 +14,10 @@ def bends(R_forearm_palm: Float) -> Float:
     return np.concatenate([bend_of(R_forearm_palm), R_forearm_palm[..., 1, :1]], axis=-1)
 
 
-def bends_by_turn(R_forearm_palm: Float) -> Float:
+def bends_by_rotation(R_forearm_palm: Float) -> Float:
     """Derivatives (T, 3, 3) of `bends` by a turn of the palms (T, 3, 3), forearm axes."""
     here, out = bends(R_forearm_palm), np.empty((len(R_forearm_palm), 3, 3))
     for k in range(3):
-        turned = rotation_vector_to_matrix(_LITTLE * np.eye(3)[k]) @ R_forearm_palm
-        out[..., k] = (bends(turned) - here) / _LITTLE
+        rotated = rotation_vector_to_matrix(_LITTLE * np.eye(3)[k]) @ R_forearm_palm
+        out[..., k] = (bends(rotated) - here) / _LITTLE
     return out

@@ -85,9 +85,9 @@ def fit_bundle(seen: Seen, rows: Int | None = None) -> Bundle:
         weight = np.where(own.known, (1.0 + chi / (_SOFT_2 * scale_2)) ** -2.0, 0.0)
         step, poses, cov = _solved(beads, T, off, weight[..., None, None] * info)
         beads = beads + step
-        turn = rotation_vector_to_matrix(poses[:, :3])
+        rotation = rotation_vector_to_matrix(poses[:, :3])
         T = T.copy()
-        T[:, :3, :3], T[:, :3, 3] = turn @ T[:, :3, :3], T[:, :3, 3] + poses[:, 3:]
+        T[:, :3, :3], T[:, :3, 3] = rotation @ T[:, :3, :3], T[:, :3, 3] + poses[:, 3:]
         if float(np.abs(step).max()) < _SETTLED_M:
             break
     off = _off(beads, T, points)

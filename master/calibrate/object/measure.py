@@ -184,10 +184,10 @@ def looks_of(T: Float) -> int:
     """In how many ways poses (T, 4, 4) differ enough that cameras see something else: greedily, the first ones kept."""
     kept = np.empty((0, 4, 4))
     for pose in T:
-        turn = np.linalg.norm(
+        rotation = np.linalg.norm(
             matrix_to_rotation_vector(kept[:, :3, :3].swapaxes(1, 2) @ pose[:3, :3]), axis=-1
         )
         way = np.linalg.norm(kept[:, :3, 3] - pose[:3, 3], axis=1)
-        if not ((turn < _LOOK_RAD) & (way < _LOOK_M)).any():
+        if not ((rotation < _LOOK_RAD) & (way < _LOOK_M)).any():
             kept = np.concatenate([kept, pose[None]])
     return len(kept)

@@ -18,8 +18,8 @@ def draw_object(path: Path, found: Measurement, profile: ObjectProfile) -> None:
     """
     bundle, own = found.bundle, np.array([profile.markers[name].position_m for name in found.names])
     # Where each sighting lies in the object: the bead less what is left, turned into its frame.
-    turn = fit_rigid(own, bundle.beads_m)[:3, :3]
-    left = np.einsum("ij,tkj,tbk->tbi", turn, bundle.T[:, :3, :3], bundle.off_m)
+    rotation = fit_rigid(own, bundle.beads_m)[:3, :3]
+    left = np.einsum("ij,tkj,tbk->tbi", rotation, bundle.T[:, :3, :3], bundle.off_m)
     figure = figure_of((16.0, 8.4))
     figure.suptitle(f"{profile.name}: {len(bundle.T)} instants in {found.looks} ways of turning and places")
     *sides, time = figure.subplots(2, 2).ravel()

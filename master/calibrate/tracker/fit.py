@@ -102,12 +102,12 @@ class _Problem:
         return _Lines(R, p, off, slope)
 
     def _foretold(self, placed: Placed, at_s: Float) -> tuple[Float, Float]:
-        turned, place, _ = self._tracker.at(at_s)
-        return foretold(placed.T_rig_tracking, placed.T_object_tracker, turned, place)
+        rotation, place, _ = self._tracker.at(at_s)
+        return foretold(placed.T_rig_tracking, placed.T_object_tracker, rotation, place)
 
     def moved(self, placed: Placed, by: Float) -> Placed:
-        turn = rotation_vector_to_matrix(by[:3])
-        X = rigid(turn, self.middle_m - turn @ self.middle_m + by[3:6]) @ placed.T_rig_tracking
+        rotation = rotation_vector_to_matrix(by[:3])
+        X = rigid(rotation, self.middle_m - rotation @ self.middle_m + by[3:6]) @ placed.T_rig_tracking
         Z = invert(placed.T_object_tracker) @ rigid(rotation_vector_to_matrix(by[6:9]), by[9:12])
         return Placed(X, invert(Z), placed.late_s + float(by[12]))
 
@@ -158,8 +158,8 @@ def sigma_at(fit: Fit, R: Float, p_m: Float) -> tuple[float, float]:
     change = np.einsum("tij,bj->tbi", slope, fit.rejected - fit.rejected.mean(axis=0))
     left = (count - 1) / count * (change**2).sum(axis=1) if count > 1 else np.zeros_like(formal)
     both = np.maximum(formal, left)
-    place, turn = both[:, :3].sum(axis=1).mean(), both[:, 3:].sum(axis=1).mean()
-    return float(np.sqrt(place)), float(np.sqrt(turn))
+    place, rotation = both[:, :3].sum(axis=1).mean(), both[:, 3:].sum(axis=1).mean()
+    return float(np.sqrt(place)), float(np.sqrt(rotation))
 
 
 def late_sigma_s(fit: Fit) -> float:

@@ -42,7 +42,7 @@ def first_lag(seen: PoseTrack, tracker: PoseTrack) -> float | None:
     """How much later the tracker's poses hold than they say [s], to some milliseconds; None: they hardly overlap."""
     begin = min(seen.t_s[0], tracker.t_s[0]) - MOST_LAG_S
     grid = np.arange(begin, max(seen.t_s[-1], tracker.t_s[-1]) + MOST_LAG_S, _GRID_S)
-    ours, theirs = _turned(seen, grid), _turned(tracker, grid)
+    ours, theirs = _rotated(seen, grid), _rotated(tracker, grid)
     steps = round(MOST_LAG_S / _GRID_S)
     costs: list[float] = []
     for lag in range(-steps, steps + 1):
@@ -65,7 +65,7 @@ def first_lag(seen: PoseTrack, tracker: PoseTrack) -> float | None:
     return (best - steps + fine) * _GRID_S
 
 
-def _turned(track: PoseTrack, t_s: Float) -> Float:
+def _rotated(track: PoseTrack, t_s: Float) -> Float:
     """By how much it turned about each instant [rad]; NaN where that is not known."""
     first, _, known = track.at(t_s - 0.5 * _CHORD_S)
     last, _, also = track.at(t_s + 0.5 * _CHORD_S)
@@ -107,16 +107,16 @@ def first_places(seen: PoseTrack, tracker: PoseTrack, late_s: float, seed: int =
 
 
 def _agree(X: Float, Y: Float, RA: Float, pA: Float, RB: Float, pB: Float) -> Bool:
-    turn, place = foretold(X, Y, RB, pB)
-    off = np.linalg.norm(matrix_to_rotation_vector(RA @ turn.swapaxes(1, 2)), axis=1)
+    rotation, place = foretold(X, Y, RB, pB)
+    off = np.linalg.norm(matrix_to_rotation_vector(RA @ rotation.swapaxes(1, 2)), axis=1)
     return (off < _NEAR_RAD) & (np.linalg.norm(pA - place, axis=1) < _NEAR_M)
 
 
 def foretold(X: Float, Y: Float, RB: Float, pB: Float) -> tuple[Float, Float]:
     """The object's turns (N, 3, 3) and places (N, 3) in the rig where the device is at (RB, pB): X B inv(Y)."""
-    turn = X[:3, :3] @ RB @ Y[:3, :3].T
+    rotation = X[:3, :3] @ RB @ Y[:3, :3].T
     device = pB @ X[:3, :3].T + X[:3, 3]
-    return turn, device - turn @ Y[:3, 3]
+    return rotation, device - rotation @ Y[:3, 3]
 
 
 def closed_form(RA: Float, pA: Float, RB: Float, pB: Float) -> tuple[Float, Float]:

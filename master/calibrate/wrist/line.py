@@ -187,9 +187,9 @@ def _profiles(
     rms = float(np.sqrt(np.mean(off[kept] ** 2)))
     xy = point + s[kept, None] * along + (centre[kept, None] * pixel_m) * across
     points = transform(placed.T_camera_board, np.concatenate([xy, np.zeros((len(xy), 1))], axis=1))
-    turned = along + slope * pixel_m * across
+    tilted = along + slope * pixel_m * across
     sigma = float(np.hypot(rms / np.sqrt(kept.sum()), _LINE_FLOOR_PX))
-    return _Centred(point + level * pixel_m * across, turned / np.linalg.norm(turned), points, sigma, rms)
+    return _Centred(point + level * pixel_m * across, tilted / np.linalg.norm(tilted), points, sigma, rms)
 
 
 def _sampled(image: Grey, uv: Float) -> Float:

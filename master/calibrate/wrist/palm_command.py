@@ -81,7 +81,7 @@ def palm(
     if json_file is not None:
         told: dict[str, object] = {
             "T_camera_palm": fit.T_camera_palm.tolist(),
-            "turn_sigma_deg": float(np.degrees(fit.turn_sigma_rad)),
+            "rotation_sigma_deg": float(np.degrees(fit.rotation_sigma_rad)),
             "shift_sigma_mm": 1e3 * fit.shift_sigma_m,
             "residual": fit.residual,
             "written": None if written is None else str(written),
@@ -111,7 +111,7 @@ def report_lines(fit: PalmFit) -> list[str]:
     lines = [
         f"palm from {fit.note}",
         f"  the camera is {where}; it looks {down:.1f} deg down to the palm",
-        f"  ± {np.degrees(fit.turn_sigma_rad):.2f} deg, ± {1e3 * fit.shift_sigma_m:.2f} mm",
+        f"  ± {np.degrees(fit.rotation_sigma_rad):.2f} deg, ± {1e3 * fit.shift_sigma_m:.2f} mm",
     ]
     lines.append("  " + ", ".join(f"{name} {value:g}" for name, value in fit.residual.items()))
     return lines
@@ -120,7 +120,7 @@ def report_lines(fit: PalmFit) -> list[str]:
 def rig_with_palm(device: Device, fit: PalmFit) -> RigCalibration:
     """The device's rig with the new pose and where it comes from."""
     residual = fit.residual | {
-        "turn_sigma_deg": round(float(np.degrees(fit.turn_sigma_rad)), 4),
+        "rotation_sigma_deg": round(float(np.degrees(fit.rotation_sigma_rad)), 4),
         "shift_sigma_mm": round(1e3 * fit.shift_sigma_m, 4),
     }
     how = provenance("calibrate palm", (device.source,), residual, fit.note)

@@ -116,10 +116,10 @@ def _pose_sigma(rig: RigCalibration) -> Float:
     """
     how = rig.provenance.get("T_camera_palm")
     told = {} if how is None or how.tool == TOOL else how.residual
-    turn, shift = np.radians(told.get("turn_sigma_deg", 0.0)), 1e-3 * told.get("shift_sigma_mm", 0.0)
+    rotation, shift = np.radians(told.get("rotation_sigma_deg", 0.0)), 1e-3 * told.get("shift_sigma_mm", 0.0)
     if how is not None and how.tool == "calibrate palm":
-        return np.repeat([np.hypot(turn, _RULER[0]), np.hypot(shift, _RULER[1])], 3)
-    return np.repeat([turn, shift] if turn > 0.0 and shift > 0.0 else _GUESS, 3)
+        return np.repeat([np.hypot(rotation, _RULER[0]), np.hypot(shift, _RULER[1])], 3)
+    return np.repeat([rotation, shift] if rotation > 0.0 and shift > 0.0 else _GUESS, 3)
 
 
 def _length_sigma(hand: HandProfile) -> Float:
@@ -179,7 +179,7 @@ def most_bent(fit: Fit, knuckles: Bool) -> Float:
 def _name(unknown: int) -> str:
     """What number `unknown` of the vector is, for a person."""
     if unknown < 6:
-        return f"the palm's {'turn about' if unknown < 3 else 'shift along'} {'xyz'[unknown % 3]}"
+        return f"the palm's {'rotation about' if unknown < 3 else 'shift along'} {'xyz'[unknown % 3]}"
     if unknown < 18:
         return f"the {_NAMES[(unknown - 6) // 3]} knuckle"
     return f"the {'thickness' if unknown < 22 else 'length'} of the {_NAMES[(unknown - 18) % 4]} finger"
@@ -188,12 +188,12 @@ def _name(unknown: int) -> str:
 def report_lines(setup: WristSetup, fit: Fit, count: int) -> tuple[str, ...]:
     """Before and after, for a person; knuckles across (to the thumb), up (to the back) and along the hand."""
     new, sigma = Unknown.of(fit.x), Unknown.of(np.sqrt(np.diag(fit.covariance)))
-    turn, shift = np.degrees(np.linalg.norm(new.pose[:3])), 1e3 * np.linalg.norm(new.pose[3:])
+    rotation, shift = np.degrees(np.linalg.norm(new.pose[:3])), 1e3 * np.linalg.norm(new.pose[3:])
     knuckles = ~fit.fist & (fit.angles_rad[..., MCP].max(axis=1) > _BENT_RAD)
     lines = [
         f"subject from {len(fit.fist)} of {count} triples and {np.isfinite(fit.off[..., 2]).sum()} fingertips in them",
         f"left: laser {1e3 * fit.laser_m:.2f} mm, tips {fit.tip_px:.1f} px; changed by {fit.surprise:.1f} of belief",
-        f"palm turned by {turn:.1f} deg, about x, y, z ± {_three(np.degrees(sigma.pose[:3]))}",
+        f"palm turned by {rotation:.1f} deg, about x, y, z ± {_three(np.degrees(sigma.pose[:3]))}",
         f"palm shifted by {shift:.1f} mm, along x, y, z ± {_three(1e3 * sigma.pose[3:])}",
         f"{'':8} {'bent':>4} {'knuckle before':>20} {'after, mm':>20} {'±':>14} {'thick':>11} {'long':>13}",
     ]
@@ -223,8 +223,8 @@ def _documented(
     """Rig and hand with where they come from."""
     sigma = Unknown.of(np.sqrt(np.diag(fit.covariance)))
     left = {"laser_rms_mm": round(1e3 * fit.laser_m, 4), "tip_rms_px": round(fit.tip_px, 4)}
-    turn, shift = np.degrees(sigma.pose[:3].max()), 1e3 * sigma.pose[3:].max()
-    pose = left | {"turn_sigma_deg": round(float(turn), 4), "shift_sigma_mm": round(float(shift), 4)}
+    rotation, shift = np.degrees(sigma.pose[:3].max()), 1e3 * sigma.pose[3:].max()
+    pose = left | {"rotation_sigma_deg": round(float(rotation), 4), "shift_sigma_mm": round(float(shift), 4)}
     knuckles = {
         f"{name}_sigma_mm": round(1e3 * float(np.linalg.norm(one)), 4)
         for name, one in zip(_NAMES, sigma.knuckle_m, strict=True)

@@ -107,7 +107,7 @@ def summary(found: Subject) -> dict[str, object]:
     new = found.unknown
     pose = {
         "T_camera_palm": [list(row) for row in found.rig.T_camera_palm or ()],
-        "turn_sigma_deg": _numbers(np.degrees(sigma.pose[:3])),
+        "rotation_sigma_deg": _numbers(np.degrees(sigma.pose[:3])),
         "shift_sigma_mm": _numbers(1e3 * sigma.pose[3:]),
     }
     fingers = {

@@ -168,15 +168,15 @@ class _Problem:
             normal = self._normal(x, guess)
             covariance = np.asarray(np.linalg.inv(normal.reduced(0.0)[0]), np.float64)
             for _ in range(_TRIALS):
-                step, turn = normal.step(damping)
-                turned = _Guess(guess.angles + turn, guess.fist, guess.used)
-                trial = self._cost(x + step, turned)
+                step, change = normal.step(damping)
+                stepped = _Guess(guess.angles + change, guess.fist, guess.used)
+                trial = self._cost(x + step, stepped)
                 if trial < cost:
                     break
                 damping *= 6.0
             else:
                 break
-            x, guess, gain, cost, damping = x + step, turned, cost - trial, trial, 0.2 * damping
+            x, guess, gain, cost, damping = x + step, stepped, cost - trial, trial, 0.2 * damping
             if gain < _SETTLED:
                 break
         return x, guess, covariance

@@ -27,7 +27,7 @@ FINGERS = slice(1, 5)
 UNKNOWN, LOCAL = 26, 3
 ABDUCTION, MCP, PIP = range(LOCAL)
 _RAYS, _NUDGE = 32, 1e-5
-_TURN_STEP, _SHIFT_STEP, _SHARE_STEP = np.radians(0.5), 5e-4, 0.02  # of central differences
+_ROTATION_STEP, _SHIFT_STEP, _SHARE_STEP = np.radians(0.5), 5e-4, 0.02  # of central differences
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,8 +76,8 @@ class SubjectModel:
     def palm(self, unknown: Unknown) -> Float:
         """T_camera_palm (4, 4)."""
         guess = self._setup.T_camera_palm
-        turn = rotation_vector_to_matrix(unknown.pose[:3])
-        return rigid(turn @ guess[:3, :3], guess[:3, 3] + unknown.pose[3:])
+        change = rotation_vector_to_matrix(unknown.pose[:3])
+        return rigid(change @ guess[:3, :3], guess[:3, 3] + unknown.pose[3:])
 
     def knuckles(self, unknown: Unknown) -> Float:
         """(4, 3) of index ... little, camera frame [m]."""
@@ -102,7 +102,7 @@ class SubjectModel:
 
     def derivatives(self, x: Float, angles: Float) -> tuple[Float, Float]:
         """How that moves with what is unknown, (T, 4, 4, 26), and with the angles, (T, 4, 4, 3); 0 where not known."""
-        steps = np.r_[np.full(3, _TURN_STEP), np.full(3, _SHIFT_STEP), np.full(2, _SHARE_STEP)]
+        steps = np.r_[np.full(3, _ROTATION_STEP), np.full(3, _SHIFT_STEP), np.full(2, _SHARE_STEP)]
         ways = np.zeros((8, UNKNOWN))
         ways[:6, :6] = np.eye(6)
         ways[6, 18:22] = ways[7, 22:26] = 1.0
@@ -110,10 +110,10 @@ class SubjectModel:
         for way, step in zip(ways, steps, strict=True):
             surfaces += [self._surface_of(Unknown.of(x + sign * step * way), angles) for sign in (1.0, -1.0)]
         for k in range(LOCAL):
-            turn = _TURN_STEP * np.eye(LOCAL)[k]
-            surfaces += [self._surface_of(Unknown.of(x), angles + sign * turn) for sign in (1.0, -1.0)]
+            change = _ROTATION_STEP * np.eye(LOCAL)[k]
+            surfaces += [self._surface_of(Unknown.of(x), angles + sign * change) for sign in (1.0, -1.0)]
         seen = self._seen(surfaces)
-        half = np.r_[steps, np.full(LOCAL, _TURN_STEP)]
+        half = np.r_[steps, np.full(LOCAL, _ROTATION_STEP)]
         slope = np.nan_to_num((seen[0::2] - seen[1::2]) / (2.0 * half[:, None, None, None]))
         out = np.zeros((*angles.shape[:2], 4, UNKNOWN))
         out[..., :6] = np.moveaxis(slope[:6], 0, -1)

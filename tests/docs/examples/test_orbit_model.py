@@ -182,9 +182,9 @@ def test_on_a_bus_the_scene_says_what_it_waits_for_and_follows(
     show.flush(timeout_sec=5.0)
     show.disconnect()
     bus.close()
-    said, turns = texts(file), [c for c in rr.chunk.RrdReader(file).stream() if c.entity_path == "/model"]
+    said, rotations = texts(file), [c for c in rr.chunk.RrdReader(file).stream() if c.entity_path == "/model"]
     assert said[0] == "waiting for a master ..."
-    assert sum(chunk.num_rows for chunk in turns) > 3
+    assert sum(chunk.num_rows for chunk in rotations) > 3
 
 
 def texts(file: Path) -> list[str]:

@@ -79,9 +79,9 @@ def test_a_knob_in_the_air_sets_the_volume_and_nothing_else_does(root: Path, set
         count, t_s = dial.push(one), (one.t_ns - START_NS) * 1e-9
         detents += count
         outside += abs(count) * (not first.start_s <= t_s <= first.stop_s + 0.5)
-    turned = np.degrees(motion.dial_rad(first.stop_s) - motion.dial_rad(first.start_s))
-    assert abs(turned) > 10.0
-    assert abs(6.0 * detents - turned) <= 6.0 + 3.0  # a detent, and what the dial may be off
+    rotated = np.degrees(motion.dial_rad(first.stop_s) - motion.dial_rad(first.start_s))
+    assert abs(rotated) > 10.0
+    assert abs(6.0 * detents - rotated) <= 6.0 + 3.0  # a detent, and what the dial may be off
     assert outside == 0
 
 

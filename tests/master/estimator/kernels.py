@@ -20,7 +20,7 @@ from master.estimator.state import grow, hide
 from master.estimator.truncated import mean_within
 from master.estimator.workspace import Model
 from master.estimator.wrist_device import bent_palm
-from master.estimator.wrist_rows import turn_slope
+from master.estimator.wrist_rows import rotation_vector_jacobian
 
 __all__ = ["Certainty", "Scratch"]
 
@@ -118,9 +118,9 @@ def joint_covariances(
 
 
 @kernel
-def turn_slope_at(turn: Float, J: Float) -> None:
-    """`master.estimator.wrist_rows.turn_slope`."""
-    turn_slope(turn, J)
+def rotation_vector_jacobian_at(rotation: Float, J: Float) -> None:
+    """`master.estimator.wrist_rows.rotation_vector_jacobian`."""
+    rotation_vector_jacobian(rotation, J)
 
 
 @kernel

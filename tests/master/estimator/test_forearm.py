@@ -22,7 +22,7 @@ from common.geometry import (
 )
 from common.wrist_bend import forearm_palm
 from master.estimator.cycle_reader import CycleReader
-from master.estimator.epoch import Epoch, Fitted, Turn
+from master.estimator.epoch import Epoch, Fitted, OrientationMeasurement
 from master.estimator.estimator import Estimator
 from master.estimator.forearm import Forearm
 from master.estimator.fused import WristSide
@@ -120,16 +120,16 @@ class WristCase:
     def heading_off_deg(self, arm: Arm) -> float:
         return float(np.degrees(abs(np.angle(np.exp(1j * (self.heading_rad - arm.heading_rad))))))
 
-    def turn(self, t_ms: int) -> Turn | None:
-        return self.side.turn_at(t_ms * MS, self.estimator)
+    def orientation(self, t_ms: int) -> OrientationMeasurement | None:
+        return self.side.orientation_at(t_ms * MS, self.estimator)
 
     def epoch(self, arm: Arm, t_ms: int, *, seen: bool = True, shift_ms: int = 0) -> Fitted:
         """Fit the hand of one time, whose markers are seen or not."""
         t_ns, T = (t_ms + shift_ms) * MS, rigid(arm.palm(t_ms), PLACE)
         points = RIGHT.marker_points(RIGHT.forward(T, ANGLES), MARKERS) if seen else NOWHERE
-        turn = self.side.turn_at(t_ns, self.estimator)
-        hand = self.estimator.push(Epoch(t_ns, points, T[:3, 1], cov_m2=COV, turn=turn))
-        self.side.solved(t_ns, hand, self.estimator, turned=turn is not None)
+        orientation = self.side.orientation_at(t_ns, self.estimator)
+        hand = self.estimator.push(Epoch(t_ns, points, T[:3, 1], cov_m2=COV, orientation=orientation))
+        self.side.solved(t_ns, hand, self.estimator, oriented=orientation is not None)
         return hand
 
     def played(
@@ -167,9 +167,9 @@ def test_one_palm_tells_the_sum_of_heading_and_a_bend_whose_axis_is_upright_and_
     points = RIGHT.marker_points(RIGHT.forward(T, ANGLES), MARKERS)
     for t_ns in (0, 1_000 * MS):
         wrist_case.forearm.push(t_ns, matrix_to_quaternion(RIG_WORLD.T @ lies @ PALM_IMU))
-        turn = wrist_case.side.turn_at(t_ns, wrist_case.estimator)
-        hand = wrist_case.estimator.push(Epoch(t_ns, points, T[:3, 1], cov_m2=COV, turn=turn))
-        wrist_case.side.solved(t_ns, hand, wrist_case.estimator, turned=turn is not None)
+        orientation = wrist_case.side.orientation_at(t_ns, wrist_case.estimator)
+        hand = wrist_case.estimator.push(Epoch(t_ns, points, T[:3, 1], cov_m2=COV, orientation=orientation))
+        wrist_case.side.solved(t_ns, hand, wrist_case.estimator, oriented=orientation is not None)
     assert np.degrees(np.abs(wrist_case.bend)).max() < 1.0
     assert wrist_case.bend_sigma_deg[1] == pytest.approx(11.0, abs=2.0)  # as before
     assert wrist_case.bend_sigma_deg[0] < 4.0
@@ -179,13 +179,13 @@ def test_one_palm_tells_the_sum_of_heading_and_a_bend_whose_axis_is_upright_and_
 def test_nothing_is_said_of_the_palm_before_a_heading_is_known(root: Path) -> None:
     arm, wrist_case = Arm(), WristCase.of(root)
     wrist_case.played(arm, range(0, 100), seen=False)
-    assert wrist_case.turn(50) is None
+    assert wrist_case.orientation(50) is None
     assert 10.0 < wrist_case.bend_sigma_deg.min() < wrist_case.bend_sigma_deg.max() < 15.0
     for t_ms in (96, 112):  # the first palm tells the heading of a straight wrist, the next how it is bent
         wrist_case.epoch(arm, t_ms)
-    turn = wrist_case.turn(112)
-    assert turn is not None
-    assert degrees(turn.rotation @ forearm_palm(wrist_case.bend), arm.palm(112)) < 5.0
+    orientation = wrist_case.orientation(112)
+    assert orientation is not None
+    assert degrees(orientation.rotation @ forearm_palm(wrist_case.bend), arm.palm(112)) < 5.0
 
 
 def test_a_heading_that_the_file_knows_is_there_at_once(root: Path) -> None:
@@ -193,9 +193,9 @@ def test_a_heading_that_the_file_knows_is_there_at_once(root: Path) -> None:
     wrist_case = WristCase.of(root, msgspec.structs.replace(IMU, heading_sigma_rad=0.1))
     assert wrist_case.heading_sigma_deg == pytest.approx(np.degrees(0.1))
     wrist_case.forearm.push(48 * MS, arm.said(48))
-    turn = wrist_case.turn(48)
-    assert turn is not None
-    assert degrees(turn.rotation, arm.forearm(48)) < 4.0
+    orientation = wrist_case.orientation(48)
+    assert orientation is not None
+    assert degrees(orientation.rotation, arm.forearm(48)) < 4.0
 
 
 def test_a_palm_that_is_hidden_is_turned_as_the_forearm_is_and_doubted_more_and_more(root: Path) -> None:
@@ -273,10 +273,10 @@ def test_a_palm_that_contradicts_is_the_markers_alone(root: Path) -> None:
 def test_an_imu_that_begins_anew_has_no_heading_until_a_palm_is_seen(root: Path) -> None:
     arm, wrist_case = Arm(), WristCase.of(root)
     wrist_case.played(arm, range(0, 4_000), drift=0.05)
-    assert wrist_case.turn(3_990) is not None
+    assert wrist_case.orientation(3_990) is not None
     arm.heading_rad -= 0.5  # too little to be seen as a jump
     wrist_case.played(arm, range(6_000, 6_096), seen=False, drift=0.001)
-    assert wrist_case.turn(6_090) is None
+    assert wrist_case.orientation(6_090) is None
     wrist_case.played(arm, range(6_096, 10_000), drift=0.001)
     assert wrist_case.heading_off_deg(arm) < 3.0
 
@@ -285,7 +285,7 @@ def test_a_silence_in_which_the_same_imu_went_on_costs_the_heading_what_it_says(
     arm, wrist_case = Arm(), WristCase.of(root)
     wrist_case.played(arm, range(0, 6_000), drift=0.05)
     known = radians(wrist_case.heading_sigma_deg)
-    assert wrist_case.turn(6_500) is None  # no sample near
+    assert wrist_case.orientation(6_500) is None  # no sample near
     wrist_case.played(arm, range(8_000, 8_100), seen=False, drift=0.25)
     assert radians(wrist_case.heading_sigma_deg) == pytest.approx(np.hypot(known, 0.2), rel=0.03)
 
@@ -303,9 +303,9 @@ def test_a_clock_that_is_set_back_is_followed(root: Path, back_ms: int) -> None:
 def test_samples_that_are_missing_or_nan_change_nothing(root: Path) -> None:
     arm, wrist_case = Arm(), WristCase.of(root)
     wrist_case.played(arm, range(0, 2_000))
-    before = wrist_case.turn(1_984)
+    before = wrist_case.orientation(1_984)
     wrist_case.forearm.push(2_000 * MS, np.full(4, nan))
-    after = wrist_case.turn(1_984)
+    after = wrist_case.orientation(1_984)
     assert before is not None
     assert after is not None
     np.testing.assert_array_equal(after.rotation, before.rotation)
@@ -357,5 +357,5 @@ def test_a_mounting_is_needed_and_without_a_vertical_it_is_not_placed() -> None:
     bare = Forearm(msgspec.structs.replace(IMU, q_rig_world=None))
     assert not bare.placed
     bare.push(0, np.array([1.0, 0.0, 0.0, 0.0]))
-    assert bare.turn_at(0, np.zeros(13), np.eye(13)) is None
+    assert bare.orientation_at(0, np.zeros(13), np.eye(13)) is None
     assert bare.heading_of(0, np.eye(3), np.zeros(13)) is None

@@ -13,7 +13,7 @@ from common.geometry import axis_rotation, matrix_to_rotation_vector, rotation_v
 from common.wrist_bend import forearm_palm
 from master.estimator.wrist_device import BEND, HEADING, LIGHT, TILT
 from tests.hand_helpers import any_rotation
-from tests.master.estimator.kernels import turn_slope_at
+from tests.master.estimator.kernels import rotation_vector_jacobian_at
 from tests.master.estimator.whole import Whole, silent
 from tests.master.estimator.wrist_case import Seen, WristCase
 
@@ -63,12 +63,12 @@ def tip_depth(whole: Whole, seen: Seen, off: float) -> None:
     lines_of_sight.depth_w2[:] = whole.rng.uniform(1.0, 9.0, 5)
 
 
-def turn(whole: Whole, seen: Seen, off: float) -> None:
+def orientation(whole: Whole, seen: Seen, off: float) -> None:
     """Of a forearm that is turned `off` from where it would put the palm; tilt and heading are as they were."""
     belief, rng = whole.belief, whole.rng
     palm = rotation_vector_to_matrix(off * rng.normal(size=3)) @ whole.T[:3, :3]
     belief.forearm[:3, :3] = palm @ forearm_palm(BENT).T
-    belief.turn_info[:], belief.turned[0], belief.on_forearm[0] = spd(rng, 3), 1.0, 1.0
+    belief.orientation_info[:], belief.oriented[0], belief.on_forearm[0] = spd(rng, 3), 1.0, 1.0
     belief.axes[:] = any_rotation(rng)
     whole.z[TILT : HEADING + 1] = belief.z[TILT : HEADING + 1] = rng.normal(0.0, 0.2, 3)
 
@@ -80,7 +80,7 @@ def largest(whole: Whole, numeric: Float) -> Float:
     return np.repeat([max(float(part.max()), 1e-3) for part in parts], size)
 
 
-KINDS = [(laser, 0.35), (tip, 1e-5), (tip_depth, 1e-5), (turn, 1e-5)]
+KINDS = [(laser, 0.35), (tip, 1e-5), (tip_depth, 1e-5), (orientation, 1e-5)]
 
 
 @pytest.mark.parametrize(("kind", "share"), KINDS[1:])
@@ -165,7 +165,7 @@ def test_tilt_and_heading_away_from_the_believed_turn_the_palm(wrist_case: Wrist
     """To second order: of a few degrees the cost's slope is right to a few percent."""
     for seed in range(4):
         whole, seen = hand(wrist_case, seed)
-        turn(whole, seen, 0.1)
+        orientation(whole, seen, 0.1)
         whole.z[TILT : HEADING + 1] += whole.rng.normal(0.0, 0.05, 3)
         _, gradient, _ = whole.cost()
         numeric = whole.slope()
@@ -178,7 +178,7 @@ def test_a_small_turn_changes_the_rotation_vector_as_its_derivative_says(seed: i
     axis = rng.normal(size=3)
     vector = angle_rad * axis / np.linalg.norm(axis)
     by, rotation = np.empty((3, 3)), rotation_vector_to_matrix(vector)
-    turn_slope_at(vector, by)
+    rotation_vector_jacobian_at(vector, by)
     for k in range(3):
         ends = [
             matrix_to_rotation_vector(axis_rotation(k, way * 1e-5) @ rotation) / 2e-5 for way in (1.0, -1.0)

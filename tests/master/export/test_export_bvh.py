@@ -114,10 +114,10 @@ def test_the_angles_of_a_joint_are_those_of_another_library() -> None:
 
 def test_a_right_angle_about_x_and_a_full_turn_do_no_harm() -> None:
     steps = np.radians(np.arange(0.0, 720.0, 30.0))
-    turning = quaternion_to_matrix(
+    rotating = quaternion_to_matrix(
         np.stack([np.cos(steps / 2), 0 * steps, np.sin(steps / 2), 0 * steps], axis=1)
     )
-    angles = euler_zxy_deg(turning)
+    angles = euler_zxy_deg(rotating)
     np.testing.assert_allclose(angles[:, 2], np.degrees(steps), atol=1e-9)  # two turns, no leap
     lock = Rotation.from_euler("ZXY", [[20.0, 90.0, 30.0], [20.0, -90.0, 30.0]], degrees=True).as_matrix()
     again = Rotation.from_euler("ZXY", euler_zxy_deg(lock), degrees=True).as_matrix()

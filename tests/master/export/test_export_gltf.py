@@ -86,9 +86,9 @@ def test_joints_are_where_they_were_and_turned_as_they_were(
         found = model.world(key)
         places = np.array([found[name][:3, 3] for name in JOINTS])
         assert np.abs(places - FLIP * pose.position_m).max() < NEAR_M
-        turned = Rotation.from_matrix([found[name][:3, :3] for name in JOINTS])
+        rotated = Rotation.from_matrix([found[name][:3, :3] for name in JOINTS])
         true = Rotation.from_matrix(np.diag(FLIP)) * Rotation.from_quat(np.roll(pose.orientation_wxyz, -1, 1))
-        assert np.degrees((turned.inv() * true).magnitude()).max() < 0.01
+        assert np.degrees((rotated.inv() * true).magnitude()).max() < 0.01
 
 
 def test_the_skin_is_bound_to_the_joints_at_rest(tmp_path: Path) -> None:

@@ -242,7 +242,7 @@ def test_no_joint_twists(finger: int, local: Vector, side: str) -> None:
         parent = np.eye(3)
         for k, link in enumerate(fabrik.chain.links):
             child = np.array(result.orientations[k])
-            own = np.array(link.turn).T @ parent.T @ child
+            own = np.array(link.rotation).T @ parent.T @ child
             if isinstance(link.joint, Hinge):
                 assert own @ np.array(link.joint.axis) == pytest.approx(np.array(link.joint.axis), abs=1e-12)
             else:  # no turn about y and then about x gives the row of y another x than the rest pose has

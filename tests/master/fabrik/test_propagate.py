@@ -289,8 +289,8 @@ def by_formula(t_s: Float, y: Float, sigma: Float) -> tuple[Float, float]:
     tt = np.outer(t_s, t_s)
     one, found = np.ones(len(t_s)), list[tuple[float, Float, float, Float]]()
     for V, A in PX_M * np.array([[0.01, 0.3], [1.0, 1.5], [1.0, 15.0]]):
-        turning = tt**2 / 4.0 + 18.0**2 * tt**3 / 36.0 + 18.0**4 * tt**4 / 576.0
-        S = V**2 * tt + A**2 * turning + np.diag(fresh)
+        rotating = tt**2 / 4.0 + 18.0**2 * tt**3 / 36.0 + 18.0**4 * tt**4 / 576.0
+        S = V**2 * tt + A**2 * rotating + np.diag(fresh)
         weights = np.linalg.solve(S, one)
         c = weights.sum()
         x = weights @ y / c

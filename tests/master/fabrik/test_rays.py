@@ -155,8 +155,8 @@ def test_an_unsure_pose_widens_most_along_the_sight_and_age_adds_to_it() -> None
     sure, unsure = correct_centres(hand(0.0), uv), correct_centres(hand(0.2), uv)
     more = np.sqrt(np.diagonal(unsure.cov_m2 - sure.cov_m2, axis1=1, axis2=2)[:5])
     assert (more[:, 2] > 2.0 * more[:, :2].max(axis=1)).all()
-    old, turned = correct_centres(hand(0.0), uv, 0.02), correct_centres(hand(0.02 * CAPS.turn_rad_s), uv)
-    size = [np.trace(found.cov_m2[:5] - sure.cov_m2[:5], axis1=1, axis2=2) for found in (old, turned)]
+    old, rotated = correct_centres(hand(0.0), uv, 0.02), correct_centres(hand(0.02 * CAPS.rotation_rad_s), uv)
+    size = [np.trace(found.cov_m2[:5] - sure.cov_m2[:5], axis1=1, axis2=2) for found in (old, rotated)]
     np.testing.assert_allclose(*size, rtol=0.05)
 
 
@@ -190,14 +190,17 @@ def test_what_a_calibration_leaves_is_what_its_file_states() -> None:
 
 
 def test_points_and_covariances_turn_with_the_rig() -> None:
-    turn = rigid(palm(np.array([30.0, -20.0, 70.0]))[:3, :3], np.array([1.0, 2.0, 3.0]))
-    moved = tuple(replace(c, T_rig_camera=turn @ c.T_rig_camera) for c in CAMERAS)
-    known, R = hand(0.1), turn[:3, :3]
+    rotation = rigid(palm(np.array([30.0, -20.0, 70.0]))[:3, :3], np.array([1.0, 2.0, 3.0]))
+    moved = tuple(replace(c, T_rig_camera=rotation @ c.T_rig_camera) for c in CAMERAS)
+    known, R = hand(0.1), rotation[:3, :3]
     joints = replace(known.joints, rotation=R @ known.joints.rotation)
-    turned = replace(known, joints=joints, tilt_cov_rad2=R @ known.tilt_cov_rad2 @ R.T)
+    rotated = replace(known, joints=joints, tilt_cov_rad2=R @ known.tilt_cov_rad2 @ R.T)
     uv = seen(known.joints)[1]
-    here, there = correct_centres(known, uv), RayTriangulator(moved, TABLES)(uv, SIGMA, UNSTATED, turned, 0.0)
-    np.testing.assert_allclose(there.points_m, here.points_m @ R.T + turn[:3, 3], atol=1e-9)
+    here, there = (
+        correct_centres(known, uv),
+        RayTriangulator(moved, TABLES)(uv, SIGMA, UNSTATED, rotated, 0.0),
+    )
+    np.testing.assert_allclose(there.points_m, here.points_m @ R.T + rotation[:3, 3], atol=1e-9)
     np.testing.assert_allclose(there.cov_m2, R @ here.cov_m2 @ R.T, rtol=1e-6, atol=1e-12)
 
 

@@ -26,10 +26,10 @@ EXACT = (
     camera(0, np.eye(3), (0.0, 0.0, 0.0), np.zeros(5)),
     camera(0, np.eye(3), (0.075, 0.0, 0.0), np.zeros(5)),
 )
-TURNED = axis_rotation(2, 0.005) @ axis_rotation(1, -0.015)
+ROTATED = axis_rotation(2, 0.005) @ axis_rotation(1, -0.015)
 MADE_BY_HAND = (
     camera(0, axis_rotation(0, 0.02), (0.01, 0.0, 0.0), DISTORTED),
-    camera(1, axis_rotation(0, 0.025) @ TURNED, (0.085, 0.001, 0.0), DISTORTED),
+    camera(1, axis_rotation(0, 0.025) @ ROTATED, (0.085, 0.001, 0.0), DISTORTED),
 )
 PINHOLE = AffineDisparity(500.0 * 0.075, 0.0)
 FLAT = CapTables.flat(6)  # on no hand: what is seen of them is their centroid

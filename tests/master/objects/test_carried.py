@@ -17,8 +17,10 @@ NOISE_M = 0.002
 def object_at(t_s: float) -> Float:
     """Rests for a second, is lifted by 10 cm, turned by 40 degrees about an axis beside it, and rests."""
     share = float(np.clip((t_s - 1.0) / 1.0, 0.0, 1.0))
-    turn = np.radians(40.0) * float(np.clip((t_s - 2.5) / 1.0, 0.0, 1.0))
-    return rigid(rotation_vector_to_matrix(np.array([0.0, 0.0, turn])), np.array([0.0, -0.1 * share, 0.5]))
+    rotation = np.radians(40.0) * float(np.clip((t_s - 2.5) / 1.0, 0.0, 1.0))
+    return rigid(
+        rotation_vector_to_matrix(np.array([0.0, 0.0, rotation])), np.array([0.0, -0.1 * share, 0.5])
+    )
 
 
 def told(

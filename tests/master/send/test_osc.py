@@ -74,8 +74,10 @@ def test_what_is_not_known_has_no_message_and_a_left_hand_is_left(ear: socket.so
 
 
 def test_objects_contact_and_gestures_have_addresses_of_their_own(ear: socket.socket) -> None:
-    turn = np.array([0.5, 0.5, -0.5, 0.5])
-    wand = ObjectPose("wand", T_NS, np.array([0.1, 0.2, 0.3]), turn, np.eye(6), 0.001, 1, True, 3, 3, False)
+    quaternion = np.array([0.5, 0.5, -0.5, 0.5])
+    wand = ObjectPose(
+        "wand", T_NS, np.array([0.1, 0.2, 0.3]), quaternion, np.eye(6), 0.001, 1, True, 3, 3, False
+    )
     touch = np.array([True, False, False, False, True])
     contact = Contact(
         "me", "wand", T_NS, np.arange(5) / 8, np.ones(5), np.zeros((5, 3)), touch, 0.25, held=True

@@ -103,9 +103,9 @@ def test_tables_and_picture_show_it(out: Path, told: dict[str, Any]) -> None:
 def test_calibration_is_ours_and_what_it_refuses_is_said(told: dict[str, Any]) -> None:
     for one in told["calibrated"].values():
         assert one["said"]
-        assert 0.0 < one["nominal_turn_deg"] < 5.3
+        assert 0.0 < one["nominal_rotation_deg"] < 5.3
         if one["refused"]:  # then the rig file's pose is used
-            assert one["turn_deg"] == one["nominal_turn_deg"]
+            assert one["rotation_deg"] == one["nominal_rotation_deg"]
 
 
 def test_a_study_goes_on_from_what_was_detected_and_solves_anew(out: Path, told: dict[str, Any]) -> None:

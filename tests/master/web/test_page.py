@@ -127,9 +127,11 @@ def test_a_closing_socket_is_not_asked_for_the_round_trip() -> None:
 
 def an_object(page: Page, sink: WebSink) -> None:
     """An object is where its pose says, turned by pi about x as the hand is."""
-    where, turn = np.array([0.1, 0.05, 0.4]), np.array([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])
+    where, quaternion = np.array([0.1, 0.05, 0.4]), np.array([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])
     sink.write(
-        ObjectPose("mug", 9, where, turn, np.full((6, 6), np.nan), math.nan, 2, True, 3, 3, occluded=False)
+        ObjectPose(
+            "mug", 9, where, quaternion, np.full((6, 6), np.nan), math.nan, 2, True, 3, 3, occluded=False
+        )
     )
     until(page, "handView.objects.size === 1")
     group = "handView.objects.get('mug').group"

@@ -25,10 +25,10 @@ KEY = "11" * 32
 
 
 def pose(seq: int, known: bool = True) -> TrackerPose:
-    place, turn = (
+    place, quaternion = (
         (np.zeros(3), np.array([1.0, 0, 0, 0])) if known else (np.full(3, np.nan), np.full(4, np.nan))
     )
-    return TrackerPose("tracker", 0, seq, 10_000_000 * seq, place, turn)
+    return TrackerPose("tracker", 0, seq, 10_000_000 * seq, place, quaternion)
 
 
 class Source:
@@ -123,8 +123,8 @@ def test_a_synthetic_tracker_is_where_the_object_is_in_a_frame_of_its_own(tmp_pa
             continue
         found = SET_UP_TRACKING @ told @ np.linalg.inv(SET_UP_TRACKER)
         truth = tracker.scene.truth(float(t_s)).objects["cube"]
-        turn = matrix_to_rotation_vector(found[:3, :3] @ truth[:3, :3].T)
-        off.append(np.array([np.linalg.norm(found[:3, 3] - truth[:3, 3]), np.linalg.norm(turn)]))
+        quaternion = matrix_to_rotation_vector(found[:3, :3] @ truth[:3, :3].T)
+        off.append(np.array([np.linalg.norm(found[:3, 3] - truth[:3, 3]), np.linalg.norm(quaternion)]))
     worst = np.max(off, axis=0)
     assert 0 < lost < 20  # some half seconds behind something
     assert 2e-4 < worst[0] < 4e-3

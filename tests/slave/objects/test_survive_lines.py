@@ -32,8 +32,8 @@ def test_a_recorded_session_says_who_is_there_and_where() -> None:
 def test_the_quaternion_has_w_first_and_turns_device_axes_into_those_of_the_system() -> None:
     [one] = found(b"1.5 T20 POSE 1 2 3 0.707107 0 0 0.707107 \r\n")
     assert isinstance(one, Pose)
-    turned = quaternion_to_matrix(np.array(one.orientation_wxyz))
-    np.testing.assert_allclose(turned @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-6)  # a quarter about z
+    rotated = quaternion_to_matrix(np.array(one.orientation_wxyz))
+    np.testing.assert_allclose(rotated @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-6)  # a quarter about z
     assert math.isclose(math.hypot(*one.orientation_wxyz), 1.0, rel_tol=1e-12)
 
 
@@ -69,8 +69,8 @@ def test_a_pose_that_was_cut_and_run_into_by_the_next_line_is_never_believed(cut
         (b"8.0 WM0 POSE 0.1 0.2 0.3 0.707107 0.0 \xff 0.707107", Fault.NUMBER),
         (b"nan WM0 POSE 0.1 0.2 0.3 0.707107 0.0 0.0 0.707107", Fault.NUMBER),
         (b"-1.0 WM0 POSE 0.1 0.2 0.3 0.707107 0.0 0.0 0.707107", Fault.NUMBER),
-        (b"8.0 WM0 POSE 0.1 0.2 0.3 0.707107 0.0 0.0 0.7", Fault.TURN),
-        (b"8.0 WM0 POSE 0.1 0.2 0.3 0.0 0.0 0.0 0.0", Fault.TURN),
+        (b"8.0 WM0 POSE 0.1 0.2 0.3 0.707107 0.0 0.0 0.7", Fault.QUATERNION),
+        (b"8.0 WM0 POSE 0.1 0.2 0.3 0.0 0.0 0.0 0.0", Fault.QUATERNION),
         (b"8.0 WM0 POSE 0.1 0.2 inf 1.0 0.0 0.0 0.0", Fault.PLACE),
         (b"8.0 WM0 POSE 1e9 0.2 0.3 1.0 0.0 0.0 0.0", Fault.PLACE),
     ],

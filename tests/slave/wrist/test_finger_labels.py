@@ -22,7 +22,7 @@ VISIBLE_M = 2e-3
 NEAR_PX = 10.0
 
 
-def turned(degrees: tuple[float, float, float]) -> WristView:
+def rotated_view(degrees: tuple[float, float, float]) -> WristView:
     """The view of a device whose palm is believed to be turned against where it is."""
     palm = VIEW.T_camera_palm.copy()
     palm[:3, :3] = rotation_vector_to_matrix(np.radians(degrees)) @ palm[:3, :3]
@@ -35,7 +35,7 @@ def turned(degrees: tuple[float, float, float]) -> WristView:
 def test_fingers_are_told_apart_though_the_palm_is_not_quite_where_it_should_be(
     name: str, degrees: tuple[float, float, float]
 ) -> None:
-    one, view = scene(name, 61), turned(degrees)
+    one, view = scene(name, 61), rotated_view(degrees)
     renderer = WristRenderer(one, "wrist", 2)
     right: list[bool] = []
     for t in np.linspace(1.0, 58.0, 9).tolist():
@@ -74,6 +74,6 @@ def test_lines_of_a_palm_that_deviates_and_holds_something_are_counted_from_the_
     ambient, laser, led = (renderer.render(t, kind) for kind in STROBE)
     fingers = separate(lit(led, ambient), view)
     assert abs(np.degrees(truth.bend_rad[1])) > 5.0
-    assert fingers.turn.straight
+    assert fingers.palm_pose.straight
     found = laser_lines(lit(laser, ambient), fingers, view).uv[1:]
     assert (np.linalg.norm(found - truth.laser_uv[2:6], axis=1) < NEAR_PX).all()

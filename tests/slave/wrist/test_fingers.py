@@ -67,8 +67,8 @@ def test_a_black_image_is_told() -> None:
 
 
 def test_a_left_hand_has_its_thumb_on_the_other_side() -> None:
-    turned = np.diag([-1.0, 1.0, 1.0, 1.0]) @ VIEW.T_camera_palm @ np.diag([-1.0, 1.0, 1.0, 1.0])
-    rig = replace(RIG, T_camera_palm=tuple(tuple(row) for row in turned.tolist()))
+    rotated = np.diag([-1.0, 1.0, 1.0, 1.0]) @ VIEW.T_camera_palm @ np.diag([-1.0, 1.0, 1.0, 1.0])
+    rig = replace(RIG, T_camera_palm=tuple(tuple(row) for row in rotated.tolist()))
     left = search_bands_of(WristView.of(rig, CAMERA, mirrored_profile(HAND)))
     assert left.thumb_side == -search_bands_of(VIEW).thumb_side
     mirror = 2.0 * VIEW.optics.matrix[0, 2]
@@ -95,9 +95,9 @@ def test_a_crease_between_touching_fingers_is_the_seam() -> None:
     assert np.abs(found - crease)[inside].max() < 8.0
 
 
-@pytest.mark.parametrize(("turned_deg", "part"), [(-100.0, "fingers"), (60.0, "thumb")])
-def test_a_palm_whose_fingers_the_camera_cannot_see_is_refused(turned_deg: float, part: str) -> None:
+@pytest.mark.parametrize(("rotated_deg", "part"), [(-100.0, "fingers"), (60.0, "thumb")])
+def test_a_palm_whose_fingers_the_camera_cannot_see_is_refused(rotated_deg: float, part: str) -> None:
     T = VIEW.T_camera_palm.copy()
-    T[:3, :3] = axis_rotation(0, np.radians(turned_deg)) @ T[:3, :3]
+    T[:3, :3] = axis_rotation(0, np.radians(rotated_deg)) @ T[:3, :3]
     with pytest.raises(CalibrationError, match=f"T_camera_palm: the camera does not see the {part}"):
         search_bands_of(dataclasses.replace(VIEW, T_camera_palm=T))

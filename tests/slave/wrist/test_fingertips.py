@@ -158,8 +158,8 @@ def test_a_mirrored_hand_has_mirrored_tips() -> None:
     assert k is not None
     plain = replace(CAMERA, intrinsics=replace(k, cx_px=319.5, distortion=(0.0, 0.0, 0.0, 0.0, 0.0)))
     flip = np.diag([-1.0, 1.0, 1.0, 1.0])
-    turned = flip @ np.array(RIG.T_camera_palm) @ flip
-    rows = [tuple(row) for row in turned.tolist()]
+    rotated = flip @ np.array(RIG.T_camera_palm) @ flip
+    rows = [tuple(row) for row in rotated.tolist()]
     other = replace(RIG, T_camera_palm=(rows[0], rows[1], rows[2], (0.0, 0.0, 0.0, 1.0)))
     right, left = WristView.of(RIG, plain, HAND), WristView.of(other, plain, mirrored_profile(HAND))
     off: list[float] = []

@@ -7,7 +7,7 @@ import pytest
 
 from slave.wrist.seams import FENCE, minimum_cost_paths
 
-TURN = 0.02
+STEP_COST = 0.02
 
 
 def fenced(rng: np.random.Generator, stations: int, width: int) -> np.ndarray:
@@ -20,7 +20,7 @@ def energy_of(energy: np.ndarray, path: tuple[int, ...]) -> float:
     steps = np.abs(np.diff(path))
     if (steps > 2).any():
         return np.inf
-    return float(energy[np.arange(len(path)), list(path)].sum() + TURN * steps.sum())
+    return float(energy[np.arange(len(path)), list(path)].sum() + STEP_COST * steps.sum())
 
 
 @pytest.mark.parametrize("stations", [2, 5, 6])

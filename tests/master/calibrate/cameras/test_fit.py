@@ -22,13 +22,13 @@ NOISE_PX = 0.1
 
 def errors(fit: CamerasFit, truth: Scene) -> tuple[float, float, float]:
     """Worst focal length [px], place [mm] and turn [degrees] of the cameras."""
-    focal, place, turn = [0.0], [0.0], [0.0]
+    focal, place, rotation = [0.0], [0.0], [0.0]
     for i, camera in enumerate(fit.views.cameras):
         T, E = truth.T_camera_rig[camera], fit.solution.bundle.T_camera_rig[i]
         focal.append(abs(fit.solution.bundle.lenses[i, 0] - truth.lenses[camera][0]))
         place.append(1e3 * float(np.linalg.norm(invert(T)[:3, 3] - invert(E)[:3, 3])))
-        turn.append(float(np.degrees(np.linalg.norm(cv2.Rodrigues(T[:3, :3].T @ E[:3, :3])[0]))))
-    return max(focal), max(place), max(turn)
+        rotation.append(float(np.degrees(np.linalg.norm(cv2.Rodrigues(T[:3, :3].T @ E[:3, :3])[0]))))
+    return max(focal), max(place), max(rotation)
 
 
 def with_observation(
@@ -48,10 +48,10 @@ def with_observation(
 def test_cameras_are_found_where_they_are(cameras: int, seed: int) -> None:
     truth = scene(seed, cameras, views=16, shape_mm=0.1)
     fit = fit_cameras(truth.views(NOISE_PX, seed), bent=True)  # less than 16 views tell for certain
-    focal, place, turn = errors(fit, truth)
+    focal, place, rotation = errors(fit, truth)
     assert focal < 2.0
     assert place < 0.8
-    assert turn < 0.15
+    assert rotation < 0.15
     assert not fit.rejected
     # 0.1 px per coordinate is 0.14 px per corner, less what was spent on the estimate.
     assert 0.11 < fit.rms_px < 0.15
@@ -119,10 +119,10 @@ def test_a_board_that_looks_the_same_turned_is_turned_right() -> None:
     for board in (Checkerboard(7, 5, 0.03), Checkerboard(6, 6, 0.03)):
         truth = scene(11, 2, views=12, board=board)
         views = truth.views(NOISE_PX, 11)
-        turns = orderings(board)
-        assert len(turns) == (2 if board.columns == 7 else 4)
+        rotations = orderings(board)
+        assert len(rotations) == (2 if board.columns == 7 else 4)
         for i, view in enumerate(views.views):
-            order = turns[i % len(turns)]
+            order = rotations[i % len(rotations)]
             views = with_observation(
                 views, view.name, "right", lambda s, order=order: replace(s, corners_px=s.corners_px[order])
             )

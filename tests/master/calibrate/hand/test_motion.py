@@ -17,7 +17,7 @@ from master.calibrate.hand.motion import hand_from_motion, motion_lines
 from master.calibrate.hand.motion_couplings import Ratio, motion_couplings
 from master.calibrate.hand.palm import find_palm
 from master.mocap.joint_motion import Side
-from tests.master.mocap.moved import LEFT, RIGHT, SHIFT, TURN, hand_at, motion_of, ns, write_table
+from tests.master.mocap.moved import LEFT, RIGHT, ROTATION, SHIFT, hand_at, motion_of, ns, write_table
 
 T_S = np.arange(900) / 30.0
 BASES = tuple(name for name in JOINTS if name.endswith("finger-metacarpal"))
@@ -33,7 +33,7 @@ def run(*options: str) -> str:
 @pytest.mark.parametrize("without", [(), BASES, ("palm", *BASES)])
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_a_hand_comes_back_and_shows_its_side(side: Side, without: tuple[str, ...]) -> None:
-    joints = hand_at(T_S, MODELS[side]).position_m @ TURN.T + SHIFT
+    joints = hand_at(T_S, MODELS[side]).position_m @ ROTATION.T + SHIFT
     hand = hand_from_motion(motion_of(joints, T_S, without), "again")
     assert hand.profile.side == side
     assert not hand.palm.mirrored

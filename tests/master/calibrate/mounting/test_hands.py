@@ -8,7 +8,7 @@ import pytest
 from common.arrays import Float
 from common.geometry import rotation_vector_to_matrix
 from master.calibrate.mounting.hands import HandProblem, Hands
-from master.estimator.attached import Attached
+from master.estimator.body_points import BodyPoints
 from master.estimator.parameters import HandParameters
 from master.estimator.priors import Habits, habits_of
 from tests.master.calibrate.mounting.moved import moved
@@ -25,7 +25,7 @@ def problem(seed: int = 5) -> tuple[HandProblem, Hands]:
     T[:, :3, :3] = rotation_vector_to_matrix(rng.normal(size=(COUNT, 3)))
     T[:, :3, 3] = rng.normal(0.0, 0.2, (COUNT, 3))
     hands = Hands(T, parameters.low + share * (parameters.high - parameters.low))
-    markers = Attached.markers(seen.hand, parameters, seen.markers)
+    markers = BodyPoints.markers(seen.hand, parameters, seen.markers)
     shape = (COUNT, len(seen.markers), 3)
     free = habits_of(seen.hand, parameters)
     whiten = 1e3 * np.eye(3) + rng.normal(0.0, 50.0, (*shape, 3))

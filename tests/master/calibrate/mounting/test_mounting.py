@@ -23,9 +23,9 @@ from tests.master.calibrate.mounting.moved import CAMERA_LATE_NS, IMU_LATE_NS, M
 from tests.master.test_solve_both import write_detections
 
 CERTAIN = {
-    "turn_sigma_deg": 1.0,
+    "rotation_sigma_deg": 1.0,
     "shift_sigma_mm": 1.0,
-    "imu_turn_sigma_deg": 1.0,
+    "imu_rotation_sigma_deg": 1.0,
     "camera_imu_sigma_deg": 1.0,
     "camera_clock_sigma_ms": 1.0,
     "imu_clock_sigma_ms": 1.0,
@@ -81,8 +81,8 @@ def test_the_command_writes_the_true_mounting_into_a_tree(
     folder, tree, picture = recorded(seen, tmp_path), tmp_path / "tree", tmp_path / "mounting.png"
     command.mounting(folder, folder, out=tree, picture=picture, json_file=tmp_path / "found.json")
 
-    turn_deg, shift_mm, imu_deg, camera_ms, imu_ms = errors(found[0], seen.both).tolist()
-    assert turn_deg < 2.0  # of which most is that nobody knows when a wrist is straight
+    rotation_deg, shift_mm, imu_deg, camera_ms, imu_ms = errors(found[0], seen.both).tolist()
+    assert rotation_deg < 2.0  # of which most is that nobody knows when a wrist is straight
     assert shift_mm < 1.5
     assert imu_deg < 0.7
     assert camera_ms < 2.0  # skin is not made of cones, and six seconds are few
@@ -150,7 +150,7 @@ def test_what_no_mounting_explains_is_refused() -> None:
 @pytest.mark.parametrize(
     ("quantity", "value", "told"),
     [
-        ("imu_turn_sigma_deg", 5.0, "turn the forearm about another axis"),
+        ("imu_rotation_sigma_deg", 5.0, "turn the forearm about another axis"),
         ("shift_sigma_mm", 5.0, "bend every finger"),
         ("imu_clock_sigma_ms", 9.0, "move fingers and forearm faster"),
     ],

@@ -14,7 +14,7 @@ from master.calibrate.mounting.mounting import _cycles
 from master.calibrate.mounting.problem import Problem
 from master.calibrate.mounting.tracks import HandTrack, ImuTrack
 from master.calibrate.mounting.unknown import UNKNOWN, Unknown, believed
-from master.calibrate.mounting.wrists import bends, bends_by_turn
+from master.calibrate.mounting.wrists import bends, bends_by_rotation
 from master.wrist_setup import WristSetup
 from tests.master.calibrate.mounting.moved import CAMERA_LATE_NS, IMU_LATE_NS, ZERO_NS, moved
 
@@ -91,7 +91,7 @@ def test_a_step_of_gauss_and_newton_lessens_the_cost() -> None:
 
 def test_a_turn_about_the_axes_of_the_forearm_bends_the_wrist() -> None:
     bent, little = rotation_vector_to_matrix(np.array([[0.3, 0.0, 0.0], [0.0, 0.0, 0.0]])), 1e-4
-    by = bends_by_turn(bent)
+    by = bends_by_rotation(bent)
     for k in range(3):
         there, back = (bends(rotation_vector_to_matrix(way * little * EYE[k]) @ bent) for way in (1.0, -1.0))
         np.testing.assert_allclose(by[..., k], (there - back) / (2.0 * little), atol=1e-4)

@@ -94,7 +94,9 @@ def test_from_a_kept_motion_to_files_that_the_line_takes(
     assert cube.tags is not None
     for file in (rig.provenance["T_rig_tracking"], cube.provenance["T_object_tracker"]):
         assert (file.tool, file.data) == ("calibrate tracker", ("motion.npz",))
-        assert {"position_mm", "turn_deg", "position_sigma_mm", "turn_sigma_deg"} <= set(file.residual)
+        assert {"position_mm", "rotation_deg", "position_sigma_mm", "rotation_sigma_deg"} <= set(
+            file.residual
+        )
     numbers = json.loads(told.read_text())
     assert numbers["late_ms"] == pytest.approx(1e3 * motion.late_s, abs=2.0)
     [solved] = TrackerLine(cube, rig).push(motion.tracked()[300])
@@ -106,7 +108,7 @@ def test_what_it_needs_is_said(
     run: Run, tree: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     motion = tmp_path / "motion.npz"
-    poor = Motion(1, turns=(1.0, 0.0, 0.0))
+    poor = Motion(1, rotations=(1.0, 0.0, 0.0))
     write_motion(motion, poor.objects(), poor.tracked())
     before = (tree / "rigs" / "desk-cube.json").read_bytes()
     cube = load(tree / "objects" / "cube.json", ObjectProfile)
@@ -173,8 +175,8 @@ def test_coverage_tells_which_axis_and_what_else_is_missing() -> None:
         return found.missing
 
     assert of(Motion(7, strays=0.0)) == ()
-    [turn] = of(Motion(7, strays=0.0, turns=(1.0, 1.0, 0.1)))
-    assert "about its z axis as well" in turn
+    [rotation] = of(Motion(7, strays=0.0, rotations=(1.0, 1.0, 0.1)))
+    assert "about its z axis as well" in rotation
     assert any("hand's width" in line for line in of(Motion(7, strays=0.0, way_m=0.02)))
     assert any("together for 8 s" in line for line in of(Motion(7, seconds=4.0)))
     assert any("faster" in line for line in of(Motion(7, strays=0.0, pace=0.02)))

@@ -30,8 +30,8 @@ def off_plane_mm(laser: Image, ambient: Image, placed: BoardPose) -> float:
 def test_the_board_is_where_it_was_rendered() -> None:
     _, placed = first()
     true = scene_of(SEED, VIEWS).poses[0]
-    turned = np.degrees(np.arccos((np.trace(placed.T_camera_board[:3, :3].T @ true[:3, :3]) - 1.0) / 2.0))
-    assert turned < 0.2
+    rotated = np.degrees(np.arccos((np.trace(placed.T_camera_board[:3, :3].T @ true[:3, :3]) - 1.0) / 2.0))
+    assert rotated < 0.2
     assert 1e3 * np.linalg.norm(placed.T_camera_board[:3, 3] - true[:3, 3]) < 0.3
     sigma_mm = 1e3 * np.sqrt(np.diag(placed.covariance)[3:])
     assert (sigma_mm < 0.2).all()

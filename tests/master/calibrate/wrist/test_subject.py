@@ -62,16 +62,16 @@ def test_knuckles_5_mm_off_and_a_palm_askew_are_found_within_stated_sigma(
     people: dict[int, Person], subjects: dict[int, Subject], seed: int
 ) -> None:
     person, found = people[seed], subjects[seed]
-    turn_before, before = person.errors(person.rig, person.hand)
-    turn, after = person.errors(found.rig, found.hand)
+    rotation_before, before = person.errors(person.rig, person.hand)
+    rotation, after = person.errors(found.rig, found.hand)
     assert np.sqrt(np.mean(after**2)) < 0.75 * np.sqrt(np.mean(before**2))
     assert np.abs(after[:, 0]).max() < 2.5  # across is what the laser tells best [mm]
     by_sigma = 1e-3 * after / found.knuckle_sigma_m
     assert np.sqrt(np.mean(by_sigma**2)) < 1.5
     assert np.abs(by_sigma).max() < 3.0
     # About y and z the palm is told by where fingers go aside, about x by the flat hand alone.
-    assert np.linalg.norm(turn[1:]) < max(2.5, np.linalg.norm(turn_before[1:]))
-    assert abs(turn[0]) < 3.0 * np.degrees(np.sqrt(found.fit.covariance[0, 0]))
+    assert np.linalg.norm(rotation[1:]) < max(2.5, np.linalg.norm(rotation_before[1:]))
+    assert abs(rotation[0]) < 3.0 * np.degrees(np.sqrt(found.fit.covariance[0, 0]))
     assert found.rig.provenance["T_camera_palm"].tool == "calibrate subject"
     assert {"knuckles", "palmar_scale"} <= found.hand.provenance.keys()
     # What is written is what was fitted.
@@ -98,9 +98,9 @@ def test_derivatives_are_those_of_the_function(people: dict[int, Person]) -> Non
     model, rng = SubjectModel(setup_of(people[41])), np.random.default_rng(0)
     x = 1e-3 * rng.standard_normal(UNKNOWN)
     by_x, by_angles = model.derivatives(x, ANGLES)
-    way, turn = 3e-4 * rng.standard_normal(UNKNOWN), 3e-3 * rng.standard_normal(ANGLES.shape)
-    ahead, behind = model(x + way, ANGLES + turn), model(x - way, ANGLES - turn)
-    change = 2.0 * (by_x @ way + (by_angles @ turn[..., None])[..., 0])
+    way, rotation = 3e-4 * rng.standard_normal(UNKNOWN), 3e-3 * rng.standard_normal(ANGLES.shape)
+    ahead, behind = model(x + way, ANGLES + rotation), model(x - way, ANGLES - rotation)
+    change = 2.0 * (by_x @ way + (by_angles @ rotation[..., None])[..., 0])
     scale = np.array([1e-4, 1e-4, 0.2, 0.2])  # m and px
     np.testing.assert_array_less(np.abs((ahead - behind - change) / scale), 1.0)
 
@@ -194,8 +194,8 @@ def test_what_tells_nothing_or_a_lie_is_refused(
         hand = load(CALIB / "hands" / "default-left.json", HandProfile)
     else:
         assert rig.laser_plane is not None
-        turned = rotation_vector_to_matrix(np.array([0.1, 0.0, 0.0])) @ np.array(rig.laser_plane.normal)
-        x, y, z = turned.tolist()
+        rotated = rotation_vector_to_matrix(np.array([0.1, 0.0, 0.0])) @ np.array(rig.laser_plane.normal)
+        x, y, z = rotated.tolist()
         rig = replace(rig, laser_plane=replace(rig.laser_plane, normal=(x, y, z)))
     with pytest.raises(FitError, match=match):
         calibrate_subject(cycles, rig, person.camera, hand)

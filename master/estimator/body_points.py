@@ -18,7 +18,7 @@ _AXIS_JOINT: Int = np.array([0, 0, 1, 2])  # joint of the chain at which abducti
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Attached:
+class BodyPoints:
     """P points, each fixed to a joint of a finger's chain or to the palm.
 
     Attributes:
@@ -39,7 +39,7 @@ class Attached:
     parameters: HandParameters
 
     @classmethod
-    def markers(cls, model: HandModel, parameters: HandParameters, names: Sequence[str]) -> "Attached":
+    def markers(cls, model: HandModel, parameters: HandParameters, names: Sequence[str]) -> "BodyPoints":
         """The markers of these names.
 
         Raises:
@@ -56,7 +56,7 @@ class Attached:
         return cls._of(model, parameters, places)
 
     @classmethod
-    def joints(cls, model: HandModel, parameters: HandParameters) -> "Attached":
+    def joints(cls, model: HandModel, parameters: HandParameters) -> "BodyPoints":
         """The 26 joints themselves."""
         on_chain = np.isin(np.arange(26), CHAINS)
         places = [
@@ -68,7 +68,7 @@ class Attached:
     @classmethod
     def _of(
         cls, model: HandModel, parameters: HandParameters, places: Sequence[tuple[int | None, Float]]
-    ) -> "Attached":
+    ) -> "BodyPoints":
         """Points at (joint of a chain, offset in its frame), or (None, place in the palm frame)."""
         count = len(places)
         finger, level, on_finger = np.zeros(count, int), np.zeros(count, int), np.zeros((count, 1), bool)
@@ -85,11 +85,11 @@ class Attached:
         offset = np.array([offset for _, offset in places]).reshape(count, 3)
         return cls(finger, level, on_finger, offset, moves, axis, parameters)
 
-    def only(self, use: Bool) -> "Attached":
+    def only(self, use: Bool) -> "BodyPoints":
         """The points where `use` (P,) is true."""
         if use.all():
             return self
-        return Attached(
+        return BodyPoints(
             self.finger[use],
             self.level[use],
             self.on_finger[use],
@@ -118,5 +118,5 @@ class Attached:
         axes[..., :1, :] = self.abduction_axis
         np.negative(chains.rotation[..., :3, :, 0], out=axes[..., 1:, :])
         arm = points_m[..., None, :] - chains.position_m[..., self.finger[:, None], _AXIS_JOINT, :]
-        turned = skew(axes)[..., self.finger, :, :, :] @ arm[..., None]  # (..., P, 4, 3, 1)
-        return self.parameters.by_parameters(turned[..., 0].swapaxes(-1, -2) @ self.moves, x)
+        moments = skew(axes)[..., self.finger, :, :, :] @ arm[..., None]  # (..., P, 4, 3, 1)
+        return self.parameters.by_parameters(moments[..., 0].swapaxes(-1, -2) @ self.moves, x)

@@ -50,7 +50,7 @@ _MOST_VIEWS = np.array([1, 3])  # on either side of the straight one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PalmTurn:
+class PalmPose:
     """How the palm lies now.
 
     Attributes:
@@ -92,23 +92,23 @@ class _Marks:
     edge_weight: Float32
 
 
-def palm_turn(led: Image, view: WristView) -> PalmTurn:
+def find_palm_pose(led: Image, view: WristView) -> PalmPose:
     """How the palm lies in the difference of LED and ambient frame (H, W)."""
     bend = bend_seen(np.sqrt(shrink(led)), view)
     if not bend.any():
-        return PalmTurn(STRAIGHT, view.T_camera_palm, view)
+        return PalmPose(STRAIGHT, view.T_camera_palm, view)
     steps = np.rint(bend / STEP_RAD / _VIEW_STEPS).clip(-_MOST_VIEWS, _MOST_VIEWS).astype(np.int64)
-    return PalmTurn(bend, turned(view, bend).T_camera_palm, _view(view, int(steps[0]), int(steps[1])))
+    return PalmPose(bend, rotated_view(view, bend).T_camera_palm, _view(view, int(steps[0]), int(steps[1])))
 
 
 def prepare(view: WristView) -> list[WristView]:
-    """All views that `palm_turn` gives, the straight one among them."""
+    """All views that `find_palm_pose` gives, the straight one among them."""
     _marks(view)
     flexion, deviation = (range(-int(most), int(most) + 1) for most in _MOST_VIEWS)
     return [_view(view, a, b) for a in flexion for b in deviation]
 
 
-def turned(view: WristView, bend_rad: Float) -> WristView:
+def rotated_view(view: WristView, bend_rad: Float) -> WristView:
     """The view of a palm that a bend (2,) has turned."""
     T = view.T_camera_palm @ rigid(forearm_palm(bend_rad), np.zeros(3))
     return replace(view, T_camera_palm=T)
@@ -118,7 +118,7 @@ def turned(view: WristView, bend_rad: Float) -> WristView:
 def _view(view: WristView, flexion: int, deviation: int) -> WristView:
     if not flexion and not deviation:
         return view
-    return turned(view, STEP_RAD * _VIEW_STEPS * np.array([flexion, deviation]))
+    return rotated_view(view, STEP_RAD * _VIEW_STEPS * np.array([flexion, deviation]))
 
 
 def bend_seen(near: Float32, view: WristView) -> Float:
@@ -156,8 +156,8 @@ def _marks(view: WristView) -> _Marks:
     hardly: Bool = np.abs(bends / _NEAR_STRAIGHT_RAD).max(axis=1) <= 1.0
     gap, gap_weight = _gaps(view)
     edge, edge_weight = _edges(view)
-    at, inside = zip(*(_pixels(turned(view, bend), gap) for bend in bends), strict=True)
-    sides, shows = zip(*(_pixels(turned(view, bend), edge) for bend in bends), strict=True)
+    at, inside = zip(*(_pixels(rotated_view(view, bend), gap) for bend in bends), strict=True)
+    sides, shows = zip(*(_pixels(rotated_view(view, bend), edge) for bend in bends), strict=True)
     return _Marks(
         bends,
         (0.5 * ((bends / _TYPICAL_RAD) ** 2).sum(axis=1)).astype(np.float32),

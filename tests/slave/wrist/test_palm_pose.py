@@ -19,7 +19,7 @@ from slave.wrist.detector import find
 from slave.wrist.fingers import separate
 from slave.wrist.laser import laser_lines
 from slave.wrist.led_depth import shrink
-from slave.wrist.palm_turn import bend_seen, palm_turn, prepare, turned
+from slave.wrist.palm_pose import bend_seen, find_palm_pose, prepare, rotated_view
 from slave.wrist.strobe import StrobeCycle
 from tests.slave.wrist.wrist_frames import VIEW, scene
 
@@ -64,23 +64,23 @@ def seen(bend_deg: tuple[float, float], curled: float = 0.1, seed: int = 5) -> S
 
 @pytest.mark.parametrize("bend", BENDS)
 def test_the_bend_of_a_wrist_is_seen(bend: tuple[float, float]) -> None:
-    off = np.degrees(palm_turn(seen(bend).led, VIEW).bend_rad) - bend
+    off = np.degrees(find_palm_pose(seen(bend).led, VIEW).bend_rad) - bend
     assert abs(off[0]) < FLEXION_DEG
     assert abs(off[1]) < DEVIATION_DEG
 
 
 @pytest.mark.parametrize("curled", [0.0, 0.4, 0.8, 1.0])
 def test_a_straight_wrist_changes_nothing(curled: float) -> None:
-    turn = palm_turn(seen((0.0, 0.0), curled).led, VIEW)
-    assert turn.straight
-    assert turn.view is VIEW
+    rotation = find_palm_pose(seen((0.0, 0.0), curled).led, VIEW)
+    assert rotation.straight
+    assert rotation.view is VIEW
 
 
 def test_neither_the_dark_nor_noise_is_a_bent_wrist() -> None:
     rng = np.random.default_rng(3)
     dark = np.zeros((VIEW.optics.height_px, VIEW.optics.width_px), np.uint8)
     for image in (dark, dark + 200, rng.integers(0, 12, dark.shape).astype(np.uint8)):
-        assert palm_turn(image, VIEW).straight
+        assert find_palm_pose(image, VIEW).straight
 
 
 def test_twice_the_light_is_the_same_bend() -> None:
@@ -108,7 +108,7 @@ def test_the_palm_that_comes_into_the_plane_is_no_finger() -> None:
 
 def test_no_tip_is_told_of_a_bent_wrist() -> None:
     one = seen((0.0, -12.0))
-    assert not separate(one.led, VIEW).turn.straight
+    assert not separate(one.led, VIEW).palm_pose.straight
     dark = np.zeros_like(one.led)
     ambient, laser, led = (Frame(k, k, k, image) for k, image in enumerate((dark, one.laser, one.led)))
     assert np.isnan(find(StrobeCycle(ambient, laser, led), VIEW).tips.uv).all()
@@ -117,5 +117,5 @@ def test_no_tip_is_told_of_a_bent_wrist() -> None:
 def test_a_view_is_ready_for_every_bend() -> None:
     ready = prepare(VIEW)
     assert VIEW in ready
-    assert turned(VIEW, STRAIGHT).T_camera_palm == pytest.approx(VIEW.T_camera_palm)
-    assert all(palm_turn(seen(bend).led, VIEW).view in ready for bend in BENDS)
+    assert rotated_view(VIEW, STRAIGHT).T_camera_palm == pytest.approx(VIEW.T_camera_palm)
+    assert all(find_palm_pose(seen(bend).led, VIEW).view in ready for bend in BENDS)
