@@ -26,12 +26,12 @@ from common.imu_fusion import OrientationFilter
 from common.messages import ImuSample
 from common.sim.imu import SimulatedImu
 from common.sim.motion import HandState, smooth_step
-from common.wrist_bend import STRAIGHT, forearm_palm
+from common.wrist_joint import STRAIGHT, forearm_palm
 from master.estimator.cycle_reader import CycleReader
 from master.estimator.epoch import Epoch, Fitted
 from master.estimator.estimator import Estimator
 from master.estimator.fused import WristSide
-from master.estimator.wrist_device import BEND, HEADING
+from master.estimator.wrist_device import HEADING, WRIST_ANGLES
 from master.estimator.wrist_model import WristModel, loosened
 from master.rig import load_setup
 from master.rig_setup import RigSetup
@@ -50,7 +50,7 @@ Kind = Literal["plain", "staying"]
 KINDS: tuple[Kind, ...] = ("plain", "staying")
 
 
-class BentWrist:
+class FlexedWrist:
     """A wrist that goes from one posture to the next, and wavers. Pure in time: holds its script."""
 
     def __init__(self, seed: int) -> None:
@@ -133,7 +133,7 @@ class Arm:
 
     seed: int
     forearm: RotatedArm
-    wrist: BentWrist
+    wrist: FlexedWrist
     samples: list[ImuSample]
 
     @classmethod
@@ -141,7 +141,7 @@ class Arm:
         """Simulate."""
         forearm, fusion = RotatedArm(seed), OrientationFilter(imu.rate_hz)
         samples = [fusion.push(one) for one in SimulatedImu(forearm, imu, seed).around(0.0, seconds)]
-        return cls(seed, forearm, BentWrist(seed), samples)
+        return cls(seed, forearm, FlexedWrist(seed), samples)
 
     def lies(self, t_s: float) -> Float:
         """The forearm (3, 3) in the rig."""
@@ -191,7 +191,7 @@ def moments(arm: Arm, kind: Kind, rigs: tuple[RigSetup, WristSetup]) -> Iterator
         shown = since_s <= _TOLD_S
         hand = line.push(sample.t_ns, told.of(arm.palm(t_s)) if shown else unseen)
         if shown:
-            last = line.estimator.extras[BEND : BEND + 2].copy()
+            last = line.estimator.extras[WRIST_ANGLES : WRIST_ANGLES + 2].copy()
         looked = [s for s in _AFTER_S[1:] if abs(since_s - _TOLD_S - s) < 0.5 * _FRAME_S]
         if _SETTLED_S < since_s <= _TOLD_S and frame % 15 == 0:
             looked = [0.0]
@@ -207,11 +207,11 @@ def _moment(
         return Moment(after_s, np.full(5, 180.0), np.full(3, np.inf))
     z, cov, truth = estimator.extras, estimator.extras_cov, arm.wrist.at(t_s)
     heading = remainder(z[HEADING] - arm.heading(sample), 2.0 * pi)
-    bent = z[BEND : BEND + 2] - truth
+    bent = z[WRIST_ANGLES : WRIST_ANGLES + 2] - truth
     palm = matrix_to_rotation_vector(arm.palm(t_s) @ hand.solution.T_rig_palm[:3, :3].T)
     surprise = (
         heading**2 / cov[HEADING, HEADING],
-        bent @ np.linalg.solve(cov[BEND : BEND + 2, BEND : BEND + 2], bent),
+        bent @ np.linalg.solve(cov[WRIST_ANGLES : WRIST_ANGLES + 2, WRIST_ANGLES : WRIST_ANGLES + 2], bent),
         palm @ np.linalg.solve(hand.solution.alone[:3, :3], palm),
     )
     off = [float(np.linalg.norm(one)) for one in (heading, bent, palm, last - truth, truth)]

@@ -28,7 +28,7 @@ from common.messages import HandPose, ImuSample
 from common.sim.poses import StudyPoses
 from common.sim.render import Renderer
 from common.sim.scene import Scene, view_centre
-from common.sim.together import Bent
+from common.sim.together import FlexedWrist
 from common.sim.wrist.scene import WristScene
 from master.rig import load_setup
 from master.rig_pipeline import pipeline_of
@@ -72,7 +72,7 @@ def by_both(number: int, seconds: float = SECONDS) -> dict[str, Told]:
     marked, wrist_setup = _setup("desk-back3"), load_setup(CALIBRATION, "wrist-back3")
     who = _person(number, marked)
     model, seed = HandModel.of(who.hand), _MOTION + number
-    motion = Bent(posed := StudyPoses(model, view_centre(marked.rig), seed), seed)
+    motion = FlexedWrist(posed := StudyPoses(model, view_centre(marked.rig), seed), seed)
     scene = Scene.of_motion(marked.rig, marked.cameras, who.hand, motion, seed)
     rng = np.random.default_rng([number, 77])
     true = replace(wrist_setup.rig, T_camera_palm=who.rig.T_camera_palm)

@@ -279,11 +279,11 @@ class HandModel:
 
 def _swing(root: Float, link_rotation: Float, side_sign: float) -> Float:
     """`HandModel.swing` of root rotations (5, 3, 3) and rest turns (5, 3, 3, 3)."""
-    abduct, bend = _about(1, side_sign), _about(0, -1.0)  # a flexion turns by -a about +x
+    abduct, flexion = _about(1, side_sign), _about(0, -1.0)  # a flexion turns by -a about +x
     out = np.empty((3, 5, 4, 3, 3))
     out[:, 0, 0], out[:, 1:, 0] = root[0] @ abduct, abduct[:, None] @ root[1:]
-    out[:, :, 1] = bend[:, None]
-    out[:, :, 2:] = link_rotation[:, :2] @ bend[:, None, None]
+    out[:, :, 1] = flexion[:, None]
+    out[:, :, 2:] = link_rotation[:, :2] @ flexion[:, None, None]
     return out
 
 

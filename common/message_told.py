@@ -97,9 +97,9 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
         palm_world_wxyz: (4,) quaternion, palm axes -> the world of the IMU on a wrist device, whose z axis is
             vertical. NaN: not known, or no such device.
         palm_world_sigma_rad: (2,) its standard deviations: tilt against the vertical per axis, heading about it.
-        wrist_bend_rad: (2,) flexion and deviation of the wrist between a device on the forearm and the palm
-            (`common.wrist_bend`). NaN: no such device, or nothing tells.
-        wrist_bend_sigma_rad: (2,) their standard deviations.
+        wrist_angles_rad: (2,) flexion and deviation of the wrist between a device on the forearm and the palm
+            (`common.wrist_joint`). NaN: no such device, or nothing tells.
+        wrist_angles_sigma_rad: (2,) their standard deviations.
     """
 
     hand: Name
@@ -122,8 +122,8 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
     ambiguous: Bool = field(default_factory=lambda: _NOT_AMBIGUOUS)
     palm_world_wxyz: UnitQuaternion = field(default_factory=lambda: _NO_ROTATION)
     palm_world_sigma_rad: Numbers = field(default_factory=lambda: _NO_SIGMA)
-    wrist_bend_rad: Annotated[Float, within(-10.0, 10.0)] = field(default_factory=lambda: _NO_SIGMA)
-    wrist_bend_sigma_rad: Numbers = field(default_factory=lambda: _NO_SIGMA)
+    wrist_angles_rad: Annotated[Float, within(-10.0, 10.0)] = field(default_factory=lambda: _NO_SIGMA)
+    wrist_angles_sigma_rad: Numbers = field(default_factory=lambda: _NO_SIGMA)
 
     def __post_init__(self) -> None:
         m = self.markers_m.size // 3
@@ -285,8 +285,8 @@ def _hand_arrays(m: int) -> Layout:
         ambiguous=(FINGER_COUNT,),
         palm_world_wxyz=(4,),
         palm_world_sigma_rad=(2,),
-        wrist_bend_rad=(2,),
-        wrist_bend_sigma_rad=(2,),
+        wrist_angles_rad=(2,),
+        wrist_angles_sigma_rad=(2,),
     )
 
 

@@ -8,9 +8,9 @@ import numpy as np
 from common.arrays import Float
 from common.calibration import CameraCalibration, FilterCalibration, ImuCalibration, RigCalibration, Volume
 from common.hand_model import FINGERS, HandModel
-from common.wrist_bend import forearm_palm
 from common.wrist_calibration import FingerLine
 from common.wrist_device import WristDevice
+from common.wrist_joint import forearm_palm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,8 +70,8 @@ class WristSetup(WristDevice):
             imu=rig.imu if rig.imu is not None and rig.imu.q_palm_imu is not None else None,
         )
 
-    def bent(self, bend_rad: Float) -> "WristSetup":
-        """The same before the palm of a wrist that is bent by (2,) [rad] (`common.wrist_bend`)."""
+    def flexed(self, wrist_angles_rad: Float) -> "WristSetup":
+        """The same before the palm of a wrist that is bent by (2,) [rad] (`common.wrist_joint`)."""
         T = self.T_camera_palm.copy()
-        T[:3, :3] = T[:3, :3] @ forearm_palm(bend_rad)
+        T[:3, :3] = T[:3, :3] @ forearm_palm(wrist_angles_rad)
         return replace(self, T_camera_palm=T)

@@ -18,7 +18,7 @@ from common.calibration import CameraCalibration, HandProfile, RigCalibration, l
 from common.camera_model import CameraModel
 from common.frame_recording import Illumination, Manifest
 from common.hand_model import HandModel
-from common.wrist_bend import forearm_palm
+from common.wrist_joint import forearm_palm
 
 ORDER = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
 Arrays = dict[str, npt.NDArray[np.generic]]
@@ -28,7 +28,7 @@ class Moment(NamedTuple):
     """The hand at one instant: named angles (21,) [rad], and flexion and deviation of the wrist (2,) [rad]."""
 
     angles_rad: Float
-    bend_rad: Float
+    wrist_angles_rad: Float
 
 
 class View(NamedTuple):
@@ -71,7 +71,7 @@ class Device:
     def view(self, moment: Moment) -> View:
         """Pose the hand and look at it."""
         T = np.array(self.rig.T_camera_palm)
-        T[:3, :3] = T[:3, :3] @ forearm_palm(moment.bend_rad)
+        T[:3, :3] = T[:3, :3] @ forearm_palm(moment.wrist_angles_rad)
         posed = self.hand_mesh.pose(moment.angles_rad, T)
         uv = self.optics.project(posed.verts)
         size = self.optics.width_px, self.optics.height_px

@@ -111,7 +111,7 @@ def write_set(one: Set, datasets: Path, folder: Path, seed: int) -> None:
     )
     three = np.array([[moment.angles_rad for moment in cycle] for cycle in one.moments])
     truth: Arrays = {"angles": three[:, 1], "angles_3frames": three}
-    truth["bend"] = np.array([cycle[1].bend_rad for cycle in one.moments])
+    truth["flexion"] = np.array([cycle[1].wrist_angles_rad for cycle in one.moments])
     truth["ambient"] = np.array([one.light] * len(three))
     truth |= {key: np.array([row[key] for row in truths]) for key in truths[0]}
     write_truth(folder, truth, _meta(one, device, manifest, seed))

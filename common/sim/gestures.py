@@ -45,7 +45,7 @@ _SHOWN_DEG = {
     "point": ((50.0, 175.0), (25.0, 140.0)),
 }
 REACH_M = np.array([0.04, 0.025, 0.04])
-BEND_DEG = np.array([5.0, 3.0])
+WRIST_DEG = np.array([5.0, 3.0])
 _FREE = (REST, POSES["open_palm"], FIST, WAVE_CREST, POSES["counting_two"], REST)
 _LOOSEN_DEG = np.array([[14.0, -14.0, -14.0], *[[0.0, -17.0, -16.0]] * 4])
 
@@ -157,7 +157,7 @@ class Gestures:
         knob = next((knob for start, knob in reversed(self._knobs) if t >= start), None)
         if knob is not None:
             pose = pose @ _about(knob, float(self._rotation_vector.at(t)[0]))
-        return HandState(pose, angles, np.radians(BEND_DEG) * self._sway.at(t))
+        return HandState(pose, angles, np.radians(WRIST_DEG) * self._sway.at(t))
 
     def _pose(self, shown_rad: Float, shift_m: Float, rotation_rad: Float) -> Float:
         """`T_rig_palm` (4, 4): shown like that (2,), fingers up in the image."""

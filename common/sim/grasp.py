@@ -119,10 +119,10 @@ class Grasp:
         )
         held = CLOSED_S <= s < RELEASE_S
         bar = (pose if held else self._T_grip) @ self._T_palm_object
-        bend = np.radians(
+        wrist_angles = np.radians(
             SWAY_DEG * self._sway.at(max(t_s, 0.0)) + swing + near * np.array([FLEXED_DEG, 0.0])
         )
-        return HandState(pose, angles, bend, (Cylinder(bar, self._radius_m, BAR_LENGTH_M, held),))
+        return HandState(pose, angles, wrist_angles, (Cylinder(bar, self._radius_m, BAR_LENGTH_M, held),))
 
     def _rotation_and_swing(self, k: int, s: float) -> tuple[Float, Float]:
         """How round `k` turns the palm about the rig's axes (3,) [rad], and bends the wrist by that (2,) [deg]."""

@@ -17,7 +17,7 @@ from common.arrays import Float
 from common.geometry import axis_rotation, rigid
 from common.hand_model import HandModel
 from common.sim.held import Cylinder
-from common.wrist_bend import STRAIGHT
+from common.wrist_joint import STRAIGHT
 
 PERIOD_S = 60.0
 PEAK_SPEED_M_S = 1.0
@@ -52,14 +52,14 @@ class HandState:
     Attributes:
         T_rig_palm: Palm pose (4, 4) [m].
         angles_rad: (5, 4) [rad].
-        bend_rad: (2,) how the wrist is bent between forearm and palm (`common.wrist_bend`).
+        wrist_angles_rad: (2,) how the wrist is bent between forearm and palm (`common.wrist_joint`).
         things: What stands about, or is held.
         objects: Poses (4, 4) [m], rig frame, of the tracked objects that move by themselves, in the rig's order.
     """
 
     T_rig_palm: Float
     angles_rad: Float
-    bend_rad: Float = field(default_factory=lambda: STRAIGHT)
+    wrist_angles_rad: Float = field(default_factory=lambda: STRAIGHT)
     things: tuple[Cylinder, ...] = ()
     objects: tuple[Float, ...] = ()
 

@@ -55,7 +55,7 @@ class _Row:
     views: tuple[MarkerView, ...]
     t_row0: tuple[float, ...]
     reference: SceneTruth
-    bend_rad: Float
+    wrist_angles_rad: Float
 
 
 class SceneTake:
@@ -124,7 +124,9 @@ class SceneTake:
                 views.append(view)
                 yield TakenFrame(name, k, FIRST_NS + round(t * 1e9), Illumination.NONE, image)
             at_s = times[0] + self._centre_s
-            self._rows.append(_Row(tuple(views), times, scene.truth(at_s), scene.motion.at(at_s).bend_rad))
+            self._rows.append(
+                _Row(tuple(views), times, scene.truth(at_s), scene.motion.at(at_s).wrist_angles_rad)
+            )
 
     def truth(self) -> Arrays:
         """One row per frame of each camera."""
@@ -140,7 +142,7 @@ class SceneTake:
             "joints": np.array([truth.joints.position_m[1:] for truth in truths]),
             "angles": np.array([named_angles(self._scene.model, truth.angles_rad) for truth in truths]),
             "T_palm": np.array([truth.T_rig_palm for truth in truths]),
-            "bend": np.array([row.bend_rad for row in rows]),
+            "flexion": np.array([row.wrist_angles_rad for row in rows]),
         } | self._truth_of_objects()
 
     def _truth_of_objects(self) -> Arrays:

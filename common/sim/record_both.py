@@ -82,6 +82,6 @@ def _check_alike(marker_scene: Scene, wrist_scene: WristScene, times_s: tuple[fl
         seen, device = marker_scene.motion.at(t_s), wrist_scene.motion.at(t_s)
         if not (
             np.array_equal(seen.angles_rad, device.angles_rad)
-            and np.array_equal(seen.bend_rad, device.bend_rad)
+            and np.array_equal(seen.wrist_angles_rad, device.wrist_angles_rad)
         ):
             raise ValueError(f"the scenes move differently at {t_s} s")

@@ -37,7 +37,7 @@ class SceneTruth:
         angles_rad: (5, 4).
         joints: Positions (26, 3) [m] and rotations of all joints, rig frame.
         markers_m: (M, 3) centroids of the painted surfaces [m], rig frame; middles of the beads of objects.
-        bend_rad: (2,) how the wrist is bent between forearm and palm (`common.wrist_bend`).
+        wrist_angles_rad: (2,) how the wrist is bent between forearm and palm (`common.wrist_joint`).
         things: What stands about, or is held, and is not tracked.
         objects: Tracked object -> `T_rig_object` (4, 4) [m].
     """
@@ -47,7 +47,7 @@ class SceneTruth:
     angles_rad: Float
     joints: HandJoints
     markers_m: Float
-    bend_rad: Float
+    wrist_angles_rad: Float
     things: tuple[Cylinder, ...]
     objects: Mapping[str, Float] = field(default_factory=dict[str, Float])
 
@@ -192,7 +192,7 @@ class Scene:
             state.angles_rad,
             joints,
             self._marker_points(joints, poses),
-            state.bend_rad,
+            state.wrist_angles_rad,
             self.untracked(state),
             dict(zip(self.rig.objects, poses, strict=True)),
         )

@@ -53,7 +53,7 @@ class ObjectTravel:
         """Of a hand and an object about a place (3,) [m]; the same seed, the same motion."""
         rng = np.random.default_rng([seed, 37])
         self._model, self._centre = model, np.asarray(centre_m, dtype=np.float64)
-        self._wander, self._drift, self._bend = Waves(rng, 6), Drift(rng), Waves(rng, 5)
+        self._wander, self._drift, self._wrist = Waves(rng, 6), Drift(rng), Waves(rng, 5)
         self._place = self._centre + AT_M + rng.uniform(-0.01, 0.01, 3)
         self._facing = rotation_vector_to_matrix(np.radians(rng.uniform(-20.0, 20.0, 3))) @ facing(
             np.radians(25.0)
@@ -79,7 +79,7 @@ class ObjectTravel:
         before = smooth_step((t - come) / (there - come)) * smooth_step((gone - t) / (gone - leave))
         aside = self._centre + ASIDE_M
         shift = shift + (1.0 - before) * ASIDE_M + before * (self._place - self._centre + self._before)
-        share = (1.0 - before) * (0.25 + 0.25 * self._bend.at(t))
+        share = (1.0 - before) * (0.25 + 0.25 * self._wrist.at(t))
         rest, fist = np.array(REST, dtype=np.float64), np.array(FIST, dtype=np.float64)
         posture = rest + share[:, None] * (fist - rest)
         palm = base_pose(self._model, aside - ASIDE_M, shift, rotation)

@@ -52,7 +52,7 @@ class LaserCut:
         self._setup, self._surface, self._axes = setup, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
         self._nodes = -_INSIDE * np.cos(np.pi * np.arange(rays) / (rays - 1))
 
-    def bent(self, setup: WristSetup) -> "LaserCut":
+    def flexed(self, setup: WristSetup) -> "LaserCut":
         """The same hand before another palm pose of this device."""
         other = copy(self)
         other._setup = setup

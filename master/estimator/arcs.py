@@ -141,8 +141,10 @@ def _arcs(rig: Rig, T: Float, seen: Bool, k: int, m: int, pair: int, work: Scrat
         else:
             bx, by, bz = bx - T[0, 3], by - T[1, 3], bz - T[2, 3]
         for i in range(3):
-            bent = _arc(w[f, level, k], w[f, level, m], bx, by, bz, i)
-            room.joint[pair, joint, i] = bent + (room.joint[pair, joint - 1, i] if level > 0 else 0.0)
+            second_derivative = _arc(w[f, level, k], w[f, level, m], bx, by, bz, i)
+            room.joint[pair, joint, i] = second_derivative + (
+                room.joint[pair, joint - 1, i] if level > 0 else 0.0
+            )
     for marker in range(mounts.finger.shape[0]):
         if not seen[marker]:
             continue
@@ -161,8 +163,8 @@ def _arcs(rig: Rig, T: Float, seen: Bool, k: int, m: int, pair: int, work: Scrat
                 room.marker[pair, 3 * marker + i] = _arc(w[0, 0, k], w[0, 0, m], bx, by, bz, i)
             else:
                 carried = room.joint[pair, room.joint_of[f, level], i]
-                bent = _arc(w[f, bone, k], w[f, bone, m], bx, by, bz, i)
-                room.marker[pair, 3 * marker + i] = carried + bent
+                second_derivative = _arc(w[f, bone, k], w[f, bone, m], bx, by, bz, i)
+                room.marker[pair, 3 * marker + i] = carried + second_derivative
 
 
 @inner

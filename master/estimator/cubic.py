@@ -21,7 +21,7 @@ from master.estimator.finger_surface import OWN_MOVES, Surface, cut, look
 from master.estimator.hand_tables import HandTables
 from master.estimator.natural_curve import NaturalCurve
 from master.estimator.parameters import HandParameters
-from master.estimator.wrist_device import Device, bent_palm
+from master.estimator.wrist_device import Device, flexed_palm
 from master.wrist_setup import WristSetup
 
 ROOT_MM = 102.06
@@ -43,7 +43,7 @@ def _laser_points(
     """Write laser points (C, 5, 3) [m] of hands of angles (C, 20); NaN where the laser misses a finger."""
     palm, axes = np.zeros((4, 4)), np.zeros((2, 3))
     hand, device, work = boxed_hand[0], boxed_device[0], boxed_work[0]
-    bent_palm(device.palm, 0.0, 0.0, palm, axes)
+    flexed_palm(device.palm, 0.0, 0.0, palm, axes)
     for c in range(angles.shape[0]):
         for f in range(5):
             look(hand, device, palm, axes, angles[c], f, OWN_MOVES, work)

@@ -78,7 +78,7 @@ class EpochSteps:
         self._ground, self._lines_of_sight = self._space["ground"], self._space["belief"]["sights"]
         hand, device = boxed(self._rig.hand), boxed(device)
         self._model = Model(hand, boxed(settings.record()), mounts, self._rig.cameras, device)
-        self.at.room.search.bend_share[0] = settings.bend_share
+        self.at.room.search.wrist_share[0] = settings.wrist_share
         self.at.belief.z_info[0, 0] = 1.0  # of a rig without wrist device: one extra that means nothing
         if wrist is not None:
             self._lay_out(wrist)

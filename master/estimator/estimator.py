@@ -15,7 +15,7 @@ from master.estimator.parameters import HandParameters
 from master.estimator.reinitialise import NONE, HabitTables, Reinitialiser
 from master.estimator.settings import DEFAULT, Settings
 from master.estimator.update import Estimate
-from master.estimator.wrist_device import BEND, HEADING, LIGHT
+from master.estimator.wrist_device import HEADING, LIGHT, WRIST_ANGLES
 from master.estimator.wrist_model import WristModel
 
 _SOMEWHERE_M = 0.1  # about each axis: a hand that is known no better than this is lost
@@ -92,8 +92,10 @@ class Estimator:
 
     def forget_heading(self) -> None:
         """Let the heading of an IMU be any, and what was learnt with it."""
-        self._now.z_cov[BEND:LIGHT] = self._now.z_cov[:, BEND:LIGHT] = 0.0
-        self._now.z_cov[range(BEND, LIGHT), range(BEND, LIGHT)] = self._now.stationary[BEND:LIGHT]
+        self._now.z_cov[WRIST_ANGLES:LIGHT] = self._now.z_cov[:, WRIST_ANGLES:LIGHT] = 0.0
+        self._now.z_cov[range(WRIST_ANGLES, LIGHT), range(WRIST_ANGLES, LIGHT)] = self._now.stationary[
+            WRIST_ANGLES:LIGHT
+        ]
 
     def begin_heading(self, heading_rad: float, variance_rad2: float) -> None:
         """Take the heading of an IMU from a palm that was solved without it."""

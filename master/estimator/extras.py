@@ -27,7 +27,7 @@ from master.estimator.matrices import cholesky, inverse
 from master.estimator.problem import Belief
 from master.estimator.settings import Settings
 from master.estimator.state import HandState
-from master.estimator.wrist_device import BEND, EXTRAS, HEADING, LIGHT, RATE, TILT
+from master.estimator.wrist_device import EXTRAS, HEADING, LIGHT, RATE, TILT, WRIST_ANGLES
 
 _CONSTANT_S = 1e4
 
@@ -56,13 +56,13 @@ def stationary_of(settings: Settings, *, loose: bool, tilt_rad: float) -> Float:
         tilt_rad: Of the IMU's vertical.
     """
     stationary = np.zeros(EXTRAS)
-    stationary[:BEND] = settings.hinge_rad**2
+    stationary[:WRIST_ANGLES] = settings.hinge_rad**2
     stationary[:1] = 1e-6  # a thumb's hinges are no parallel ones
-    bend = np.array(
+    wrist_angles = np.array(
         [settings.flexion_rad, settings.deviation_rad] if loose else 2 * [settings.calibrated_palm_rad]
     )
-    stationary[BEND : BEND + 2] = bend**2
-    stationary[RATE : RATE + 2] = (settings.pace_1_s * bend) ** 2
+    stationary[WRIST_ANGLES : WRIST_ANGLES + 2] = wrist_angles**2
+    stationary[RATE : RATE + 2] = (settings.pace_1_s * wrist_angles) ** 2
     stationary[TILT : TILT + 2] = max(tilt_rad, 1e-3) ** 2
     stationary[HEADING] = np.pi**2 / 3.0
     stationary[LIGHT] = settings.light_unit**2
@@ -104,7 +104,7 @@ def predict_extras(
     paced = settings.pace_1_s * away
     decay = exp(-paced)
     for b in range(2):
-        at, rate = BEND + b, RATE + b
+        at, rate = WRIST_ANGLES + b, RATE + b
         M[at, at], M[at, rate] = (1.0 + paced) * decay, away * decay
         M[rate, at], M[rate, rate] = -(settings.pace_1_s**2) * away * decay, (1.0 - paced) * decay
         z[at] -= state.habit[b]
@@ -131,7 +131,7 @@ def predict_extras(
             P[i, i] += state.stationary[i]
     P[HEADING, HEADING] += process_noise_rad2
     for b in range(2):
-        z[BEND + b] += state.habit[b]
+        z[WRIST_ANGLES + b] += state.habit[b]
     for i in range(K):
         belief.z[i] = z[i]
         for j in range(i + 1):
@@ -175,7 +175,7 @@ def keep_extras(
     first = cov.shape[0] - K
     for i in range(K):
         # What the palm tells and what fingers tell are two blocks: within one, as much is new of everything.
-        errs_s = settings.wrist_errs_s if BEND <= i < LIGHT else settings.errs_s
+        errs_s = settings.wrist_errs_s if WRIST_ANGLES <= i < LIGHT else settings.errs_s
         new[i] = 1.0 - exp(-min(dt_s, 10.0) / errs_s)
         for j in range(K):
             A[i, j] = cov[first + i, first + j] / scale
@@ -200,4 +200,4 @@ def keep_extras(
             state.z[i] += P[i, j] * room.M[1, j]
     share = 1.0 - exp(-min(dt_s, 10.0) / settings.habit_s)
     for b in range(2):
-        state.habit[b] += share * (state.z[BEND + b] - state.habit[b])
+        state.habit[b] += share * (state.z[WRIST_ANGLES + b] - state.habit[b])

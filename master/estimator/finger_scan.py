@@ -44,7 +44,7 @@ class Prior:
     """What is believed of fingers before a triple is seen.
 
     Attributes:
-        palm: (4, 4) palm, camera frame, and `bend_axes` (2, 3) as of `bent_palm`.
+        palm: (4, 4) palm, camera frame, and `wrist_axes` (2, 3) as of `flexed_palm`.
         twist, twist2: (5,) mean and variance of the twist of the hinges [rad].
         light, light2: (1,) mean and variance of the logarithm of the light's unit.
         natural, slope: (5, 4) natural angles by the PIP: natural + slope PIP.
@@ -60,7 +60,7 @@ class Prior:
     """
 
     palm: Float
-    bend_axes: Float
+    wrist_axes: Float
     twist: Float
     twist2: Float
     light: Float
@@ -85,7 +85,7 @@ class Prior:
         return record(
             cls,
             palm=(4, 4),
-            bend_axes=(2, 3),
+            wrist_axes=(2, 3),
             twist=5,
             twist2=5,
             light=1,
@@ -318,7 +318,7 @@ def scan_finger(
         if (node - scan.first[f]) % _RESTART == 0:
             for start in range(_COARSE):
                 _put(hand, f, aside, _COARSE_RAD[start], dip, prior.twist[f], scan)
-                look(hand, device, prior.palm, prior.bend_axes, a, f, NO_MOVES, surface)
+                look(hand, device, prior.palm, prior.wrist_axes, a, f, NO_MOVES, surface)
                 cost = _rows(settings, lines_of_sight, prior, f, tip, scan)
                 if cost < best:
                     best, at = cost, start
@@ -326,7 +326,7 @@ def scan_finger(
             before = x[f, node - 1]
             _put(hand, f, before[0], before[1], before[3], before[4], scan)
             if at < _COARSE:
-                look(hand, device, prior.palm, prior.bend_axes, a, f, NO_MOVES, surface)
+                look(hand, device, prior.palm, prior.wrist_axes, a, f, NO_MOVES, surface)
                 if _rows(settings, lines_of_sight, prior, f, tip, scan) < best:
                     at = _COARSE
         if at < _COARSE:
@@ -334,7 +334,7 @@ def scan_finger(
         steps = _STEPS if at == _COARSE else _STEPS_RESTART
         length = cost = 0.0
         for k in range(steps + 1):
-            look(hand, device, prior.palm, prior.bend_axes, a, f, OWN_MOVES, surface)
+            look(hand, device, prior.palm, prior.wrist_axes, a, f, OWN_MOVES, surface)
             if k == steps - 1:
                 length = cut(device, f, surface)
                 if length > 0.0:

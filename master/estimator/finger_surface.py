@@ -335,7 +335,7 @@ def look(
     hand: HandTables,
     device: Any,
     T: Float,
-    bend_axes: Float,
+    wrist_axes: Float,
     angles: Float,
     f: int,
     moves: int,
@@ -345,7 +345,7 @@ def look(
 
     Args:
         hand, device: What is looked at, and by what.
-        T: (4, 4) palm, camera frame, and `bend_axes` (2, 3) about which the wrist bends (`bent_palm`).
+        T: (4, 4) palm, camera frame, and `wrist_axes` (2, 3) about which the wrist bends (`flexed_palm`).
         angles: (20,) [rad].
         f: Finger.
         moves: By how many of `MOVES` derivatives are wanted.
@@ -374,7 +374,7 @@ def look(
     for i in range(3):
         A[1, i], A[2, i], A[3, i] = -R[0, i, 0], -R[1, i, 0], -R[2, i, 0]
         A[4, i] = 0.0
-        A[5, i], A[6, i] = bend_axes[0, i], bend_axes[1, i]
+        A[5, i], A[6, i] = wrist_axes[0, i], wrist_axes[1, i]
     # The twist turns about the first bone as it is before the flexion.
     c, s = cos(angles[4 * f + 1]), sin(angles[4 * f + 1])
     swing, u = hand.swing, hand.twist_axis[f]

@@ -19,12 +19,12 @@ import numpy as np
 from common.arrays import Float
 from common.calibration import ImuCalibration
 from common.geometry import Wxyz, matrix_of, matrix_to_quaternion, quaternion_product
-from common.wrist_bend import bend_quaternion
+from common.wrist_joint import wrist_quaternion
 from master.estimator.epoch import OrientationMeasurement
 from master.estimator.imu_samples import Between, OrientationSamples
 from master.estimator.palm_imu import SURE_RAD, rotation_of
 from master.estimator.settings import DEFAULT
-from master.estimator.wrist_device import BEND, HEADING, TILT
+from master.estimator.wrist_device import HEADING, TILT, WRIST_ANGLES
 
 ANYWHERE_RAD = pi / sqrt(3.0)  # standard deviation of a uniform circle
 LOST_RAD = 1.0  # a heading less sure than this may point anywhere
@@ -99,7 +99,11 @@ class Forearm:
         sigma = hypot(DEFAULT.strap_rad, DEFAULT.palm_process_noise_rad_s * found.away_s)
         axes = matrix_of(self._rig_world).T.copy()  # about x and y of the world the forearm tilts,
         axes[2] = matrix_of(tilted)[:, 2]  # about the vertical that is believed it turns
-        wide = z_cov[HEADING, HEADING] + process_noise + np.trace(z_cov[BEND : BEND + 2, BEND : BEND + 2])
+        wide = (
+            z_cov[HEADING, HEADING]
+            + process_noise
+            + np.trace(z_cov[WRIST_ANGLES : WRIST_ANGLES + 2, WRIST_ANGLES : WRIST_ANGLES + 2])
+        )
         return OrientationMeasurement(
             rotation, _EYE / sigma**2, bool(wide < SURE_RAD**2), axes, process_noise
         )
@@ -109,8 +113,8 @@ class Forearm:
         found = self._samples.between(t_ns)
         if found is None or self._rig_world is None:
             return None
-        flexion, deviation = z[BEND : BEND + 2].tolist()
-        palm = matrix_of(quaternion_product(self._forearm(found), bend_quaternion(flexion, deviation)))
+        flexion, deviation = z[WRIST_ANGLES : WRIST_ANGLES + 2].tolist()
+        palm = matrix_of(quaternion_product(self._forearm(found), wrist_quaternion(flexion, deviation)))
         rotation = matrix_of(self._tilted(self._rig_world, z)).T @ R_rig_palm @ palm.T
         return atan2(rotation[1, 0] - rotation[0, 1], rotation[0, 0] + rotation[1, 1])
 
@@ -124,12 +128,12 @@ class Forearm:
         long = abs(t_ns - self._contrary_ns[0]) > _CONTRARY_NS
         return long and len(self._contrary_ns) >= _CONTRARY
 
-    def world_at(self, t_ns: int, bend_rad: Float, bend_cov: Float) -> tuple[Float, Float]:
+    def world_at(self, t_ns: int, wrist_angles_rad: Float, wrist_cov: Float) -> tuple[Float, Float]:
         """The palm at an instant in the IMU's own world, which needs no heading.
 
         Args:
             t_ns: The instant.
-            bend_rad, bend_cov: (2,), (2, 2) of the wrist.
+            wrist_angles_rad, wrist_cov: (2,), (2, 2) of the wrist.
 
         Returns:
             Quaternion (4,), palm axes -> the IMU's world, and standard deviations (2,) [rad]: tilt per axis, heading;
@@ -139,15 +143,15 @@ class Forearm:
         if found is None:
             return NO_WORLD
         half_heading = DEFAULT.palm_process_noise_rad_s * found.away_s
-        forearm, (flexion, deviation) = self._forearm(found), bend_rad.tolist()
-        (ff, fd), (_, dd) = bend_cov.tolist()
+        forearm, (flexion, deviation) = self._forearm(found), wrist_angles_rad.tolist()
+        (ff, fd), (_, dd) = wrist_cov.tolist()
         c, s = cos(deviation), sin(deviation)
         # Along each axis of the world: what a flexion, about the forearm's x as it deviates, and a deviation leave.
         about = [(c * x - s * z, y) for x, y, z in matrix_of(forearm).tolist()]
         x, y, z = (u * u * ff + 2.0 * u * v * fd + v * v * dd for u, v in about)
         tilt = hypot(self._imu.orientation_sigma_rad, half_heading, sqrt(0.5 * (x + y)))
         heading = hypot(self._imu.heading_sigma_rad or 0.0, found.drift_rad, half_heading, sqrt(z))
-        palm = np.array(quaternion_product(forearm, bend_quaternion(flexion, deviation)))
+        palm = np.array(quaternion_product(forearm, wrist_quaternion(flexion, deviation)))
         return -palm if palm[0] < 0.0 else palm, np.array([tilt, min(heading, ANYWHERE_RAD)])
 
     def _between(self, t_ns: int) -> Between | None:

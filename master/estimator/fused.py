@@ -20,7 +20,7 @@ from master.estimator.estimator import Estimator
 from master.estimator.forearm import LOST_RAD, Forearm
 from master.estimator.observation_sources import ON_MARKERS
 from master.estimator.pipeline import MarkerPipeline, SolvedPose
-from master.estimator.wrist_device import BEND, HEADING
+from master.estimator.wrist_device import HEADING, WRIST_ANGLES
 from master.wrist_setup import WristSetup
 
 _SILENT_FRAMES = 2.2  # of the slowest camera: when so long no epoch came, the device's triples lead
@@ -119,19 +119,26 @@ class WristSide:
         heading = self.forearm.heading_of(t_ns, hand.solution.T_rig_palm[:3, :3], estimator.extras)
         if heading is not None:
             self.counts["forearm.begun"] += 1
-            bend = estimator.extras_cov[BEND : BEND + 2, BEND : BEND + 2]
-            estimator.begin_heading(heading, float(np.trace(bend) + np.trace(hand.solution.alone[:3, :3])))
+            wrist_angles = estimator.extras_cov[
+                WRIST_ANGLES : WRIST_ANGLES + 2, WRIST_ANGLES : WRIST_ANGLES + 2
+            ]
+            estimator.begin_heading(
+                heading, float(np.trace(wrist_angles) + np.trace(hand.solution.alone[:3, :3]))
+            )
 
     def told(self, pose: HandPose, estimator: Estimator) -> HandPose:
         """The pose with what else is known of the hand."""
         changes: dict[str, Float | Code | Bool] = {}
         if self.forearm is not None:
-            bend, cov = (
-                estimator.extras[BEND : BEND + 2].copy(),
-                estimator.extras_cov[BEND : BEND + 2, BEND : BEND + 2],
+            wrist_angles, cov = (
+                estimator.extras[WRIST_ANGLES : WRIST_ANGLES + 2].copy(),
+                estimator.extras_cov[WRIST_ANGLES : WRIST_ANGLES + 2, WRIST_ANGLES : WRIST_ANGLES + 2],
             )
-            changes["wrist_bend_rad"], changes["wrist_bend_sigma_rad"] = bend, np.sqrt(np.diag(cov))
-            world = self.forearm.world_at(pose.t_ns, bend, cov)
+            changes["wrist_angles_rad"], changes["wrist_angles_sigma_rad"] = (
+                wrist_angles,
+                np.sqrt(np.diag(cov)),
+            )
+            world = self.forearm.world_at(pose.t_ns, wrist_angles, cov)
             changes["palm_world_wxyz"], changes["palm_world_sigma_rad"] = world
         if abs(pose.t_ns - self.laser_ns) <= _MAX_AGE_NS:
             changes["laser_m"], changes["level"], changes["ambiguous"] = (

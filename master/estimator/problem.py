@@ -108,9 +108,9 @@ class Search:
     slope: Float  # (5, 3)
     by_rotation: Float  # (8, 3)
     palm_camera: Float  # (4, 4)
-    bend_axes: Float  # (2, 3)
+    wrist_axes: Float  # (2, 3)
     twist: Float  # (5,)
-    bend_share: Float  # (1,) as of `Settings`
+    wrist_share: Float  # (1,) as of `Settings`
     local_J: Float  # (3, 8)
     local_r: Float  # (3,)
     local_w: Float  # (3,)
@@ -145,9 +145,9 @@ class Search:
             slope=(5, 3),
             by_rotation=(8, 3),
             palm_camera=(4, 4),
-            bend_axes=(2, 3),
+            wrist_axes=(2, 3),
             twist=5,
-            bend_share=1,
+            wrist_share=1,
             local_J=(3, 8),
             local_r=3,
             local_w=3,
@@ -159,5 +159,5 @@ class Search:
             outliers=1,
             rows=Scratch.empty(),
         )
-        room.bend_share[0] = 1.0
+        room.wrist_share[0] = 1.0
         return room

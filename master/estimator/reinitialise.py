@@ -9,14 +9,14 @@ import numpy as np
 from common.arrays import Float
 from common.geometry import fit_rigid
 from common.hand_model import HandModel
-from common.wrist_bend import forearm_palm
+from common.wrist_joint import forearm_palm
 from master.estimator.epoch import Epoch
 from master.estimator.epoch_steps import EpochSteps
 from master.estimator.parameters import HandParameters
 from master.estimator.priors import Habits, curled, habits_of
 from master.estimator.settings import Settings
 from master.estimator.solve import MAX_ITERATIONS
-from master.estimator.wrist_device import BEND
+from master.estimator.wrist_device import WRIST_ANGLES
 
 _BENDS_RAD = (0.1, 0.7, 1.3)  # of the PIP, from which a search afresh begins: open to closed
 _MCP_PER_PIP = 0.6
@@ -51,9 +51,9 @@ class Reinitialiser:
         self, steps: EpochSteps, parameters: HandParameters, habits: HabitTables, settings: Settings
     ) -> None:
         self._steps, self._parameters, self._habits, self._settings = steps, parameters, habits, settings
-        bent = np.zeros((len(_BENDS_RAD), 5, 4))
-        bent[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (_MCP_PER_PIP, 1.0))[:, None]
-        self._postures = np.array([parameters.of_angles(angles) for angles in bent])
+        postures = np.zeros((len(_BENDS_RAD), 5, 4))
+        postures[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (_MCP_PER_PIP, 1.0))[:, None]
+        self._postures = np.array([parameters.of_angles(angles) for angles in postures])
         self._finger_of_free = parameters.free // 4
         any_finger = habits.unlike(NONE)
         likeliest = np.asarray(np.linalg.solve(any_finger.normal[0], any_finger.pull[0]), np.float64)
@@ -138,7 +138,7 @@ class Reinitialiser:
         """How the palm is turned by other sensors (3, 3), with the bend that is believed; None: they do not say."""
         if at.orientation is None or at.orientation.axes is None:
             return None if at.orientation is None else at.orientation.rotation
-        return at.orientation.rotation @ forearm_palm(self._steps.now.z[BEND : BEND + 2])
+        return at.orientation.rotation @ forearm_palm(self._steps.now.z[WRIST_ANGLES : WRIST_ANGLES + 2])
 
     def _as_told(self, x: Float) -> Float:
         """Free angles (n,) with those of fingers whose valley was searched."""

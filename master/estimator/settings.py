@@ -234,7 +234,7 @@ class Settings(NamedTuple):
     calibrated_palm_rad: Annotated[
         float, Range("rad", 0.001, 0.5, "of a palm that was calibrated before its device")
     ] = radians(1.0)
-    bend_share: Annotated[
+    wrist_share: Annotated[
         float, Range("1", 0.0, 1.0, "of what fingers tell of the wrist's bend: they err together")
     ] = 0.6
     strap_rad: Annotated[

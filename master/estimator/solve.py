@@ -28,7 +28,7 @@ from master.estimator.matrices import cholesky, copy, substitute
 from master.estimator.priors import Habits
 from master.estimator.problem import Belief, Rig, Search
 from master.estimator.residuals import Observations, marker_rows
-from master.estimator.wrist_device import BEND, EXTRAS, bent_palm
+from master.estimator.wrist_device import EXTRAS, WRIST_ANGLES, flexed_palm
 from master.estimator.wrist_rows import finger_rows, orientation_row
 
 MAX_ITERATIONS = 25
@@ -199,7 +199,9 @@ def linearise(
             search.twist[f] = z[f]
         twist_hand(hand, search.twist)
         if belief.lines_of_sight.rows[0] > 0.0:
-            bent_palm(rig.device.palm, z[BEND], z[BEND + 1], search.palm_camera, search.bend_axes)
+            flexed_palm(
+                rig.device.palm, z[WRIST_ANGLES], z[WRIST_ANGLES + 1], search.palm_camera, search.wrist_axes
+            )
             for f in range(5):
                 cost += finger_rows(rig, belief, f, z, x.shape[0], gradient, normal, search)
     chains(hand, T, work.angles, work.R, work.P)

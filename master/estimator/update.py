@@ -371,11 +371,11 @@ def take_over_epoch(
                 state.measured_rotation[i, j] = space.room.search.palm[i, j]
     for f in range(5):
         pip = 6 + hand.first[f] + 2
-        bend_open = state.cov[pip, pip] > settings.tracked_pip_rad**2
+        pip_open = state.cov[pip, pip] > settings.tracked_pip_rad**2
         if space.ground.sources[f] > 0:
-            state.level[f], state.vague[f] = 0, f > 0 and bend_open
+            state.level[f], state.vague[f] = 0, f > 0 and pip_open
         elif space.scan.known[f] > 0.0:
-            state.level[f], state.vague[f] = task.level[f], task.ambiguous[f] or bend_open
+            state.level[f], state.vague[f] = task.level[f], task.ambiguous[f] or pip_open
     copy(found.palm, out.palm)
     for a in range(20):
         out.angles[a] = state.angles[a] = work.angles[a]

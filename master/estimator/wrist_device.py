@@ -18,7 +18,7 @@ from common.records import filled, record
 from master.estimator.laser_plane import PlaneAxes
 from master.wrist_setup import WristSetup
 
-TWIST, BEND, RATE, TILT, HEADING, LIGHT, EXTRAS = 0, 5, 7, 9, 11, 12, 13
+TWIST, WRIST_ANGLES, RATE, TILT, HEADING, LIGHT, EXTRAS = 0, 5, 7, 9, 11, 12, 13
 NO_EXTRAS = 1  # of a rig without wrist device: one that means nothing
 _PALM_M = 7e-4  # what calibration leaves of plane and palm: a palm pitched by 0.2 degrees, and 0.3 mm
 _BLUR_PX = 0.5
@@ -190,7 +190,7 @@ def loosen(W: Float, J: Float, row: int, cov: Float) -> None:
     a, b, c = W[1, 1] / det, -W[0, 1] / det, W[0, 0] / det
     for i in range(2):
         for j in range(2):
-            p = cov[BEND + i, BEND + j]
+            p = cov[WRIST_ANGLES + i, WRIST_ANGLES + j]
             a += J[row, 5 + i] * p * J[row, 5 + j]
             b += J[row, 5 + i] * p * J[row + 1, 5 + j]
             c += J[row + 1, 5 + i] * p * J[row + 1, 5 + j]
@@ -300,10 +300,10 @@ def observe_wrist(
 
 
 @inner
-def bent_palm(F: Float, flexion: float, deviation: float, T: Float, axes: Float) -> None:
+def flexed_palm(F: Float, flexion: float, deviation: float, T: Float, axes: Float) -> None:
     """Write the palm (4, 4) of a wrist that is bent, and the axes (2, 3) of flexion and deviation.
 
-    F: (4, 4) palm of the straight wrist, or the rotation of the forearm in it (`common.wrist_bend`).
+    F: (4, 4) palm of the straight wrist, or the rotation of the forearm in it (`common.wrist_joint`).
     """
     c, s, cd, sd = cos(flexion), sin(flexion), cos(deviation), sin(deviation)
     for i in range(3):

@@ -7,7 +7,7 @@
 
 What was seen before or after the epoch is brought to it by the rates of the angles (`master.estimator.update`).
 A finger is seen from the forearm, so the first three move with its own angles, the twist of its hinges and the bend of
-the wrist, and not with where the hand is in the room. Of the bend they tell a little only (`bend_share`), for that all
+the wrist, and not with where the hand is in the room. Of the bend they tell a little only (`wrist_share`), for that all
 fingers seem bent by as much is mostly an error that they share; what its doubt makes of them is in their noise.
 """
 
@@ -18,7 +18,7 @@ from common.kernels import inlined, inner
 from master.estimator.finger_surface import MOVES, look
 from master.estimator.kinematics import rotation_between
 from master.estimator.problem import Belief, Rig, Search
-from master.estimator.wrist_device import BEND, LIGHT, TILT, bent_palm
+from master.estimator.wrist_device import LIGHT, TILT, WRIST_ANGLES, flexed_palm
 
 _SMALL_RAD = 1e-4  # below it a rotation vector counts as so long in the derivative
 
@@ -54,11 +54,11 @@ def sensed_palm(belief: Belief, z: Float, search: Search) -> None:
             for j in range(3):
                 search.palm[i, j] = F[i, j]
         return
-    bent_palm(F, z[BEND], z[BEND + 1], R, search.bend_axes)
+    flexed_palm(F, z[WRIST_ANGLES], z[WRIST_ANGLES + 1], R, search.wrist_axes)
     for i in range(3):  # rig axes
         for a in range(3):
             slope[a, i] = belief.axes[a, i]
-        slope[3, i], slope[4, i] = search.bend_axes[0, i], search.bend_axes[1, i]
+        slope[3, i], slope[4, i] = search.wrist_axes[0, i], search.wrist_axes[1, i]
     for i in range(3):
         search.off[i] = 0.0
         for a in range(3):
@@ -120,7 +120,7 @@ def orientation_row(
 @inlined
 def _column(n: int, a: int) -> int:
     """The unknown of tilt 2, heading, flexion, deviation."""
-    return 6 + n + (TILT + a if a < 3 else BEND + a - 3)
+    return 6 + n + (TILT + a if a < 3 else WRIST_ANGLES + a - 3)
 
 
 @inlined
@@ -141,7 +141,7 @@ def finger_rows(
 ) -> float:
     """Add the rows of finger f, of angles `search.rows.angles`; return their cost.
 
-    `search.palm_camera` and `search.bend_axes` are those of the bend.
+    `search.palm_camera` and `search.wrist_axes` are those of the bend.
     """
     hand, lines_of_sight, work, surface = rig.hand, belief.lines_of_sight, search.rows, search.surface
     start = hand.first[f]
@@ -151,14 +151,14 @@ def finger_rows(
         at[c] = 6 + start + c
     at[count], at[count + 1], at[count + 2], at[count + 3] = (
         base + f,
-        base + BEND,
-        base + BEND + 1,
+        base + WRIST_ANGLES,
+        base + WRIST_ANGLES + 1,
         base + LIGHT,
     )
     size, cost = count + 4, 0.0
     if lines_of_sight.lit[f] == 0.0 and lines_of_sight.shown[f] == 0.0:
         return 0.0
-    look(hand, rig.device, search.palm_camera, search.bend_axes, work.angles, f, MOVES, surface)
+    look(hand, rig.device, search.palm_camera, search.wrist_axes, work.angles, f, MOVES, surface)
     for what in range(2):
         if (what == 0 and lines_of_sight.lit[f] == 0.0) or (what == 1 and lines_of_sight.shown[f] == 0.0):
             continue
@@ -193,8 +193,8 @@ def finger_rows(
             cost += 0.5 * w[i] * r[i]
         for a in range(size):
             # What fingers tell of the bend counts for little: they err together, as the device is put on.
-            of_bend = a == count + 1 or a == count + 2
-            share = search.bend_share[0] if of_bend else 1.0
+            of_wrist = a == count + 1 or a == count + 2
+            share = search.wrist_share[0] if of_wrist else 1.0
             for i in range(rows):
                 gradient[at[a]] += share * J[i, a] * w[i]
             p0 = W[0, 0] * J[0, a] + W[0, 1] * J[1, a]
@@ -204,7 +204,7 @@ def finger_rows(
                 total = p0 * J[0, b] + p1 * J[1, b]
                 if rows == 3:
                     total += p2 * J[2, b]
-                if b == count + 1 or b == count + 2 or of_bend:
-                    total *= search.bend_share[0]
+                if b == count + 1 or b == count + 2 or of_wrist:
+                    total *= search.wrist_share[0]
                 normal[at[a], at[b]] += total
     return cost

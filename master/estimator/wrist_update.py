@@ -20,7 +20,15 @@ from master.estimator.settings import Settings
 from master.estimator.solve import palm_off
 from master.estimator.state import NEVER_NS, HandState
 from master.estimator.workspace import Model, Task
-from master.estimator.wrist_device import BEND, EXTRAS, LIGHT, LinesOfSight, bent_palm, loosen, loosen_short
+from master.estimator.wrist_device import (
+    EXTRAS,
+    LIGHT,
+    WRIST_ANGLES,
+    LinesOfSight,
+    flexed_palm,
+    loosen,
+    loosen_short,
+)
 
 _FK, _IK = int(Level.FK), int(Level.IK)
 
@@ -59,7 +67,7 @@ def _expected(
         prior.process_noise[f] = max(settings.process_noise_rad_s * told_s, settings.goes_on_rad)
         if lines_of_sight.lit[f] == 0.0 and lines_of_sight.shown[f] == 0.0:
             continue
-        look(hand, device, prior.palm, prior.bend_axes, scan.angles, f, MOVES, scan.surface)
+        look(hand, device, prior.palm, prior.wrist_axes, scan.angles, f, MOVES, scan.surface)
         J = scan.surface.J
         loosen(lines_of_sight.laser_W[f], J, 0, state.z_cov)
         loosen(lines_of_sight.tip_W[f], J, 2, state.z_cov)
@@ -99,7 +107,7 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
         task.level[f] = 0
     if state.z.shape[0] < EXTRAS or lines_of_sight.rows[0] == 0.0:
         return
-    bent_palm(device.palm, state.z[BEND], state.z[BEND + 1], prior.palm, prior.bend_axes)
+    flexed_palm(device.palm, state.z[WRIST_ANGLES], state.z[WRIST_ANGLES + 1], prior.palm, prior.wrist_axes)
     _expected(hand, device, settings, state, task, lines_of_sight, scan, prior)
     expect_coupling(settings, state, max(dt_s, 0.0), prior)
     for f in range(5):

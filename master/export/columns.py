@@ -63,7 +63,7 @@ def hand_columns(poses: Poses, begin_t_ns: int) -> list[Column]:
             for k, name in enumerate(names)
         ]
     out += [
-        Column(f"wrist_{name}_rad", poses.wrist_bend_rad[:, k], "rad", "forearm", "bend of the wrist")
+        Column(f"wrist_{name}_rad", poses.wrist_angles_rad[:, k], "rad", "forearm", "bend of the wrist")
         for k, name in enumerate(("flexion", "deviation"))
     ]
     out.append(

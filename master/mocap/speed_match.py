@@ -41,8 +41,8 @@ def clock_offset(ours: Track, theirs: Track) -> tuple[int, float, float]:
     inner = score[best - 1 : best + 2]
     shift = 0.0
     if 0 < best < len(score) - 1 and np.isfinite(inner).all():
-        bend = inner[0] - 2.0 * inner[1] + inner[2]
-        shift = 0.5 * (inner[0] - inner[2]) / bend if bend < 0.0 else 0.0
+        curvature = inner[0] - 2.0 * inner[1] + inner[2]
+        shift = 0.5 * (inner[0] - inner[2]) / curvature if curvature < 0.0 else 0.0
     lags = np.arange(len(score)) - best
     far = np.where(np.abs(lags) * _STEP_NS > _APART_NS, score, -1.0)
     second = int(np.argmax(far))

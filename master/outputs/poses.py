@@ -31,7 +31,7 @@ class Poses:
         level: (T, 5) `Level` codes: what a wrist device solved each finger from.
         ambiguous: (T, 5) another pose of that finger explains what was seen as well.
         palm_world_wxyz, palm_world_sigma_rad: (T, 4), (T, 2) palm in the world of a wrist device's IMU; NaN: none.
-        wrist_bend_rad, wrist_bend_sigma_rad: (T, 2) of the wrist, where a device sits on the forearm; NaN: none.
+        wrist_angles_rad, wrist_angles_sigma_rad: (T, 2) of the wrist, where a device sits on the forearm; NaN: none.
     """
 
     hand: str
@@ -54,8 +54,8 @@ class Poses:
     ambiguous: Bool
     palm_world_wxyz: Float
     palm_world_sigma_rad: Float
-    wrist_bend_rad: Float
-    wrist_bend_sigma_rad: Float
+    wrist_angles_rad: Float
+    wrist_angles_sigma_rad: Float
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit together.
@@ -136,7 +136,7 @@ def record(marker_count: int) -> np.dtype[np.void]:
             ("ambiguous", "?", (FINGER_COUNT,)),
             ("palm_world_wxyz", "<f8", (4,)),
             ("palm_world_sigma_rad", "<f8", (2,)),
-            ("wrist_bend_rad", "<f8", (2,)),
-            ("wrist_bend_sigma_rad", "<f8", (2,)),
+            ("wrist_angles_rad", "<f8", (2,)),
+            ("wrist_angles_sigma_rad", "<f8", (2,)),
         ]
     )

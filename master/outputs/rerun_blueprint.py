@@ -22,7 +22,7 @@ _PLOTS: tuple[tuple[str, str, tuple[float, float] | None, bool], ...] = (
     (_RATE, "plots/rate_hz", None, False),
     ("Error against the truth [mm]", "plots/error_mm", (0.0, 20.0), True),
     ("Fingers to object [mm]", "plots/contact_mm", (-10.0, 60.0), True),
-    ("Bend of the wrist [deg]", "plots/wrist_bend_deg", (-60.0, 60.0), True),
+    ("Bend of the wrist [deg]", "plots/wrist_angles_deg", (-60.0, 60.0), True),
     ("PIP flexion (thumb: MCP) [deg]", "plots/pip_deg", (-10.0, 120.0), True),
     ("Marker: raw to filtered [mm]", "plots/jitter_mm", (0.0, 5.0), True),
     ("Joints tracked; markers, or laser points, seen", "plots/seen", (0.0, 30.0), True),
@@ -55,7 +55,7 @@ def blueprint(setups: Sequence[RigSetup], *, live: bool, with_truth: bool) -> rr
     cameras = {name: camera for setup in setups for name, camera in setup.cameras.items()}
     rate_hz = max(camera.frame_rate_hz for camera in cameras.values())  # of the fastest
     with_markers = any(setup.has_markers for setup in setups)
-    with_bend = any(setup.has_markers and setup.wrist is not None for setup in setups)
+    with_wrist = any(setup.has_markers and setup.wrist is not None for setup in setups)
     hidden = [f"- {WORLD}/hand/{setup.hand.profile.name}/uncertainty" for setup in setups]
     span = rrb.VisibleTimeRange(
         TIMELINE,
@@ -82,7 +82,7 @@ def blueprint(setups: Sequence[RigSetup], *, live: bool, with_truth: bool) -> rr
         for name in cameras
     ]
     rejected = {name for name, there in (
-        ("plots/jitter_mm", with_markers), ("plots/error_mm", with_truth), ("plots/wrist_bend_deg", with_bend),
+        ("plots/jitter_mm", with_markers), ("plots/error_mm", with_truth), ("plots/wrist_angles_deg", with_wrist),
         ("plots/contact_mm", any(setup.objects for setup in setups)),
     ) if not there}  # fmt: skip
     rows = [

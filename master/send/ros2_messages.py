@@ -22,10 +22,10 @@ POSES, STATES, FLAGS = (
     "std_msgs/msg/UInt8MultiArray",
 )
 POSE, TRANSFORMS = "geometry_msgs/msg/PoseWithCovarianceStamped", "tf2_msgs/msg/TFMessage"
-_BENDS = ("abduction", "flexion", "pip", "dip")
-_THUMB_BENDS = ("cmc_abduction", "cmc_flexion", "mcp", "ip")
+_ANGLES = ("abduction", "flexion", "pip", "dip")
+_THUMB_ANGLES = ("cmc_abduction", "cmc_flexion", "mcp", "ip")
 ANGLES = tuple(
-    f"{finger}_{bend}" for finger in FINGERS for bend in (_THUMB_BENDS if finger == "thumb" else _BENDS)
+    f"{finger}_{angle}" for finger in FINGERS for angle in (_THUMB_ANGLES if finger == "thumb" else _ANGLES)
 )
 _LAST_NS = 2**31 * 1_000_000_000 - 1  # ROS's seconds have 32 bits
 _STORE = get_typestore(Stores.ROS2_JAZZY)

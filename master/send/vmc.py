@@ -10,7 +10,7 @@ from common.arrays import Bool, Float
 from common.geometry import quaternion_to_matrix
 from common.messages import HandPose, Told
 from common.output_settings import VmcOutput
-from common.wrist_bend import forearm_palm
+from common.wrist_joint import forearm_palm
 from master.send.osc_packets import Blank, BlankBundle, floats, ints
 from master.send.sides import Side, side_of
 from master.send.times import Times
@@ -77,6 +77,6 @@ class VmcSink:
         place[0] = (self._settings.forearm_m if side == "right" else -self._settings.forearm_m, 0.0, 0.0)
         if self._settings.hand == "rest":
             quaternion[0] = _STILL
-        elif self._settings.hand == "bend":
-            quaternion[0] = self._maps[side].bent(forearm_palm(pose.wrist_bend_rad))
+        elif self._settings.hand == "wrist":
+            quaternion[0] = self._maps[side].flexed(forearm_palm(pose.wrist_angles_rad))
         return place, quaternion

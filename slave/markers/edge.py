@@ -77,9 +77,9 @@ def centre_of(share: Float32, shape: Ellipse, u: float, v: float) -> Centre | No
     residual: Float = np.zeros(RAYS)
     for iteration in range(ROUNDS):
         away = points - centre
-        bent = away @ inverse
-        level = np.sqrt(np.maximum((away * bent).sum(axis=1), 1e-9))  # 2 on the ellipse
-        slope: Float = bent / level[:, None]
+        inner = away @ inverse
+        level = np.sqrt(np.maximum((away * inner).sum(axis=1), 1e-9))  # 2 on the ellipse
+        slope: Float = inner / level[:, None]
         length = np.sqrt(np.maximum((slope * slope).sum(axis=1), 1e-9))
         residual = (level - 2.0) / length  # distance from the ellipse, outwards positive
         # At first the centre is off by a part of the radius, and the own edge is where the distances are largest.

@@ -164,8 +164,8 @@ def _fitted(strength: Float32, circle: Float) -> tuple[float, float, float, floa
         near = np.abs(_AT - _distance(circle[None]).T) <= tolerance + _STEP
         at = np.clip(np.where(near, strength, -1.0).argmax(axis=1), 1, RADII - 2)
         before, here, after = strength[_RAY, at - 1], strength[_RAY, at], strength[_RAY, at + 1]
-        bend = np.minimum(before - 2.0 * here + after, -1e-6)  # a parabola through three samples
-        found = _AT[at] + _STEP * np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
+        curvature = np.minimum(before - 2.0 * here + after, -1e-6)  # a parabola through three samples
+        found = _AT[at] + _STEP * np.clip(0.5 * (before - after) / curvature, -0.5, 0.5)
         away_x, away_y = found * _COS - x, found * _SIN - y
         away = np.hypot(away_x, away_y)
         residual = away - radius

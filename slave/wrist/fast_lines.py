@@ -204,11 +204,11 @@ def _part(
         if k < left or k == right:  # beyond the last run
             end, aside = (left, 1) if k < left else (right, -1)
             at = end + inner * aside
-            bend = 0.0
+            steepness = 0.0
             if inner:
-                bend = (row[end + limits[1] * aside] - row[at]) / (math.sqrt(5.5) - math.sqrt(2.5))
-                bend = min(max(bend, 0.0), limits[0])
-            u, v = column[end] - 0.5 * aside, row[at] - bend * math.sqrt(2.5)
+                steepness = (row[end + limits[1] * aside] - row[at]) / (math.sqrt(5.5) - math.sqrt(2.5))
+                steepness = min(max(steepness, 0.0), limits[0])
+            u, v = column[end] - 0.5 * aside, row[at] - steepness * math.sqrt(2.5)
             du, dv = u - column[at], v - row[at]
             u, v = (u + column[at]) / 2.0, (v + row[at]) / 2.0
         else:

@@ -46,7 +46,7 @@ def finger_labels(finger: Int, runs: Runs, points: Float, reach: Reach) -> Int:
     aside = (of > _THUMB) & ((middle < _FROM[of]) | (middle > _TO[of]))
     aside &= _room(of, nearest, aside | no_thumb)
     of = np.where(no_thumb | aside, nearest, of)
-    if reach.bent:
+    if reach.flexed:
         beyond_index = (of == _INDEX) & (middle < _OUTSIDE_INDEX)
         if ((of == _INDEX) & ~beyond_index).any():
             of = np.where(beyond_index, _THUMB, of)

@@ -55,8 +55,8 @@ def measure(runs: Runs, finger: Int, width_px: int) -> FingerLines:
     u, v = runs.column.astype(np.float64), runs.row
     down = v[1:] - v[:-1]
     segment = np.sqrt(down * down + 1.0) * goes_on
-    bent = np.flatnonzero(inner[: len(left)] != left)
-    for k in (left[bent], left[bent] + 1, right[bent] - 1, right[bent] - 2):
+    long_lines = np.flatnonzero(inner[: len(left)] != left)
+    for k in (left[long_lines], left[long_lines] + 1, right[long_lines] - 1, right[long_lines] - 2):
         segment[k] = 0.0
     last = np.concatenate([left, right])
     to_end = outer - points[inner]
@@ -117,6 +117,6 @@ def _ends(points: Float, left: Int, right: Int) -> tuple[Float, Int]:
     outer = points[np.concatenate([left, right])]
     outer[: len(left), 0] -= 0.5
     outer[len(left) :, 0] += 0.5
-    bend = np.clip((points[deep, 1] - points[inner, 1]) / (np.sqrt(5.5) - np.sqrt(2.5)), 0.0, STEEPEST)
-    outer[:, 1] = points[inner, 1] - bend * np.sqrt(2.5)
+    steepness = np.clip((points[deep, 1] - points[inner, 1]) / (np.sqrt(5.5) - np.sqrt(2.5)), 0.0, STEEPEST)
+    outer[:, 1] = points[inner, 1] - steepness * np.sqrt(2.5)
     return outer, inner

@@ -63,7 +63,7 @@ def laser_lines(laser: Image, fingers: Fingers, view: WristView, engine: Engine 
         thumb = np.flatnonzero(finger == 0)
         beyond = reach.beyond_m(points[thumb])
         off, doubt = beyond_ball(runs, thumb, beyond)
-        seen[0] = not (reach.bent and on_ball(beyond))
+        seen[0] = not (reach.flexed and on_ball(beyond))
         uv[0] += off
         sigma[0] = np.hypot(np.hypot(sigma[0], doubt), _THUMB_PX)
     uv[~seen], sigma[~seen], length[~seen] = np.nan, np.nan, np.nan

@@ -19,7 +19,7 @@ import numpy as np
 from common.arrays import Bool, Float, Image, Int
 from common.geometry import rigid
 from common.hand_model import CHAINS, METACARPALS
-from common.wrist_bend import STRAIGHT, forearm_palm
+from common.wrist_joint import STRAIGHT, forearm_palm
 from slave.wrist.led_depth import SHRINK, Float32, shrink
 from slave.wrist.view import WristView
 from slave.wrist.workspace_samples import NEAREST_M, in_image
@@ -54,19 +54,19 @@ class PalmPose:
     """How the palm lies now.
 
     Attributes:
-        bend_rad: (2,) bend of the wrist (`common.wrist_bend`).
+        wrist_angles_rad: (2,) bend of the wrist (`common.wrist_joint`).
         T_camera_palm: (4, 4) with it [m].
         view: One as if the palm lay about like that: what corridors and reach are made of.
     """
 
-    bend_rad: Float
+    wrist_angles_rad: Float
     T_camera_palm: Float
     view: WristView
 
     @property
     def straight(self) -> bool:
         """Whether the palm is where a straight wrist has it, as far as can be told."""
-        return not self.bend_rad.any()
+        return not self.wrist_angles_rad.any()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +83,7 @@ class _Marks:
         edge_weight: (B, S).
     """
 
-    bends: Float
+    candidates: Float
     prior: Float32
     near_straight: Bool
     gap: Int
@@ -94,11 +94,15 @@ class _Marks:
 
 def find_palm_pose(led: Image, view: WristView) -> PalmPose:
     """How the palm lies in the difference of LED and ambient frame (H, W)."""
-    bend = bend_seen(np.sqrt(shrink(led)), view)
-    if not bend.any():
+    wrist_angles = wrist_angles_seen(np.sqrt(shrink(led)), view)
+    if not wrist_angles.any():
         return PalmPose(STRAIGHT, view.T_camera_palm, view)
-    steps = np.rint(bend / STEP_RAD / _VIEW_STEPS).clip(-_MOST_VIEWS, _MOST_VIEWS).astype(np.int64)
-    return PalmPose(bend, rotated_view(view, bend).T_camera_palm, _view(view, int(steps[0]), int(steps[1])))
+    steps = np.rint(wrist_angles / STEP_RAD / _VIEW_STEPS).clip(-_MOST_VIEWS, _MOST_VIEWS).astype(np.int64)
+    return PalmPose(
+        wrist_angles,
+        rotated_view(view, wrist_angles).T_camera_palm,
+        _view(view, int(steps[0]), int(steps[1])),
+    )
 
 
 def prepare(view: WristView) -> list[WristView]:
@@ -108,9 +112,9 @@ def prepare(view: WristView) -> list[WristView]:
     return [_view(view, a, b) for a in flexion for b in deviation]
 
 
-def rotated_view(view: WristView, bend_rad: Float) -> WristView:
+def rotated_view(view: WristView, wrist_angles_rad: Float) -> WristView:
     """The view of a palm that a bend (2,) has turned."""
-    T = view.T_camera_palm @ rigid(forearm_palm(bend_rad), np.zeros(3))
+    T = view.T_camera_palm @ rigid(forearm_palm(wrist_angles_rad), np.zeros(3))
     return replace(view, T_camera_palm=T)
 
 
@@ -121,7 +125,7 @@ def _view(view: WristView, flexion: int, deviation: int) -> WristView:
     return rotated_view(view, STEP_RAD * _VIEW_STEPS * np.array([flexion, deviation]))
 
 
-def bend_seen(near: Float32, view: WristView) -> Float:
+def wrist_angles_seen(near: Float32, view: WristView) -> Float:
     """The bend (2,) [rad] by roots of grey levels (h, w) of the shrunken image; 0 where none is plain."""
     marks = _marks(view)
     shown = _shown(near.ravel(), marks)
@@ -130,10 +134,10 @@ def bend_seen(near: Float32, view: WristView) -> Float:
     more = float(score[best] - score[marks.near_straight].max())
     if not any(shown[best] >= least and more >= least_more for least, least_more in _BELIEVED):
         return STRAIGHT
-    about = (np.abs(marks.bends - marks.bends[best]) < 1.5 * STEP_RAD).all(axis=1)
+    about = (np.abs(marks.candidates - marks.candidates[best]) < 1.5 * STEP_RAD).all(axis=1)
     weight = np.exp(score[about] - score[best])
-    bend: Float = weight @ marks.bends[about] / weight.sum()
-    return STRAIGHT if marks.near_straight[best] else bend
+    wrist_angles: Float = weight @ marks.candidates[about] / weight.sum()
+    return STRAIGHT if marks.near_straight[best] else wrist_angles
 
 
 def _shown(near: Float32, marks: _Marks) -> Float32:
@@ -152,15 +156,19 @@ def _shown(near: Float32, marks: _Marks) -> Float32:
 def _marks(view: WristView) -> _Marks:
     flexion, deviation = (np.arange(-most, most + 1, dtype=np.float64) for most in _MOST_STEPS.tolist())
     steps: Float = np.stack(np.meshgrid(flexion, deviation, indexing="ij"), axis=-1)
-    bends: Float = STEP_RAD * steps.reshape(-1, 2)
-    hardly: Bool = np.abs(bends / _NEAR_STRAIGHT_RAD).max(axis=1) <= 1.0
+    candidates: Float = STEP_RAD * steps.reshape(-1, 2)
+    hardly: Bool = np.abs(candidates / _NEAR_STRAIGHT_RAD).max(axis=1) <= 1.0
     gap, gap_weight = _gaps(view)
     edge, edge_weight = _edges(view)
-    at, inside = zip(*(_pixels(rotated_view(view, bend), gap) for bend in bends), strict=True)
-    sides, shows = zip(*(_pixels(rotated_view(view, bend), edge) for bend in bends), strict=True)
+    at, inside = zip(
+        *(_pixels(rotated_view(view, wrist_angles), gap) for wrist_angles in candidates), strict=True
+    )
+    sides, shows = zip(
+        *(_pixels(rotated_view(view, wrist_angles), edge) for wrist_angles in candidates), strict=True
+    )
     return _Marks(
-        bends,
-        (0.5 * ((bends / _TYPICAL_RAD) ** 2).sum(axis=1)).astype(np.float32),
+        candidates,
+        (0.5 * ((candidates / _TYPICAL_RAD) ** 2).sum(axis=1)).astype(np.float32),
         hardly,
         np.array(at),
         (gap_weight * np.array(inside)).astype(np.float32),

@@ -58,13 +58,13 @@ class Reach:
     plane_m: Float32
     focal_px: float
     T_camera_palm: Float
-    bent: bool
+    flexed: bool
     palm: "Palm"
     first_row: int
 
     def at_palm_pose(self, palm_pose: PalmPose) -> "Reach":
         """The same where the palm lies just so."""
-        return replace(self, T_camera_palm=palm_pose.T_camera_palm, bent=not palm_pose.straight)
+        return replace(self, T_camera_palm=palm_pose.T_camera_palm, flexed=not palm_pose.straight)
 
     def holds(self, finger: Int, uv: Float) -> Bool:
         """Whether the laser can be on these fingers (N,) at pixels (N, 2) of the image."""
@@ -87,7 +87,7 @@ class Reach:
 
     def on_palm(self, uv: Float) -> Bool:
         """Whether at pixels (N, 2) a bent wrist has brought the palm itself into the plane."""
-        if not self.bent:
+        if not self.flexed:
             return np.zeros(len(uv), np.bool_)
         points = self._before_palm(uv)
         return self.palm.surface(points, self.palm.place(points))

@@ -143,7 +143,7 @@ class Before:
     def at(self, t_s: float) -> HandState:
         state = self._state
         return HandState(
-            state.T_rig_palm, state.angles_rad, state.bend_rad, () if self.bare else (self._bar,)
+            state.T_rig_palm, state.angles_rad, state.wrist_angles_rad, () if self.bare else (self._bar,)
         )
 
 

@@ -215,8 +215,8 @@ def hand_poses(draw: st.DrawFn) -> HandPose:
         ambiguous=draw(arrays(np.bool_, FINGER_COUNT)),
         palm_world_wxyz=draw(floats(HandPose, "palm_world_wxyz", 4)),
         palm_world_sigma_rad=draw(floats(HandPose, "palm_world_sigma_rad", 2)),
-        wrist_bend_rad=draw(floats(HandPose, "wrist_bend_rad", 2)),
-        wrist_bend_sigma_rad=draw(floats(HandPose, "wrist_bend_sigma_rad", 2)),
+        wrist_angles_rad=draw(floats(HandPose, "wrist_angles_rad", 2)),
+        wrist_angles_sigma_rad=draw(floats(HandPose, "wrist_angles_sigma_rad", 2)),
     )
 
 
@@ -698,7 +698,7 @@ def test_a_report_can_be_read_whatever_was_counted() -> None:
 
 DEFAULTED = {
     *("latency_ns", "laser_m", "level", "ambiguous", "palm_world_wxyz", "palm_world_sigma_rad"),
-    *("wrist_bend_rad", "wrist_bend_sigma_rad"),
+    *("wrist_angles_rad", "wrist_angles_sigma_rad"),
     *("heading_sigma_rad", "t_sigma_ns", "exposure_us", "body"),
     *("strength", "angle_rad", "origin_m", "direction"),
     *("host", "version"),

@@ -29,18 +29,18 @@ START_S, SECONDS = 20.5, 0.07
 
 
 @dataclass(frozen=True)
-class Bent:
+class FlexedWrist:
     """A motion with a wrist that bends."""
 
     motion: HandMotion
     period_s: float = 60.0
 
     def at(self, t_s: float) -> HandState:
-        return replace(self.motion.at(t_s), bend_rad=np.array([0.2 * np.sin(t_s), 0.1]))
+        return replace(self.motion.at(t_s), wrist_angles_rad=np.array([0.2 * np.sin(t_s), 0.1]))
 
 
 def scenes() -> tuple[Scene, WristScene]:
-    motion = Bent(SEEN.motion)
+    motion = FlexedWrist(SEEN.motion)
     return replace(SEEN, motion=motion), WristScene(WRIST, CAMERAS, SEEN.model, motion, "dark", 5)
 
 
@@ -66,12 +66,12 @@ def test_a_recording_of_both_has_all_frames_on_one_clock_and_both_truths(tmp_pat
 
     truth = np.load(tmp_path / "r/truth.npz")
     at_s = float(truth["t_ref"][1])
-    np.testing.assert_array_equal(truth["bend"][1], seen.motion.at(at_s).bend_rad)
+    np.testing.assert_array_equal(truth["flexion"][1], seen.motion.at(at_s).wrist_angles_rad)
     np.testing.assert_array_equal(truth["T_palm"][1], seen.truth(at_s).T_rig_palm)
     assert truth["wrist_t_ns"].tolist() == [cycles[1].t_ns, cycles[4].t_ns]
     of_wrist = device.truth(START_S + 4 / 90)
     np.testing.assert_array_equal(truth["wrist_laser_uv"][1], of_wrist.laser_uv)
-    np.testing.assert_array_equal(truth["wrist_bend"][1], of_wrist.bend_rad)
+    np.testing.assert_array_equal(truth["wrist_flexion"][1], of_wrist.wrist_angles_rad)
     meta = msgspec.json.decode((tmp_path / "r/truth_meta.json").read_bytes())
     assert meta["markers"] == list(DESK.markers)
     assert meta["wrist"]["groups"][0] == "palm"

@@ -68,8 +68,8 @@ def poses(setup: RigSetup, wrist_truths: list[WristTruth]) -> Poses:
                 markers_cov_m2=np.full((6, 3, 3), np.nan),
                 inside_volume=np.ones(26, np.bool_),
                 laser_m=device.laser_pt[1:6],
-                wrist_bend_rad=now.bend_rad,
-                wrist_bend_sigma_rad=np.radians([2.0, 4.0]),
+                wrist_angles_rad=now.wrist_angles_rad,
+                wrist_angles_sigma_rad=np.radians([2.0, 4.0]),
             )
         )
     return Poses.of(out)
@@ -79,11 +79,11 @@ def test_what_the_device_sees_stands_in_the_rig_where_the_hand_is(
     setup: RigSetup, poses: Poses, wrist_truths: list[WristTruth]
 ) -> None:
     assert setup.wrist is not None
-    assert np.abs(poses.wrist_bend_rad).max() > np.radians(5.0), "a straight wrist would prove little"
+    assert np.abs(poses.wrist_angles_rad).max() > np.radians(5.0), "a straight wrist would prove little"
     cameras = DevicePlace.of(poses, setup.hand).cameras(setup.wrist.T_camera_palm)
     for T, now, there in zip(cameras, wrist_truths, poses.position_m, strict=True):
         np.testing.assert_allclose(transform(T, now.joints.position_m), there, atol=1e-6)
-    straight = replace(poses, wrist_bend_rad=np.full((len(poses), 2), np.nan))
+    straight = replace(poses, wrist_angles_rad=np.full((len(poses), 2), np.nan))
     moved = DevicePlace.of(straight, setup.hand).cameras(setup.wrist.T_camera_palm)
     assert np.linalg.norm(moved[:, :3, 3] - cameras[:, :3, 3], axis=1).max() > 1e-3  # unknown counts as none
 
@@ -109,7 +109,7 @@ def test_a_fused_run_is_all_there_and_its_device_moves(setup: RigSetup, poses: P
     rows, hand = rows_of(path), f"/world/hand/{setup.hand.profile.name}"
     for entity in ("/world/markers/raw", "/world/rays/left", "/world/rays/wrist/laser", "/world/laser/points",
                    "/world/cameras/wrist/laser", f"{hand}/skeleton", f"{hand}/forearm", f"{hand}/forearm_doubt",
-                   "/plots/wrist_bend_deg/flexion", "/plots/seen/markers", "/plots/seen/laser_points"):  # fmt: skip
+                   "/plots/wrist_angles_deg/flexion", "/plots/seen/markers", "/plots/seen/laser_points"):  # fmt: skip
         assert rows[entity] == len(poses), entity
     for entity in ROOT:
         assert rows[entity] == len(poses) - 1, entity

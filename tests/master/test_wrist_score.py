@@ -58,8 +58,8 @@ def poses(exact: WristTruth) -> Poses:
         ambiguous=np.zeros((N, 5), np.bool_),
         palm_world_wxyz=np.full((N, 4), np.nan),
         palm_world_sigma_rad=np.full((N, 2), np.nan),
-        wrist_bend_rad=np.full((N, 2), np.nan),
-        wrist_bend_sigma_rad=np.full((N, 2), np.nan),
+        wrist_angles_rad=np.full((N, 2), np.nan),
+        wrist_angles_sigma_rad=np.full((N, 2), np.nan),
     )
 
 

@@ -25,7 +25,7 @@ from common.sim.motion import (
     base_pose,
     smooth_step,
 )
-from common.wrist_bend import STRAIGHT, forearm_palm
+from common.wrist_joint import STRAIGHT, forearm_palm
 
 MOVE_S = 0.8  # at most: the way from one posture to the next
 CURL_S = 10.0  # there and back
@@ -234,12 +234,12 @@ class OnForearm:
     def at(self, t_s: float) -> HandState:
         """Forearm and fingers at time `t_s` [s]; before 0 the pose of 0."""
         state = self._motion.at(t_s)
-        if not state.bend_rad.any():
+        if not state.wrist_angles_rad.any():
             return state
         back = rigid(
-            forearm_palm(state.bend_rad).T, np.zeros(3)
+            forearm_palm(state.wrist_angles_rad).T, np.zeros(3)
         )  # both frames have their origin in the wrist
-        return replace(state, T_rig_palm=state.T_rig_palm @ back, bend_rad=STRAIGHT)
+        return replace(state, T_rig_palm=state.T_rig_palm @ back, wrist_angles_rad=STRAIGHT)
 
 
 def wrist_motion(

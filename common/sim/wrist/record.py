@@ -156,7 +156,7 @@ class WristTake:
             "ambient": np.array([scene.ambient] * len(lasers)),
             "angles": np.array([named_angles(scene.model, truth.angles_rad) for truth in at_laser]),
             "joints": np.array([truth.joints.position_m[1:] for truth in at_laser]),
-            "bend": np.array([truth.bend_rad for truth in at_laser]),
+            "flexion": np.array([truth.wrist_angles_rad for truth in at_laser]),
             "laser_uv": np.array([truth.laser_uv for truth in at_laser]),
             "laser_pt": np.array([truth.laser_pt for truth in at_laser]),
             "laser_xyz": np.array([truth.laser_xyz for truth in at_laser]),

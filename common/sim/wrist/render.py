@@ -22,7 +22,7 @@ SURFACE_STEP = 2  # px between the rays that shade skin; 1 is twice as sharp and
 # For a camera that loses what it has no time to draw. Half the time; fingertips are found as often and as well, and
 # the laser line is drawn to parts of a pixel of the picture whatever the step is.
 LIVE_STEP = 4
-LIVE_BEND_RAD = np.radians(
+LIVE_WRIST_RAD = np.radians(
     0.25
 )  # the palm of a bent wrist is drawn anew by such steps: a tenth of a millimetre, twice
 _ILLUMINATIONS = tuple(Illumination)  # frames of one instant differ in their noise, too
@@ -34,7 +34,7 @@ class WristRenderer:
     function of t."""
 
     def __init__(
-        self, scene: WristScene, camera: str, step: int = SURFACE_STEP, bend_step_rad: float = 0.0
+        self, scene: WristScene, camera: str, step: int = SURFACE_STEP, wrist_step_rad: float = 0.0
     ) -> None:
         """Prepare all that stands still (some tenths of a second).
 
@@ -42,7 +42,7 @@ class WristRenderer:
             scene: What it looks at.
             camera: The one camera of its rig.
             step: Pixels between the rays that shade skin.
-            bend_step_rad: To multiples of this the bend is rounded at which the palm is drawn; 0: not at all.
+            wrist_step_rad: To multiples of this the bend is rounded at which the palm is drawn; 0: not at all.
 
         Raises:
             CalibrationError: No such camera.
@@ -50,7 +50,7 @@ class WristRenderer:
         if camera not in scene.rig.cameras:
             raise CalibrationError(f"rig {scene.rig.name!r}: cameras: no camera {camera!r}")
         self._scene = scene
-        self._surface = HandSurface(scene, step, bend_step_rad)
+        self._surface = HandSurface(scene, step, wrist_step_rad)
         self._room = light.Room.of(scene.ambient, scene.seed)
         self._leds = light.Leds(np.array(scene.rig.led, dtype=np.float64))
         optics = scene.optics
@@ -77,7 +77,7 @@ class WristRenderer:
         """Image (H, W), grey, of the frame at mid-exposure at scene time `t_s` [s], lit by the room and by `lit`."""
         state = self._scene.motion.at(t_s)
         bodies = self._scene.bodies_of(state)
-        palm = self._surface.palm(bodies, state.bend_rad)
+        palm = self._surface.palm(bodies, state.wrist_angles_rad)
         fingers = self._surface.appearance(bodies, palm)
         leds = lit is Illumination.LED
         count = len(self._scene.capsules.group)

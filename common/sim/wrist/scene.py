@@ -20,7 +20,7 @@ from common.sim.wrist.laser import LaserSheet, LineTruth
 from common.sim.wrist.motion import wrist_motion
 from common.sim.wrist.things import bodies_of, with_things
 from common.tapered_capsules import Capsules
-from common.wrist_bend import forearm_palm
+from common.wrist_joint import forearm_palm
 
 Ambient = Literal["dark", "indoor", "bright", "sun"]
 TIP_WITHIN_M = 0.003  # of its own finger before a tip: it lies 12 degrees behind the edge of a round tip
@@ -45,7 +45,7 @@ class WristTruth:
         laser_seg: (7,) the segment that carries most of the line (0 metacarpal, 1 proximal ... 3 distal); -1: none.
         tip_xyz, tip_uv: (5, 3) [m], (5, 2) [px] outermost point of the skin along each last bone.
         tip_visible: (5,) whether the camera sees that point, or it lies just behind the edge of its own finger.
-        bend_rad: (2,) how the wrist is bent (`common.wrist_bend`).
+        wrist_angles_rad: (2,) how the wrist is bent (`common.wrist_joint`).
     """
 
     t_s: float
@@ -60,7 +60,7 @@ class WristTruth:
     tip_xyz: Float
     tip_uv: Float
     tip_visible: Bool
-    bend_rad: Float
+    wrist_angles_rad: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,9 +164,9 @@ class WristScene:
         """The flesh while wrist and fingers are straight, camera frame."""
         return self.capsules.bodies(self._straight)
 
-    def bent_bodies(self, bend_rad: Float) -> Capsules:
+    def flexed_bodies(self, wrist_angles_rad: Float) -> Capsules:
         """The flesh of straight fingers while the wrist is bent by that (2,), camera frame."""
-        return self.bodies_of(HandState(np.eye(4), np.zeros((5, 4)), bend_rad))
+        return self.bodies_of(HandState(np.eye(4), np.zeros((5, 4)), wrist_angles_rad))
 
     def truth(self, t_s: float) -> WristTruth:
         """Exact state at scene time `t_s` [s]; before 0 the pose of 0."""
@@ -188,18 +188,18 @@ class WristScene:
             tips,
             self.optics.project(tips),
             self.sheet.seen(bodies, tips, TIP_WITHIN_M),
-            state.bend_rad,
+            state.wrist_angles_rad,
         )
 
     def _joints(self, state: HandState) -> HandJoints:
         """Where the camera, which sits on the forearm, sees them."""
         T = self.T_camera_palm
-        if state.bend_rad.any():
-            T = T @ rigid(forearm_palm(state.bend_rad), np.zeros(3))
+        if state.wrist_angles_rad.any():
+            T = T @ rigid(forearm_palm(state.wrist_angles_rad), np.zeros(3))
         return self.model.forward(T, state.angles_rad)
 
     def _bodies(self, state: HandState, joints: HandJoints) -> Capsules:
-        R_straight = self._straight.rotation[WRIST] if state.bend_rad.any() else None
+        R_straight = self._straight.rotation[WRIST] if state.wrist_angles_rad.any() else None
         capsules = self.capsules.bodies(joints, R_straight)
         if not state.things:
             return capsules

@@ -60,10 +60,10 @@ class HandSurface:
         straight: The palm of a straight wrist.
     """
 
-    def __init__(self, scene: WristScene, step: int, bend_step_rad: float = 0.0) -> None:
+    def __init__(self, scene: WristScene, step: int, wrist_step_rad: float = 0.0) -> None:
         optics = scene.optics
-        self._scene, self._step, self._bend_step_rad = scene, step, bend_step_rad
-        self._bent: tuple[tuple[int, ...], Palm] | None = None
+        self._scene, self._step, self._wrist_step_rad = scene, step, wrist_step_rad
+        self._flexed: tuple[tuple[int, ...], Palm] | None = None
         self.size = (-(-optics.width_px // step), -(-optics.height_px // step))
         columns, lines = (np.arange(n, dtype=np.float64) * step + 0.5 * (step - 1) for n in self.size)
         rays = optics.ray(np.stack(np.meshgrid(columns, lines), axis=-1)).reshape(-1, 3)
@@ -78,18 +78,18 @@ class HandSurface:
         outside = set(forearm) - set(np.unique(met).tolist())
         self._rotated = [body for body in range(scene.capsules.still) if body not in outside]
 
-    def palm(self, bodies: Capsules, bend_rad: Float) -> Palm:
+    def palm(self, bodies: Capsules, wrist_angles_rad: Float) -> Palm:
         """The palm of a hand whose flesh is at `bodies`, of a wrist bent by that (2,); `straight` itself while it is
         straight."""
         if self._scene.capsules.same_palm(bodies, self._straight_bodies):
             return self.straight
-        if self._bend_step_rad <= 0.0:
+        if self._wrist_step_rad <= 0.0:
             return self._palm(bodies, self._rotated)
-        steps = tuple(np.rint(bend_rad / self._bend_step_rad).astype(int).tolist())
-        if self._bent is None or self._bent[0] != steps:
-            rounded = self._scene.bent_bodies(self._bend_step_rad * np.array(steps))
-            self._bent = steps, self._palm(rounded, self._rotated)
-        return self._bent[1]
+        steps = tuple(np.rint(wrist_angles_rad / self._wrist_step_rad).astype(int).tolist())
+        if self._flexed is None or self._flexed[0] != steps:
+            rounded = self._scene.flexed_bodies(self._wrist_step_rad * np.array(steps))
+            self._flexed = steps, self._palm(rounded, self._rotated)
+        return self._flexed[1]
 
     def appearance(self, bodies: Capsules, palm: Palm) -> SurfaceView:
         """What is seen of fingers, thumb and things, of a hand whose flesh is at `bodies`, before its palm."""

@@ -146,7 +146,7 @@ def summary(found: "Mounting") -> dict[str, object]:
         "sigma": found.sigma,
         "residual": left_of(found.fit),
         "cycles": len(found.cycles.t_s),
-        "bend_deg": _span(np.degrees(found.fit.bend_rad)),
+        "wrist_deg": _span(np.degrees(found.fit.wrist_angles_rad)),
     }
 
 

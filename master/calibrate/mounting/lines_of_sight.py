@@ -70,8 +70,8 @@ class LinesOfSight:
         for k in range(3):
             all_of.append(self._moved(R, shift_m + _SHIFT_M * np.eye(3)[k], *local))
         for k in range(4):
-            bent = self._local(angles + _ROTATION_STEP * np.eye(4)[k], thick, reach_m)
-            all_of.append(self._moved(R, shift_m, *bent))
+            stepped = self._local(angles + _ROTATION_STEP * np.eye(4)[k], thick, reach_m)
+            all_of.append(self._moved(R, shift_m, *stepped))
         all_of.append(self._moved(R, shift_m, *self._local(angles, thick + _THICK, reach_m)))
         seen = self._seen(all_of)
         out = np.zeros((*seen.shape[1:], len(_STEPS) + 1))

@@ -30,8 +30,8 @@ def draw_mounting(path: Path, found: Mounting, optics: CameraModel) -> None:
     above.set(title="laser points from above [mm]: dots seen, rings fitted", xlabel="across", ylabel="along")
     above.set_aspect("equal")
     for values, colour, name in (
-        (fit.bend_rad[:, 0], BLUE, "flexion"),
-        (fit.bend_rad[:, 1], ORANGE, "deviation"),
+        (fit.wrist_angles_rad[:, 0], BLUE, "flexion"),
+        (fit.wrist_angles_rad[:, 1], ORANGE, "deviation"),
         (fit.twist_rad, GREY, "twist, which no wrist has"),
     ):
         wrist.plot(cycles.t_s, np.degrees(values), ".", color=colour, label=name)

@@ -11,7 +11,7 @@ share the mounting (`unknown.Unknown`). Four kinds of sight pull at them:
   however the wrist is bent, and its joint stays where it is;
 - **the wrist**, which bends and does not twist:
   R_forearm_palm = R_forearm_imu (R_rig_world R_world_imu)' R_rig_palm has two angles and no third
-  (`common.wrist_bend`);
+  (`common.wrist_joint`);
 - **its zero**, which no sensor knows: a wrist that bends as far one way as the other is straight in the mean.
 
 The hand of each instant is eliminated (Schur's complement), which leaves 34 unknowns. Steps are those of Levenberg and
@@ -47,7 +47,7 @@ from master.calibrate.mounting.unknown import (
     Unknown,
     believed,
 )
-from master.calibrate.mounting.wrists import bends, bends_by_rotation
+from master.calibrate.mounting.wrists import bends_by_rotation, wrist_rotation_angles
 from master.estimator.body_points import BodyPoints
 from master.estimator.parameters import HandParameters
 from master.estimator.priors import Habits, habits_of
@@ -56,7 +56,7 @@ _SURFACE_M, _TIP_M = 8e-4, 1e-3  # skin of another shape than the cones; a tip i
 _CAP_M = 5e-4  # where caps sit, beyond the noise of the cameras
 _HABITS = 1e-2  # of their information: what sensors tell is to count
 _TWIST_RAD = np.radians(1.0)
-_BENT_RAD = np.radians(15.0)
+_WRIST_RAD = np.radians(15.0)
 _PER_S = 4.0  # independent instants
 _FARTHEST = 8.0  # of a finger that the laser should meet and does not
 _TRIALS, _SETTLED = 6, 0.03  # of a step; the gain that is none
@@ -109,7 +109,7 @@ class Problem:
         self.sigma = np.concatenate([laser_m, np.repeat(tip_px[..., None], 2, axis=-1)], axis=-1)
         last_s, first_s = cycles.t_s[-1], cycles.t_s[0]
         self._share = min(_PER_S * (last_s - first_s) / count, 1.0)
-        self._bend_sigma = np.array([_BENT_RAD, _BENT_RAD, _TWIST_RAD])
+        self._wrist_sigma = np.array([_WRIST_RAD, _WRIST_RAD, _TWIST_RAD])
         self._believed = believed()
 
     def followed(self, unknown: Unknown, rounds: Sequence[int]) -> tuple[Unknown, Hands, int]:
@@ -140,7 +140,9 @@ class Problem:
         place = self._hands.place(hands)
         far = (whiten @ (place - np.nan_to_num(markers.points_m))[..., None])[..., 0]
         whiten = whiten * ((1.0 + np.vecdot(far, far) / STRAYS**2) ** -0.5)[..., None, None]
-        told = [np.nan_to_num(part) for part in (markers.points_m, markers.speed_m_s, markers.bent_m_s2)]
+        told = [
+            np.nan_to_num(part) for part in (markers.points_m, markers.speed_m_s, markers.acceleration_m_s2)
+        ]
         self._told = _Told(
             unknown,
             Markers(told[0], told[1], told[2], markers.cov_m2),
@@ -194,13 +196,23 @@ class Problem:
     def result(self, unknown: Unknown, hands: Hands, steps: int) -> Fit:
         """What is told of the end."""
         covariance = np.asarray(np.linalg.inv(self.normal(unknown, hands).reduced(0.0)[0]), np.float64)
-        shown, bend = self._shown(unknown, hands)
+        shown, wrist_angles = self._shown(unknown, hands)
         off = (self._data - shown) / self.sigma
         here = self._here(unknown)
         far = self._hands.place(hands) - here.points_m
         seen = self._hands.whiten[..., 0, 0] > 0.0
         marker_m = float(np.sqrt((far[seen] ** 2).sum(axis=-1).mean()))
-        return Fit(unknown, covariance, bend[:, :2], bend[:, 2], off, self.sigma, shown, marker_m, steps)
+        return Fit(
+            unknown,
+            covariance,
+            wrist_angles[:, :2],
+            wrist_angles[:, 2],
+            off,
+            self.sigma,
+            shown,
+            marker_m,
+            steps,
+        )
 
     def _stepped(self, unknown: Unknown, hands: Hands, step: Float, own: Float) -> tuple[Unknown, Hands]:
         after = hands.moved(own)
@@ -210,9 +222,9 @@ class Problem:
     def _here(self, unknown: Unknown) -> Markers:
         """The markers when the frames were taken."""
         late_s, told = unknown.camera_late_s - self._told.about.camera_late_s, self._told.markers
-        speed = told.speed_m_s + late_s * told.bent_m_s2
-        points = told.points_m + late_s * (told.speed_m_s + 0.5 * late_s * told.bent_m_s2)
-        return Markers(points, speed, told.bent_m_s2, told.cov_m2)
+        speed = told.speed_m_s + late_s * told.acceleration_m_s2
+        points = told.points_m + late_s * (told.speed_m_s + 0.5 * late_s * told.acceleration_m_s2)
+        return Markers(points, speed, told.acceleration_m_s2, told.cov_m2)
 
     def _orientations(self, unknown: Unknown) -> ImuOrientations:
         """The IMU when the frames were taken."""
@@ -242,7 +254,7 @@ class Problem:
         R = self._camera_rig(unknown, orientations) @ hands.T_rig_palm[:, :3, :3]
         angles = self._parameters.angles(hands.x)
         seen = self._lines_of_sight(R, unknown.shift_m, angles, unknown.thick, unknown.reach_m)
-        return seen, bends(self._wrists(unknown, hands, orientations))
+        return seen, wrist_rotation_angles(self._wrists(unknown, hands, orientations))
 
     def _off(self, shown: Float) -> Float:
         """Fitted minus seen (T, 4, SEEN) in standard deviations, 0 where not seen; what the laser misses is far."""
@@ -252,12 +264,12 @@ class Problem:
 
     def cost(self, unknown: Unknown, hands: Hands) -> float:
         """Sum of squares, strays weighed down."""
-        shown, bend = self._shown(unknown, hands)
+        shown, wrist_angles = self._shown(unknown, hands)
         off = self._off(shown)
         pairs = off[..., 0::2] ** 2 + off[..., 1::2] ** 2
         data = (STRAYS**2 * np.log1p(pairs / STRAYS**2)).sum()
-        bent = ((bend / self._bend_sigma) ** 2).sum(axis=-1) * self._known
-        wrist = (STRAYS**2 * np.log1p(bent / STRAYS**2)).sum()
+        chi2 = ((wrist_angles / self._wrist_sigma) ** 2).sum(axis=-1) * self._known
+        wrist = (STRAYS**2 * np.log1p(chi2 / STRAYS**2)).sum()
         markers = replace(self._hands, points_m=self._here(unknown).points_m)
         held = 2.0 * markers.cost(hands).sum()
         believed_off = unknown.off(self._first) / self._believed
@@ -315,9 +327,9 @@ class Problem:
     ) -> tuple[Float, Float, Float]:
         """As `_line_of_sight_rows`, of flexion, deviation and twist."""
         wrist = self._wrists(unknown, hands, orientations)
-        bent = bends(wrist) / self._bend_sigma
-        root = (1.0 + np.vecdot(bent, bent) / STRAYS**2) ** -0.5  # where the hand itself was mistaken
-        weight = (self._known * root)[:, None] / self._bend_sigma
+        chi2 = wrist_rotation_angles(wrist) / self._wrist_sigma
+        root = (1.0 + np.vecdot(chi2, chi2) / STRAYS**2) ** -0.5  # where the hand itself was mistaken
+        weight = (self._known * root)[:, None] / self._wrist_sigma
         by_rotation = weight[..., None] * bends_by_rotation(wrist)
         forearm_rig = unknown.R_forearm_imu @ np.swapaxes(self._rig_imu(unknown, orientations), 1, 2)
         own = np.zeros((len(wrist), 3, 6 + hands.x.shape[1]))
@@ -325,7 +337,7 @@ class Problem:
         shared = np.zeros((len(wrist), 3, UNKNOWN))
         shared[..., FOREARM_IMU] = by_rotation
         self._world_columns(shared, -by_rotation @ forearm_rig, unknown, orientations)
-        return bends(wrist) * weight, own, shared
+        return wrist_rotation_angles(wrist) * weight, own, shared
 
     def _world_columns(
         self, shared: Float, by_imu: Float, unknown: Unknown, orientations: ImuOrientations

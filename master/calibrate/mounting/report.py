@@ -78,7 +78,7 @@ def left_of(fit: Fit) -> dict[str, float]:
 def report_lines(fit: Fit, sigma: dict[str, float], count: int) -> tuple[str, ...]:
     """The result for a person."""
     unknown, left = fit.unknown, left_of(fit)
-    bend = np.degrees(np.quantile(fit.bend_rad, [0.02, 0.98], axis=0))
+    wrist_angles = np.degrees(np.quantile(fit.wrist_angles_rad, [0.02, 0.98], axis=0))
     x, y, z = 1e3 * unknown.shift_m
     seen = (
         f"{np.isfinite(fit.off[..., 0]).sum()} laser points, {np.isfinite(fit.off[..., 2]).sum()} fingertips"
@@ -86,9 +86,9 @@ def report_lines(fit: Fit, sigma: dict[str, float], count: int) -> tuple[str, ..
     what = (
         f"laser {left['laser_mm']:.2f} mm, tips {left['tip_px']:.1f} px, markers {left['marker_mm']:.2f} mm"
     )
-    flexed, aside = (f"{low:+.0f} ... {high:+.0f} deg" for low, high in bend.T)
+    flexed, aside = (f"{low:+.0f} ... {high:+.0f} deg" for low, high in wrist_angles.T)
     lines = [
-        f"mounting from {len(fit.bend_rad)} of {count} triples, {seen}",
+        f"mounting from {len(fit.wrist_angles_rad)} of {count} triples, {seen}",
         f"left: {what}; {100 * fit.strays:.0f} % stray",
         f"wrist bent {flexed}, aside {aside}; its mean is called straight",
         f"{'':24} {'found':>22} {'standard deviation':>20}",

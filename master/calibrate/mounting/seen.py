@@ -48,7 +48,7 @@ class Fit:
     Attributes:
         unknown: It.
         covariance: (UNKNOWN, UNKNOWN) of steps on it.
-        bend_rad: (T, 2) flexion and deviation of the wrist in each triple.
+        wrist_angles_rad: (T, 2) flexion and deviation of the wrist in each triple.
         twist_rad: (T,) what no wrist does.
         off: (T, 4, SEEN) seen minus fitted, in standard deviations; NaN: not seen.
         sigma: (T, 4, SEEN) these [m, px].
@@ -59,7 +59,7 @@ class Fit:
 
     unknown: Unknown
     covariance: Float
-    bend_rad: Float
+    wrist_angles_rad: Float
     twist_rad: Float
     off: Float
     sigma: Float

@@ -29,13 +29,13 @@ class Markers:
 
     Attributes:
         points_m: (T, M, 3) cap centroids, rig frame; NaN: not seen, or a gap nearby.
-        speed_m_s, bent_m_s2: (T, M, 3) first and second derivative.
+        speed_m_s, acceleration_m_s2: (T, M, 3) first and second derivative.
         cov_m2: (T, M, 3, 3).
     """
 
     points_m: Float
     speed_m_s: Float
-    bent_m_s2: Float
+    acceleration_m_s2: Float
     cov_m2: Float
 
     @property
@@ -109,8 +109,8 @@ class HandTrack:
         solvable = np.where(told[..., None, None], normal, np.eye(_TERMS))
         taylor = np.asarray(np.linalg.solve(solvable, pull), np.float64)
         taylor[~told] = np.nan
-        speed, bent = taylor[:, :, 1] / _NEAR_S, 2.0 * taylor[:, :, 2] / _NEAR_S**2
-        return Markers(taylor[:, :, 0], speed, bent, self.cov_m2[near])
+        speed, acceleration = taylor[:, :, 1] / _NEAR_S, 2.0 * taylor[:, :, 2] / _NEAR_S**2
+        return Markers(taylor[:, :, 0], speed, acceleration, self.cov_m2[near])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,20 +4,20 @@ import numpy as np
 
 from common.arrays import Float
 from common.geometry import rotation_vector_to_matrix
-from common.wrist_bend import bend_of
+from common.wrist_joint import wrist_angles_of
 
 _LITTLE = 1e-5
 
 
-def bends(R_forearm_palm: Float) -> Float:
+def wrist_rotation_angles(R_forearm_palm: Float) -> Float:
     """Flexion, deviation and twist (..., 3) [rad] of rotations (..., 3, 3)."""
-    return np.concatenate([bend_of(R_forearm_palm), R_forearm_palm[..., 1, :1]], axis=-1)
+    return np.concatenate([wrist_angles_of(R_forearm_palm), R_forearm_palm[..., 1, :1]], axis=-1)
 
 
 def bends_by_rotation(R_forearm_palm: Float) -> Float:
-    """Derivatives (T, 3, 3) of `bends` by a turn of the palms (T, 3, 3), forearm axes."""
-    here, out = bends(R_forearm_palm), np.empty((len(R_forearm_palm), 3, 3))
+    """Derivatives (T, 3, 3) of `wrist_rotation_angles` by a turn of the palms (T, 3, 3), forearm axes."""
+    here, out = wrist_rotation_angles(R_forearm_palm), np.empty((len(R_forearm_palm), 3, 3))
     for k in range(3):
         rotated = rotation_vector_to_matrix(_LITTLE * np.eye(3)[k]) @ R_forearm_palm
-        out[..., k] = (bends(rotated) - here) / _LITTLE
+        out[..., k] = (wrist_rotation_angles(rotated) - here) / _LITTLE
     return out

@@ -60,8 +60,8 @@ def first_lag(seen: PoseTrack, tracker: PoseTrack) -> float | None:
     fine = 0.0
     if 0 < best < len(costs) - 1 and np.isfinite([costs[best - 1], costs[best + 1]]).all():
         before, here, after = costs[best - 1 : best + 2]
-        bent = before - 2.0 * here + after
-        fine = 0.5 * (before - after) / bent if bent > 0.0 else 0.0
+        curvature = before - 2.0 * here + after
+        fine = 0.5 * (before - after) / curvature if curvature > 0.0 else 0.0
     return (best - steps + fine) * _GRID_S
 
 

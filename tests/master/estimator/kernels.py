@@ -19,7 +19,7 @@ from master.estimator.solve import linearise
 from master.estimator.state import grow, hide
 from master.estimator.truncated import mean_within
 from master.estimator.workspace import Model
-from master.estimator.wrist_device import bent_palm
+from master.estimator.wrist_device import flexed_palm
 from master.estimator.wrist_rows import rotation_vector_jacobian
 
 __all__ = ["Certainty", "Scratch"]
@@ -127,7 +127,7 @@ def rotation_vector_jacobian_at(rotation: Float, J: Float) -> None:
 def look_at(
     boxed_hand: Any,
     boxed_device: Any,
-    bend: Float,
+    wrist_angles: Float,
     twist: Float,
     angles: Float,
     f: int,
@@ -136,7 +136,7 @@ def look_at(
     """`master.estimator.finger_surface.look` at a wrist that is bent by (2,) and hinges rolled by (5,)."""
     T, axes, hand, device = np.zeros((4, 4)), np.zeros((2, 3)), boxed_hand[0], boxed_device[0]
     twist_hand(hand, twist)
-    bent_palm(device.palm, bend[0], bend[1], T, axes)
+    flexed_palm(device.palm, wrist_angles[0], wrist_angles[1], T, axes)
     return look(hand, device, T, axes, angles, f, MOVES, boxed_work[0])
 
 

@@ -13,7 +13,7 @@ from master.estimator.extras import ExtrasRoom, stationary_of
 from master.estimator.problem import Belief
 from master.estimator.settings import DEFAULT
 from master.estimator.state import HandState
-from master.estimator.wrist_device import BEND, EXTRAS, HEADING, LIGHT, RATE, TILT
+from master.estimator.wrist_device import EXTRAS, HEADING, LIGHT, RATE, TILT, WRIST_ANGLES
 from tests.master.estimator.kernels import keep_extras_at, predict_extras_at
 
 N = 8
@@ -75,19 +75,21 @@ def drawn(seed: int) -> tuple[Float, Float]:
 def test_a_bend_moves_as_its_closed_form(dt_s: float) -> None:
     """Matern 3/2: mean and variance of bend and rate that were known exactly (Hartikainen, Saerkkae 2010)."""
     mean = np.zeros(EXTRAS)
-    mean[[BEND, RATE]] = 0.3, -0.8
+    mean[[WRIST_ANGLES, RATE]] = 0.3, -0.8
     found = Extras().set(mean, 1e-18 * np.eye(EXTRAS)).after(dt_s)
     paced, sigma2 = DEFAULT.pace_1_s * dt_s, DEFAULT.flexion_rad**2
     decay = exp(-paced)
-    bend = decay * ((1.0 + paced) * 0.3 - 0.8 * dt_s)
+    wrist_angles = decay * ((1.0 + paced) * 0.3 - 0.8 * dt_s)
     rate = decay * (-(DEFAULT.pace_1_s**2) * dt_s * 0.3 - 0.8 * (1.0 - paced))
-    np.testing.assert_allclose(found.mean[[BEND, RATE]], [bend, rate], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.mean[[WRIST_ANGLES, RATE]], [wrist_angles, rate], rtol=1e-9, atol=1e-12)
     variance = sigma2 * (1.0 - decay**2 * ((1.0 + paced) ** 2 + paced**2))
     of_rate = DEFAULT.pace_1_s**2 * sigma2 * (1.0 - decay**2 * ((1.0 - paced) ** 2 + paced**2))
     both = 2.0 * sigma2 * DEFAULT.pace_1_s * paced**2 * decay**2
     expected = [[variance, both], [both, of_rate]]
-    np.testing.assert_allclose(found.cov[np.ix_([BEND, RATE], [BEND, RATE])], expected, rtol=1e-6, atol=1e-12)
-    np.testing.assert_allclose(found.mean[[BEND + 1, RATE + 1]], 0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        found.cov[np.ix_([WRIST_ANGLES, RATE], [WRIST_ANGLES, RATE])], expected, rtol=1e-6, atol=1e-12
+    )
+    np.testing.assert_allclose(found.mean[[WRIST_ANGLES + 1, RATE + 1]], 0.0, atol=1e-12)
 
 
 @given(st.floats(0.0, 3.0), st.floats(0.0, 3.0), seeds)
@@ -105,7 +107,7 @@ def test_doubt_ends_at_what_is_usual_and_the_heading_walks_on() -> None:
     far = Extras().set(mean, cov)
     for _ in range(100):
         far.after(1e3, 1e-3)
-    quick = [*range(BEND, HEADING)]
+    quick = [*range(WRIST_ANGLES, HEADING)]
     np.testing.assert_allclose(
         far.cov[quick][:, quick], np.diag(far.state.stationary)[quick][:, quick], atol=1e-9
     )
@@ -126,17 +128,17 @@ def test_a_bend_goes_back_to_the_posture_that_is_kept() -> None:
     extras = Extras()
     extras.state.habit[:] = -0.4, 0.1
     mean = np.zeros(EXTRAS)
-    mean[BEND : BEND + 2] = 0.2, 0.2
+    mean[WRIST_ANGLES : WRIST_ANGLES + 2] = 0.2, 0.2
     extras.set(mean, 1e-6 * np.eye(EXTRAS))
     extras.after(0.3 / DEFAULT.pace_1_s)
-    assert -0.4 < extras.mean[BEND] < 0.2
+    assert -0.4 < extras.mean[WRIST_ANGLES] < 0.2
     extras.after(15.0 / DEFAULT.pace_1_s)
-    np.testing.assert_allclose(extras.mean[BEND : BEND + 2], [-0.4, 0.1], atol=1e-3)
+    np.testing.assert_allclose(extras.mean[WRIST_ANGLES : WRIST_ANGLES + 2], [-0.4, 0.1], atol=1e-3)
 
 
 def test_a_posture_that_is_kept_is_learnt() -> None:
     extras, information, measured = Extras(), np.zeros((EXTRAS, EXTRAS)), np.zeros(EXTRAS)
-    information[BEND, BEND], measured[BEND] = 1e4, -0.5
+    information[WRIST_ANGLES, WRIST_ANGLES], measured[WRIST_ANGLES] = 1e4, -0.5
     for _ in range(60):
         extras.after(1.0).told(1.0, information, measured)
     assert extras.state.habit[0] == pytest.approx(-0.5, abs=0.04)
@@ -203,6 +205,10 @@ def test_it_stays_a_covariance_whatever_comes(seed: int) -> None:
 
 def test_a_palm_that_was_calibrated_does_not_bend_and_a_tilt_is_at_least_of_a_milliradian() -> None:
     strapped, loose = (stationary_of(DEFAULT, loose=loose, tilt_rad=0.0) for loose in (False, True))
-    np.testing.assert_allclose(np.sqrt(strapped[BEND : BEND + 2]), DEFAULT.calibrated_palm_rad)
-    np.testing.assert_allclose(np.sqrt(loose[BEND : BEND + 2]), [DEFAULT.flexion_rad, DEFAULT.deviation_rad])
+    np.testing.assert_allclose(
+        np.sqrt(strapped[WRIST_ANGLES : WRIST_ANGLES + 2]), DEFAULT.calibrated_palm_rad
+    )
+    np.testing.assert_allclose(
+        np.sqrt(loose[WRIST_ANGLES : WRIST_ANGLES + 2]), [DEFAULT.flexion_rad, DEFAULT.deviation_rad]
+    )
     np.testing.assert_allclose(np.sqrt(loose[TILT : TILT + 2]), 1e-3)

@@ -8,14 +8,14 @@ import pytest
 
 from common.arrays import Float
 from common.hand_model import CHAINS
-from common.wrist_bend import STRAIGHT
+from common.wrist_joint import STRAIGHT
 from master.calibrate.laser_cut import LaserCut
 from master.estimator.laser_plane import PlaneAxes
 from master.wrist_setup import WristSetup
 from tests.master.estimator.wrist_case import NO_TWIST, PIP, WristCase, bent, natural
 from tests.wrist_run import mirrored_setup
 
-BENDS = [(0.0, 0.0), (12.0, 0.0), (-10.0, 5.0), (-20.0, -12.0), (-25.0, 15.0)]
+WRIST_ANGLES = [(0.0, 0.0), (12.0, 0.0), (-10.0, 5.0), (-20.0, -12.0), (-25.0, 15.0)]
 
 
 @pytest.fixture(scope="module")
@@ -45,11 +45,11 @@ def differences(wrist_case: WristCase, angles: Float, bend: Float, twist: Float)
     return out
 
 
-@pytest.mark.parametrize("bend_deg", BENDS)
+@pytest.mark.parametrize("wrist_deg", WRIST_ANGLES)
 def test_derivatives_are_those_of_finite_differences(
-    wrist_case: WristCase, bend_deg: tuple[float, float]
+    wrist_case: WristCase, wrist_deg: tuple[float, float]
 ) -> None:
-    rng, bend = np.random.default_rng(3), np.radians(bend_deg)
+    rng, bend = np.random.default_rng(3), np.radians(wrist_deg)
     for _ in range(4):
         angles = np.radians(np.column_stack([rng.uniform(-4, 4, 5), *rng.uniform(25.0, 50.0, (3, 5))]))
         twist = np.radians(rng.uniform(-5.0, 5.0, 5))
@@ -77,12 +77,12 @@ def away_m(setup: WristSetup, laser: Float) -> Float:
     return setup.offset_m / (np.column_stack([laser, np.ones(5)]) @ setup.normal)
 
 
-@pytest.mark.parametrize("bend_deg", BENDS)
+@pytest.mark.parametrize("wrist_deg", WRIST_ANGLES)
 def test_the_cut_is_near_to_that_of_the_calibration(
-    wrist_case: WristCase, bend_deg: tuple[float, float]
+    wrist_case: WristCase, wrist_deg: tuple[float, float]
 ) -> None:
     """Within half a millimetre: its rays are evenly spread, and miss what they graze at both ends of the line."""
-    rng, bend = np.random.default_rng(8), np.radians(bend_deg)
+    rng, bend = np.random.default_rng(8), np.radians(wrist_deg)
     off: list[Float] = []
     longer: list[Float] = []
     for _ in range(40):

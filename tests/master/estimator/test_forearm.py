@@ -20,13 +20,13 @@ from common.geometry import (
     rigid,
     rotation_vector_to_matrix,
 )
-from common.wrist_bend import forearm_palm
+from common.wrist_joint import forearm_palm
 from master.estimator.cycle_reader import CycleReader
 from master.estimator.epoch import Epoch, Fitted, OrientationMeasurement
 from master.estimator.estimator import Estimator
 from master.estimator.forearm import Forearm
 from master.estimator.fused import WristSide
-from master.estimator.wrist_device import BEND, HEADING, RATE
+from master.estimator.wrist_device import HEADING, RATE, WRIST_ANGLES
 from master.estimator.wrist_model import WristModel, loosened
 from tests.hand_helpers import any_rotation, small_cov
 from tests.master.estimator.fitted import PAIR, found
@@ -58,7 +58,7 @@ class Arm:
     def _waves(self, t_ms: int) -> Float:
         return self._size * np.sin(1e-3 * self._rate * t_ms + self._phase)
 
-    def bend(self, t_ms: int) -> Float:
+    def wrist_angles(self, t_ms: int) -> Float:
         return self._waves(t_ms)[3:]
 
     def forearm(self, t_ms: int) -> Float:
@@ -67,7 +67,7 @@ class Arm:
 
     def palm(self, t_ms: int) -> Float:
         """(3, 3) in the rig."""
-        return self.forearm(t_ms) @ forearm_palm(self.bend(t_ms))
+        return self.forearm(t_ms) @ forearm_palm(self.wrist_angles(t_ms))
 
     def said(self, t_ms: int) -> Float:
         """What the IMU says (4,)."""
@@ -102,12 +102,12 @@ class WristCase:
         return self.side.forearm
 
     @property
-    def bend(self) -> Float:
-        return self.estimator.extras[BEND : BEND + 2].copy()
+    def wrist_angles(self) -> Float:
+        return self.estimator.extras[WRIST_ANGLES : WRIST_ANGLES + 2].copy()
 
     @property
-    def bend_sigma_deg(self) -> Float:
-        return np.degrees(np.sqrt(np.diag(self.estimator.extras_cov)[BEND : BEND + 2]))
+    def wrist_sigma_deg(self) -> Float:
+        return np.degrees(np.sqrt(np.diag(self.estimator.extras_cov)[WRIST_ANGLES : WRIST_ANGLES + 2]))
 
     @property
     def heading_rad(self) -> float:
@@ -154,8 +154,8 @@ def test_heading_and_bend_are_learnt_from_palms(root: Path) -> None:
         assert wrist_case.counts["forearm.outlier"] == 0
         assert wrist_case.heading_off_deg(arm) < 2.0
         assert wrist_case.heading_off_deg(arm) < 3.0 * wrist_case.heading_sigma_deg
-        assert np.degrees(np.abs(wrist_case.bend - arm.bend(7_968))).max() < 2.5
-        assert wrist_case.bend_sigma_deg.max() < 5.0
+        assert np.degrees(np.abs(wrist_case.wrist_angles - arm.wrist_angles(7_968))).max() < 2.5
+        assert wrist_case.wrist_sigma_deg.max() < 5.0
 
 
 def test_one_palm_tells_the_sum_of_heading_and_a_bend_whose_axis_is_upright_and_neither_alone(
@@ -170,9 +170,9 @@ def test_one_palm_tells_the_sum_of_heading_and_a_bend_whose_axis_is_upright_and_
         orientation = wrist_case.side.orientation_at(t_ns, wrist_case.estimator)
         hand = wrist_case.estimator.push(Epoch(t_ns, points, T[:3, 1], cov_m2=COV, orientation=orientation))
         wrist_case.side.solved(t_ns, hand, wrist_case.estimator, oriented=orientation is not None)
-    assert np.degrees(np.abs(wrist_case.bend)).max() < 1.0
-    assert wrist_case.bend_sigma_deg[1] == pytest.approx(11.0, abs=2.0)  # as before
-    assert wrist_case.bend_sigma_deg[0] < 4.0
+    assert np.degrees(np.abs(wrist_case.wrist_angles)).max() < 1.0
+    assert wrist_case.wrist_sigma_deg[1] == pytest.approx(11.0, abs=2.0)  # as before
+    assert wrist_case.wrist_sigma_deg[0] < 4.0
     assert wrist_case.heading_sigma_deg > 9.0
 
 
@@ -180,12 +180,12 @@ def test_nothing_is_said_of_the_palm_before_a_heading_is_known(root: Path) -> No
     arm, wrist_case = Arm(), WristCase.of(root)
     wrist_case.played(arm, range(0, 100), seen=False)
     assert wrist_case.orientation(50) is None
-    assert 10.0 < wrist_case.bend_sigma_deg.min() < wrist_case.bend_sigma_deg.max() < 15.0
+    assert 10.0 < wrist_case.wrist_sigma_deg.min() < wrist_case.wrist_sigma_deg.max() < 15.0
     for t_ms in (96, 112):  # the first palm tells the heading of a straight wrist, the next how it is bent
         wrist_case.epoch(arm, t_ms)
     orientation = wrist_case.orientation(112)
     assert orientation is not None
-    assert degrees(orientation.rotation @ forearm_palm(wrist_case.bend), arm.palm(112)) < 5.0
+    assert degrees(orientation.rotation @ forearm_palm(wrist_case.wrist_angles), arm.palm(112)) < 5.0
 
 
 def test_a_heading_that_the_file_knows_is_there_at_once(root: Path) -> None:
@@ -219,11 +219,11 @@ def test_without_markers_the_bend_is_believed_less_and_less_and_the_heading_stay
     arm, wrist_case = Arm(), WristCase.of(root)
     wrist_case.played(arm, range(0, 8_000))
     learnt = wrist_case.heading_rad
-    sigma, bends = [wrist_case.bend_sigma_deg], [wrist_case.bend]
+    sigma, bends = [wrist_case.wrist_sigma_deg], [wrist_case.wrist_angles]
     for begin, end in ((8_000, 8_192), (8_192, 8_496), (8_496, 9_008), (9_008, 14_000)):
         wrist_case.played(arm, range(begin, end), seen=False)
-        sigma.append(wrist_case.bend_sigma_deg)
-        bends.append(wrist_case.bend)
+        sigma.append(wrist_case.wrist_sigma_deg)
+        bends.append(wrist_case.wrist_angles)
     assert (np.diff(np.array(sigma), axis=0) > 0.0).all()
     assert sigma[-1][0] < 14.2  # of any wrist
     assert sigma[-1][1] < 11.5
@@ -297,7 +297,7 @@ def test_a_clock_that_is_set_back_is_followed(root: Path, back_ms: int) -> None:
     wrist_case.played(arm, range(6_000, 8_000), shift_ms=100_000 - back_ms)
     assert wrist_case.heading_off_deg(arm) < 3.0
     assert wrist_case.heading_sigma_deg < 10.0
-    assert np.degrees(np.abs(wrist_case.bend - arm.bend(7_968))).max() < 4.0
+    assert np.degrees(np.abs(wrist_case.wrist_angles - arm.wrist_angles(7_968))).max() < 4.0
 
 
 def test_samples_that_are_missing_or_nan_change_nothing(root: Path) -> None:
@@ -320,12 +320,12 @@ def test_samples_that_are_missing_or_nan_change_nothing(root: Path) -> None:
 def test_in_its_own_world_the_palm_is_bent_as_well(root: Path) -> None:
     arm, wrist_case = Arm(), WristCase.of(root)
     wrist_case.played(arm, range(0, 6_000))
-    cov = wrist_case.estimator.extras_cov[BEND : BEND + 2, BEND : BEND + 2]
-    wxyz, sigma = wrist_case.forearm.world_at(5_968 * MS, wrist_case.bend, cov)
+    cov = wrist_case.estimator.extras_cov[WRIST_ANGLES : WRIST_ANGLES + 2, WRIST_ANGLES : WRIST_ANGLES + 2]
+    wxyz, sigma = wrist_case.forearm.world_at(5_968 * MS, wrist_case.wrist_angles, cov)
     truth = axis_rotation(2, -arm.heading_rad) @ RIG_WORLD.T @ arm.palm(5_968)
     assert degrees(quaternion_to_matrix(wxyz), truth) < 4.0
     assert 1.0 < np.degrees(sigma[0]) < 8.0
-    wxyz, sigma = wrist_case.forearm.world_at(9_000 * MS, wrist_case.bend, cov)
+    wxyz, sigma = wrist_case.forearm.world_at(9_000 * MS, wrist_case.wrist_angles, cov)
     assert np.isnan([*wxyz, *sigma]).all()
 
 
@@ -337,8 +337,10 @@ def test_the_bend_is_within_what_is_claimed(root: Path) -> None:
         wrist_case.played(arm, range(0, 3_000))
         for begin in range(3_000, 6_000, 208):
             wrist_case.played(arm, range(begin, begin + 208))
-            off = wrist_case.bend - arm.bend(begin + 176)
-            cov = wrist_case.estimator.extras_cov[BEND : BEND + 2, BEND : BEND + 2]
+            off = wrist_case.wrist_angles - arm.wrist_angles(begin + 176)
+            cov = wrist_case.estimator.extras_cov[
+                WRIST_ANGLES : WRIST_ANGLES + 2, WRIST_ANGLES : WRIST_ANGLES + 2
+            ]
             inside.append(bool(off @ np.linalg.solve(cov, off) < 5.991))
     assert np.mean(inside) > 0.90
 

@@ -89,10 +89,10 @@ def test_a_palm_that_nobody_sees_is_doubted_more_and_more(cut: Solved) -> None:
 
 
 def test_bend_and_turn_of_the_palm_are_told_with_their_doubt(seen: Seen, whole: Solved) -> None:
-    truth = np.array([seen[0].scene.motion.at(t).bend_rad for t in whole.t_s.tolist()])
-    off = np.abs(whole.poses.wrist_bend_rad - truth)
-    assert np.isfinite(whole.poses.wrist_bend_sigma_rad).all()
-    assert (off < 4.0 * whole.poses.wrist_bend_sigma_rad).mean() > 0.9
+    truth = np.array([seen[0].scene.motion.at(t).wrist_angles_rad for t in whole.t_s.tolist()])
+    off = np.abs(whole.poses.wrist_angles_rad - truth)
+    assert np.isfinite(whole.poses.wrist_angles_sigma_rad).all()
+    assert (off < 4.0 * whole.poses.wrist_angles_sigma_rad).mean() > 0.9
     assert np.isfinite(whole.poses.palm_world_wxyz).all()
 
 

@@ -10,15 +10,15 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.geometry import axis_rotation, matrix_to_rotation_vector, rotation_vector_to_matrix
-from common.wrist_bend import forearm_palm
-from master.estimator.wrist_device import BEND, HEADING, LIGHT, TILT
+from common.wrist_joint import forearm_palm
+from master.estimator.wrist_device import HEADING, LIGHT, TILT, WRIST_ANGLES
 from tests.hand_helpers import any_rotation
 from tests.master.estimator.kernels import rotation_vector_jacobian_at
 from tests.master.estimator.whole import Whole, silent
 from tests.master.estimator.wrist_case import Seen, WristCase
 
 seeds = st.integers(0, 2**32 - 1)
-BENT = np.radians([-8.0, 4.0])
+FLEXED = np.radians([-8.0, 4.0])
 
 
 @pytest.fixture(scope="module")
@@ -30,10 +30,10 @@ def hand(wrist_case: WristCase, seed: int) -> tuple[Whole, Seen]:
     """One before the device, of which nothing is believed, and what is seen of it."""
     whole = Whole(wrist_case.model, seed, wrist_case.device)
     silent(whole)
-    whole.z[:5], whole.z[BEND : BEND + 2] = whole.rng.normal(0.0, 0.05, 5), BENT
+    whole.z[:5], whole.z[WRIST_ANGLES : WRIST_ANGLES + 2] = whole.rng.normal(0.0, 0.05, 5), FLEXED
     whole.z[LIGHT] = whole.rng.normal()
     angles = whole.parameters.angles(whole.x)
-    return whole, wrist_case.looks(angles, BENT, whole.z[:5])
+    return whole, wrist_case.looks(angles, FLEXED, whole.z[:5])
 
 
 def spd(rng: np.random.Generator, n: int) -> Float:
@@ -67,7 +67,7 @@ def orientation(whole: Whole, seen: Seen, off: float) -> None:
     """Of a forearm that is turned `off` from where it would put the palm; tilt and heading are as they were."""
     belief, rng = whole.belief, whole.rng
     palm = rotation_vector_to_matrix(off * rng.normal(size=3)) @ whole.T[:3, :3]
-    belief.forearm[:3, :3] = palm @ forearm_palm(BENT).T
+    belief.forearm[:3, :3] = palm @ forearm_palm(FLEXED).T
     belief.orientation_info[:], belief.oriented[0], belief.on_forearm[0] = spd(rng, 3), 1.0, 1.0
     belief.axes[:] = any_rotation(rng)
     whole.z[TILT : HEADING + 1] = belief.z[TILT : HEADING + 1] = rng.normal(0.0, 0.2, 3)
@@ -111,7 +111,7 @@ def test_the_laser_row_is_that_of_ridge_and_lack(wrist_case: WristCase) -> None:
             pull = seen.by[f, :2].T @ lines_of_sight.laser_W[f] @ r
             expected[6 : 6 + n] += by_free[f].T @ pull[:4]
             expected[6 + n + f] += pull[4]
-            expected[6 + n + BEND : 6 + n + BEND + 2] += pull[5:]
+            expected[6 + n + WRIST_ANGLES : 6 + n + WRIST_ANGLES + 2] += pull[5:]
             cost += 0.5 * r @ lines_of_sight.laser_W[f] @ r
         found, gradient, _ = whole.cost()
         assert found == pytest.approx(cost, rel=1e-9)
@@ -128,7 +128,7 @@ def test_the_normal_matrix_is_the_bend_of_the_cost_where_nothing_is_off(
         cost, gradient, normal = whole.cost()
         assert abs(cost) < 1e-12
         np.testing.assert_allclose(gradient, 0.0, atol=1e-6)
-        numeric = whole.bend_of_cost()
+        numeric = whole.hessian_of_cost()
         np.testing.assert_allclose(normal, numeric, atol=share * np.abs(numeric).max())
 
 
@@ -155,9 +155,9 @@ def test_a_finger_tells_its_own_angles_and_twist_and_the_bend(wrist_case: WristC
     _, gradient, _ = whole.cost()
     own, extras = np.flatnonzero(whole.parameters.free // 4 == 2), 6 + whole.n
     moved = set(np.flatnonzero(gradient).tolist())
-    allowed = {*(6 + own).tolist(), extras + BEND, extras + BEND + 1, extras + LIGHT}
+    allowed = {*(6 + own).tolist(), extras + WRIST_ANGLES, extras + WRIST_ANGLES + 1, extras + LIGHT}
     assert moved <= (allowed | {extras + 2})
-    assert {extras + BEND, extras + BEND + 1, extras + LIGHT} <= moved
+    assert {extras + WRIST_ANGLES, extras + WRIST_ANGLES + 1, extras + LIGHT} <= moved
     assert (extras + 2 in moved) == teaches
 
 

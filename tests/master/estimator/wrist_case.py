@@ -10,7 +10,7 @@ from common.arrays import Bool, Float
 from common.hand_model import CHAINS
 from common.messages import HandPose, WristDetections
 from common.records import boxed
-from common.wrist_bend import STRAIGHT
+from common.wrist_joint import STRAIGHT
 from master.estimator.finger_surface import Surface
 from master.estimator.hand_tables import HandTables
 from master.estimator.parameters import HandParameters
@@ -66,14 +66,14 @@ class WristCase:
         assert wrist is not None
         return cls(wrist)
 
-    def looks(self, angles: Float, bend: Float = STRAIGHT, twist: Float = NO_TWIST) -> Seen:
+    def looks(self, angles: Float, wrist_angles: Float = STRAIGHT, twist: Float = NO_TWIST) -> Seen:
         """What is seen of angles (5, 4) [rad], at a bend (2,) and with hinges rolled by (5,) [rad]."""
         work, flat = Surface.empty(), np.ascontiguousarray(angles).reshape(20)
         laser, ridge, tip = (np.full((5, 2), np.nan) for _ in range(3))
         length, depth, by, stretch = np.zeros(5), np.zeros(5), np.zeros((5, 5, 7)), np.zeros(5)
         for f in range(5):
             boxes = boxed(self.tables), boxed(self.device)
-            stretch[f] = look_at(*boxes, np.asarray(bend), np.asarray(twist), flat, f, boxed(work))
+            stretch[f] = look_at(*boxes, np.asarray(wrist_angles), np.asarray(twist), flat, f, boxed(work))
             ridge[f], tip[f], depth[f], by[f] = work.seen[:2], work.seen[2:4], work.tip[2], work.J
             length[f] = cut_at(boxed(self.device), f, boxed(work))
             if length[f] > 0.0:
@@ -87,7 +87,7 @@ class WristCase:
         *,
         tips: Bool | bool = True,
         unit: float | None = None,
-        bend: Float = STRAIGHT,
+        wrist_angles: Float = STRAIGHT,
         twist: Float = NO_TWIST,
         lines: bool = False,
     ) -> WristDetections:
@@ -101,7 +101,7 @@ class WristCase:
             bend, twist: As of `looks`.
             lines: Whether lengths of the lines are reported.
         """
-        seen, optics = self.looks(angles, bend, twist), self.setup.optics
+        seen, optics = self.looks(angles, wrist_angles, twist), self.setup.optics
         laser = optics.distort(seen.laser)
         tip = np.where((np.ones(5, np.bool_) & tips)[:, None], optics.distort(seen.tip), np.nan)
         depth = np.full(5, np.nan) if unit is None else unit * seen.depth_m

@@ -220,14 +220,14 @@ def test_the_bone_of_the_hand_as_the_settings_want_it(ear: socket.socket, side: 
     _, still = sent(ear, pose, replace(FACING, hand="rest", forearm_m=0.3))
     np.testing.assert_allclose(still[f"{top}Hand"].rotation, np.eye(3), atol=1e-6)
     np.testing.assert_allclose(still[f"{top}Hand"].position_m, [0.3 * sign, 0, 0], atol=1e-6)
-    _, unknown = sent(ear, pose, replace(FACING, hand="bend"))
+    _, unknown = sent(ear, pose, replace(FACING, hand="wrist"))
     assert f"{top}Hand" not in unknown  # no device on the forearm: the avatar keeps it as it is
     assert len(unknown) == 15
-    bent = replace(pose, wrist_bend_rad=np.array([np.pi / 2, 0.0]))  # fingers to the palm's side: down
-    _, down = sent(ear, bent, replace(FACING, hand="bend"))
+    flexed = replace(pose, wrist_angles_rad=np.array([np.pi / 2, 0.0]))  # fingers to the palm's side: down
+    _, down = sent(ear, flexed, replace(FACING, hand="wrist"))
     np.testing.assert_allclose(down[f"{top}Hand"].rotation @ [sign, 0, 0], [0, -1, 0], atol=1e-6)
-    aside = replace(pose, wrist_bend_rad=np.array([0.0, np.pi / 2]))  # to the thumb of a right hand
-    _, to_side = sent(ear, aside, replace(FACING, hand="bend"))
+    aside = replace(pose, wrist_angles_rad=np.array([0.0, np.pi / 2]))  # to the thumb of a right hand
+    _, to_side = sent(ear, aside, replace(FACING, hand="wrist"))
     np.testing.assert_allclose(to_side[f"{top}Hand"].rotation @ [sign, 0, 0], [0, 0, sign], atol=1e-6)
 
 

@@ -11,7 +11,7 @@ from common.arrays import Float, Image
 from common.sim.motion import FIST, REST, HandMotion, HandState, angles_of
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene, WristTruth
-from common.wrist_bend import STRAIGHT
+from common.wrist_joint import STRAIGHT
 from slave.cameras.source import Frame
 from slave.cameras.synthetic import STROBE
 from slave.wrist.background import lit
@@ -19,11 +19,11 @@ from slave.wrist.detector import find
 from slave.wrist.fingers import separate
 from slave.wrist.laser import laser_lines
 from slave.wrist.led_depth import shrink
-from slave.wrist.palm_pose import bend_seen, find_palm_pose, prepare, rotated_view
+from slave.wrist.palm_pose import find_palm_pose, prepare, rotated_view, wrist_angles_seen
 from slave.wrist.strobe import StrobeCycle
 from tests.slave.wrist.wrist_frames import VIEW, scene
 
-BENDS = ((22.0, -8.0), (-16.0, 8.0), (0.0, 12.0), (0.0, -12.0), (12.0, 8.0), (-15.0, -8.0))
+WRIST_ANGLES = ((22.0, -8.0), (-16.0, 8.0), (0.0, 12.0), (0.0, -12.0), (12.0, 8.0), (-15.0, -8.0))
 FLEXION_DEG, DEVIATION_DEG = 8.0, 2.5  # of error; between two fingers there are about 12 degrees
 NEAR_PX = 6.0
 
@@ -33,8 +33,8 @@ class Held:
 
     period_s = 60.0
 
-    def __init__(self, motion: HandMotion, angles_rad: Float, bend_rad: Float) -> None:
-        self._state = replace(motion.at(0.0), angles_rad=angles_rad, bend_rad=bend_rad)
+    def __init__(self, motion: HandMotion, angles_rad: Float, wrist_angles_rad: Float) -> None:
+        self._state = replace(motion.at(0.0), angles_rad=angles_rad, wrist_angles_rad=wrist_angles_rad)
 
     def at(self, t_s: float) -> HandState:
         """The same at any time."""
@@ -51,20 +51,20 @@ class Seen(NamedTuple):
 
 
 @cache
-def seen(bend_deg: tuple[float, float], curled: float = 0.1, seed: int = 5) -> Seen:
+def seen(wrist_deg: tuple[float, float], curled: float = 0.1, seed: int = 5) -> Seen:
     """A hand between rest (0) and fist (1)."""
     whole = scene("standard@indoor", seed)
     rest, fist = np.array(REST, dtype=np.float64), np.array(FIST, dtype=np.float64)
     angles = angles_of(whole.model, rest + curled * (fist - rest), np.zeros((5, 4)))
-    held: WristScene = replace(whole, motion=Held(whole.motion, angles, np.radians(bend_deg)))
+    held: WristScene = replace(whole, motion=Held(whole.motion, angles, np.radians(wrist_deg)))
     renderer = WristRenderer(held, "wrist", 2)
     ambient, laser, led = (renderer.render(0.0, kind) for kind in STROBE)
     return Seen(lit(laser, ambient), lit(led, ambient), held.truth(0.0))
 
 
-@pytest.mark.parametrize("bend", BENDS)
-def test_the_bend_of_a_wrist_is_seen(bend: tuple[float, float]) -> None:
-    off = np.degrees(find_palm_pose(seen(bend).led, VIEW).bend_rad) - bend
+@pytest.mark.parametrize("wrist_angles", WRIST_ANGLES)
+def test_the_bend_of_a_wrist_is_seen(wrist_angles: tuple[float, float]) -> None:
+    off = np.degrees(find_palm_pose(seen(wrist_angles).led, VIEW).wrist_angles_rad) - wrist_angles
     assert abs(off[0]) < FLEXION_DEG
     assert abs(off[1]) < DEVIATION_DEG
 
@@ -85,13 +85,13 @@ def test_neither_the_dark_nor_noise_is_a_bent_wrist() -> None:
 
 def test_twice_the_light_is_the_same_bend() -> None:
     led = seen((12.0, 8.0)).led // 2
-    once, twice = (bend_seen(np.sqrt(shrink(image)), VIEW) for image in (led, 2 * led))
+    once, twice = (wrist_angles_seen(np.sqrt(shrink(image)), VIEW) for image in (led, 2 * led))
     assert np.degrees(np.abs(once - twice)).max() < 2.0
 
 
-@pytest.mark.parametrize("bend", BENDS)
-def test_fingers_keep_their_names(bend: tuple[float, float]) -> None:
-    one = seen(bend)
+@pytest.mark.parametrize("wrist_angles", WRIST_ANGLES)
+def test_fingers_keep_their_names(wrist_angles: tuple[float, float]) -> None:
+    one = seen(wrist_angles)
     found = laser_lines(one.laser, separate(one.led, VIEW), VIEW).uv[1:]
     known = np.isfinite(found[:, 0])
     off = np.linalg.norm(found - one.truth.laser_uv[2:6], axis=1)
@@ -118,4 +118,4 @@ def test_a_view_is_ready_for_every_bend() -> None:
     ready = prepare(VIEW)
     assert VIEW in ready
     assert rotated_view(VIEW, STRAIGHT).T_camera_palm == pytest.approx(VIEW.T_camera_palm)
-    assert all(find_palm_pose(seen(bend).led, VIEW).view in ready for bend in BENDS)
+    assert all(find_palm_pose(seen(wrist_angles).led, VIEW).view in ready for wrist_angles in WRIST_ANGLES)

@@ -7,14 +7,14 @@ import pytest
 
 from common.arrays import Float
 from common.geometry import quaternion_to_matrix, rotation_vector_to_matrix
-from common.wrist_bend import forearm_palm
+from common.wrist_joint import forearm_palm
 from master.calibrate.mounting.hands import Hands
 from master.calibrate.mounting.lines_of_sight import LinesOfSight
 from master.calibrate.mounting.mounting import _cycles
 from master.calibrate.mounting.problem import Problem
 from master.calibrate.mounting.tracks import HandTrack, ImuTrack
 from master.calibrate.mounting.unknown import UNKNOWN, Unknown, believed
-from master.calibrate.mounting.wrists import bends, bends_by_rotation
+from master.calibrate.mounting.wrists import bends_by_rotation, wrist_rotation_angles
 from master.wrist_setup import WristSetup
 from tests.master.calibrate.mounting.moved import CAMERA_LATE_NS, IMU_LATE_NS, ZERO_NS, moved
 
@@ -35,7 +35,7 @@ def problem() -> tuple[Problem, Unknown, Hands]:
     track = ImuTrack(seen.samples, zero_ns)
     middle = seen.samples[len(seen.samples) // 2]
     then = seen.both.scene.truth(1e-9 * (middle.t_ns + IMU_LATE_NS - ZERO_NS))
-    forearm = then.T_rig_palm[:3, :3] @ forearm_palm(then.bend_rad).T
+    forearm = then.T_rig_palm[:3, :3] @ forearm_palm(then.wrist_angles_rad).T
     first = Unknown(
         setup.T_camera_palm[:3, :3] @ R,
         setup.T_camera_palm[:3, 3] + 1e-3,
@@ -93,7 +93,10 @@ def test_a_turn_about_the_axes_of_the_forearm_bends_the_wrist() -> None:
     bent, little = rotation_vector_to_matrix(np.array([[0.3, 0.0, 0.0], [0.0, 0.0, 0.0]])), 1e-4
     by = bends_by_rotation(bent)
     for k in range(3):
-        there, back = (bends(rotation_vector_to_matrix(way * little * EYE[k]) @ bent) for way in (1.0, -1.0))
+        there, back = (
+            wrist_rotation_angles(rotation_vector_to_matrix(way * little * EYE[k]) @ bent)
+            for way in (1.0, -1.0)
+        )
         np.testing.assert_allclose(by[..., k], (there - back) / (2.0 * little), atol=1e-4)
     np.testing.assert_allclose(
         np.abs(np.linalg.det(by[1])), 1.0, atol=1e-4

@@ -42,7 +42,7 @@ def test_a_parabola_is_followed_exactly_and_not_over_a_gap() -> None:
     markers = track().markers(np.array([0.2521, 0.55]))
     np.testing.assert_allclose(markers.points_m[0, 0], [0.2 * 0.2521, 0.1 * 0.2521**2, 0.5], atol=1e-12)
     np.testing.assert_allclose(markers.speed_m_s[0, 0], [0.2, 0.2 * 0.2521, 0.0], atol=1e-9)
-    np.testing.assert_allclose(markers.bent_m_s2[0, 0], [0.0, 0.2, 0.0], atol=1e-7)
+    np.testing.assert_allclose(markers.acceleration_m_s2[0, 0], [0.0, 0.2, 0.0], atol=1e-7)
     assert markers.seen.tolist() == [[True], [False]]
 
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.geometry import axis_rotation, matrix_of
-from common.wrist_bend import STRAIGHT, bend_of, bend_quaternion, forearm_palm
+from common.wrist_joint import STRAIGHT, forearm_palm, wrist_angles_of, wrist_quaternion
 
 ANGLE = st.floats(-1.4, 1.4)
 
@@ -21,8 +21,8 @@ def test_flexion_brings_the_fingers_towards_the_palm_of_the_hand_and_deviation_t
 def test_the_bend_of_a_rotation_is_the_one_that_made_it(flexion: float, deviation: float) -> None:
     R = forearm_palm(np.array([flexion, deviation]))
     np.testing.assert_allclose(R, axis_rotation(1, deviation) @ axis_rotation(0, flexion), atol=1e-15)
-    np.testing.assert_allclose(matrix_of(bend_quaternion(flexion, deviation)), R, atol=1e-14)
-    np.testing.assert_allclose(bend_of(R), [flexion, deviation], atol=1e-12)
+    np.testing.assert_allclose(matrix_of(wrist_quaternion(flexion, deviation)), R, atol=1e-14)
+    np.testing.assert_allclose(wrist_angles_of(R), [flexion, deviation], atol=1e-12)
 
 
 def test_many_bends_at_once_are_those_one_by_one() -> None:

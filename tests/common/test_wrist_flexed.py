@@ -22,7 +22,7 @@ from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from common.sim.wrist.surface import HandSurface
 from common.sim.wrist.things import bodies_of
-from common.wrist_bend import STRAIGHT, forearm_palm
+from common.wrist_joint import STRAIGHT, forearm_palm
 
 CALIB = Path(__file__).resolve().parents[2] / "calib_json"
 CAMERAS = {"wrist": load(CALIB / "cameras/wrist.json", CameraCalibration)}
@@ -31,7 +31,7 @@ HAND = load(CALIB / "hands/default-right.json", HandProfile)
 DESK = load(CALIB / "rigs/desk.json", RigCalibration)
 DESK_CAMERAS = {name: load(CALIB / f"cameras/{name}.json", CameraCalibration) for name in DESK.cameras}
 SCENE = WristScene.by_name("poses@dark", RIG, CAMERAS, HAND, 5)
-BEND = np.radians([-18.0, 7.0])
+WRIST_ANGLES = np.radians([-18.0, 7.0])
 LASER, LED = Illumination.LASER, Illumination.LED
 ACROSS = rigid(axis_rotation(1, np.pi / 2), np.array([0.0, -0.033, 0.075]))  # a grip of the palm
 COARSE = 4
@@ -42,44 +42,46 @@ class Doing:
     """A motion with a bent wrist, and a cylinder that goes with the palm."""
 
     motion: HandMotion
-    bend_rad: Float = field(default_factory=lambda: STRAIGHT)
+    wrist_angles_rad: Float = field(default_factory=lambda: STRAIGHT)
     T_palm_thing: Float | None = None
     period_s: float = 60.0
 
     def at(self, t_s: float) -> HandState:
         state = self.motion.at(t_s)
         if self.T_palm_thing is None:
-            return replace(state, bend_rad=self.bend_rad)
+            return replace(state, wrist_angles_rad=self.wrist_angles_rad)
         held = Cylinder(state.T_rig_palm @ self.T_palm_thing, 0.025, 0.14, held=True)
-        return replace(state, bend_rad=self.bend_rad, things=(held,))
+        return replace(state, wrist_angles_rad=self.wrist_angles_rad, things=(held,))
 
 
-def doing(bend_rad: Float = STRAIGHT, thing: Float | None = None) -> WristScene:
-    return replace(SCENE, motion=Doing(SCENE.motion, bend_rad, thing))
+def doing(wrist_angles_rad: Float = STRAIGHT, thing: Float | None = None) -> WristScene:
+    return replace(SCENE, motion=Doing(SCENE.motion, wrist_angles_rad, thing))
 
 
 @pytest.mark.parametrize("t_s", [4.0, 19.0])
 def test_a_flexed_wrist_is_seen_as_a_device_that_is_mounted_so(t_s: float) -> None:
-    T = SCENE.T_camera_palm @ rigid(forearm_palm(BEND), np.zeros(3))
+    T = SCENE.T_camera_palm @ rigid(forearm_palm(WRIST_ANGLES), np.zeros(3))
     device = replace(SCENE, rig=msgspec.structs.replace(RIG, T_camera_palm=tuple(map(tuple, T.tolist()))))
-    bent, same = doing(BEND), device.truth(t_s)
-    truth = bent.truth(t_s)
-    np.testing.assert_array_equal(truth.bend_rad, BEND)
+    flexed, same = doing(WRIST_ANGLES), device.truth(t_s)
+    truth = flexed.truth(t_s)
+    np.testing.assert_array_equal(truth.wrist_angles_rad, WRIST_ANGLES)
     np.testing.assert_allclose(truth.joints.position_m, same.joints.position_m, atol=1e-12)
     np.testing.assert_allclose(truth.laser_uv, same.laser_uv, atol=1e-6)
     np.testing.assert_allclose(truth.laser_len_vis, same.laser_len_vis, atol=1e-9)
     np.testing.assert_array_equal(truth.tip_visible, same.tip_visible)
     assert np.nanmax(np.abs(truth.laser_uv - SCENE.truth(t_s).laser_uv)) > 20.0  # or nothing was bent
     for lit in (LASER, LED):
-        one, other = (WristRenderer(s, "wrist", COARSE).render(t_s, lit).astype(int) for s in (bent, device))
+        one, other = (
+            WristRenderer(s, "wrist", COARSE).render(t_s, lit).astype(int) for s in (flexed, device)
+        )
         assert (np.abs(one - other) > 2).mean() < 1e-3  # rounding decides which texel an edge has
 
 
 def test_the_forearm_stays_before_its_camera_when_the_wrist_bends() -> None:
-    bent, straight = doing(BEND).bodies_at(4.0), SCENE.bodies_at(4.0)
+    flexed, straight = doing(WRIST_ANGLES).bodies_at(4.0), SCENE.bodies_at(4.0)
     forearm = SCENE.capsules.forearm
-    np.testing.assert_allclose(bent.start_m[forearm], straight.start_m[forearm], atol=1e-12)
-    moved = np.linalg.norm(bent.stop_m - straight.stop_m, axis=1)
+    np.testing.assert_allclose(flexed.start_m[forearm], straight.start_m[forearm], atol=1e-12)
+    moved = np.linalg.norm(flexed.stop_m - straight.stop_m, axis=1)
     assert np.delete(moved, forearm).min() > 0.001
 
 
@@ -87,7 +89,7 @@ def test_a_palm_that_never_bends_is_prepared_once_and_one_that_hardly_bends_look
     surface = HandSurface(SCENE, COARSE)
     assert surface.palm(SCENE.bodies_at(7.0), np.zeros(2)) is surface.straight
     hardly = doing(np.array([1e-9, 0.0]))
-    assert surface.palm(hardly.bodies_at(7.0), hardly.motion.at(7.0).bend_rad) is not surface.straight
+    assert surface.palm(hardly.bodies_at(7.0), hardly.motion.at(7.0).wrist_angles_rad) is not surface.straight
     one, other = (WristRenderer(s, "wrist", COARSE).render(7.0, LED).astype(int) for s in (SCENE, hardly))
     assert (one != other).mean() < 1e-3
 
@@ -95,7 +97,7 @@ def test_a_palm_that_never_bends_is_prepared_once_and_one_that_hardly_bends_look
 def test_a_palm_bent_out_of_the_picture_leaves_it_empty() -> None:
     away = doing(np.array([-1.6, 0.0]))
     assert not len(
-        HandSurface(away, COARSE).palm(away.bodies_at(7.0), away.motion.at(7.0).bend_rad).seen.pixel
+        HandSurface(away, COARSE).palm(away.bodies_at(7.0), away.motion.at(7.0).wrist_angles_rad).seen.pixel
     )
     assert WristRenderer(away, "wrist", COARSE).render(7.0, LED).max() < 12
     assert np.isnan(away.truth(7.0).laser_uv).all()
@@ -177,7 +179,7 @@ def test_an_imu_next_to_the_camera_feels_the_forearm_and_not_the_palm() -> None:
         period_s: float = 60.0
 
         def at(self, t_s: float) -> HandState:
-            return replace(SCENE.motion.at(0.0), bend_rad=np.array([0.5 * (t_s - 1.0), 0.0]))
+            return replace(SCENE.motion.at(0.0), wrist_angles_rad=np.array([0.5 * (t_s - 1.0), 0.0]))
 
     imu = RIG.imu
     assert imu is not None
@@ -199,9 +201,9 @@ def test_what_marker_rigs_see_at_the_same_time_is_found_by_name(name: str) -> No
     for t_s in (0.9, 5.3):
         ours, theirs = shown.motion.at(t_s), seen.motion.at(t_s)
         np.testing.assert_array_equal(ours.angles_rad, theirs.angles_rad)
-        np.testing.assert_array_equal(ours.bend_rad, theirs.bend_rad)
+        np.testing.assert_array_equal(ours.wrist_angles_rad, theirs.wrist_angles_rad)
         assert len(ours.things) == len(theirs.things) == int(name == "grasp")
-    assert np.degrees(np.abs([shown.truth(t).bend_rad for t in (0.9, 2.1, 5.3)])).max() > 1.0
+    assert np.degrees(np.abs([shown.truth(t).wrist_angles_rad for t in (0.9, 2.1, 5.3)])).max() > 1.0
 
 
 def test_a_closed_hand_keeps_lines_and_tips_in_sight_beyond_the_bar_it_holds() -> None:

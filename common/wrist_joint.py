@@ -1,6 +1,6 @@
 """The wrist joint between forearm and palm: what stands between a device on the forearm and the hand.
 
-`bend_rad` (..., 2) is flexion and deviation, zero where forearm and palm frame coincide. A flexion is a rotation about
+`wrist_angles_rad` (..., 2) is flexion and deviation, 0 where forearm and palm frame agree. A flexion is a rotation about
 the palm's x, positive where the fingers go to the side of the palm of the hand, a deviation one about its y, positive
 towards the thumb of a right hand:
 
@@ -21,18 +21,18 @@ STRAIGHT = np.zeros(2)
 STRAIGHT.flags.writeable = False
 
 
-def forearm_palm(bend_rad: Float) -> Float:
+def forearm_palm(wrist_angles_rad: Float) -> Float:
     """Rotations (..., 3, 3), palm axes -> forearm axes, of bends (..., 2) [rad]."""
-    flexion, deviation = bend_rad[..., 0], bend_rad[..., 1]
+    flexion, deviation = wrist_angles_rad[..., 0], wrist_angles_rad[..., 1]
     c, s, cd, sd = np.cos(flexion), np.sin(flexion), np.cos(deviation), np.sin(deviation)
-    R = np.zeros((*bend_rad.shape[:-1], 3, 3))
+    R = np.zeros((*wrist_angles_rad.shape[:-1], 3, 3))
     R[..., 0, 0], R[..., 0, 1], R[..., 0, 2] = cd, sd * s, sd * c
     R[..., 1, 1], R[..., 1, 2] = c, -s
     R[..., 2, 0], R[..., 2, 1], R[..., 2, 2] = -sd, cd * s, cd * c
     return R
 
 
-def bend_quaternion(flexion_rad: float, deviation_rad: float) -> Wxyz:
+def wrist_quaternion(flexion_rad: float, deviation_rad: float) -> Wxyz:
     """The quaternion of `forearm_palm` of one bend."""
     c, s, cd, sd = (
         cos(0.5 * flexion_rad),
@@ -43,7 +43,7 @@ def bend_quaternion(flexion_rad: float, deviation_rad: float) -> Wxyz:
     return cd * c, cd * s, sd * c, -sd * s
 
 
-def bend_of(R_forearm_palm: Float) -> Float:
+def wrist_angles_of(R_forearm_palm: Float) -> Float:
     """Bends (..., 2) [rad] whose rotation comes near to a rotation (..., 3, 3): of one about x and y it is exact."""
     deviation = np.arctan2(-R_forearm_palm[..., 2, 0], R_forearm_palm[..., 0, 0])
     flexion = np.arctan2(-R_forearm_palm[..., 1, 2], R_forearm_palm[..., 1, 1])
