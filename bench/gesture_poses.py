@@ -97,7 +97,7 @@ def wrist_device(numbers: Sequence[int] | range) -> Told:
             seed=_SEED,
             blocks=1,
             conditions=(("calibrated", "detected"),),
-            level=None,
+            solver_mode=None,
             step=2,
             guided=96,
             out=Path(folder),

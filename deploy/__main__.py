@@ -62,7 +62,7 @@ def _replay(options: argparse.Namespace) -> int:
         options.out,
         options.calibration,
         options.hand,
-        level=options.level,
+        solver_mode=options.solver_mode,
         solver=options.solver,
         only=options.only,
         cameras=options.camera,

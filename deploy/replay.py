@@ -29,7 +29,7 @@ class ReplaySettings:
         out: Folder for detections, poses and summary.
         calibration: calib_json tree for marker colours and hands, or None.
         hand: Hand profile, or None for the rig's.
-        level: What the fingers before a wrist device are solved from: fk, ik, auto; None: as its rig says.
+        solver_mode: What the fingers before a wrist device are solved from: fk, ik, auto; None: as its rig says.
         solver: Whose hand a rig of markers publishes: estimator, fabrik; None: as it says.
         cameras, rig, times: Of videos: NAME=PATH each, the rig's name, the table of times.
         only: "markers" or "wrist": the rigs of that kind alone; None: all.
@@ -39,7 +39,7 @@ class ReplaySettings:
     out: Path
     calibration: Path | None
     hand: Path | None
-    level: str | None = None
+    solver_mode: str | None = None
     solver: str | None = None
     only: str | None = None
     cameras: Sequence[str] = ()
@@ -55,8 +55,8 @@ def run_replay(settings: ReplaySettings, say: Callable[[str], None]) -> dict[str
     """
     folder = _recording_of(settings, say)
     rigs = _rigs(folder, settings.only)
-    if settings.level is not None and all(rig.kind != "wrist" for rig in rigs):
-        raise ReplayError(f"--level: {folder} is of no wrist device, which alone has levels")
+    if settings.solver_mode is not None and all(rig.kind != "wrist" for rig in rigs):
+        raise ReplayError(f"--solver-mode: {folder} is of no wrist device, which alone has levels")
     if settings.solver is not None and all(rig.kind != "markers" for rig in rigs):
         raise ReplayError(f"--solver: {folder} is of no rig of markers, which alone has solvers")
     if settings.hand is not None and not settings.hand.is_file():  # said now, not after all the detection
@@ -76,7 +76,7 @@ def run_replay(settings: ReplaySettings, say: Callable[[str], None]) -> dict[str
         _step("slave", "detect", recording, "--camera", camera, *calibration, *needs, *target)
     say("solving ...")
     which = [] if settings.only is None else ["--only", settings.only]
-    which += [] if settings.level is None else ["--level", settings.level]
+    which += [] if settings.solver_mode is None else ["--solver-mode", settings.solver_mode]
     which += [] if settings.solver is None else ["--solver", settings.solver]
     results = ["--detections", str(out), "--out", str(out)]
     _step("master", "solve", recording, *calibration, *hand, *which, *results)

@@ -51,7 +51,7 @@ def rigs_to_solve(
     manifest: Manifest,
     names: Sequence[str],
     only: Literal["markers", "wrist"] | None = None,
-    level: Literal["fk", "ik", "auto"] | None = None,
+    solver_mode: Literal["fk", "ik", "auto"] | None = None,
     solver: Literal["estimator", "fabrik"] | None = None,
 ) -> list[RigCalibration]:
     """The rigs of a recording that are solved, those of markers first.
@@ -60,7 +60,7 @@ def rigs_to_solve(
         manifest: Of the recording.
         names: Rigs that are wanted; none: all.
         only: Of one kind alone.
-        level: Of the wrist rigs in place of their own.
+        solver_mode: Of the wrist rigs in place of their own.
         solver: Of the marker rigs in place of their own.
 
     Raises:
@@ -80,11 +80,15 @@ def rigs_to_solve(
                 f"--solver: rig {rigs[0].name!r} is of a wrist device; a rig of markers has solvers"
             )
         rigs = [msgspec.structs.replace(rig, solver=solver) if rig.kind == "markers" else rig for rig in rigs]
-    if level is None:
+    if solver_mode is None:
         return rigs
     if all(rig.kind != "wrist" for rig in rigs):
-        raise CalibrationError(f"--level: rig {rigs[0].name!r} is of markers; a wrist device has levels")
-    return [msgspec.structs.replace(rig, level=level) if rig.kind == "wrist" else rig for rig in rigs]
+        raise CalibrationError(
+            f"--solver-mode: rig {rigs[0].name!r} is of markers; a wrist device has levels"
+        )
+    return [
+        msgspec.structs.replace(rig, solver_mode=solver_mode) if rig.kind == "wrist" else rig for rig in rigs
+    ]
 
 
 def solve_hands(

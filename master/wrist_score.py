@@ -13,7 +13,7 @@ from common.arrays import Bool, Float, Int
 from common.errors import RecordingError
 from common.frame_recording import FrameRecording, Illumination
 from common.hand_model import FINGER_JOINTS, FINGERS
-from common.messages import FINGER_COUNT, Level, WristDetections
+from common.messages import FINGER_COUNT, SolverMode, WristDetections
 from common.recorded_files import TRUTH, has_truth, read_truth
 from master.outputs.poses import Poses
 from master.score import put
@@ -218,7 +218,7 @@ def _score_both(poses: Poses, row: Int, truth: WristTruth) -> dict[str, float]:
     """What became of the fingers whose laser line and tip are both in sight; `row` (N,) of the poses."""
     both = clear_line(truth) & truth.tip_visible
     error = np.abs(np.degrees(at_rows(poses.angles_rad[:, :, 2], row) - truth.pip_rad))
-    by_ik = at_rows((poses.level == Level.IK).astype(np.float64), row) == 1.0
+    by_ik = at_rows((poses.solver_mode == SolverMode.IK).astype(np.float64), row) == 1.0
     out: dict[str, float] = {}
     for f, name in enumerate(FINGERS):
         out[f"both_{name}"] = float(both[:, f].sum())

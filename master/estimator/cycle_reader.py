@@ -28,7 +28,7 @@ class CycleReader:
 
     def read(self, message: WristDetections, t_ns: int) -> tuple[WristRows, Float]:
         """The rows of a triple for an epoch, and its laser points (5, 3) [m], camera frame; NaN: not seen."""
-        setup, level = self._setup, self._setup.level
+        setup, solver_mode = self._setup, self._setup.solver_mode
         uv = np.concatenate([message.laser_uv, message.tip_uv])
         self._reject("outside", uv[:5], message.laser_sigma_px)
         self._reject("tip_outside", uv[5:], message.tip_sigma_px)
@@ -41,9 +41,9 @@ class CycleReader:
                 self._counts[f"no_plane.{FINGERS[f]}"] += 1
         points_m = xy1[:5] * away[:, None]
         laser, tip = xy1[:5, :2].copy(), xy1[5:, :2].copy()
-        if level == "fk":
+        if solver_mode == "fk":
             tip[:] = nan
-        elif level == "ik":
+        elif solver_mode == "ik":
             alone = ~(np.isfinite(laser[:, 0]) & np.isfinite(tip[:, 0]))
             laser[alone], tip[alone] = nan, nan
         law = _NO_LAW if self._cubic is None else np.where(np.isnan(tip[:, 0]), self._cubic(points_m), nan)

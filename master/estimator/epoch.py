@@ -119,7 +119,7 @@ class Fitted:
             a finger the sum of `ON_MARKERS`, `BY_MARKERS` where its own is placed, and `ON_OTHERS` by its level; for
             the palm one of the former and which markers are seen.
         anew: The hand of a moment ago was wrong: nothing of it is in this one.
-        level: (5,) `Level` codes of what a wrist device tells the fingers from, now.
+        solver_mode: (5,) `SolverMode` codes of what a wrist device tells the fingers from, now.
         ambiguous: (5,) whether another pose of the finger explains that as well.
         rotation_rejected: Whether the palm by markers contradicts the measured orientation, which was left out.
         refused, off: (5,) fingertips and laser points that no pose explains.
@@ -131,7 +131,7 @@ class Fitted:
     source: Code
     sources: Int
     reinitialised: bool = False
-    level: Code = field(default_factory=lambda: np.zeros(5, np.uint8))
+    solver_mode: Code = field(default_factory=lambda: np.zeros(5, np.uint8))
     ambiguous: Bool = field(default_factory=lambda: np.zeros(5, np.bool_))
     rotation_rejected: bool = False
     refused: Bool = field(default_factory=lambda: np.zeros(5, np.bool_))

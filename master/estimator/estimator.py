@@ -15,7 +15,7 @@ from master.estimator.parameters import HandParameters
 from master.estimator.reinitialise import NONE, HabitTables, Reinitialiser
 from master.estimator.settings import DEFAULT, Settings
 from master.estimator.update import Estimate
-from master.estimator.wrist_device import HEADING, LIGHT, WRIST_ANGLES
+from master.estimator.wrist_device import HEADING, LED_SCALE, WRIST_ANGLES
 from master.estimator.wrist_model import WristModel
 
 _SOMEWHERE_M = 0.1  # about each axis: a hand that is known no better than this is lost
@@ -92,10 +92,10 @@ class Estimator:
 
     def forget_heading(self) -> None:
         """Let the heading of an IMU be any, and what was learnt with it."""
-        self._now.z_cov[WRIST_ANGLES:LIGHT] = self._now.z_cov[:, WRIST_ANGLES:LIGHT] = 0.0
-        self._now.z_cov[range(WRIST_ANGLES, LIGHT), range(WRIST_ANGLES, LIGHT)] = self._now.stationary[
-            WRIST_ANGLES:LIGHT
-        ]
+        self._now.z_cov[WRIST_ANGLES:LED_SCALE] = self._now.z_cov[:, WRIST_ANGLES:LED_SCALE] = 0.0
+        self._now.z_cov[range(WRIST_ANGLES, LED_SCALE), range(WRIST_ANGLES, LED_SCALE)] = (
+            self._now.stationary[WRIST_ANGLES:LED_SCALE]
+        )
 
     def begin_heading(self, heading_rad: float, variance_rad2: float) -> None:
         """Take the heading of an IMU from a palm that was solved without it."""
@@ -134,7 +134,7 @@ class Estimator:
                 rejected = orientation is None
                 if rejected and np.trace(self._at.found.cov[:3, :3]) < _SURE_RAD2:
                     break
-        told = self.wrist and bool(task.level.any())
+        told = self.wrist and bool(task.solver_mode.any())
         if ground.seen[0] > 0 or (told and (at.place is not None or self._knows_place())):
             self._now.seen_ns[0] = at.t_ns
         sources = self._sources(at, palm_shown=palm_shown)
@@ -196,10 +196,12 @@ class Estimator:
         ground = self._at.ground
         sources: list[int] = ground.sources.tolist()
         if self.wrist:
-            told = zip(self._now.level.tolist(), self._now.told_ns.tolist(), strict=False)  # of fingers alone
-            for f, (level, told_ns) in enumerate(told):
+            told = zip(
+                self._now.solver_mode.tolist(), self._now.told_ns.tolist(), strict=False
+            )  # of fingers alone
+            for f, (solver_mode, told_ns) in enumerate(told):
                 if (at.t_ns - told_ns) * 1e-9 <= self.settings.tracked_cycle_s:
-                    sources[f] += ON_OTHERS * level
+                    sources[f] += ON_OTHERS * solver_mode
         if not palm_shown:
             sources[5] = 0
         elif not ground.by_markers[0]:
@@ -234,7 +236,7 @@ class Estimator:
             out.source,
             sources,
             reinitialised,
-            level=task.level.copy(),
+            solver_mode=task.solver_mode.copy(),
             ambiguous=task.ambiguous.astype(np.bool_),
             rotation_rejected=rejected,
             refused=task.refused.astype(np.bool_),

@@ -27,7 +27,7 @@ from master.estimator.matrices import cholesky, inverse
 from master.estimator.problem import Belief
 from master.estimator.settings import Settings
 from master.estimator.state import HandState
-from master.estimator.wrist_device import EXTRAS, HEADING, LIGHT, RATE, TILT, WRIST_ANGLES
+from master.estimator.wrist_device import EXTRAS, HEADING, LED_SCALE, RATE, TILT, WRIST_ANGLES
 
 _CONSTANT_S = 1e4
 
@@ -65,7 +65,7 @@ def stationary_of(settings: Settings, *, loose: bool, tilt_rad: float) -> Float:
     stationary[RATE : RATE + 2] = (settings.pace_1_s * wrist_angles) ** 2
     stationary[TILT : TILT + 2] = max(tilt_rad, 1e-3) ** 2
     stationary[HEADING] = np.pi**2 / 3.0
-    stationary[LIGHT] = settings.light_unit**2
+    stationary[LED_SCALE] = settings.led_scale**2
     return stationary
 
 
@@ -175,7 +175,7 @@ def keep_extras(
     first = cov.shape[0] - K
     for i in range(K):
         # What the palm tells and what fingers tell are two blocks: within one, as much is new of everything.
-        errs_s = settings.wrist_errs_s if WRIST_ANGLES <= i < LIGHT else settings.errs_s
+        errs_s = settings.wrist_errs_s if WRIST_ANGLES <= i < LED_SCALE else settings.errs_s
         new[i] = 1.0 - exp(-min(dt_s, 10.0) / errs_s)
         for j in range(K):
             A[i, j] = cov[first + i, first + j] / scale

@@ -1,6 +1,6 @@
 """Kernels of how the MCP of a hand goes with its PIP, learnt from the fingers whose tips are seen.
 
-A natural MCP is a share of the PIP (`master.estimator.natural_curve`). But each hand has a share of its own, and keeps
+A natural MCP is a share of the PIP (`master.estimator.flexion_synergy`). But each hand has its own share, and keeps
 to it more closely or less. Both are those of a regression through the origin,
 
     e = MCP - natural MCP,   share = sum(PIP e) / sum(PIP^2),   spread^2 = sum(e^2) / sum(PIP^2) - share^2,

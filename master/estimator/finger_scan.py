@@ -20,7 +20,7 @@ from typing import Any
 from common.arrays import Float, Int
 from common.kernels import inlined, inner
 from common.records import record
-from master.estimator.finger_surface import NO_MOVES, OWN_MOVES, Surface, cut, first_hit, look
+from master.estimator.finger_surface import NO_MOVES, OWN_MOVES, Surface, first_hit, laser_centroid, look
 from master.estimator.hand_tables import HandTables
 from master.estimator.kinematics import twist_hand
 from master.estimator.matrices import cholesky, substitute
@@ -336,10 +336,14 @@ def scan_finger(
         for k in range(steps + 1):
             look(hand, device, prior.palm, prior.wrist_axes, a, f, OWN_MOVES, surface)
             if k == steps - 1:
-                length = cut(device, f, surface)
+                length = laser_centroid(device, f, surface)
                 if length > 0.0:
-                    lines_of_sight.lack[f, 0] = surface.cut[0] / surface.cut[2] - surface.seen[0]
-                    lines_of_sight.lack[f, 1] = surface.cut[1] / surface.cut[2] - surface.seen[1]
+                    lines_of_sight.lack[f, 0] = (
+                        surface.laser_centroid[0] / surface.laser_centroid[2] - surface.seen[0]
+                    )
+                    lines_of_sight.lack[f, 1] = (
+                        surface.laser_centroid[1] / surface.laser_centroid[2] - surface.seen[1]
+                    )
             cost = _rows(settings, lines_of_sight, prior, f, tip, scan)
             if not _normal(scan) or k == steps:
                 break

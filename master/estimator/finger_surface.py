@@ -5,7 +5,7 @@ makes of the cut is the centroid of the part that is lit and seen. It lies near 
 that face the laser, pulled in to 0.77 of the radius, for the mean of a cosine over the half circle that faces the light
 lies there (pi / 4, less what is seen at a slant). Where the chain of ridge points crosses the plane nearest to the
 laser is the laser point: within 0.2 mm (median) from a PIP of 45 degrees on, 0.4 mm over all, at most about 1 mm. The
-ridge has derivatives in closed form; the exact cut (`cut`) tells what it lacks.
+ridge has derivatives in closed form; the exact cut (`laser_centroid`) tells what it lacks.
 
 A body that turns about an axis moves its point q on the plane by v, and the plane then meets the chain, of direction s,
 at q + v - s (n . v) / (n . s), with n the normal of the plane.
@@ -51,7 +51,7 @@ class Surface:
     lit: Float  # (RAYS, 5) x, y, z, clearness, body
     reached: Float  # (7,) whether the plane comes near a cone
     begins: Float  # (7,) no part of a cone is nearer to the camera [m]
-    cut: Float  # (3,) point of the exact cut
+    laser_centroid: Float  # (3,) point of the exact cut
     R: Float  # (4, 3, 3) joints, camera frame
     P: Float  # (4, 3)
     axis: Float  # (7, 3) about which each of `MOVES` turns what is beyond
@@ -76,7 +76,7 @@ class Surface:
             lit=(RAYS, 5),
             reached=7,
             begins=7,
-            cut=3,
+            laser_centroid=3,
             R=(4, 3, 3),
             P=(4, 3),
             axis=(7, 3),
@@ -133,8 +133,8 @@ def crossing(device: Any, f: int, work: Surface) -> int:
         dot = x * along[k, 0] + y * along[k, 1] + z * along[k, 2]
         x, y, z = x - dot * along[k, 0], y - dot * along[k, 1], z - dot * along[k, 2]
         scale = device.radius[f, k] / sqrt(x * x + y * y + z * z)
-        for_ridge = _PULLED_IN * scale
-        Q[k, 0], Q[k, 1], Q[k, 2] = S[k, 0] + for_ridge * x, S[k, 1] + for_ridge * y, S[k, 2] + for_ridge * z
+        pulled_in = _PULLED_IN * scale
+        Q[k, 0], Q[k, 1], Q[k, 2] = S[k, 0] + pulled_in * x, S[k, 1] + pulled_in * y, S[k, 2] + pulled_in * z
         if k == 7:
             out, ahead = _CAP_OUT * scale, _CAP_ALONG * device.radius[f, k]
             Q[8, 0] = S[7, 0] + out * x + ahead * along[7, 0]
@@ -225,8 +225,8 @@ def first_hit(t: Float, dx: float, dy: float, dz: float) -> float:
 
 
 @inner
-def cut(device: Any, f: int, work: Surface) -> float:
-    """Write the centroid of the line that is lit and seen on finger f, of `work.S`, to `work.cut` (3,) [m].
+def laser_centroid(device: Any, f: int, work: Surface) -> float:
+    """Write the centroid of the line that is lit and seen on finger f, of `work.S`, to `work.laser_centroid` (3,) [m].
 
     Returns:
         Length of that line in the undistorted image [px]; 0: the laser misses the finger, or it is not seen.
@@ -326,7 +326,7 @@ def cut(device: Any, f: int, work: Surface) -> float:
         return 0.0
     u, v = u / total, v / total
     far = offset / (n[0] * u + n[1] * v + n[2])
-    work.cut[0], work.cut[1], work.cut[2] = far * u, far * v, far
+    work.laser_centroid[0], work.laser_centroid[1], work.laser_centroid[2] = far * u, far * v, far
     return total * device.focal[0]
 
 

@@ -55,7 +55,7 @@ class WristSide:
         self._waiting: deque[WristDetections] = deque(maxlen=_KEPT)
         self._last_ns = -(2**62)
         self.laser_m, self.laser_ns = np.full((5, 3), nan), -(2**62)
-        self.level, self.ambiguous = np.zeros(5, np.uint8), np.zeros(5, np.bool_)
+        self.solver_mode, self.ambiguous = np.zeros(5, np.uint8), np.zeros(5, np.bool_)
 
     def push(self, message: WristDetections) -> int | None:
         """Take a triple; return its time, or None: it is not later than the last."""
@@ -104,8 +104,8 @@ class WristSide:
             estimator: What solved it.
             turned: Whether it had a TURN row to begin with.
         """
-        if hand.level.any():
-            self.level, self.ambiguous = hand.level, hand.ambiguous
+        if hand.solver_mode.any():
+            self.solver_mode, self.ambiguous = hand.solver_mode, hand.ambiguous
         self._count("tip_refused", hand.refused)
         self._count("off", hand.off)
         self._count("ambiguous", hand.ambiguous)
@@ -141,9 +141,9 @@ class WristSide:
             world = self.forearm.world_at(pose.t_ns, wrist_angles, cov)
             changes["palm_world_wxyz"], changes["palm_world_sigma_rad"] = world
         if abs(pose.t_ns - self.laser_ns) <= _MAX_AGE_NS:
-            changes["laser_m"], changes["level"], changes["ambiguous"] = (
+            changes["laser_m"], changes["solver_mode"], changes["ambiguous"] = (
                 self.laser_m,
-                self.level,
+                self.solver_mode,
                 self.ambiguous,
             )
         return msgspec.structs.replace(pose, **changes)

@@ -228,7 +228,7 @@ class Settings(NamedTuple):
         float,
         Range("chi square", 1.0, 100.0, "of laser point and fingertip of a finger that teaches nothing"),
     ] = 5.0
-    light_unit: Annotated[float, Range("1", 0.1, 10.0, "of the unit's logarithm, which may be any")] = 3.0
+    led_scale: Annotated[float, Range("1", 0.1, 10.0, "of the unit's logarithm, which may be any")] = 3.0
     flexion_rad: Annotated[float, Range("rad", 0.01, 1.5, "of wrists; Palmer et al. 1985")] = radians(14.0)
     deviation_rad: Annotated[float, Range("rad", 0.01, 1.5, "of wrists; Palmer et al. 1985")] = radians(11.0)
     calibrated_palm_rad: Annotated[

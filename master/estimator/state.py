@@ -47,7 +47,7 @@ class HandState:
         z, z_cov: (K,), (K, K) mean and covariance of the extras, which are filtered (`master.estimator.extras`).
         z_ns: (1,) when they were stepped last, `stationary` (K,) variances that their doubt grows to, and `habit` (2,) [rad]
             the bend of the wrist that is kept.
-        level: (5,) `Level` codes of what a wrist device told each finger from last; 0: markers told it since.
+        solver_mode: (5,) `SolverMode` codes of what a wrist device told each finger from last; 0: markers since.
         searched: (5,) triples since the whole valley of a finger was searched.
         vague: (5,) whether that was not well enough to be tracked.
         coupling: (3,) sums of what was learnt of MCP and PIP (`master.estimator.finger_coupling`).
@@ -74,7 +74,7 @@ class HandState:
     z_ns: Int
     stationary: Float
     habit: Float
-    level: Code
+    solver_mode: Code
     searched: Int
     vague: Bool
     coupling: Float
@@ -109,7 +109,7 @@ class HandState:
             z_ns=("i8", 1),
             stationary=extras,
             habit=2,
-            level=("u1", 5),
+            solver_mode=("u1", 5),
             searched=("i8", 5),
             vague=("u1", 5),
             coupling=3,

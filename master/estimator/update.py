@@ -118,7 +118,7 @@ def _judge(
     for joint in range(26):
         f = hand.finger[joint]
         part = f if f >= 0 else PALM_PART
-        by_wrist = f >= 0 and state.level[f] > 0
+        by_wrist = f >= 0 and state.solver_mode[f] > 0
         most_s = settings.tracked_cycle_s if by_wrist else settings.tracked_age_s
         measured_lately = (t_ns - state.told_ns[part]) * 1e-9 <= most_s
         sure = f < 0 or not state.vague[f]
@@ -373,9 +373,9 @@ def take_over_epoch(
         pip = 6 + hand.first[f] + 2
         pip_open = state.cov[pip, pip] > settings.tracked_pip_rad**2
         if space.ground.sources[f] > 0:
-            state.level[f], state.vague[f] = 0, f > 0 and pip_open
+            state.solver_mode[f], state.vague[f] = 0, f > 0 and pip_open
         elif space.scan.known[f] > 0.0:
-            state.level[f], state.vague[f] = task.level[f], task.ambiguous[f] or pip_open
+            state.solver_mode[f], state.vague[f] = task.solver_mode[f], task.ambiguous[f] or pip_open
     copy(found.palm, out.palm)
     for a in range(20):
         out.angles[a] = state.angles[a] = work.angles[a]

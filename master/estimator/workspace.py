@@ -31,7 +31,7 @@ class Task:
         continuous: (1,) whether epochs follow each other.
         scanned: (20,) angles of fingers whose valley was searched, where it is likeliest.
         refused: (5,) fingertips, and `off` (5,) laser points, that no pose explains.
-        level: (5,) `Level` codes of what fingers are told from.
+        solver_mode: (5,) `SolverMode` codes of what fingers are told from.
         ambiguous: (5,) whether another pose explains as much.
     """
 
@@ -50,7 +50,7 @@ class Task:
     scanned: Float
     refused: Bool
     off: Bool
-    level: Code
+    solver_mode: Code
     ambiguous: Bool
 
     @classmethod
@@ -73,7 +73,7 @@ class Task:
             scanned=20,
             refused=("u1", 5),
             off=("u1", 5),
-            level=("u1", 5),
+            solver_mode=("u1", 5),
             ambiguous=("u1", 5),
         )
 

@@ -18,7 +18,7 @@ from common.records import filled, record
 from master.estimator.laser_plane import PlaneAxes
 from master.wrist_setup import WristSetup
 
-TWIST, WRIST_ANGLES, RATE, TILT, HEADING, LIGHT, EXTRAS = 0, 5, 7, 9, 11, 12, 13
+TWIST, WRIST_ANGLES, RATE, TILT, HEADING, LED_SCALE, EXTRAS = 0, 5, 7, 9, 11, 12, 13
 NO_EXTRAS = 1  # of a rig without wrist device: one that means nothing
 _PALM_M = 7e-4  # what calibration leaves of plane and palm: a palm pitched by 0.2 degrees, and 0.3 mm
 _BLUR_PX = 0.5

@@ -111,7 +111,7 @@ class WristPipeline:
             self._hand,
             NO_WORLD if self._forearm is None else self._forearm.world_at(t_ns, *_STRAIGHT),
         )
-        told: Bool = hand.level > 0
+        told: Bool = hand.solver_mode > 0
         self._seen_ns[told] = t_ns
         known: Bool = t_ns - self._seen_ns <= (self._forget_ns if self._continuous else 0)
         for event, fingers in (
@@ -157,6 +157,6 @@ class WristPipeline:
             laser_m=laser_m,
             palm_world_wxyz=world[0],
             palm_world_sigma_rad=world[1],
-            level=hand.level,
+            solver_mode=hand.solver_mode,
             ambiguous=hand.ambiguous,
         )

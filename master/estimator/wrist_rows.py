@@ -18,7 +18,7 @@ from common.kernels import inlined, inner
 from master.estimator.finger_surface import MOVES, look
 from master.estimator.kinematics import rotation_between
 from master.estimator.problem import Belief, Rig, Search
-from master.estimator.wrist_device import LIGHT, TILT, WRIST_ANGLES, flexed_palm
+from master.estimator.wrist_device import LED_SCALE, TILT, WRIST_ANGLES, flexed_palm
 
 _SMALL_RAD = 1e-4  # below it a rotation vector counts as so long in the derivative
 
@@ -153,7 +153,7 @@ def finger_rows(
         base + f,
         base + WRIST_ANGLES,
         base + WRIST_ANGLES + 1,
-        base + LIGHT,
+        base + LED_SCALE,
     )
     size, cost = count + 4, 0.0
     if lines_of_sight.lit[f] == 0.0 and lines_of_sight.shown[f] == 0.0:
@@ -175,7 +175,7 @@ def finger_rows(
             )
             if lines_of_sight.depth_w2[f] > 0.0:
                 rows = 3
-                r[2] = surface.seen[4] + z[LIGHT] - lines_of_sight.depth[f]
+                r[2] = surface.seen[4] + z[LED_SCALE] - lines_of_sight.depth[f]
         for i in range(rows):
             for c in range(count):
                 J[i, c] = 0.0

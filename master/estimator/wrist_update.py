@@ -5,7 +5,7 @@ from typing import Any
 
 from common.arrays import Float
 from common.kernels import inner, kernel
-from common.messages import Level
+from common.messages import SolverMode
 from master.estimator.extras import predict_extras
 from master.estimator.finger_coupling import expect_coupling, learn_coupling
 from master.estimator.finger_density import choose, weigh_hands
@@ -22,7 +22,7 @@ from master.estimator.state import NEVER_NS, HandState
 from master.estimator.workspace import Model, Task
 from master.estimator.wrist_device import (
     EXTRAS,
-    LIGHT,
+    LED_SCALE,
     WRIST_ANGLES,
     LinesOfSight,
     flexed_palm,
@@ -30,7 +30,7 @@ from master.estimator.wrist_device import (
     loosen_short,
 )
 
-_FK, _IK = int(Level.FK), int(Level.IK)
+_FK, _IK = int(SolverMode.FK), int(SolverMode.IK)
 
 
 @inner
@@ -47,14 +47,17 @@ def _expected(
     """Write what is believed of the fingers before a triple; bring what was seen to the epoch, by their rates."""
     dt_s = (task.t_ns[0] - state.t_ns[0]) * 1e-9
     measured_lately = task.continuous[0] > 0 and state.known[0] > 0 and 0.0 < dt_s <= settings.forget_s
-    prior.light[0], prior.light2[0] = state.z[LIGHT], state.z_cov[LIGHT, LIGHT]
+    prior.light[0], prior.light2[0] = state.z[LED_SCALE], state.z_cov[LED_SCALE, LED_SCALE]
     for f in range(5):
         prior.twist[f], prior.twist2[f] = state.z[f], max(state.z_cov[f, f], 1e-8)
         told_s = (task.t_ns[0] - state.told_ns[f]) * 1e-9
         had_previous = measured_lately and told_s <= settings.forget_s
         prior.had_previous[f] = 1.0 if had_previous else 0.0
         known = (
-            had_previous and state.level[f] > 0 and state.vague[f] == 0 and told_s <= settings.tracked_cycle_s
+            had_previous
+            and state.solver_mode[f] > 0
+            and state.vague[f] == 0
+            and told_s <= settings.tracked_cycle_s
         )
         state.searched[f] = state.searched[f] + 1 if known else 0
         known = known and state.searched[f] % settings.search_again != 0
@@ -104,7 +107,7 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
     for f in range(5):
         scan.known[f] = lines_of_sight.teaches[f] = 0.0
         task.refused[f] = task.off[f] = task.ambiguous[f] = False
-        task.level[f] = 0
+        task.solver_mode[f] = 0
     if state.z.shape[0] < EXTRAS or lines_of_sight.rows[0] == 0.0:
         return
     flexed_palm(device.palm, state.z[WRIST_ANGLES], state.z[WRIST_ANGLES + 1], prior.palm, prior.wrist_axes)
@@ -138,7 +141,7 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
             choose(hand, settings, lines_of_sight, prior, f, scan)
             for k in range(4):
                 task.scanned[4 * f + k] = scan.mode[f, k]
-            task.level[f] = _IK if lines_of_sight.shown[f] > 0.0 else _FK
+            task.solver_mode[f] = _IK if lines_of_sight.shown[f] > 0.0 else _FK
             curled = f > 0 and scan.out[f, 2] > settings.branch_rad
             task.ambiguous[f] = scan.parts[f] > 1.5 or (curled and lines_of_sight.shown[f] == 0.0)
             # The unit of light is learnt a little at a time, and nothing of a finger that is in doubt.

@@ -119,7 +119,7 @@ class Chain:
         return positions, orientations.reshape(-1, 3, 3)
 
 
-def nearest_reach(chain: Chain) -> float:
+def least_root_to_end(chain: Chain) -> float:
     """Least |end - root| [m] inside the limits.
 
     Pattern search over the joints behind the first, from several starts.

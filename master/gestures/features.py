@@ -133,7 +133,7 @@ class FeatureExtractor:
             hand=pose.hand,
             t_ns=pose.t_ns,
             known=np.empty(5, np.bool_),
-            seen=pose.tracked[TIPS] | ((pose.level > 0) & ~pose.ambiguous),
+            seen=pose.tracked[TIPS] | ((pose.solver_mode > 0) & ~pose.ambiguous),
             sigma_m=np.empty(5),
             shape_sigma_m=np.empty(5),
             bend_rad=np.empty((5, 3)),

@@ -16,7 +16,7 @@ from common.frame_recording import open_recording
 from common.geometry import transform
 from master.calibrate.wrist.subject import calibrate_subject
 from master.recorded import recorded_cycles
-from master.study.line import Inputs, Level, claim, detect, solved, write_exact
+from master.study.line import Inputs, SolverMode, claim, detect, solved, write_exact
 from master.study.participant import Known, Participant, about, participant
 from master.study.session import TRIAL_S, record_guided, record_trials
 from master.study.trials import Trial, trials_of
@@ -47,7 +47,7 @@ class Task:
         seed: Of the study.
         blocks: How often the six poses are made.
         conditions: What is known and from what inputs fingers are solved, in which all trials are judged.
-        level: Of the master; None: what the rig file says.
+        solver_mode: Of the master; None: what the rig file says.
         step: Pixels between the rays that shade skin.
         guided: Triples of the guided motion.
         out: Folder of the study.
@@ -63,7 +63,7 @@ class Task:
     seed: int
     blocks: int
     conditions: tuple[Condition, ...]
-    level: Level | None
+    solver_mode: SolverMode | None
     step: int
     guided: int
     out: Path
@@ -126,7 +126,7 @@ def run_participant(task: Task, number: int) -> Outcome:
                 write_exact(folder / TRIALS, camera, there)
             elif not (there / f"detections_{camera}.npz").exists():
                 detect(folder / TRIALS, camera, folder / known / HAND, there)
-            poses = solved(folder / TRIALS, hand, there, task.level)
+            poses = solved(folder / TRIALS, hand, there, task.solver_mode)
             opened = open_recording(folder / TRIALS)
             trials[name_of((known, inputs))] = trials_of(opened, camera, who.name, poses)
     if not task.keep:

@@ -11,7 +11,7 @@ import numpy as np
 from common.arrays import Float
 from common.errors import RecordingError
 from common.hand_model import FINGERS
-from common.messages import Level
+from common.messages import SolverMode
 from common.replacing import replacing
 from common.sim.motion import POSES
 from master.study import paper
@@ -91,7 +91,7 @@ def lines_of(result: Result) -> list[str]:
     lines += ["", *_reach_lines(cells, poses), "", *_icc_lines(again)]
     if len(result.trials) > 1:
         lines += ["", *_cause_lines(result)]
-    lines += ["", *_level_lines(result)]
+    lines += ["", *_mode_lines(result)]
     if result.calibrated:
         lines += ["", *_calibration_lines(result.calibrated)]
     return [*lines, "", *_verdict(cells, again)]
@@ -206,22 +206,22 @@ def _cause_lines(result: Result) -> list[str]:
     return lines
 
 
-def _level_lines(result: Result) -> list[str]:
+def _mode_lines(result: Result) -> list[str]:
     """Mean error of the tracked fingers by what they were solved from, and whether that left a choice."""
-    kinds = (("laser alone (fk)", Level.FK, False), ("laser and tip (ik)", Level.IK, False))
+    kinds = (("laser alone (fk)", SolverMode.FK, False), ("laser and tip (ik)", SolverMode.IK, False))
     lines = [
         "By level, of the same condition: mean absolute error in degrees (trials).",
         "",
         "| solved from | " + " | ".join(FINGERS) + " |",
         "|---|" + "--:|" * len(FINGERS),
     ]
-    for name, level, ambiguous in (*kinds, ("laser and tip, ambiguous", Level.IK, True)):
+    for name, solver_mode, ambiguous in (*kinds, ("laser and tip, ambiguous", SolverMode.IK, True)):
         texts: list[str] = []
         for f in range(len(FINGERS)):
             error = [
                 abs(one.pip_deg[f] - one.truth_deg[f])
                 for one in result.trials[result.judged]
-                if one.tracked[f] and one.level[f] == level and one.ambiguous[f] is ambiguous
+                if one.tracked[f] and one.solver_mode[f] == solver_mode and one.ambiguous[f] is ambiguous
             ]
             texts.append(f"{np.mean(error):.1f} ({len(error)})" if error else "none")
         lines.append(f"| {name} | " + " | ".join(texts) + " |")

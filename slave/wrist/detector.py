@@ -19,10 +19,10 @@ from slave.wrist.fingertips import NO_TIPS, Fingertips, fingertips
 from slave.wrist.laser import LaserLines, laser_lines
 from slave.wrist.palm_pose import prepare
 from slave.wrist.postures import postures_of
-from slave.wrist.reach import reach_of
 from slave.wrist.search_bands import search_bands_of
 from slave.wrist.strobe import Strobe, StrobeCycle
 from slave.wrist.view import WristView
+from slave.wrist.workspace import workspace_of
 
 RECENT = 4  # triples
 
@@ -115,7 +115,7 @@ def prepared(view: WristView, engine: Engine = NUMPY) -> WristView:
     postures_of(view)
     for rotated_view in prepare(view):
         search_bands_of(rotated_view)
-        reach_of(rotated_view)
+        workspace_of(rotated_view)
     dark = Frame(0, 0, 0, np.zeros((view.optics.height_px, view.optics.width_px), np.uint8))
     find(StrobeCycle(dark, dark, dark), view, engine)
     return view

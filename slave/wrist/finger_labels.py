@@ -1,7 +1,7 @@
 """Whose each part of the laser line is, by where it lies on the laser's plane, where the seams cannot be right.
 
 A pixel of the plane is a known place before the palm. Fingers lean little to the side, so that it lies nearest to the
-axis of its own (`Reach.place`), even where seams were drawn through another valley. A wrist that deviates by 5 degrees
+axis of its own (`LaserWorkspace.place`), even where seams lie in another valley. A wrist that deviates by 5 degrees
 moves all of them by half a finger, and a palm that holds something does not show it; but where four lines lie side by
 side their middle is between the second and the third. The thumb crosses the plane near its MCP or beside the palm:
 what lies as near to its root is its own, and what lies before the knuckles and farther away than that never is.
@@ -11,12 +11,12 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from slave.wrist.finger_lines import NONE
-from slave.wrist.reach import Reach
 from slave.wrist.runs import SHORT, Runs
+from slave.wrist.workspace import LaserWorkspace
 
 _THUMB, _INDEX = 0, 1
 _OUTSIDE_INDEX = 0.5  # place: there is the thumb of a bent wrist where the index is in its own
-# Where `Reach.place` is a finger's, thumb ... little: half a spacing from its axis and what the palm may be off. Folded
+# Where `LaserWorkspace.place` is a finger's, thumb ... little: half a spacing, and the palm's error. Folded
 # fingers point to the root of the thumb, the little one a quarter of a spacing towards it.
 _FROM: Float = np.array([-np.inf, -np.inf, 1.35, 2.3, 3.1])
 _TO: Float = np.array([np.inf, 1.65, 2.65, 3.65, np.inf])
@@ -27,11 +27,11 @@ _ASIDE = (0.3, 0.7)  # place: by less it is folded fingers; farther the palm has
 _CREASE_PX = 20  # columns on either side of a seam in which the crease may be
 
 
-def finger_labels(finger: Int, runs: Runs, points: Float, reach: Reach) -> Int:
+def finger_labels(finger: Int, runs: Runs, points: Float, workspace: LaserWorkspace) -> Int:
     """Fingers (N,) of runs at pixels (N, 2), from those that seams say (N,), `NONE` where there is no line."""
-    beyond, place = reach.on_plane(points)
+    beyond, place = workspace.on_plane(points)
     on = finger != NONE
-    near = on & reach.only_thumb(beyond, place)
+    near = on & workspace.only_thumb(beyond, place)
     out = np.where(near, _THUMB, finger)
     place = place - _shift(place[out > _THUMB])
     out = _at_creases(out, runs)
@@ -42,11 +42,11 @@ def finger_labels(finger: Int, runs: Runs, points: Float, reach: Reach) -> Int:
     middle = np.add.reduceat(place, first) / count
     of = out[first]
     nearest = np.clip(np.rint(middle), 1, 4).astype(np.int64)
-    no_thumb = (of == _THUMB) & reach.no_thumb(np.add.reduceat(beyond, first) / count, middle)
+    no_thumb = (of == _THUMB) & workspace.no_thumb(np.add.reduceat(beyond, first) / count, middle)
     aside = (of > _THUMB) & ((middle < _FROM[of]) | (middle > _TO[of]))
     aside &= _room(of, nearest, aside | no_thumb)
     of = np.where(no_thumb | aside, nearest, of)
-    if reach.flexed:
+    if workspace.flexed:
         beyond_index = (of == _INDEX) & (middle < _OUTSIDE_INDEX)
         if ((of == _INDEX) & ~beyond_index).any():
             of = np.where(beyond_index, _THUMB, of)

@@ -14,10 +14,10 @@ from slave.wrist.engine import NUMPY, Engine
 from slave.wrist.finger_labels import finger_labels
 from slave.wrist.finger_lines import NONE, FingerLines
 from slave.wrist.fingers import Fingers
-from slave.wrist.reach import reach_of
 from slave.wrist.runs import FLOOR
 from slave.wrist.thumb_line import beyond_ball, on_ball
 from slave.wrist.view import WristView
+from slave.wrist.workspace import workspace_of
 
 _LEAST_M = 2e-3  # of line that must be seen
 # Standard deviations, by what the centroids of simulated hands of several seeds are off by.
@@ -45,25 +45,25 @@ class LaserLines:
 
 def laser_lines(laser: Image, fingers: Fingers, view: WristView, engine: Engine = NUMPY) -> LaserLines:
     """Find the segments in the difference of laser and ambient frame."""
-    reach = reach_of(fingers.palm_pose.view).at_palm_pose(fingers.palm_pose)
-    runs, on_line = engine.lines(laser, reach.first_row)
+    workspace = workspace_of(fingers.palm_pose.view).at_palm_pose(fingers.palm_pose)
+    runs, on_line = engine.lines(laser, workspace.first_row)
     if not len(runs.row):
         return LaserLines(np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan))
     points: Float = np.stack([runs.column, runs.row], axis=-1, dtype=np.float64)
     finger = fingers.finger_of(points)
     finger[~on_line] = NONE
-    finger = finger_labels(finger, runs, points, reach)
-    finger[~reach.holds(finger, points)] = NONE
-    finger[reach.on_palm(points)] = NONE
+    finger = finger_labels(finger, runs, points, workspace)
+    finger[~workspace.holds(finger, points)] = NONE
+    finger[workspace.on_palm(points)] = NONE
     finger_lines = engine.measure(runs, finger, view.optics.width_px)
     uv, length = finger_lines.uv, finger_lines.line
-    seen = length * reach.metres_per_px(uv) >= _LEAST_M
+    seen = length * workspace.metres_per_px(uv) >= _LEAST_M
     sigma = _sigma_px(finger_lines, shown=fingers.shown)
     if seen[0]:
         thumb = np.flatnonzero(finger == 0)
-        beyond = reach.beyond_m(points[thumb])
+        beyond = workspace.beyond_m(points[thumb])
         off, doubt = beyond_ball(runs, thumb, beyond)
-        seen[0] = not (reach.flexed and on_ball(beyond))
+        seen[0] = not (workspace.flexed and on_ball(beyond))
         uv[0] += off
         sigma[0] = np.hypot(np.hypot(sigma[0], doubt), _THUMB_PX)
     uv[~seen], sigma[~seen], length[~seen] = np.nan, np.nan, np.nan

@@ -127,10 +127,10 @@ def search_bands_of(view: WristView) -> SearchBands:
     still = SearchBands(
         row, _FIRST_RADIUS_PX, root, up, thumb_side, empty, empty, _NO_MAP, 0, _NO_MAP, _NO_MAP, _palm(view)
     )
-    *reach, crossed = _thumb_reach(view, still, stations)
+    *workspace, crossed = _thumb_workspace(view, still, stations)
     rows = row + STATION_PX * np.arange(stations, dtype=np.float64)
     three = _between_fingers(view, rows)
-    middle, half = (np.vstack([three[k], np.full(stations, reach[k])]) for k in (0, 1))
+    middle, half = (np.vstack([three[k], np.full(stations, workspace[k])]) for k in (0, 1))
     placed = replace(still, middle=middle, half=half, weight=_weight(view, rows), thumb_crosses=crossed)
     grids = [placed.pixels(seam, placed.lateral(seam)) for seam in range(4)]
     grid = np.concatenate(grids, axis=1)
@@ -190,7 +190,7 @@ def _band(at: Float, low: Float, high: Float, stations: Float) -> tuple[Float, F
     return (lows + highs) / 2.0, (highs - lows) / 2.0
 
 
-def _thumb_reach(view: WristView, still: SearchBands, stations: int) -> tuple[float, float, int]:
+def _thumb_workspace(view: WristView, still: SearchBands, stations: int) -> tuple[float, float, int]:
     """The thumb's corridor: middle and half width [rad] on the finger's side of all that its axis can reach; and how
     many stations the thumb crosses however it is held.
 

@@ -32,12 +32,12 @@ from common.messages import (
     HandPose,
     Health,
     ImuSample,
-    Level,
     MarkerDetections,
     Message,
     ObjectPose,
     ObjectSource,
     Preview,
+    SolverMode,
     Source,
     Still,
     TagDetections,
@@ -211,7 +211,7 @@ def hand_poses(draw: st.DrawFn) -> HandPose:
         inside_volume=draw(arrays(np.bool_, j)),
         latency_ns=draw(times),
         laser_m=draw(floats(HandPose, "laser_m", FINGER_COUNT, 3)),
-        level=draw(arrays(np.uint8, FINGER_COUNT, elements=st.sampled_from(list(Level)).map(int))),
+        solver_mode=draw(arrays(np.uint8, FINGER_COUNT, elements=st.sampled_from(list(SolverMode)).map(int))),
         ambiguous=draw(arrays(np.bool_, FINGER_COUNT)),
         palm_world_wxyz=draw(floats(HandPose, "palm_world_wxyz", 4)),
         palm_world_sigma_rad=draw(floats(HandPose, "palm_world_sigma_rad", 2)),
@@ -379,7 +379,7 @@ def parts_of(pose: HandPose, *more: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize("markers", [0, 6, MAX_MARKERS])
 def test_a_pose_of_good_arrays_is_the_one_that_is_checked_and_holds_them(markers: int) -> None:
-    parts = parts_of(sample_pose(markers), "laser_m", "level")
+    parts = parts_of(sample_pose(markers), "laser_m", "solver_mode")
     pose = HandPose.known_good("right", 5, **parts)
     assert_same(pose, HandPose(hand="right", t_ns=5, **parts))
     assert encode(decode(encode(pose))) == encode(pose)
@@ -395,7 +395,7 @@ def test_a_pose_of_good_arrays_is_the_one_that_is_checked_and_holds_them(markers
         ("position_m", np.zeros((JOINT_COUNT, 3), np.float32)),
         ("valid", np.ones(JOINT_COUNT, np.uint8)),
         ("markers_raw_m", np.zeros((5, 3))),
-        ("level", np.zeros(5)),
+        ("solver_mode", np.zeros(5)),
         ("latency", np.zeros(5)),
     ],
 )
@@ -580,7 +580,7 @@ def test_a_message_knows_whether_a_marker_has_a_rival() -> None:
         (ImuSample, {"heading_sigma_rad": -0.1}),
         (ImuSample, {"heading_sigma_rad": float("inf")}),
         (HandPose, {"laser_m": b"\0" * 8 * 14}),
-        (HandPose, {"level": b"\3\0\0\0\0"}),
+        (HandPose, {"solver_mode": b"\3\0\0\0\0"}),
         (HandPose, {"ambiguous": b"\0" * 4}),
         (HandPose, {"palm_world_wxyz": b"\0" * 8 * 3}),
         (HandPose, {"palm_world_sigma_rad": np.full(2, np.inf).tobytes()}),
@@ -697,7 +697,7 @@ def test_a_report_can_be_read_whatever_was_counted() -> None:
 
 
 DEFAULTED = {
-    *("latency_ns", "laser_m", "level", "ambiguous", "palm_world_wxyz", "palm_world_sigma_rad"),
+    *("latency_ns", "laser_m", "solver_mode", "ambiguous", "palm_world_wxyz", "palm_world_sigma_rad"),
     *("wrist_angles_rad", "wrist_angles_sigma_rad"),
     *("heading_sigma_rad", "t_sigma_ns", "exposure_us", "body"),
     *("strength", "angle_rad", "origin_m", "direction"),

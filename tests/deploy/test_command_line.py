@@ -86,14 +86,14 @@ def steps_of_replay(
 def test_both_kinds_are_detected_camera_by_camera_and_solved_together(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    steps = steps_of_replay(tmp_path, monkeypatch, level="fk")
+    steps = steps_of_replay(tmp_path, monkeypatch, solver_mode="fk")
     assert [step[step.index("--camera") + 1] for step in steps if "detect" in step] == [
         "left",
         "right",
         "palm",
     ]
     assert ["--hand" in step for step in steps] == [False, False, True, True]  # markers know no hand
-    assert ["--level" in step for step in steps] == [False, False, False, True]
+    assert ["--solver-mode" in step for step in steps] == [False, False, False, True]
     assert steps[2][-1] == str(tmp_path / "out/detections_palm.npz")
     assert steps[3][-4:] == ("--detections", str(tmp_path / "out"), "--out", str(tmp_path / "out"))
 
@@ -158,7 +158,7 @@ def test_a_missing_hand_is_said_before_the_work(tmp_path: Path, capsys: pytest.C
 def test_levels_of_a_marker_rig_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig = {"name": "desk", "kind": "markers", "cameras": ["left", "right"]}
     (tmp_path / "recording.json").write_text(json.dumps({"rig": rig}))
-    assert main(["replay", str(tmp_path), "--out", str(tmp_path / "out"), "--level", "ik"]) == 1
+    assert main(["replay", str(tmp_path), "--out", str(tmp_path / "out"), "--solver-mode", "ik"]) == 1
     assert "of no wrist device" in capsys.readouterr().err
 
 

@@ -138,12 +138,12 @@ def test_a_joined_hand_follows_all_its_files(root: Path, tmp_path: Path) -> None
         pipeline.push(exact_cycle(wrist_setup(root), scene.truth(0.1 * k), k))
     path = files.calibration / "rigs/wrist.json"
     rig = load(path, RigCalibration)
-    save(path, msgspec.structs.replace(rig, level="fk"))
+    save(path, msgspec.structs.replace(rig, solver_mode="fk"))
     tuning.reload()
     assert lines == ["changed files are in use"]
     [new] = tuning.setups
     assert new.wrist is not None
-    assert new.wrist.level == "fk"
+    assert new.wrist.solver_mode == "fk"
     pipeline.push(exact_cycle(wrist_setup(root), scene.truth(0.6), 6))
     save(path, msgspec.structs.replace(rig, hand="default-left"))
     with pytest.raises(

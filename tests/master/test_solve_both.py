@@ -39,9 +39,12 @@ class Recorded:
     opened: FrameRecording
 
     def solve(
-        self, out: Path, only: Literal["markers", "wrist"] | None = None, level: Literal["fk"] | None = None
+        self,
+        out: Path,
+        only: Literal["markers", "wrist"] | None = None,
+        solver_mode: Literal["fk"] | None = None,
     ) -> dict[str, object]:
-        rigs = rigs_to_solve(self.opened.manifest, [], only, level)
+        rigs = rigs_to_solve(self.opened.manifest, [], only, solver_mode)
         out.mkdir()
         setups = setups_of(rigs, self.opened.manifest.cameras, lambda _name: self.both.markers.hand)
         return solve_hands(self.opened, setups, self.opened.folder, out)
@@ -94,7 +97,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
 def test_both_streams_make_one_hand_that_is_scored_against_both_truths(
     recorded: Recorded, tmp_path: Path
 ) -> None:
-    summary = recorded.solve(tmp_path / "out", level="fk")
+    summary = recorded.solve(tmp_path / "out", solver_mode="fk")
     poses = load_poses(tmp_path / "out/poses.npz")
     assert len(poses) == summary["poses"]
     assert len(poses) > 15
@@ -136,9 +139,9 @@ def test_what_is_not_there_is_refused_by_name(recorded: Recorded) -> None:
         rigs_to_solve(manifest, ["attic"])
     with pytest.raises(RecordingError, match="no rig to solve of kind 'wrist'; it has desk of markers"):
         rigs_to_solve(manifest, ["desk"], "wrist")
-    with pytest.raises(CalibrationError, match="--level: rig 'desk' is of markers"):
+    with pytest.raises(CalibrationError, match="--solver-mode: rig 'desk' is of markers"):
         rigs_to_solve(manifest, [], "markers", "fk")
-    assert [rig.level for rig in rigs_to_solve(manifest, [], None, "fk")] == ["auto", "fk"]
+    assert [rig.solver_mode for rig in rigs_to_solve(manifest, [], None, "fk")] == ["auto", "fk"]
     with pytest.raises(CalibrationError, match=r"--solver: .* of a wrist device"):
         rigs_to_solve(manifest, [], "wrist", None, "fabrik")
     solvers = [rig.solver for rig in rigs_to_solve(manifest, [], None, None, "fabrik")]
@@ -149,7 +152,7 @@ def test_a_second_hand_has_files_of_its_own_and_no_score_of_the_first(
     recorded: Recorded, tmp_path: Path
 ) -> None:
     both, left = recorded.both, msgspec.structs.replace(recorded.both.markers.rig, hand="made-left")
-    wrist_scene = msgspec.structs.replace(both.wrist.rig, level="fk")
+    wrist_scene = msgspec.structs.replace(both.wrist.rig, solver_mode="fk")
     first = RigSetup.of(wrist_scene, both.wrist.cameras, both.wrist.hand)
     second = RigSetup.of(left, both.markers.cameras, LEFT)
     solve_hands(recorded.opened, (first, second), recorded.opened.folder, tmp_path)

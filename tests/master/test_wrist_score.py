@@ -9,7 +9,7 @@ import pytest
 from common.arrays import Bool, Float, Int
 from common.errors import RecordingError
 from common.frame_recording import FrameRecording, FrameRow, Illumination, Manifest
-from common.messages import Level, WristDetections
+from common.messages import SolverMode, WristDetections
 from master.outputs.poses import Poses
 from master.wrist_score import GROUPS, WristTruth, cycles_missed, load_wrist_truth, score_tips, score_wrist
 from tests.hand_helpers import camera_file
@@ -54,7 +54,7 @@ def poses(exact: WristTruth) -> Poses:
         inside_volume=np.ones((N, 26), np.bool_),
         latency_ns=np.zeros(N, np.int64),
         laser_m=exact.laser_m[:, 1:6],
-        level=np.full((N, 5), Level.FK, np.uint8),
+        solver_mode=np.full((N, 5), SolverMode.FK, np.uint8),
         ambiguous=np.zeros((N, 5), np.bool_),
         palm_world_wxyz=np.full((N, 4), np.nan),
         palm_world_sigma_rad=np.full((N, 2), np.nan),
@@ -107,10 +107,10 @@ def test_fingers_with_laser_and_tip_in_sight_are_scored_apart() -> None:
     angles = poses(exact).angles_rad.copy()
     angles[:, 1, 2] += np.radians([50.0, 50.0, 4.0, -8.0])
     angles[3, 3, 2] = np.nan
-    level = np.full((N, 5), Level.FK, np.uint8)
-    level[1:3, 1] = Level.IK
+    solver_mode = np.full((N, 5), SolverMode.FK, np.uint8)
+    solver_mode[1:3, 1] = SolverMode.IK
     exact = replace(exact, tip_visible=visible, laser_seen_m=seen)
-    got = score_wrist(replace(poses(exact), angles_rad=angles, level=level), exact)
+    got = score_wrist(replace(poses(exact), angles_rad=angles, solver_mode=solver_mode), exact)
     assert (got["both_index"], got["both_ik_index"]) == (2.0, 1.0)
     assert got["both_pip_deg_index"] == pytest.approx(6.0)
     assert (got["both_ring"], got["both_pip_deg_ring"], got["both_ik_ring"]) == (4.0, 0.0, 0.0)

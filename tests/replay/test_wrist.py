@@ -111,7 +111,7 @@ def test_fingertips_are_not_invented(replays: dict[str, Replay], name: str) -> N
 def by_laser_alone(replay: Replay, root: Path, out: Path) -> Replay:
     """The same detections, solved at level fk."""
     files = ["--hand", str(replay.hand), "--detections", str(replay.out), "--out", str(out)]
-    command(root, "master", "solve", str(replay.recording), *files, "--level", "fk")
+    command(root, "master", "solve", str(replay.recording), *files, "--solver-mode", "fk")
     return replace(replay, out=out)
 
 

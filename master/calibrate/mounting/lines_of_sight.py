@@ -1,6 +1,6 @@
 """What a wrist device sees of a hand: laser points and tips of four fingers, and how they move with what is unknown.
 
-The laser's cut and the tip are those that the master solves fingers with (`master.calibrate.laser_cut`,
+The laser's cut and the tip are those that the master solves fingers with (`master.calibrate.laser_intersection`,
 `common.fingertips`), so that what is fitted is what will be used. Beside the palm's pose and the angles two
 numbers of each finger are unknown, which a mounting must not take for its own: how thick its skin is, and where on the
 pulp its tip is seen.
@@ -14,7 +14,7 @@ from common.arrays import Float
 from common.fingertips import Fingertips
 from common.geometry import rotation_vector_to_matrix
 from common.palmar_surface import PalmarSurface
-from master.calibrate.laser_cut import LaserCut
+from master.calibrate.laser_intersection import LaserIntersection
 from master.estimator.laser_plane import PlaneAxes
 from master.wrist_setup import WristSetup
 
@@ -30,7 +30,7 @@ class LinesOfSight:
 
     def __init__(self, setup: WristSetup) -> None:
         self._setup, self._surface, self._axes = setup, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
-        self._cut, self._tips = LaserCut(setup, _RAYS), Fingertips.of(setup.model)
+        self._intersection, self._tips = LaserIntersection(setup, _RAYS), Fingertips.of(setup.model)
 
     def flat(self, point_m: Float) -> Float:
         """Points (..., 3) [m] on the laser plane as (across, along) (..., 2)."""
@@ -103,6 +103,6 @@ class LinesOfSight:
     def _seen(self, hands: list[tuple[Float, ...]]) -> Float:
         """(P, T, 4, SEEN) of P hands."""
         radius = np.stack([one[1] for one in hands])[:, None]
-        line = self._cut.line(np.stack([one[0] for one in hands]), radius, np.bool_(False))
+        line = self._intersection.line(np.stack([one[0] for one in hands]), radius, np.bool_(False))
         tips = self._setup.optics.project(np.stack([one[2] for one in hands]))
         return np.concatenate([line.point_m, tips], axis=-1)

@@ -2,7 +2,7 @@
 
 Unknown of the subject (26) are the palm's pose, and of each of the four fingers where its knuckle is, how thick it is
 and how long. Unknown in each triple are three angles of each finger; the DIP follows the PIP. What is seen are the
-laser point on its plane and the fingertip. Both are reckoned as the master does it (`master.calibrate.laser_cut`,
+laser point on its plane and the fingertip. Both are made as the master does (`master.calibrate.laser_intersection`,
 `common.fingertips`), so that what is fitted is what will be used.
 """
 
@@ -18,9 +18,9 @@ from common.fingertips import Fingertips
 from common.geometry import rigid, rotation_vector_to_matrix, transform
 from common.hand_model import CHAINS, JOINTS, Chains, HandModel
 from common.palmar_surface import PalmarSurface
-from master.calibrate.laser_cut import LaserCut
+from master.calibrate.laser_intersection import LaserIntersection
+from master.estimator.flexion_synergy import DIP, FlexionSynergy
 from master.estimator.laser_plane import PlaneAxes
-from master.estimator.natural_curve import DIP, NaturalCurve
 from master.wrist_setup import WristSetup
 
 FINGERS = slice(1, 5)
@@ -57,12 +57,12 @@ class SubjectModel:
 
     def __init__(self, setup: WristSetup) -> None:
         self._setup, self._surface, self._axes = setup, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
-        self._cut, self._tips = LaserCut(setup, _RAYS), Fingertips.of(setup.model)
+        self._intersection, self._tips = LaserIntersection(setup, _RAYS), Fingertips.of(setup.model)
         self._root = setup.model.rest_position_m[CHAINS[:, 0]]
-        curve = NaturalCurve.of(setup.model)
+        synergy = FlexionSynergy.of(setup.model)
         distance = np.linalg.norm(transform(setup.T_camera_palm, self._root[FINGERS].mean(axis=0)))
         self.px_per_m = float(setup.optics.matrix[0, 0] / distance)  # at the knuckles
-        self.mcp_per_pip, self.dip_per_pip = curve.slope[FINGERS, 1], curve.slope[FINGERS, DIP]
+        self.mcp_per_pip, self.dip_per_pip = synergy.slope[FINGERS, 1], synergy.slope[FINGERS, DIP]
 
     @property
     def none(self) -> Unknown:
@@ -151,7 +151,7 @@ class SubjectModel:
         """(P, T, 4, 4) laser points and tips of P hands."""
         spheres = np.stack([one[0] for one in surfaces])
         radius = np.stack([one[1] for one in surfaces])[:, None]
-        line = self._cut.line(spheres, radius, np.bool_(False))
+        line = self._intersection.line(spheres, radius, np.bool_(False))
         tips = self._setup.optics.project(np.stack([one[2] for one in surfaces]))
         return np.concatenate([line.point_m, tips], axis=-1)
 

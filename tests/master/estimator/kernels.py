@@ -10,7 +10,7 @@ from master.estimator.arcs import add_arcs
 from master.estimator.cameras import CameraArrays, project
 from master.estimator.certainty import Certainty, linear, surer
 from master.estimator.extras import keep_extras, predict_extras
-from master.estimator.finger_surface import MOVES, cut, look
+from master.estimator.finger_surface import MOVES, laser_centroid, look
 from master.estimator.kinematics import Scratch, angles_of, chains, twist_hand
 from master.estimator.priors import Habits
 from master.estimator.problem import Rig
@@ -141,9 +141,9 @@ def look_at(
 
 
 @kernel
-def cut_at(boxed_device: Any, f: int, boxed_work: Any) -> float:
-    """`master.estimator.finger_surface.cut`, after `look_at`."""
-    return cut(boxed_device[0], f, boxed_work[0])
+def laser_centroid_at(boxed_device: Any, f: int, boxed_work: Any) -> float:
+    """`master.estimator.finger_surface.laser_centroid`, after `look_at`."""
+    return laser_centroid(boxed_device[0], f, boxed_work[0])
 
 
 @kernel

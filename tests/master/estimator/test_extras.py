@@ -13,7 +13,7 @@ from master.estimator.extras import ExtrasRoom, stationary_of
 from master.estimator.problem import Belief
 from master.estimator.settings import DEFAULT
 from master.estimator.state import HandState
-from master.estimator.wrist_device import EXTRAS, HEADING, LIGHT, RATE, TILT, WRIST_ANGLES
+from master.estimator.wrist_device import EXTRAS, HEADING, LED_SCALE, RATE, TILT, WRIST_ANGLES
 from tests.master.estimator.kernels import keep_extras_at, predict_extras_at
 
 N = 8
@@ -114,13 +114,13 @@ def test_doubt_ends_at_what_is_usual_and_the_heading_walks_on() -> None:
     np.testing.assert_allclose(far.mean[quick], 0.0, atol=1e-9)
     assert far.mean[HEADING] == pytest.approx(mean[HEADING])
     assert far.cov[HEADING, HEADING] == pytest.approx(cov[HEADING, HEADING] + 0.1)
-    assert np.abs(far.mean[LIGHT]) < 1e-3 * np.abs(mean[LIGHT])
+    assert np.abs(far.mean[LED_SCALE]) < 1e-3 * np.abs(mean[LED_SCALE])
 
 
 def test_what_is_constant_is_so_for_a_session() -> None:
     mean, cov = drawn(2)
     later = Extras().set(mean, cov).after(600.0)
-    kept = [*range(5), LIGHT]
+    kept = [*range(5), LED_SCALE]
     np.testing.assert_allclose(later.mean[kept], mean[kept], rtol=0.07)
 
 
@@ -165,7 +165,7 @@ def test_an_epoch_long_after_the_last_counts_as_a_whole_and_one_at_once_not_at_a
     np.testing.assert_allclose(np.diag(long.cov), np.diag(kalman), rtol=0.01)
     before = again.cov
     alone = np.zeros((EXTRAS, EXTRAS))
-    alone[LIGHT, LIGHT] = 1.0 / cov[LIGHT, LIGHT]
+    alone[LED_SCALE, LED_SCALE] = 1.0 / cov[LED_SCALE, LED_SCALE]
     again.told(0.0, alone, measured, scale)
     np.testing.assert_allclose(again.cov, before, rtol=1e-6, atol=1e-12)
 
@@ -199,7 +199,8 @@ def test_it_stays_a_covariance_whatever_comes(seed: int) -> None:
         assert (size > 0.0).all()
         assert np.linalg.eigvalsh(cov / np.outer(size, size)).min() > -1e-7
         assert (
-            size[[*range(HEADING), LIGHT]] < 1.01 * np.sqrt(extras.state.stationary[[*range(HEADING), LIGHT]])
+            size[[*range(HEADING), LED_SCALE]]
+            < 1.01 * np.sqrt(extras.state.stationary[[*range(HEADING), LED_SCALE]])
         ).all()
 
 

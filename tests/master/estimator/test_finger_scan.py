@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.messages import Level
+from common.messages import SolverMode
 from master.estimator.finger_scan import NODES, Scan
 from master.estimator.wrist_pipeline import WristPipeline
 from tests.master.estimator.wrist_case import (
@@ -36,10 +36,10 @@ def scan_of(line: WristPipeline) -> Scan:
 
 
 def scanned(
-    wrist_case: WristCase, angles: Float, level: Literal["fk", "auto"] = "auto", tip_px: float = 2.0
+    wrist_case: WristCase, angles: Float, solver_mode: Literal["fk", "auto"] = "auto", tip_px: float = 2.0
 ) -> Scan:
     """The valleys of a hand of angles (5, 4)."""
-    line, seen = pipeline(wrist_case, level), wrist_case.message(angles)
+    line, seen = pipeline(wrist_case, solver_mode), wrist_case.message(angles)
     pushed(line, message(seen.laser_uv, seen.tip_uv, tip_px=tip_px))
     return scan_of(line)
 
@@ -145,4 +145,4 @@ def test_a_finger_that_is_not_seen_is_not_searched(wrist_case: WristCase) -> Non
     laser[3] = np.nan
     pose = pushed(line, message(laser, np.full((5, 2), np.nan)))
     np.testing.assert_array_equal(scan_of(line).known, [1.0, 1.0, 1.0, 0.0, 1.0])
-    assert pose.level[3] == Level.NONE
+    assert pose.solver_mode[3] == SolverMode.NONE

@@ -9,7 +9,7 @@ import pytest
 from common.arrays import Float
 from common.hand_model import CHAINS
 from common.wrist_joint import STRAIGHT
-from master.calibrate.laser_cut import LaserCut
+from master.calibrate.laser_intersection import LaserIntersection
 from master.estimator.laser_plane import PlaneAxes
 from master.wrist_setup import WristSetup
 from tests.master.estimator.wrist_case import NO_TWIST, PIP, WristCase, bent, natural
@@ -28,7 +28,7 @@ def differences(wrist_case: WristCase, angles: Float, bend: Float, twist: Float)
 
     def seen(angles: Float, bend: Float, twist: Float) -> Float:
         at = wrist_case.looks(angles, bend, twist)
-        return np.concatenate([at.ridge, at.tip, np.log(at.depth_m)[:, None]], axis=1)
+        return np.concatenate([at.predicted_laser, at.tip, np.log(at.depth_m)[:, None]], axis=1)
 
     nudge, out = 1e-6, np.empty((5, 5, 7))
     for k in range(7):
@@ -56,13 +56,13 @@ def test_derivatives_are_those_of_finite_differences(
         seen, J = wrist_case.looks(angles, bend, twist), differences(wrist_case, angles, bend, twist)
         np.testing.assert_allclose(seen.by[:, 2:], J[:, 2:], atol=1e-6)
         # That the ridge turns with the light is left out [m/rad]: a tenth of what moves most.
-        off = (seen.by - J)[1:, :2] * away_m(wrist_case.setup, seen.ridge)[1:, None, None]
+        off = (seen.by - J)[1:, :2] * away_m(wrist_case.setup, seen.predicted_laser)[1:, None, None]
         np.testing.assert_allclose(off, 0.0, atol=0.012)
 
 
-def cut_of(setup: WristSetup, angles: Float) -> tuple[Float, Float]:
+def laser_centroid_of(setup: WristSetup, angles: Float) -> tuple[Float, Float]:
     """Points (5, 2) on the plane [m] and lengths (5,) [px] by another cut, of 64 rays that are densest at the ends."""
-    point, length, _ = LaserCut(setup)(angles[None, None])
+    point, length, _ = LaserIntersection(setup)(angles[None, None])
     return point[:, 0, 0], length[:, 0, 0]
 
 
@@ -88,7 +88,7 @@ def test_the_cut_is_near_to_that_of_the_calibration(
     for _ in range(40):
         angles = wrist_case.setup.model.clamp(bent(*rng.uniform([0.0, 0.0, -8.0], [60.0, 85.0, 8.0])))
         seen = wrist_case.looks(angles, bend)
-        point, length = cut_of(wrist_case.setup.bent(bend), angles)
+        point, length = laser_centroid_of(wrist_case.setup.bent(bend), angles)
         both = (seen.length_px > 2.0) & (length > 2.0) & np.isfinite(point[:, 0])
         off.append(1e3 * np.linalg.norm(on_plane(wrist_case.setup, seen.laser) - point, axis=1)[both])
         longer.append(seen.length_px[both] / length[both])
@@ -99,7 +99,7 @@ def test_the_cut_is_near_to_that_of_the_calibration(
     assert 0.85 < np.median(ratio) < 1.02
 
 
-def test_the_ridge_crosses_the_plane_where_the_finger_is_cut(wrist_case: WristCase) -> None:
+def test_the_closed_form_meets_the_plane_where_the_surface_does(wrist_case: WristCase) -> None:
     """Where one phalanx alone is in the light."""
     off: list[Float] = []
     for pip in range(5, 90, 5):
@@ -108,7 +108,9 @@ def test_the_ridge_crosses_the_plane_where_the_finger_is_cut(wrist_case: WristCa
         off.append(
             1e3
             * np.linalg.norm(
-                on_plane(wrist_case.setup, seen.ridge) - cut_of(wrist_case.setup, angles)[0], axis=1
+                on_plane(wrist_case.setup, seen.predicted_laser)
+                - laser_centroid_of(wrist_case.setup, angles)[0],
+                axis=1,
             )
         )
     mm = np.array(off)
@@ -149,7 +151,7 @@ def test_the_left_hand_is_the_right_one_mirrored(wrist_case: WristCase) -> None:
     for pip in (10.0, 40.0, 70.0):
         angles = bent(0.5 * pip, pip, 4.0)
         here, there = right.looks(angles), left.looks(angles)
-        for one, other in ((here.ridge, there.ridge), (here.tip, there.tip)):
+        for one, other in ((here.predicted_laser, there.predicted_laser), (here.tip, there.tip)):
             np.testing.assert_allclose(other, one * [-1.0, 1.0], atol=1e-12)
         np.testing.assert_allclose(there.laser, here.laser * [-1.0, 1.0], atol=2e-3)
         np.testing.assert_allclose(there.length_px, here.length_px, rtol=0.03)
@@ -173,7 +175,7 @@ def test_a_finger_that_ends_before_the_plane_is_prolonged(wrist_case: WristCase)
     seen = wrist_case.looks(bent(-10.0, 0.0), bend)
     assert (seen.stretch[1:] >= 16).all()
     assert (seen.length_px[1:] == 0.0).all()
-    assert np.isfinite(seen.ridge).all()
+    assert np.isfinite(seen.predicted_laser).all()
     assert np.isfinite(seen.by).all()
     assert seen.by.shape[2] == 7
     assert PIP == 2

@@ -11,7 +11,7 @@ from bench.fusion_solved import Solved, solve
 from bench.played import START_NS
 from common.arrays import Bool
 from common.hand_model import CHAINS
-from common.messages import HandPose, ImuSample, Level, MarkerDetections, Source, WristDetections
+from common.messages import HandPose, ImuSample, MarkerDetections, SolverMode, Source, WristDetections
 from master.estimator.fused import FusedPipeline
 from master.estimator.settings import DEFAULT
 from master.rig_pipeline import pipeline_of
@@ -100,10 +100,10 @@ def test_without_the_wrist_device_the_cameras_go_on_by_themselves(seen: Seen, wh
     single = without(seen, lambda message: isinstance(message, WristDetections) and gone(message))
     at = (single.t_s > GONE_S + 0.1) & (single.t_s < BACK_S)
     np.testing.assert_array_equal(single.t_s, whole.t_s)
-    assert not (single.poses.level[at] > 0).any()
+    assert not (single.poses.solver_mode[at] > 0).any()
     assert single.poses.valid[at].all()
     assert np.nanmedian(single.off_mm[at]) < 8.0
-    assert (single.poses.level[single.t_s > BACK_S + 0.1] > 0).any()
+    assert (single.poses.solver_mode[single.t_s > BACK_S + 0.1] > 0).any()
 
 
 def test_without_the_imu_the_palm_is_that_of_the_markers(seen: Seen, whole: Solved) -> None:
@@ -164,7 +164,7 @@ def test_the_same_messages_make_the_same_poses(seen: Seen) -> None:
 
 
 def test_levels_are_told_with_the_poses(whole: Solved) -> None:
-    told = whole.poses.level[whole.t_s > 1.2]
+    told = whole.poses.solver_mode[whole.t_s > 1.2]
     assert (told[:, 1:] > 0).mean() > 0.8
-    assert (told[:, 1:] == Level.IK).any()
+    assert (told[:, 1:] == SolverMode.IK).any()
     assert np.isfinite(whole.poses.laser_m[whole.t_s > 1.2]).mean() > 0.7

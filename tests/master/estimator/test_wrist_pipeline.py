@@ -14,10 +14,10 @@ from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, Volume, load
 from common.errors import CalibrationError
 from common.hand_model import CHAINS, FINGERS, METACARPALS, HandModel
-from common.messages import HandPose, Level, Source, WristDetections
+from common.messages import HandPose, SolverMode, Source, WristDetections
 from common.palmar_surface import SPREAD, PalmarSurface
 from master.estimator.settings import DEFAULT
-from master.estimator.wrist_device import LIGHT
+from master.estimator.wrist_device import LED_SCALE
 from master.estimator.wrist_pipeline import WristPipeline
 from master.rig_setup import RigSetup
 from master.wrist_setup import WristSetup
@@ -52,10 +52,14 @@ class Line:
     """A pipeline, and the next time."""
 
     def __init__(
-        self, wrist_case: WristCase, level: Literal["fk", "ik", "auto"] = "auto", *, continuous: bool = False
+        self,
+        wrist_case: WristCase,
+        solver_mode: Literal["fk", "ik", "auto"] = "auto",
+        *,
+        continuous: bool = False,
     ) -> None:
         self.wrist_case, self.t_ns = wrist_case, 0
-        self.pipeline = pipeline(wrist_case, level, continuous=continuous)
+        self.pipeline = pipeline(wrist_case, solver_mode, continuous=continuous)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -102,14 +106,14 @@ def test_a_natural_hand_is_found_by_the_laser_alone(laser_alone: Line, wrist_cas
         assert pose.tracked[CHAINS[4]].all()
         assert pose.valid.all()
         assert (pose.source == Source.WRIST).all()
-        assert (pose.level == Level.FK).all()
+        assert (pose.solver_mode == SolverMode.FK).all()
 
 
 @pytest.mark.parametrize(("mcp", "pip"), [(20.0, 85.0), (45.0, 62.0), (30.0, 75.0), (15.0, 80.0)])
 def test_unnatural_fingers_are_found_by_laser_and_tip(wrist_case: WristCase, mcp: float, pip: float) -> None:
     angles = bent(mcp, pip, 4.0)
     pose = Line(wrist_case, "ik").sees(angles)
-    assert (pose.level[1:] == Level.IK).all()
+    assert (pose.solver_mode[1:] == SolverMode.IK).all()
     clear = ~pose.ambiguous
     assert clear.sum() >= 2
     off = np.degrees(np.abs(pose.angles_rad - angles)[:, :DIP])[clear]
@@ -125,10 +129,10 @@ def test_unnatural_fingers_are_found_by_laser_and_tip(wrist_case: WristCase, mcp
 
 def test_by_the_laser_alone_the_same_fingers_are_far_off(wrist_case: WristCase) -> None:
     angles = bent(50.0, 55.0)
-    both, one = (Line(wrist_case, level).sees(angles) for level in ("ik", "fk"))
+    both, one = (Line(wrist_case, solver_mode).sees(angles) for solver_mode in ("ik", "fk"))
     assert (np.abs(both.angles_rad - angles)[1:, PIP] < np.radians(6.0)).all()
     assert (np.abs(one.angles_rad - angles)[1:, PIP] > np.radians(20.0)).all()
-    assert (one.level == Level.FK).all()
+    assert (one.solver_mode == SolverMode.FK).all()
 
 
 def test_the_left_hand_is_solved_as_the_right_one(root: Path) -> None:
@@ -172,12 +176,12 @@ def test_a_hand_that_nobody_sees_is_a_palm_and_no_fingers(wrist_case: WristCase)
 
 def test_a_missing_tip_falls_back_or_is_left_out(wrist_case: WristCase) -> None:
     angles, tips = bent(27.0, 60.0), np.arange(5) != 1
-    auto, alone = (Line(wrist_case, level).sees(angles, tips=tips) for level in ("auto", "ik"))
-    np.testing.assert_array_equal(auto.level == Level.IK, tips)
-    assert auto.level[1] == Level.FK
+    auto, alone = (Line(wrist_case, solver_mode).sees(angles, tips=tips) for solver_mode in ("auto", "ik"))
+    np.testing.assert_array_equal(auto.solver_mode == SolverMode.IK, tips)
+    assert auto.solver_mode[1] == SolverMode.FK
     assert auto.valid[CHAINS[1]].all()
     assert not auto.tracked[CHAINS[1, 1:]].any()  # habit has its tip in sight, and the others show theirs
-    assert alone.level[1] == Level.NONE
+    assert alone.solver_mode[1] == SolverMode.NONE
     assert alone.source[CHAINS[1, 1]] == Source.NONE
     assert np.isnan(alone.angles_rad[1]).all()
     assert alone.valid[CHAINS[2]].all()
@@ -187,7 +191,7 @@ def test_a_tip_without_a_laser_line_is_not_enough(wrist_case: WristCase) -> None
     laser, tip = pixels(wrist_case, bent(27.0, 60.0))
     laser[3] = np.nan
     pose = Line(wrist_case).takes(laser, tip)
-    assert pose.level[3] == Level.NONE
+    assert pose.solver_mode[3] == SolverMode.NONE
     assert not pose.valid[CHAINS[3]].any()
 
 
@@ -196,7 +200,7 @@ def test_a_tip_that_contradicts_the_laser_is_refused_and_counted(wrist_case: Wri
     tip[2] += [90.0, 0.0]  # beside the finger, 25 mm
     line = Line(wrist_case)
     pose = line.takes(laser, tip)
-    assert pose.level[2] == Level.FK
+    assert pose.solver_mode[2] == SolverMode.FK
     assert line.counts["tip_refused.middle"] == 1
     assert sum(line.counts[f"tip_refused.{name}"] for name in FINGERS) == 1
     assert not pose.tracked[CHAINS[2, 1:]].any()
@@ -238,15 +242,15 @@ def test_one_hand_that_defies_habit_takes_fk_its_belief(wrist_case: WristCase) -
     """Knuckles alone are bent: the finger whose tip is not seen is told by neither curve nor tip."""
     angles = bent(80.0, 2.0)
     pose, by_habit = (
-        Line(wrist_case, level).sees(angles, tips=np.arange(5) != 2) for level in ("auto", "fk")
+        Line(wrist_case, solver_mode).sees(angles, tips=np.arange(5) != 2) for solver_mode in ("auto", "fk")
     )
-    assert (pose.level[[1, 3, 4]] == Level.IK).all()
+    assert (pose.solver_mode[[1, 3, 4]] == SolverMode.IK).all()
     off, without = (np.abs(one.angles_rad[2, PIP] - angles[2, PIP]) for one in (pose, by_habit))
     assert off < 0.6 * without
 
 
 def test_the_cubic_is_a_preset(wrist_case: WristCase) -> None:
-    line = WristPipeline(replace(wrist_case.setup, cubic=True, level="fk"), continuous=False)
+    line = WristPipeline(replace(wrist_case.setup, cubic=True, solver_mode="fk"), continuous=False)
     flexed: list[Float] = []
     for k, pip in enumerate((10.0, 40.0, 70.0), start=1):
         seen = wrist_case.message(natural(pip), k * CYCLE_NS, tips=False)
@@ -261,7 +265,7 @@ def test_the_cubic_is_a_preset(wrist_case: WristCase) -> None:
 def light(line: Line) -> tuple[float, float]:
     """The unit of light as it is believed: its logarithm and standard deviation."""
     estimator = line.pipeline._estimator
-    return float(estimator.extras[LIGHT]), float(np.sqrt(estimator.extras_cov[LIGHT, LIGHT]))
+    return float(estimator.extras[LED_SCALE]), float(np.sqrt(estimator.extras_cov[LED_SCALE, LED_SCALE]))
 
 
 def tell_unit(line: Line, unit: float) -> None:
@@ -283,16 +287,16 @@ def test_the_unit_of_light_is_learnt(wrist_case: WristCase) -> None:
         assert light(line)[0] == pytest.approx(log, abs=1e-3)
 
 
-@pytest.mark.parametrize("level", ["ik", "auto"])
+@pytest.mark.parametrize("solver_mode", ["ik", "auto"])
 @pytest.mark.parametrize(("mcp", "pip"), [(60.0, 5.0), (55.0, 50.0), (20.0, 60.0), (30.0, 15.0)])
 def test_light_resolves_what_laser_and_tip_leave_open(
-    wrist_case: WristCase, level: Literal["ik", "auto"], mcp: float, pip: float
+    wrist_case: WristCase, solver_mode: Literal["ik", "auto"], mcp: float, pip: float
 ) -> None:
     angles = bent(mcp, pip)
-    dark, lit = Line(wrist_case, level), Line(wrist_case, level)
+    dark, lit = Line(wrist_case, solver_mode), Line(wrist_case, solver_mode)
     tell_unit(lit, 0.4)
     without, pose = dark.sees(angles), lit.sees(angles, unit=0.4)
-    both = (pose.level == Level.IK) & (without.level == Level.IK)
+    both = (pose.solver_mode == SolverMode.IK) & (without.solver_mode == SolverMode.IK)
     both[0] = False
     assert both.sum() >= 3
     off, no_observation = (np.abs(one.angles_rad - angles)[:, PIP][both] for one in (pose, without))
@@ -446,7 +450,7 @@ def test_what_an_imu_says_that_nobody_mounted_is_counted_and_turns_no_palm(wrist
 
 
 @pytest.mark.parametrize(
-    "level",
+    "solver_mode",
     [
         pytest.param(
             "auto",
@@ -465,10 +469,10 @@ def test_what_an_imu_says_that_nobody_mounted_is_counted_and_turns_no_palm(wrist
     ],
 )
 def test_nineteen_of_twenty_joints_lie_in_their_regions(
-    wrist_case: WristCase, level: Literal["fk", "auto"]
+    wrist_case: WristCase, solver_mode: Literal["fk", "auto"]
 ) -> None:
     """Of hands that stray from habits and whose skin differs as much as is believed; at auto all of them do."""
-    line, rng, inside = Line(wrist_case, level), np.random.default_rng(12), list[bool]()
+    line, rng, inside = Line(wrist_case, solver_mode), np.random.default_rng(12), list[bool]()
     thick = PalmarSurface.of(wrist_case.setup.model)
     for _ in range(150):
         angles, pip = natural(0.0), np.radians(rng.uniform(15.0, 70.0, 4))
@@ -486,7 +490,7 @@ def test_nineteen_of_twenty_joints_lie_in_their_regions(
         pose = line.takes(laser + 0.2 * rng.normal(size=(5, 2)))
         exact = wrist_case.setup.model.forward(wrist_case.setup.T_camera_palm, angles).position_m
         for f in range(1, 5):
-            if pose.level[f] == Level.FK:
+            if pose.solver_mode[f] == SolverMode.FK:
                 inside += (chi_square(pose, exact, f) < 7.815).tolist()
     assert len(inside) > 1000
     assert np.mean(inside) > 0.90
@@ -501,7 +505,7 @@ def _depth(wrist_case: WristCase) -> Float:
 def test_what_the_rig_says_of_stamps_and_volume_holds(rig: RigSetup, wrist_case: WristCase) -> None:
     stated = msgspec.structs.replace(
         rig.rig,
-        level="fk",
+        solver_mode="fk",
         stamp_offset_us={"wrist": 1500.0},
         volume=Volume(low_m=(-1, -1, 0.15), high_m=(1, 1, 1)),
     )
@@ -529,7 +533,7 @@ def test_a_rendered_curl_from_exact_points(datasets: Path) -> None:
         HandModel.of(load(datasets / "hands" / "webxr-right.json", HandProfile)),
     )
     truth = np.load(folder / "truth.npz")
-    line = WristPipeline(replace(recorded, level="fk"), continuous=False)
+    line = WristPipeline(replace(recorded, solver_mode="fk"), continuous=False)
     lasers = recorded.optics.project(truth["laser_pt"][:, 1:6])
     poses = [pushed(line, message(uv, NOTHING, (k + 1) * CYCLE_NS)) for k, uv in enumerate(lasers)]
     pip = np.degrees(truth["angles"][:, [7, 11, 15, 19]])

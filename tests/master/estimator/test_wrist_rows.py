@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from common.arrays import Float
 from common.geometry import axis_rotation, matrix_to_rotation_vector, rotation_vector_to_matrix
 from common.wrist_joint import forearm_palm
-from master.estimator.wrist_device import HEADING, LIGHT, TILT, WRIST_ANGLES
+from master.estimator.wrist_device import HEADING, LED_SCALE, TILT, WRIST_ANGLES
 from tests.hand_helpers import any_rotation
 from tests.master.estimator.kernels import rotation_vector_jacobian_at
 from tests.master.estimator.whole import Whole, silent
@@ -31,7 +31,7 @@ def hand(wrist_case: WristCase, seed: int) -> tuple[Whole, Seen]:
     whole = Whole(wrist_case.model, seed, wrist_case.device)
     silent(whole)
     whole.z[:5], whole.z[WRIST_ANGLES : WRIST_ANGLES + 2] = whole.rng.normal(0.0, 0.05, 5), FLEXED
-    whole.z[LIGHT] = whole.rng.normal()
+    whole.z[LED_SCALE] = whole.rng.normal()
     angles = whole.parameters.angles(whole.x)
     return whole, wrist_case.looks(angles, FLEXED, whole.z[:5])
 
@@ -45,7 +45,7 @@ def laser(whole: Whole, seen: Seen, off: float) -> None:
     lines_of_sight = whole.belief.lines_of_sight
     lines_of_sight.rows[0], lines_of_sight.lit[:], lines_of_sight.teaches[:] = 1.0, 1.0, 1.0
     lines_of_sight.lack[:] = whole.rng.normal(0.0, 0.02, (5, 2))
-    lines_of_sight.laser[:] = seen.ridge + lines_of_sight.lack + off * whole.rng.normal(size=(5, 2))
+    lines_of_sight.laser[:] = seen.predicted_laser + lines_of_sight.lack + off * whole.rng.normal(size=(5, 2))
     lines_of_sight.laser_W[:] = [spd(whole.rng, 2) for _ in range(5)]
 
 
@@ -59,7 +59,7 @@ def tip(whole: Whole, seen: Seen, off: float) -> None:
 def tip_depth(whole: Whole, seen: Seen, off: float) -> None:
     tip(whole, seen, off)
     lines_of_sight = whole.belief.lines_of_sight
-    lines_of_sight.depth[:] = np.log(seen.depth_m) + whole.z[LIGHT] + off * whole.rng.normal(size=5)
+    lines_of_sight.depth[:] = np.log(seen.depth_m) + whole.z[LED_SCALE] + off * whole.rng.normal(size=5)
     lines_of_sight.depth_w2[:] = whole.rng.uniform(1.0, 9.0, 5)
 
 
@@ -98,7 +98,7 @@ def test_the_gradient_of_each_kind_of_row_is_the_derivative_of_its_cost(
         assert np.linalg.eigvalsh(normal).min() > -1e-9 * np.abs(normal).max()
 
 
-def test_the_laser_row_is_that_of_ridge_and_lack(wrist_case: WristCase) -> None:
+def test_the_laser_row_is_that_of_closed_form_and_lack(wrist_case: WristCase) -> None:
     """Of what `look` says of angles, twist and bend, by plain algebra."""
     for seed in range(4):
         whole, seen = hand(wrist_case, seed)
@@ -107,7 +107,7 @@ def test_the_laser_row_is_that_of_ridge_and_lack(wrist_case: WristCase) -> None:
         by_free = whole.parameters.by_angles(whole.x).reshape(5, 4, n)
         expected, cost = np.zeros(6 + n + len(whole.z)), 0.0
         for f in range(5):
-            r = seen.ridge[f] + lines_of_sight.lack[f] - lines_of_sight.laser[f]
+            r = seen.predicted_laser[f] + lines_of_sight.lack[f] - lines_of_sight.laser[f]
             pull = seen.by[f, :2].T @ lines_of_sight.laser_W[f] @ r
             expected[6 : 6 + n] += by_free[f].T @ pull[:4]
             expected[6 + n + f] += pull[4]
@@ -155,9 +155,9 @@ def test_a_finger_tells_its_own_angles_and_twist_and_the_bend(wrist_case: WristC
     _, gradient, _ = whole.cost()
     own, extras = np.flatnonzero(whole.parameters.free // 4 == 2), 6 + whole.n
     moved = set(np.flatnonzero(gradient).tolist())
-    allowed = {*(6 + own).tolist(), extras + WRIST_ANGLES, extras + WRIST_ANGLES + 1, extras + LIGHT}
+    allowed = {*(6 + own).tolist(), extras + WRIST_ANGLES, extras + WRIST_ANGLES + 1, extras + LED_SCALE}
     assert moved <= (allowed | {extras + 2})
-    assert {extras + WRIST_ANGLES, extras + WRIST_ANGLES + 1, extras + LIGHT} <= moved
+    assert {extras + WRIST_ANGLES, extras + WRIST_ANGLES + 1, extras + LED_SCALE} <= moved
     assert (extras + 2 in moved) == teaches
 
 

@@ -18,7 +18,7 @@ from master.estimator.wrist_device import Device
 from master.estimator.wrist_model import WristModel, loosened
 from master.estimator.wrist_pipeline import WristPipeline
 from master.wrist_setup import WristSetup
-from tests.master.estimator.kernels import cut_at, look_at
+from tests.master.estimator.kernels import laser_centroid_at, look_at
 from tests.wrist_run import wrist_setup
 
 CYCLE_NS = 33_333_333
@@ -42,7 +42,7 @@ class Seen:
 
     laser: Float
     length_px: Float
-    ridge: Float
+    predicted_laser: Float
     tip: Float
     depth_m: Float
     by: Float
@@ -69,16 +69,16 @@ class WristCase:
     def looks(self, angles: Float, wrist_angles: Float = STRAIGHT, twist: Float = NO_TWIST) -> Seen:
         """What is seen of angles (5, 4) [rad], at a bend (2,) and with hinges rolled by (5,) [rad]."""
         work, flat = Surface.empty(), np.ascontiguousarray(angles).reshape(20)
-        laser, ridge, tip = (np.full((5, 2), np.nan) for _ in range(3))
+        laser, predicted_laser, tip = (np.full((5, 2), np.nan) for _ in range(3))
         length, depth, by, stretch = np.zeros(5), np.zeros(5), np.zeros((5, 5, 7)), np.zeros(5)
         for f in range(5):
             boxes = boxed(self.tables), boxed(self.device)
             stretch[f] = look_at(*boxes, np.asarray(wrist_angles), np.asarray(twist), flat, f, boxed(work))
-            ridge[f], tip[f], depth[f], by[f] = work.seen[:2], work.seen[2:4], work.tip[2], work.J
-            length[f] = cut_at(boxed(self.device), f, boxed(work))
+            predicted_laser[f], tip[f], depth[f], by[f] = work.seen[:2], work.seen[2:4], work.tip[2], work.J
+            length[f] = laser_centroid_at(boxed(self.device), f, boxed(work))
             if length[f] > 0.0:
-                laser[f] = work.cut[:2] / work.cut[2]
-        return Seen(laser, length, ridge, tip, depth, by, stretch)
+                laser[f] = work.laser_centroid[:2] / work.laser_centroid[2]
+        return Seen(laser, length, predicted_laser, tip, depth, by, stretch)
 
     def message(
         self,
@@ -135,10 +135,10 @@ def message(
 
 
 def pipeline(
-    wrist_case: WristCase, level: Literal["fk", "ik", "auto"] = "auto", *, continuous: bool = False
+    wrist_case: WristCase, solver_mode: Literal["fk", "ik", "auto"] = "auto", *, continuous: bool = False
 ) -> WristPipeline:
     """The device alone."""
-    return WristPipeline(replace(wrist_case.setup, level=level), continuous=continuous)
+    return WristPipeline(replace(wrist_case.setup, solver_mode=solver_mode), continuous=continuous)
 
 
 def pushed(line: WristPipeline, cycle: WristDetections) -> HandPose:

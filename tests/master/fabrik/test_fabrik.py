@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from common.hand_model import FINGERS, HandModel
 from common.hand_presets import preset_couplings, preset_limits
 from common.hand_profiles import generated_profile
-from master.fabrik.chain import Chain, Coupling, Link, nearest_reach
+from master.fabrik.chain import Chain, Coupling, Link, least_root_to_end
 from master.fabrik.fabrik import ChainResult, Fabrik, Reach
 from master.fabrik.finger import FingerSolver, finger_chain
 from master.fabrik.joints import Angles, Hinge, Rotor
@@ -292,7 +292,7 @@ def test_too_near_is_flagged() -> None:
         Link(IDENTITY, Rotor((-1.0, 1.0), (-1.0, 1.0)), (0.0, 0.0, -0.03)),
         Link(IDENTITY, Hinge(0.0, math.pi / 2), (0.0, 0.0, -0.02)),
     )
-    assert nearest_reach(Chain(links)) == pytest.approx(math.sqrt(13) / 100, abs=1e-6)
+    assert least_root_to_end(Chain(links)) == pytest.approx(math.sqrt(13) / 100, abs=1e-6)
     result = Fabrik.of(Chain(links)).solve((0.0, -0.01, -0.01))
     assert result.reach is Reach.TOO_NEAR
     assert not result.reached

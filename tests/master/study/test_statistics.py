@@ -33,7 +33,7 @@ def trial(
         pip_deg=(true + off,) * 5,
         truth_deg=(true,) * 5,
         tracked=(tracked,) * 5,
-        level=(1,) * 5,
+        solver_mode=(1,) * 5,
         ambiguous=(False,) * 5,
         laser_seen=(seen,) * 5,
         tip_seen=(False,) * 5,

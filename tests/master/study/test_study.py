@@ -35,7 +35,7 @@ def task(out: Path) -> Task:
         seed=3,
         blocks=1,
         conditions=(JUDGED,),
-        level="fk",
+        solver_mode="fk",
         step=6,
         guided=8,
         out=out,
@@ -111,7 +111,7 @@ def test_calibration_is_ours_and_what_it_refuses_is_said(told: dict[str, Any]) -
 def test_a_study_goes_on_from_what_was_detected_and_solves_anew(out: Path, told: dict[str, Any]) -> None:
     detections = out / "participant-01/calibrated-detected/detections_wrist.npz"
     before = detections.stat().st_mtime_ns
-    found = run_participant(replace(task(out), level="auto", keep=False, conditions=(EXACT,)), 1)
+    found = run_participant(replace(task(out), solver_mode="auto", keep=False, conditions=(EXACT,)), 1)
     assert detections.stat().st_mtime_ns == before
     assert [len(trials) for trials in found.trials.values()] == [6]
     (palm,) = (one for one in found.trials["all, exact"] if one.pose == "open_palm")

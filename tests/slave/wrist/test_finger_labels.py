@@ -13,9 +13,9 @@ from slave.wrist.finger_labels import finger_labels
 from slave.wrist.finger_lines import NONE
 from slave.wrist.fingers import separate
 from slave.wrist.laser import laser_lines
-from slave.wrist.reach import reach_of
 from slave.wrist.runs import line_runs
 from slave.wrist.view import WristView
+from slave.wrist.workspace import workspace_of
 from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW, scene
 
 VISIBLE_M = 2e-3
@@ -51,17 +51,17 @@ def test_fingers_are_told_apart_though_the_palm_is_not_quite_where_it_should_be(
 def test_seams_that_lie_one_finger_aside_do_not_move_the_line() -> None:
     renderer = WristRenderer(scene("spread@indoor", 61), "wrist", 2)
     ambient, laser, led = (renderer.render(1.0, kind) for kind in STROBE)
-    reach = reach_of(VIEW)
-    runs = line_runs(lit(laser, ambient), reach.first_row)
+    workspace = workspace_of(VIEW)
+    runs = line_runs(lit(laser, ambient), workspace.first_row)
     points = np.stack([runs.column, runs.row], axis=-1, dtype=np.float64)
     finger = separate(lit(led, ambient), VIEW).finger_of(points)
-    whose = finger_labels(finger, runs, points, reach)
+    whose = finger_labels(finger, runs, points, workspace)
     assert np.unique(whose[whose > 0]).tolist() == [1, 2, 3, 4]
     aside = np.where(finger > 0, finger + 1, finger)
     aside[finger == 4] = NONE
     assert (aside != whose)[whose > 0].mean() > 0.9
     kept = (whose > 0) & (finger != 4)
-    assert (finger_labels(aside, runs, points, reach) == whose)[kept].mean() > 0.9
+    assert (finger_labels(aside, runs, points, workspace) == whose)[kept].mean() > 0.9
 
 
 @pytest.mark.parametrize("t", [4.9, 5.1, 17.0])

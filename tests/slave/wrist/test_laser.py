@@ -13,8 +13,8 @@ from slave.cameras.synthetic import STROBE
 from slave.wrist.background import lit
 from slave.wrist.fingers import separate
 from slave.wrist.laser import laser_lines
-from slave.wrist.reach import reach_of
 from slave.wrist.runs import line_runs
+from slave.wrist.workspace import workspace_of
 from tests.slave.wrist.wrist_frames import VIEW, scene
 
 BLACK = np.zeros((480, 640), dtype=np.uint8)
@@ -116,8 +116,8 @@ def test_what_no_finger_can_reach_is_not_a_finger() -> None:
 
 
 def test_less_than_two_millimetres_of_line_is_not_reported() -> None:
-    reach = reach_of(VIEW)
-    row, column = (8 * np.argwhere(reach.cells[2])[reach.cells[2].sum() // 2]).tolist()
+    workspace = workspace_of(VIEW)
+    row, column = (8 * np.argwhere(workspace.cells[2])[workspace.cells[2].sum() // 2]).tolist()
     image = drawn(lambda u: np.full_like(u, float(row)), (column, column + 2), 220.0)
     assert np.isnan(laser_lines(image, separate(BLACK, VIEW), VIEW).uv).all()
 

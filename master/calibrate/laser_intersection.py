@@ -31,7 +31,7 @@ _INSIDE = 1.0 - 1e-5  # of the fan between its tangents, where rays surely meet 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Line:
+class LaserLine:
     """The lit and seen line on fingers (...).
 
     Attributes:
@@ -45,14 +45,14 @@ class Line:
     place: Float
 
 
-class LaserCut:
+class LaserIntersection:
     """Cuts the fingers of one hand with the laser of one device. What it holds was prepared by the constructor."""
 
     def __init__(self, setup: WristSetup, rays: int = RAYS) -> None:
         self._setup, self._surface, self._axes = setup, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
         self._nodes = -_INSIDE * np.cos(np.pi * np.arange(rays) / (rays - 1))
 
-    def flexed(self, setup: WristSetup) -> "LaserCut":
+    def flexed(self, setup: WristSetup) -> "LaserIntersection":
         """The same hand before another palm pose of this device."""
         other = copy(self)
         other._setup = setup
@@ -62,7 +62,7 @@ class LaserCut:
         """Laser points (5, C, A, 2) [m] of angles (C, A, 5, 4), and where on the finger they lie.
 
         Returns:
-            As of `Line`: points, lengths (5, C, A), places (5, C, A).
+            As of `LaserLine`: points, lengths (5, C, A), places (5, C, A).
         """
         spheres = self._surface.spheres(self._setup.model.chains(angles_rad))
         spheres = np.moveaxis(transform(self._setup.T_camera_palm, spheres), 2, 0)  # (5, C, A, K, 3)
@@ -73,7 +73,7 @@ class LaserCut:
             np.stack([line.place for line in found]),
         )
 
-    def line(self, spheres: Float, radius: Float, thumb: Bool | np.bool_) -> Line:
+    def line(self, spheres: Float, radius: Float, thumb: Bool | np.bool_) -> LaserLine:
         """The line on fingers with spheres (..., K, 3) [m], camera frame, of radii (..., K), thumbs or not (...)."""
         batch, spheres = spheres.shape[:-2], spheres.reshape(-1, *spheres.shape[-2:])
         radius = np.broadcast_to(radius, (*batch, spheres.shape[1])).reshape(-1, spheres.shape[1])
@@ -97,8 +97,8 @@ class LaserCut:
         whole = lit[1:] & lit[:-1]
         whole &= (step * step).sum(axis=0) < (_STRETCH * broad) ** 2
         first, last = _seen_part(clear[:-1], clear[1:])
-        cut = np.nonzero(whole & ((clear[1:] > 0.0) != (clear[:-1] > 0.0)))
-        _at_edge(first, last, cut, clear, lines_of_sight, before, from_camera)
+        edges = np.nonzero(whole & ((clear[1:] > 0.0) != (clear[:-1] > 0.0)))
+        _at_edge(first, last, edges, clear, lines_of_sight, before, from_camera)
         image = points[:2] / points[2]
         step = image[:, 1:] - image[:, :-1]
         weight = np.where(whole, np.sqrt((step * step).sum(axis=0)) * (last - first), 0.0)
@@ -111,7 +111,7 @@ class LaserCut:
         point = ray * (self._setup.offset_m / (ray @ self._setup.normal))[:, None]
         place = (share * body[1:]).sum(axis=0).reshape(batch)
         length = (total * self._setup.optics.matrix[0, 0]).reshape(batch)
-        return Line(self._axes.flat(point).reshape(*batch, 2), length, place)
+        return LaserLine(self._axes.flat(point).reshape(*batch, 2), length, place)
 
     def _fan(self, spheres: Float, radius: Float, known: Float) -> Float:
         """Rays (3, R, N) in the laser plane from one tangent of each finger to the other."""
@@ -170,15 +170,15 @@ def _seen_part(here: Float, there: Float) -> tuple[Float, Float]:
     """From where to where (...) chords are seen whose ends are seen as clearly as that (above 0, or not at all)."""
     with np.errstate(invalid="ignore", divide="ignore"):
         gone = here / (here - there)
-    cut = (here > 0.0) != (there > 0.0)
-    first = np.where(here > 0.0, 0.0, np.where(cut, gone, 1.0))
-    return first, np.where(there > 0.0, 1.0, np.where(cut, gone, 0.0)).clip(min=first)
+    edges = (here > 0.0) != (there > 0.0)
+    first = np.where(here > 0.0, 0.0, np.where(edges, gone, 1.0))
+    return first, np.where(there > 0.0, 1.0, np.where(edges, gone, 0.0)).clip(min=first)
 
 
 def _at_edge(
     first: Float,
     last: Float,
-    cut: tuple[Int, ...],
+    edges: tuple[Int, ...],
     clear: Float,
     lines_of_sight: Float,
     before: Float,
@@ -194,7 +194,7 @@ def _at_edge(
         before: (K - 1, R, N) where the cones begin on them.
         from_camera: (12, K - 1, N) terms of the cones.
     """
-    chord, pose = cut
+    chord, pose = edges
     if not len(chord):
         return
     rises = clear[chord + 1, pose] > 0.0

@@ -41,7 +41,7 @@ _ORIGIN = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reach:
+class LaserWorkspace:
     """Which pixels can show the laser on a finger.
 
     Attributes:
@@ -62,7 +62,7 @@ class Reach:
     palm: "Palm"
     first_row: int
 
-    def at_palm_pose(self, palm_pose: PalmPose) -> "Reach":
+    def at_palm_pose(self, palm_pose: PalmPose) -> "LaserWorkspace":
         """The same where the palm lies just so."""
         return replace(self, T_camera_palm=palm_pose.T_camera_palm, flexed=not palm_pose.straight)
 
@@ -164,7 +164,7 @@ class Palm:
 
 
 @lru_cache(maxsize=128)  # one for each way the palm may lie
-def reach_of(view: WristView) -> Reach:
+def workspace_of(view: WristView) -> LaserWorkspace:
     """The reach of one wrist rig and hand."""
     thumb, fingers = (
         along_bones(view, thumb_postures(view, 7, 7, 5, 5)),
@@ -178,7 +178,9 @@ def reach_of(view: WristView) -> Reach:
     rows = np.flatnonzero(held.any(axis=(0, 2)))
     plane = _plane(view.optics, *view.normal.tolist(), view.offset_m)
     first = _CELL_PX * int(rows[0]) if len(rows) else view.optics.height_px - 1
-    return Reach(held, plane, float(view.optics.matrix[0, 0]), view.T_camera_palm, False, _palm(view), first)
+    return LaserWorkspace(
+        held, plane, float(view.optics.matrix[0, 0]), view.T_camera_palm, False, _palm(view), first
+    )
 
 
 def _cells(view: WristView, bones: Float, radius: Float) -> Image:

@@ -9,9 +9,9 @@ import pytest
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.hand_model import HandModel
-from master.calibrate.laser_cut import LaserCut
+from master.calibrate.laser_intersection import LaserIntersection
+from master.estimator.flexion_synergy import FlexionSynergy
 from master.estimator.laser_plane import PlaneAxes
-from master.estimator.natural_curve import NaturalCurve
 from master.wrist_setup import WristSetup
 from tests.wrist_run import mirrored_setup, wrist_setup
 
@@ -26,11 +26,11 @@ def setup(root: Path) -> WristSetup:
 def test_the_left_hand_is_the_right_one_mirrored(setup: WristSetup) -> None:
     straight = replace(setup.optics, distortion=np.zeros(5))
     right = replace(setup, optics=straight)
-    angles = NaturalCurve.of(right.model).angles(
+    angles = FlexionSynergy.of(right.model).angles(
         np.radians(np.array([[10.0, 20.0, 40.0, 60.0, 80.0]])), np.radians([[5.0, 4.0, -3.0, 2.0, -6.0]])
     )[:, None]
-    there, length, _ = LaserCut(right)(angles)
-    mirror, same, _ = LaserCut(mirrored_setup(right))(angles)
+    there, length, _ = LaserIntersection(right)(angles)
+    mirror, same, _ = LaserIntersection(mirrored_setup(right))(angles)
     np.testing.assert_allclose(
         mirror, there * [-1.0, 1.0], atol=2e-4
     )  # the fan's rays go the other way round
@@ -56,7 +56,7 @@ def test_rendered_hands_have_their_laser_where_the_cut_says(datasets: Path, name
         flexion, abduction, pip, dip = truth["angles"][:, 5 + 4 * f : 9 + 4 * f].T
         angles[:, f + 1] = np.stack([abduction - resting[f], flexion, pip, dip], axis=1)
     natural = np.abs(angles[:, 1:, 2]) < np.radians(75.0)
-    point = LaserCut(setup)(angles[:, None])[0][1:, :, 0].swapaxes(0, 1)
+    point = LaserIntersection(setup)(angles[:, None])[0][1:, :, 0].swapaxes(0, 1)
     off = 1e3 * np.linalg.norm(point - PlaneAxes.of(setup).flat(truth["laser_pt"][:, 2:6]), axis=2)
     clear = natural & (truth["laser_len_vis"][:, 2:6] > 0.018)
     assert clear.sum() > 10
