@@ -34,7 +34,7 @@ def draw(found: Mapping[str, Outcome], file: Path) -> None:
         "mean joint error [mm]; wrist device: placed by the truth",
     )
     below = figure.add_subplot(grid[1, :])
-    _course(below, found[_GRASP])
+    _timeline(below, found[_GRASP])
     figure.legend(*below.get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=4)
     figure.savefig(file)
 
@@ -53,7 +53,7 @@ def _bars(axes: Axes, scenes: dict[str, dict[Kind, float]], title: str) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _course(axes: Axes, found: Outcome) -> None:
+def _timeline(axes: Axes, found: Outcome) -> None:
     """Mean PIP error of the four fingers through the first round, and when no two cameras see them."""
     until_s = min(_ROUND_S, found.shown.seconds)
     for kind in reversed(KINDS):

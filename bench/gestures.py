@@ -84,10 +84,10 @@ class Score:
             self._late(f"{event.kind} begin" if event.kind != "tap" else "tap", _s(found.t_ns) - at_s)
             if event.kind == "tap":
                 continue
-            course = [one for one in told if (one.kind, one.began_t_ns) == (found.kind, found.began_t_ns)]
-            if course[-1].phase == "end":
-                self._late(f"{event.kind} end", _s(course[-1].t_ns) - event.end_s)
-            self._values(course, truth, event.end_s)
+            updates = [one for one in told if (one.kind, one.began_t_ns) == (found.kind, found.began_t_ns)]
+            if updates[-1].phase == "end":
+                self._late(f"{event.kind} end", _s(updates[-1].t_ns) - event.end_s)
+            self._values(updates, truth, event.end_s)
         # What is said at the very end is in no event, and is not false either.
         last_s = float(truth.t_s[-1]) - 1.0
         cut_s = min((one.start_s for one in truth.motion.said if one.stop_s >= last_s), default=last_s)
@@ -102,9 +102,9 @@ class Score:
     def _late(self, what: str, seconds: float) -> None:
         self.late.setdefault(what, []).append(seconds * RATE_HZ)
 
-    def _values(self, course: Sequence[Gesture], truth: GestureTruth, end_s: float) -> None:
-        first_s, before = _s(course[0].t_ns), None
-        for one in course:
+    def _values(self, updates: Sequence[Gesture], truth: GestureTruth, end_s: float) -> None:
+        first_s, before = _s(updates[0].t_ns), None
+        for one in updates:
             t_s = _s(one.t_ns)
             if t_s > end_s:
                 break

@@ -17,7 +17,7 @@ import numpy as np
 from bench.row import Row
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.sim.illuminant import CALIBRATED_KELVIN, LightCourse
+from common.sim.illuminant import CALIBRATED_KELVIN, LightSchedule
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from slave.markers.detector import Detections, MarkerDetector
@@ -34,13 +34,13 @@ FREE_PX = 3.0
 BEGIN_S = (0.0, 4.0, 15.0, 41.0)  # an open hand, fists, a hand that shows few markers
 OPEN_S = 20.0  # an open hand: all six markers in view
 
-STILL = LightCourse(((0.0, CALIBRATED_KELVIN, 1.0),))
-RAMP = LightCourse(((2.0, 3000.0, 1.0), (12.0, 6500.0, 1.0)))
-STEPS = LightCourse(
+STILL = LightSchedule(((0.0, CALIBRATED_KELVIN, 1.0),))
+RAMP = LightSchedule(((2.0, 3000.0, 1.0), (12.0, 6500.0, 1.0)))
+STEPS = LightSchedule(
     tuple((2.0 * i + j * 1.99, k, 1.0) for i, k in enumerate(range(3000, 6501, 500)) for j in (0, 1))
 )
-EXPOSURES = LightCourse(((1.0, 4300.0, 1.0), (4.0, 4300.0, 0.7), (10.0, 4300.0, 1.3), (13.0, 4300.0, 1.0)))
-SWITCHED = LightCourse(
+EXPOSURES = LightSchedule(((1.0, 4300.0, 1.0), (4.0, 4300.0, 0.7), (10.0, 4300.0, 1.3), (13.0, 4300.0, 1.0)))
+SWITCHED = LightSchedule(
     (
         (4.0, 3000.0, 1.3),
         (4.0, 6500.0, 0.7),
@@ -50,7 +50,7 @@ SWITCHED = LightCourse(
         (11.0, 5000.0, 1.3),
     )
 )
-CANDLE = LightCourse(((1.0, 4300.0, 1.0), (9.0, 2000.0, 1.0)))
+CANDLE = LightSchedule(((1.0, 4300.0, 1.0), (9.0, 2000.0, 1.0)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,14 +117,14 @@ def rows() -> list[Row]:
             "of those half visible; the others are a few px^2",
         ),
     ]
-    courses = {
+    schedules = {
         "3000 -> 6500 K in 10 s": RAMP,
         "3000 -> 6500 K, steps of 500 K": STEPS,
         "exposure 0.7 -> 1.3": EXPOSURES,
         "lamps switched": SWITCHED,
     }
-    for name, course in courses.items():
-        got, plain = total(course), total(course, follow=False, seeds=SEEDS[:1])
+    for name, schedule in schedules.items():
+        got, plain = total(schedule), total(schedule, follow=False, seeds=SEEDS[:1])
         swapped = f"of {got.visible}, goal 0; colours fixed: {plain.swaps} of {plain.visible}"
         share = f"goal 99; colours fixed: {100.0 * plain.share:.0f}"
         out += [
@@ -140,7 +140,7 @@ def rows() -> list[Row]:
 def _starts() -> Row:
     """Programs that start under a light other than that of calibration."""
     lights = [
-        LightCourse(((0.0, kelvin, exposure),)) for kelvin in (3000.0, 6500.0) for exposure in (0.7, 1.3)
+        LightSchedule(((0.0, kelvin, exposure),)) for kelvin in (3000.0, 6500.0) for exposure in (0.7, 1.3)
     ]
     runs = [
         outcome(light, seed, camera, seconds=1.5, begin_s=begin_s)
@@ -162,10 +162,10 @@ def _candle() -> Row:
     return Row("4300 -> 2000 K: swapped before a warning", got.swaps_unwarned, "count", note)
 
 
-def total(course: LightCourse, *, follow: bool = True, seeds: Sequence[int] = SEEDS) -> Outcome:
+def total(schedule: LightSchedule, *, follow: bool = True, seeds: Sequence[int] = SEEDS) -> Outcome:
     """Outcome over seeds and both cameras."""
     return sum_of(
-        [outcome(course, seed, camera, follow=follow) for seed in seeds for camera in load_rig().cameras]
+        [outcome(schedule, seed, camera, follow=follow) for seed in seeds for camera in load_rig().cameras]
     )
 
 
@@ -178,7 +178,7 @@ def sum_of(outcomes: Sequence[Outcome]) -> Outcome:
 
 
 def outcome(
-    course: LightCourse,
+    schedule: LightSchedule,
     seed: int,
     camera: str,
     *,
@@ -187,7 +187,7 @@ def outcome(
     begin_s: float = 0.0,
 ) -> Outcome:
     """Judge one camera on one course; deterministic."""
-    scene = replace(standard_scene(seed), light=course)
+    scene = replace(standard_scene(seed), light=schedule)
     renderer, model = Renderer(scene, camera), scene.cameras[camera]
     adaptive = LightAdaptiveDetector(model, scene.rig.markers, Inline()) if follow else None
     detector: Detector = MarkerDetector(model, scene.rig.markers) if adaptive is None else adaptive
@@ -203,7 +203,7 @@ def outcome(
         if adaptive is not None:
             warned = warned or bool(adaptive.warnings)
             if k >= RATE_HZ:
-                light = apart(adaptive.log_gains, np.log(course.gains_bgr(t_s)), dim=0.0)
+                light = apart(adaptive.log_gains, np.log(schedule.gains_bgr(t_s)), dim=0.0)
         missed = int((visible & ~seen).sum())
         unwarned = (0, 0) if warned else (swaps, missed)
         got += Outcome(int(visible.sum()), int((visible & seen).sum()), swaps, wrong, *unwarned, light, 0)

@@ -45,7 +45,7 @@ class Minute:
 
 
 @dataclass(slots=True)
-class Course:
+class SoakHistory:
     """All that was watched: times since the start [s], footprints by process, minutes."""
 
     times_s: list[float] = field(default_factory=list[float])
@@ -73,7 +73,7 @@ class Watch:
 
     def __init__(self, rig: SoakRig, bus: Bus) -> None:
         """Begin; time 0 is now."""
-        self.course = Course(footprints={process.name: [] for process in rig.processes})
+        self.history = SoakHistory(footprints={process.name: [] for process in rig.processes})
         self._rig, self._start_s = rig, time.monotonic()
         self._hands: Subscription = bus.subscribe("hand", depth=_DEPTH)
         self._told: Subscription = bus.subscribe("health", depth=_DEPTH)
@@ -100,9 +100,9 @@ class Watch:
         Raises:
             OSError: One of them has ended.
         """
-        self.course.times_s.append(self.now_s)
+        self.history.times_s.append(self.now_s)
         for process in self._rig.processes:
-            self.course.footprints[process.name].append(footprint(process.pid))
+            self.history.footprints[process.name].append(footprint(process.pid))
 
     def end_minute(self) -> Minute:
         """Sum up what came since the last call.
@@ -129,8 +129,8 @@ class Watch:
             _ending(gauges, ".clock_sigma_us"),
             {name: more for name, now in held.items() if (more := grown(self._mapped[name], now))},
         )
-        self.course.minutes.append(minute)
-        self.course.counts = {name: dict(told.counts) for name, told in self._health.items()}
+        self.history.minutes.append(minute)
+        self.history.counts = {name: dict(told.counts) for name, told in self._health.items()}
         self._since_s, self._cpu_s, self._mapped, self._latency_ms = now_s, spent, held, []
         return minute
 

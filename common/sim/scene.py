@@ -16,7 +16,7 @@ from common.geometry import transform
 from common.hand_model import HandJoints, HandModel
 from common.object_profile import ObjectProfile
 from common.sim.held import Cylinder
-from common.sim.illuminant import LightCourse
+from common.sim.illuminant import LightSchedule
 from common.sim.motion import HandMotion, HandState, ScriptedMotion
 from common.sim.tracked import TrackedObjects
 
@@ -127,7 +127,7 @@ class Scene:
     centre_m: Float
     cards: tuple[Card, ...] = ()
     seed: int = STANDARD_SEED
-    light: LightCourse | None = None
+    light: LightSchedule | None = None
     objects: Mapping[str, ObjectProfile] = field(default_factory=dict[str, ObjectProfile])
     optics: Mapping[str, CameraModel] = field(default_factory=dict[str, CameraModel])
     tracked: TrackedObjects = field(init=False)

@@ -111,10 +111,10 @@ class Settings(NamedTuple):
     held_depth_m: Annotated[
         float, Range("m", 1e-4, 0.1, "a step of depth of a hand that one camera sees")
     ] = 0.004
-    drift_m_s: Annotated[
+    unobserved_depth_m_s: Annotated[
         float, Range("m/s", 0.001, 1.0, "simulated hands that one camera saw: 20 to 30 mm off after 0.6 s")
     ] = 0.08
-    drift_most_m: Annotated[float, Range("m", 0.01, 1.0, "as far as the volume goes")] = 0.15
+    unobserved_depth_most_m: Annotated[float, Range("m", 0.01, 1.0, "as far as the volume goes")] = 0.15
     # Both hypotheses.
     certain: Annotated[float, Range("1", 1.0, 50.0, "log odds that count as certain")] = 12.0
     negligible: Annotated[

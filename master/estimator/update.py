@@ -136,7 +136,7 @@ def _judge(
 
 
 @inner
-def _drift(
+def _depth_noise(
     settings: Settings, state: HandState, t_ns: int, ground: Ground, belief: Belief, out: Estimate
 ) -> None:
     """Add how far a hand may have drifted along the sight while one camera alone saw it.
@@ -148,7 +148,10 @@ def _drift(
         state.triangulated_ns[0] = t_ns
     if triangulated or not seen:
         return
-    sigma_m = min(settings.drift_m_s * (t_ns - state.triangulated_ns[0]) * 1e-9, settings.drift_most_m)
+    sigma_m = min(
+        settings.unobserved_depth_m_s * (t_ns - state.triangulated_ns[0]) * 1e-9,
+        settings.unobserved_depth_most_m,
+    )
     for joint in range(26):
         for i in range(3):
             for j in range(3):
@@ -352,7 +355,7 @@ def take_over_epoch(
             room,
             out.cov,
         )
-    _drift(settings, state, t_ns, space.ground, space.belief, out)
+    _depth_noise(settings, state, t_ns, space.ground, space.belief, out)
     state.t_ns[0], state.known[0], state.natural[0] = t_ns, True, found.natural[0]
     for f in range(5):
         if shown[f]:

@@ -31,7 +31,7 @@ Stage = Callable[[str], AbstractContextManager[None]]
 FORGET_S = 0.5  # after this long without markers nothing is known of the hand any more
 _ON_TARGET_M = 1e-4
 _FIT_M2 = (3e-3) ** 2  # of a finger's marker as the palm's fit has it
-_DRIFT_M_S = 0.3  # of a hand that is held
+_HELD_M_S = 0.3  # of a hand that is held
 _PALM_JOINTS = np.array([PALM, WRIST, *METACARPALS])
 _AWAY = rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))  # a hand before a camera at the origin
 
@@ -215,4 +215,4 @@ class FabrikSolver:
 
 def _drifted(hand: SolvedHand, age_s: float) -> SolvedHand:
     """A hand that was solved a time ago, as much less sure as it may have moved."""
-    return replace(hand, cov_m2=hand.cov_m2 + (_DRIFT_M_S * age_s) ** 2 * np.eye(3))
+    return replace(hand, cov_m2=hand.cov_m2 + (_HELD_M_S * age_s) ** 2 * np.eye(3))

@@ -3,7 +3,7 @@
 Palm and fingers both turn a knob, and the caps of the tips, turned as one in the room, have the sum of both; they are
 also what is measured best. A tip that is not seen goes with the palm, and counts less. The angle is against the grip's
 beginning, not summed up from step to step, so that neither noise nor a moment of loss adds up. A hand that lets go
-opens first: from when it begins to (`course`) the dial stands where it was, and goes on from there when it is gripped
+opens first: from when it begins to (`history`) the dial stands where it was, and goes on from there when it is gripped
 again.
 
 Tips that stand still to each other are a grip where most instants of the hold have its shape: which way the palm lies
@@ -23,9 +23,9 @@ from math import atan2, cos, pi, radians, sin, sqrt
 from common.arrays import Float
 from common.gesture_actions import DialSettings
 from common.messages import Gesture, Phase
-from master.gestures.course import Course
 from master.gestures.features import HandFeatures
 from master.gestures.grip import Tips, axis_of, is_grip, may_grip, rotation_between, spread_m, widened_m
+from master.gestures.grip_history import GripHistory
 from master.gestures.lasting import Lasting
 
 _AXIS_RAD = radians(15.0)  # how well the circle of the tips tells the axis of the knob
@@ -49,7 +49,7 @@ class _Grip:
     tips: Tips
     circle_axis: Float
     base_rad: float
-    course: Course
+    history: GripHistory
     farthest_rad: float
     axis: Float
 
@@ -140,7 +140,7 @@ class DialWatch:
 
     def _take(self, tips: Tips, axis: Float) -> None:
         """A grip closes."""
-        self._grip = _Grip(tips, axis, self._angle, Course(self._settings.quick_m), 0.0, axis)
+        self._grip = _Grip(tips, axis, self._angle, GripHistory(self._settings.quick_m), 0.0, axis)
         self._maybe.clear()
 
     def _again(self, tips: Tips) -> bool:
@@ -160,10 +160,10 @@ class DialWatch:
                 self._closed_ns = t_ns
             return
         wide = widened_m(tips, grip.tips)
-        loosened = grip.course.loosens
-        if grip.course.sound(t_ns, wide, own.loose_m):
+        loosened = grip.history.loosens
+        if grip.history.sound(t_ns, wide, own.loose_m):
             self._rotate(t_ns, tips, grip, wide)
-        elif (ahead := grip.course.ahead_rad(t_ns)) is not None:
+        elif (ahead := grip.history.ahead_rad(t_ns)) is not None:
             self._angle = ahead
         if not abs(wide) > own.open_m:
             self._closed_ns = t_ns
@@ -185,7 +185,7 @@ class DialWatch:
         along = float(rotation @ grip.axis) / max(far, 1e-12)
         twist = 2.0 * atan2(along * sin(0.5 * far), cos(0.5 * far)) + grip.base_rad
         self._angle = twist + 2.0 * pi * round((self._angle - twist) / (2.0 * pi))
-        grip.course.push(t_ns, wide_m, self._angle)
+        grip.history.push(t_ns, wide_m, self._angle)
 
     def _tell(self, dial: Lasting, phase: Phase, seen: HandFeatures, tips: Tips) -> Gesture:
         grip = self._grip

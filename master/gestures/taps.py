@@ -130,15 +130,15 @@ class TapWatch:
         """The tap of a touch that is over; nothing where two fingers may have been touched."""
         least = [min(one.gap_m) for one in gone.epochs]
         down = next(k for k, gap in enumerate(least) if gap <= gone.least_m + _DOWN_M)
-        course, nearest = gone.epochs[down:], gone.epochs[int(np.argmin(least))]
-        weight = np.array([1.0 / max(one.thumb_sigma_m, 1e-4) ** 2 for one in course])
+        flight, nearest = gone.epochs[down:], gone.epochs[int(np.argmin(least))]
+        weight = np.array([1.0 / max(one.thumb_sigma_m, 1e-4) ** 2 for one in flight])
         weight = weight / weight.sum()
-        gap = weight @ np.array([one.gap_m for one in course])
+        gap = weight @ np.array([one.gap_m for one in flight])
         finger = int(gap.argmin())
         nearer_m = float(np.delete(gap, finger).min() - gap[finger])
         if nearer_m < self._settings.nearer_m:
             return []
-        beyond = weight @ _beyond_m(np.array([one.joints_m for one in course]), finger)
+        beyond = weight @ _beyond_m(np.array([one.joints_m for one in flight]), finger)
         segment = 2 if beyond[1] > 0.0 else int(beyond[0] > 0.0)
         sigma = nearest.sigma_m
         sure = below(gone.least_m, self._settings.leave_gap_m, sigma) * below(0.0, nearer_m, sigma)

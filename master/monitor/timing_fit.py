@@ -95,8 +95,8 @@ def _plausible(evidence: Evidence, floor: Float) -> Bool:
     good = np.isfinite(evidence.value + evidence.rate + evidence.instrument + evidence.place.sum(axis=-1))
     value = np.where(good, evidence.value, np.nan)
     padded = np.pad(value, ((2, 2), (0, 0)), constant_values=np.nan)
-    course = _median(np.stack([padded[i : i + len(value)] for i in range(5)]))
-    jump = np.abs(value - course)
+    smoothed = _median(np.stack([padded[i : i + len(value)] for i in range(5)]))
+    jump = np.abs(value - smoothed)
     unlike = np.abs(np.where(good, evidence.rate - evidence.instrument, np.nan))
     return (jump <= _FAR * _median(jump) + np.sqrt(floor)) & (unlike <= _FAR * _median(unlike))
 

@@ -5,7 +5,7 @@ fitted (`master.objects.fit`) from where it was led to from the last one; where 
 what is seen in the wrong place, from what is seen alone (`master.objects.start`), the best of all starts.
 
 **Too little is seen** to tell all of it, as two beads of three: then what was known before counts as well
-(`master.objects.course`), as it was at a time before all frames of this fit, so that nothing counts twice.
+(`master.objects.trajectory`), as it was at a time before all frames of this fit, so that nothing counts twice.
 
 **One tag** has two poses that nearly explain it (`master.objects.single_tag`).
 
@@ -27,7 +27,6 @@ from master.estimator.cameras import CameraArrays
 from master.fabrik.depth import CalibrationResidual
 from master.fabrik.one_euro import OneEuroParameters
 from master.objects.association import Association, sighted_now
-from master.objects.course import Course, unheeded
 from master.objects.features import Features
 from master.objects.fit import Fitted, PoseFit
 from master.objects.hidden import Hidden
@@ -35,6 +34,7 @@ from master.objects.motion import Motion
 from master.objects.pose_filter import PoseFilter
 from master.objects.single_tag import SingleTag
 from master.objects.start import poses_of_beads, poses_of_tags
+from master.objects.trajectory import Trajectory, unheeded
 from master.objects.window import Window, Windows
 
 # What light does to a ball's centroid beyond what a slave says, and to a corner.
@@ -84,7 +84,7 @@ class ObjectLine:
         self._hidden = Hidden(self._features, self._cameras)
         middle = self._features.points.mean(axis=0) if len(self._features.points) else np.zeros(3)
         self._filter = PoseFilter(middle, OneEuroParameters.of(rig.filter))
-        self._course = Course()
+        self._trajectory = Trajectory()
         self._single_tag = SingleTag(self._features, self._cameras, self._fit)
         self._lost_behind = False
         self._last_ns = -(2**63)
@@ -110,7 +110,7 @@ class ObjectLine:
         return out
 
     def _solve(self, window: Window) -> ObjectPose:
-        predicted = self._course.predicted(window.t_ns)
+        predicted = self._trajectory.predicted(window.t_ns)
         seen = self._associated(window, None if predicted is None else predicted.T)
         now = (
             seen is not None
@@ -121,7 +121,7 @@ class ObjectLine:
             fitted = self._found(window, seen, predicted)
         if fitted is None or seen is None:
             return self._held(window, predicted)
-        if not self._course.push(window.t_ns, fitted):
+        if not self._trajectory.push(window.t_ns, fitted):
             return self._none(window)
         tracked = fitted.alone or not fitted.poorer(_TRACKED_M, _TRACKED_RAD)
         shown = self._hidden.look(window, fitted.motion.T, seen.used(fitted))
@@ -167,7 +167,7 @@ class ObjectLine:
         if best is None:
             return None
         # What was known of where it went is of another thing.
-        self._course.clear()
+        self._trajectory.clear()
         self._single_tag.forget()
         return self._single_tag.of_two(window, best[1], best[0], begins=True)
 
@@ -186,13 +186,13 @@ class ObjectLine:
         both = None
         if led:
             oldest_ns = t_ns + round(float(seen.seen.tau_s.min()) * 1e9)
-            past = self._course.past(t_ns, oldest_ns)
+            past = self._trajectory.past(t_ns, oldest_ns)
             both = self._fit(seen.seen, start, past, feature=seen.feature)
         if alone is None:
             return None if both is None else replace(both, alone=False)
         if both is None or not alone.poorer(_UNTOLD_M, _UNTOLD_RAD):
             return alone if both is None else both
-        return unheeded(both, alone, self._course.unsure_s(t_ns), _POOR_M)
+        return unheeded(both, alone, self._trajectory.unsure_s(t_ns), _POOR_M)
 
     def _holds(self, seen: Association, fitted: Fitted) -> bool:
         """Whether a pose is determined, and most of what is seen now is in its place."""
@@ -216,7 +216,7 @@ class ObjectLine:
 
     def _held(self, window: Window, predicted: Motion | None) -> ObjectPose:
         """The pose while nothing tells: led on, or none."""
-        cov = self._course.held_cov(window.t_ns)
+        cov = self._trajectory.held_cov(window.t_ns)
         if predicted is None or cov is None:
             return self._none(window)
         shown = self._hidden.look(

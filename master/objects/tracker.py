@@ -23,8 +23,8 @@ from common.errors import CalibrationError
 from common.geometry import invert, matrix_to_quaternion, quaternion_to_matrix
 from common.messages import ObjectPose, ObjectSource, TrackerPose
 from common.object_profile import ObjectProfile
-from master.objects.course import HELD_S
 from master.objects.line import SolvedObject
+from master.objects.trajectory import HELD_S
 
 LEAP_M, LEAP_M_S, LEAP_S = 0.08, 8.0, 0.15  # a leap: farther and faster than that; and how long it is doubted
 _UNKNOWN_M, _UNKNOWN_RAD = (

@@ -27,7 +27,7 @@ from bench.light import (
     outcome,
     standard_scene,
 )
-from common.sim.illuminant import LightCourse
+from common.sim.illuminant import LightSchedule
 from common.sim.render import Renderer
 from slave.markers.detector import MarkerDetector
 from slave.markers.light_adaptive import REFUSE, LightAdaptiveDetector, can_adapt, detector_for
@@ -48,8 +48,8 @@ def still(seed: int, camera: str) -> Outcome:
 @pytest.mark.parametrize(
     "course", [RAMP, STEPS, EXPOSURES, SWITCHED], ids=["ramp", "steps", "exposure", "switched"]
 )
-def test_markers_stay_found_and_themselves(course: LightCourse, seed: int, camera: str) -> None:
-    got = outcome(course, seed, camera)
+def test_markers_stay_found_and_themselves(schedule: LightSchedule, seed: int, camera: str) -> None:
+    got = outcome(schedule, seed, camera)
     assert got.visible > 1000
     assert got.swaps == 0
     assert got.found >= 0.99 * still(seed, camera).found
@@ -64,7 +64,7 @@ def test_without_following_the_same_light_swaps_markers() -> None:
 @pytest.mark.parametrize("begin_s", [0.0, 4.0, 15.0])  # an open hand, fists
 def test_a_start_under_another_light_swaps_nothing_unwarned(kelvin: float, begin_s: float) -> None:
     for exposure in (0.7, 1.3):
-        got = outcome(LightCourse(((0.0, kelvin, exposure),)), 7, "left", seconds=1.5, begin_s=begin_s)
+        got = outcome(LightSchedule(((0.0, kelvin, exposure),)), 7, "left", seconds=1.5, begin_s=begin_s)
         assert got.swaps_unwarned == 0
         if begin_s == 0.0:
             assert got.swaps == 0
@@ -102,8 +102,8 @@ class Later:
 
 
 def test_while_the_colours_are_behind_nothing_is_reported() -> None:
-    course = LightCourse(((OPEN_S + 1.0, 4300.0, 1.0), (OPEN_S + 1.0, 3000.0, 1.0)))
-    scene = replace(standard_scene(7), light=course)
+    schedule = LightSchedule(((OPEN_S + 1.0, 4300.0, 1.0), (OPEN_S + 1.0, 3000.0, 1.0)))
+    scene = replace(standard_scene(7), light=schedule)
     renderer, workers = Renderer(scene, "left"), Later(8)
     detector = LightAdaptiveDetector(scene.cameras["left"], MARKERS, workers)
     seen: list[int] = []
@@ -116,7 +116,7 @@ def test_while_the_colours_are_behind_nothing_is_reported() -> None:
     assert seen[20:28] == [0] * 8  # the lamp was switched at frame 20
     assert min(seen[29:]) >= 5
     assert detector.refused == 16
-    assert apart(detector.log_gains, np.log(course.gains_bgr(OPEN_S + 2.0))) < 0.1
+    assert apart(detector.log_gains, np.log(schedule.gains_bgr(OPEN_S + 2.0))) < 0.1
 
 
 def test_it_says_that_a_light_is_not_known_and_what_to_do() -> None:
@@ -138,8 +138,8 @@ def test_it_says_that_a_light_is_not_known_and_what_to_do() -> None:
 
 
 def test_the_same_frames_give_the_same_detections_and_a_fresh_start_keeps_the_light() -> None:
-    course = LightCourse(((0.0, 3200.0, 0.8), (2.0, 3600.0, 1.1)))
-    scene = replace(standard_scene(7), light=course)
+    schedule = LightSchedule(((0.0, 3200.0, 0.8), (2.0, 3600.0, 1.1)))
+    scene = replace(standard_scene(7), light=schedule)
     renderer = Renderer(scene, "right")
     images = [renderer.render(k / RATE_HZ) for k in range(12)]
     one, two = (LightAdaptiveDetector(scene.cameras["right"], MARKERS, Inline()) for _ in range(2))

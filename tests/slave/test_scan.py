@@ -15,7 +15,7 @@ from bench.marker_kinds import KINDS
 from bench.marker_score import clicks
 from common.arrays import Image
 from common.frame_recording import open_recording
-from common.sim.illuminant import LightCourse
+from common.sim.illuminant import LightSchedule
 from common.sim.render import Renderer
 from slave.cameras.replay import read_png
 from slave.markers.blobs import MAX_CANDIDATES, SCALE, Blob
@@ -137,8 +137,8 @@ def test_generated_markers_are_the_same(name: str, engine: str) -> None:
 
 
 def test_the_standard_scene_is_the_same_and_its_light_is_followed_alike() -> None:
-    course = LightCourse(((20.0, 4300.0, 1.0), (20.3, 3600.0, 1.2)))
-    scene = replace(standard_scene(7), light=course)
+    schedule = LightSchedule(((20.0, 4300.0, 1.0), (20.3, 3600.0, 1.2)))
+    scene = replace(standard_scene(7), light=schedule)
     markers = scene.rig.markers
     renderer = Renderer(scene, "left")
     whole, windows = (LightAdaptiveDetector(scene.cameras["left"], markers, Inline()) for _ in range(2))

@@ -16,7 +16,7 @@ from common.errors import FitError
 from common.hand_model import FINGERS, TIPS, WRIST, HandModel
 from common.hand_profiles import mirrored_profile, scaled_profile
 from master.calibrate.hand.align import GRID_S, Alignment, align, flat_scale, missing_steps
-from master.calibrate.hand.beliefs import Beliefs, Course
+from master.calibrate.hand.beliefs import Beliefs, RoutineTargets
 from master.calibrate.hand.curves import Knots
 from master.calibrate.hand.fit import ShapeFit, fit_shape
 from master.calibrate.hand.observed import Observed
@@ -150,7 +150,7 @@ def problem_of(
         points_m=observed.points_m,
         whiten=whitening(observed.cov_m2, beliefs.model_m),
         knots=knots,
-        course=Course.of(alignment.at(knots.time_s)),
+        targets=RoutineTargets.of(alignment.at(knots.time_s)),
         start=alignment.T_rig_palm,
         palm_free=bool(np.quantile(seen_back, 0.1) >= _FREE_WITH),
         beliefs=beliefs,

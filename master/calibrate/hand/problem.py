@@ -12,7 +12,7 @@ import numpy as np
 from common.arrays import Float
 from common.geometry import rotation_vector_to_matrix, skew, transform
 from common.hand_model import HandModel
-from master.calibrate.hand.beliefs import Beliefs, Course
+from master.calibrate.hand.beliefs import Beliefs, RoutineTargets
 from master.calibrate.hand.curves import BorderedNormal, Knots
 from master.calibrate.hand.shape import BIAS, LENGTH, PER_FINGER, RATIO, ROOT, ROTATION, Shape, caps_of
 
@@ -54,7 +54,7 @@ class HandRoutineProblem:
     points_m: Float
     whiten: Float
     knots: Knots
-    course: Course
+    targets: RoutineTargets
     start: Float
     palm_free: bool
     beliefs: Beliefs
@@ -63,7 +63,7 @@ class HandRoutineProblem:
         """The routine as it is asked for, by the believed shape."""
         coefficients = np.zeros((len(self.knots.time_s), CHANNELS))
         angles = coefficients[:, _PALM:].reshape(-1, 5, 4)
-        angles[..., :3] = self.course.posture_rad
+        angles[..., :3] = self.targets.posture_rad
         angles[..., 3] = self.prior.dip_ratio * angles[..., 2]
         return State(self.prior, coefficients)
 
@@ -175,15 +175,15 @@ class HandRoutineProblem:
         """Inverse sd of changes (K - 1, 26), means (K - 1, 26), and inverse sd of levels (K - 1, 26)."""
         b, h = self.beliefs, self.knots.spacing_s
         count = len(self.knots.time_s) - 1
-        moving = (self.course.moving[1:] | self.course.moving[:-1]).reshape(count, 5, 3)
-        straight = self.course.straight[:-1]
+        moving = (self.targets.moving[1:] | self.targets.moving[:-1]).reshape(count, 5, 3)
+        straight = self.targets.straight[:-1]
         wander = np.empty((count, CHANNELS))  # [1/sqrt(s)]
         mean, sigma = np.zeros((count, CHANNELS)), np.full((count, CHANNELS), np.inf)
         wander[:, :3] = b.free_palm_rad_s if self.palm_free else b.palm_rad_s
         wander[:, 3:6] = b.free_palm_m_s if self.palm_free else b.palm_m_s
         angles, means, sigmas = (a[:, _PALM:].reshape(count, 5, 4) for a in (wander, mean, sigma))
         angles[..., :3] = np.where(moving, b.moving_rad_s, b.held_rad_s)
-        means[..., :3] = self.course.posture_rad[:-1]
+        means[..., :3] = self.targets.posture_rad[:-1]
         sigmas[..., :3] = np.where(moving, b.moving_level_rad, b.level_rad)
         means[..., _PIP] = np.where(straight, b.straight_rad[0], means[..., _PIP])
         sigmas[..., _PIP] = np.where(straight, b.straight_rad[1], sigmas[..., _PIP])

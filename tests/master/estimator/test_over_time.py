@@ -81,11 +81,11 @@ def test_a_finger_that_is_lost_alone_goes_on_with_the_others(speed: float) -> No
     run(machine, range(frames), speed_deg_s=speed)
     lost = run(machine, range(frames, frames + 18), gone=(MARKER_INDEX,), speed_deg_s=speed)
     truth = [min(20.0 + speed * k / 60.0, 110.0) for k in range(frames, frames + 18)]
-    course = [pip_deg(hand) for hand in lost]
-    assert max(course) <= 110.0 + 1e-9
+    history = [pip_deg(hand) for hand in lost]
+    assert max(history) <= 110.0 + 1e-9
     moved = truth[-1] - truth[0]
     # It is the first finger, and follows the second by 0.7 of its way; what it did itself before adds to that.
-    assert abs(course[-1] - truth[-1]) < 0.45 * moved + 3.0
+    assert abs(history[-1] - truth[-1]) < 0.45 * moved + 3.0
 
 
 @pytest.mark.parametrize("speed", [90.0, 200.0, 600.0])
@@ -94,19 +94,19 @@ def test_a_hand_that_is_lost_goes_on_a_little_and_stays_inside_its_limits(speed:
     frames = 8
     before = run(machine, range(frames), speed_deg_s=speed)[-1]
     lost = run(machine, range(frames, frames + 20), gone=tuple(range(6)), speed_deg_s=speed)
-    course = np.array([pip_deg(before)] + [pip_deg(hand) for hand in lost])
-    assert course[4] > course[0] + 1.0
-    assert course.max() <= 110.0 + 1e-9
+    history = np.array([pip_deg(before)] + [pip_deg(hand) for hand in lost])
+    assert history[4] > history[0] + 1.0
+    assert history.max() <= 110.0 + 1e-9
     # The motion fades: it ends at most about 0.12 s of its speed farther on.
-    assert course[-1] - course[0] < 0.12 * speed + 12.0
+    assert history[-1] - history[0] < 0.12 * speed + 12.0
 
 
 def test_doubt_grows_while_a_finger_is_lost() -> None:
     machine = estimator()
     seen = run(machine, range(15))[-1]
     lost = run(machine, range(15, 45), gone=(MARKER_INDEX,), speed_deg_s=60.0)
-    course = [sigma_m(hand, TIPS[INDEX]) for hand in (seen, lost[0], lost[8], lost[25])]
-    assert course[0] < course[1] < course[2] < course[3]
+    history = [sigma_m(hand, TIPS[INDEX]) for hand in (seen, lost[0], lost[8], lost[25])]
+    assert history[0] < history[1] < history[2] < history[3]
     assert sigma_m(lost[25], TIPS[2]) < 1.5 * sigma_m(seen, TIPS[2])
 
 

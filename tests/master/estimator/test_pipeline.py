@@ -306,7 +306,7 @@ def test_a_hand_that_one_camera_sees_is_sure_of_its_depth_for_as_long_as_it_was_
     age_s = np.array([(pose.t_ns - last_ns) * 1e-9 for pose in poses])
     late = age_s > 0.5
     assert late.sum() > 10
-    assert np.all(sigma_m[late] >= 0.99 * DEFAULT.drift_m_s * (age_s[late] - 0.05))
+    assert np.all(sigma_m[late] >= 0.99 * DEFAULT.unobserved_depth_m_s * (age_s[late] - 0.05))
     region_m = np.sqrt([7.815 * np.linalg.eigvalsh(pose.cov_m2)[:, -1] for pose in poses])
     tracked = np.array([pose.tracked for pose in poses])
     assert tracked[0].any()

@@ -16,7 +16,7 @@ from common.hand_model import TIPS, HandModel
 from common.messages import Gesture, HandPose
 from common.sim.gesture_postures import Knob, knob_grip
 from common.sim.motion import angles_of, smooth_step
-from master.gestures.course import Course
+from master.gestures.grip_history import GripHistory
 from master.gestures.recogniser import GestureRecogniser
 
 STILL, FRAME_NS = np.zeros((5, 4)), 16_666_667
@@ -141,16 +141,16 @@ def test_a_hand_that_opens_and_closes_turns_no_dial_further_than_its_fingers() -
 
 
 def test_a_grip_that_slowly_widens_goes_on_and_a_loose_one_does_not() -> None:
-    course = Course(9e-4)
+    history = GripHistory(9e-4)
     wide = np.linspace(0.0, 2e-3, 60)
     for k, w in enumerate(wide):
-        assert course.sound(k * FRAME_NS, float(w), 2.5e-3)
-        course.push(k * FRAME_NS, float(w), 0.1)
-    assert not course.sound(60 * FRAME_NS, 2.6e-3, 2.5e-3)
-    assert course.loosens
-    assert course.ahead_rad(60 * FRAME_NS) == pytest.approx(0.1)
-    assert not course.sound(61 * FRAME_NS, float("nan"), 2.5e-3)
+        assert history.sound(k * FRAME_NS, float(w), 2.5e-3)
+        history.push(k * FRAME_NS, float(w), 0.1)
+    assert not history.sound(60 * FRAME_NS, 2.6e-3, 2.5e-3)
+    assert history.loosens
+    assert history.ahead_rad(60 * FRAME_NS) == pytest.approx(0.1)
+    assert not history.sound(61 * FRAME_NS, float("nan"), 2.5e-3)
 
 
 def test_nothing_is_led_over_before_anything_was_seen() -> None:
-    assert Course(9e-4).ahead_rad(0) is None
+    assert GripHistory(9e-4).ahead_rad(0) is None

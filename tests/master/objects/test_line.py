@@ -23,9 +23,9 @@ from common.geometry import (
 )
 from common.messages import MarkerDetections, ObjectPose, ObjectSource, TagDetections
 from common.object_profile import ObjectProfile
-from master.objects.course import HELD_S
 from master.objects.line import ObjectLine
 from master.objects.start import two_poses
+from master.objects.trajectory import HELD_S
 
 CALIBRATION = Path(__file__).parents[3] / "calib_json"
 Message = MarkerDetections | TagDetections

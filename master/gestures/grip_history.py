@@ -16,7 +16,7 @@ _FADE_S = 0.06  # in which a turn that nobody sees fades
 _LASTS_S = 0.15  # a grip that is wider for so long is just wider
 
 
-class Course:
+class GripHistory:
     """Push machine. Holds width [m] and angle [rad] of the last tenth of a second, and since when the grip loosens."""
 
     def __init__(self, quick_m: float) -> None:

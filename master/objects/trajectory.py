@@ -29,7 +29,7 @@ class _Known:
     fitted: Fitted
 
 
-class Course:
+class Trajectory:
     """Push machine. Holds the last poses, sixteen at most, and when one was told by what was seen alone."""
 
     def __init__(self) -> None:
