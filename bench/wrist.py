@@ -53,11 +53,7 @@ def rows() -> Iterator[Row]:
     name = "curl, recorded" if data.is_dir() else "curl, simulated"
     rig, camera, hand, frames = recorded(data) if data.is_dir() else simulated()
     view = WristView.of(rig, camera, hand)
-    cycles = [
-        strobe_cycle
-        for strobe_cycle in map(Strobe(camera.frame_rate_hz).push, frames)
-        if strobe_cycle is not None
-    ]
+    cycles = [cycle for cycle in map(Strobe(camera.frame_rate_hz).push, frames) if cycle is not None]
     steps = slave_steps(camera, view, frames, cycles) | master_steps(rig, camera, view, cycles)
     took = interleaved(steps, REPEATS)
     slave, whole = took["slave"], took["slave"] + took["master"]
@@ -122,7 +118,7 @@ def slave_steps(
         "of it laser": _each(with_fingers, lambda all_: laser_lines(all_[0][0], all_[1], view)),
         "of it fingertips": _each(
             list(zip(lights, found, strict=True)),
-            lambda all_: fingertips(all_[0][1], all_[1].strobe_cycle.led.image, all_[1].laser.uv, view),
+            lambda all_: fingertips(all_[0][1], all_[1].cycle.led.image, all_[1].laser.uv, view),
         ),
         "of it message": _each(found, lambda one: encode(one.message(camera.name, 1))),
     } | _with_numba(camera, view, frames, lights, with_fingers)
@@ -199,12 +195,8 @@ def _slave(camera: CameraCalibration, view: WristView, frames: list[Frame], engi
     def step() -> object:
         out = None
         for _ in range(3):
-            strobe_cycle = strobe.push(next(endless))
-            out = (
-                out
-                if strobe_cycle is None
-                else encode(find(strobe_cycle, view, engine=engine).message(camera.name, 1))
-            )
+            cycle = strobe.push(next(endless))
+            out = out if cycle is None else encode(find(cycle, view, engine=engine).message(camera.name, 1))
         return out
 
     return step

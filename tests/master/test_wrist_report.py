@@ -61,7 +61,7 @@ def test_a_run_is_scored_at_the_times_of_its_poses(
     full = report_scene(
         tmp_path / "poses.npz",
         setup,
-        Played(worn=scene),
+        Played(wrist_scene=scene),
         epoch_ns,
         tmp_path,
         {"poses_per_s": 30.0},
@@ -90,7 +90,7 @@ def test_a_run_without_a_pose_keeps_its_figures(setup: RigSetup, scene: WristSce
     full = report_scene(
         tmp_path / "poses.npz",
         setup,
-        Played(worn=scene),
+        Played(wrist_scene=scene),
         after_ns,
         tmp_path,
         {"poses": 0},

@@ -41,7 +41,7 @@ def picked(
 ) -> dict[str, HsvRange]:
     colours, found = SampledColours(), dict(ranges or {})
     for name in names:
-        found = colours.pick(image, log_gains, name, AT[name], found).ranges
+        found = colours.sample(image, log_gains, name, AT[name], found).ranges
     return found
 
 
@@ -53,10 +53,10 @@ def test_six_clicks_detect_as_well_as_the_calibrated_ranges() -> None:
         image, truth = renderer.render(0.3), renderer.markers(0.3)
         colours, ranges = SampledColours(), dict[str, HsvRange]()
         for name, uv in zip(RIG.markers, truth.uv, strict=True):
-            pick = colours.pick(image, SAME, name, (uv[0] + 2.0, uv[1] - 2.0), ranges)
-            ranges = pick.ranges
-            assert pick.row.own > 0.95
-            assert (pick.row.skin, pick.row.background_px) == (0.0, 0.0)
+            sample = colours.sample(image, SAME, name, (uv[0] + 2.0, uv[1] - 2.0), ranges)
+            ranges = sample.ranges
+            assert sample.row.own > 0.95
+            assert (sample.row.skin, sample.row.background_px) == (0.0, 0.0)
         files = CAMERAS[camera], replace(CAMERAS[camera], markers=ranges)
         detectors = [MarkerDetector(file, RIG.markers) for file in files]
         for k in range(20):
@@ -138,9 +138,9 @@ def test_a_range_of_the_file_gives_up_the_hues_that_a_picked_one_needs() -> None
 
 def test_a_range_that_was_set_by_hand_since_is_not_made_again() -> None:
     colours = SampledColours()
-    ranges = colours.pick(PICTURE, SAME, "index", AT["index"], {}).ranges
+    ranges = colours.sample(PICTURE, SAME, "index", AT["index"], {}).ranges
     mine = replace(ranges["index"], hsv_low=(60, 111, 99))
-    again = colours.pick(PICTURE, SAME, "little", AT["little"], {"index": mine}).ranges
+    again = colours.sample(PICTURE, SAME, "little", AT["little"], {"index": mine}).ranges
     assert again["index"] == mine
 
 
@@ -174,19 +174,19 @@ def test_from_no_colour_at_all_to_a_slave_that_follows_the_light(tmp_path: Path)
     tuning = CameraTuning(files, knobs, marker_changes(detector, make), lambda: True, sampler)
     commands = tuning.commands()
 
-    def pick(name: str, t_ns: int | None = None) -> dict[str, float]:
+    def sample(name: str, t_ns: int | None = None) -> dict[str, float]:
         body = ColourPick(marker=name, uv=AT[name], t_ns=t_ns)
         return dict(commands["pick"](msgspec.json.encode(body).decode()))
 
     with pytest.raises(CameraError, match="no frame was read yet"):
-        pick("thumb")
+        sample("thumb")
     moved = painted.render(painted.hand(340.0, 230.0))
     detector.push(moved, 0)
     for k, name in enumerate(NAMES):
         with pytest.raises(FitError):
-            pick(name)  # the hand has moved on since the picture that was clicked on
+            sample(name)  # the hand has moved on since the picture that was clicked on
         shown[7] = Frame(0, 7, 7, PICTURE)
-        gauges = pick(name, 7)
+        gauges = sample(name, 7)
         shown.clear()
         assert gauges["pick.pixels"] > 100
         assert gauges[f"marker.{name}.h_low"] < HUE[k] < gauges[f"marker.{name}.h_high"]

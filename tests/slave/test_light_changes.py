@@ -122,7 +122,7 @@ def test_while_the_colours_are_behind_nothing_is_reported() -> None:
 def test_it_says_that_a_light_is_not_known_and_what_to_do() -> None:
     ranges = {
         name: msgspec.structs.replace(painted.RANGES[name], reference_bgr_linear=tuple(painted.linear(paint)))
-        for name, paint in ((name, painted.paint(m)) for m, name in enumerate(painted.NAMES))
+        for name, paint in ((name, painted.marker_hsv(m)) for m, name in enumerate(painted.NAMES))
     }
     camera = msgspec.structs.replace(painted.camera(), markers=ranges)
     detector = LightAdaptiveDetector(camera, painted.NAMES, Inline())

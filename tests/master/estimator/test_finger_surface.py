@@ -88,7 +88,7 @@ def test_the_cut_is_near_to_that_of_the_calibration(
     for _ in range(40):
         angles = wrist_case.setup.model.clamp(bent(*rng.uniform([0.0, 0.0, -8.0], [60.0, 85.0, 8.0])))
         seen = wrist_case.looks(angles, bend)
-        point, length = laser_centroid_of(wrist_case.setup.bent(bend), angles)
+        point, length = laser_centroid_of(wrist_case.setup.flexed(bend), angles)
         both = (seen.length_px > 2.0) & (length > 2.0) & np.isfinite(point[:, 0])
         off.append(1e3 * np.linalg.norm(on_plane(wrist_case.setup, seen.laser) - point, axis=1)[both])
         longer.append(seen.length_px[both] / length[both])

@@ -73,7 +73,7 @@ def test_lines_of_a_palm_that_deviates_and_holds_something_are_counted_from_the_
     renderer, truth = WristRenderer(both.wrist_scene, name, 2), both.wrist_scene.truth(t)
     ambient, laser, led = (renderer.render(t, kind) for kind in STROBE)
     fingers = separate(lit(led, ambient), view)
-    assert abs(np.degrees(truth.bend_rad[1])) > 5.0
+    assert abs(np.degrees(truth.wrist_angles_rad[1])) > 5.0
     assert fingers.palm_pose.straight
     found = laser_lines(lit(laser, ambient), fingers, view).uv[1:]
     assert (np.linalg.norm(found - truth.laser_uv[2:6], axis=1) < NEAR_PX).all()
