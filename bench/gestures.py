@@ -61,7 +61,7 @@ class Score:
     """
 
     late: dict[str, list[float]] = field(default_factory=lambda: dict[str, list[float]]())
-    said: dict[str, int] = field(default_factory=lambda: dict.fromkeys(_KINDS, 0))
+    annotations: dict[str, int] = field(default_factory=lambda: dict.fromkeys(_KINDS, 0))
     missed: dict[str, int] = field(default_factory=lambda: dict.fromkeys(_KINDS, 0))
     false: dict[str, int] = field(default_factory=lambda: dict.fromkeys(_KINDS, 0))
     pinch_mm: list[float] = field(default_factory=lambda: list[float]())
@@ -73,7 +73,7 @@ class Score:
         """Hold what was told against the truth."""
         free = [one for one in told if one.phase == "begin" or one.kind == "tap"]
         for event in truth.events:
-            self.said[event.kind] += 1
+            self.annotations[event.kind] += 1
             at_s = event.end_s if event.kind == "tap" else event.begin_s
             same = [one for one in free if (one.kind, one.name) == (event.kind, event.name)]
             found = min(same, key=lambda one: abs(_s(one.t_ns) - at_s), default=None)
@@ -90,7 +90,7 @@ class Score:
             self._values(updates, truth, event.end_s)
         # What is said at the very end is in no event, and is not false either.
         last_s = float(truth.t_s[-1]) - 1.0
-        cut_s = min((one.start_s for one in truth.motion.said if one.stop_s >= last_s), default=last_s)
+        cut_s = min((one.start_s for one in truth.motion.annotations if one.stop_s >= last_s), default=last_s)
         for one in free:
             self.false[one.kind] += _s(one.t_ns) < min(cut_s, last_s)
 
@@ -223,7 +223,7 @@ def true_poses(motion: HandMotion, model: HandModel, seconds: float) -> Iterator
 def table(name: str, score: Score) -> Iterator[Row]:
     """The rows of one score."""
     for kind in _KINDS:
-        note = f"said {score.said[kind]}, missed {score.missed[kind]}"
+        note = f"said {score.annotations[kind]}, missed {score.missed[kind]}"
         yield Row(f"{name}: {kind}, told and not said", float(score.false[kind]), "", note)
     for what, late in sorted(score.late.items()):
         yield Row(f"{name}: {what}, late", *_most(np.array(late), "frame"))

@@ -160,8 +160,8 @@ def _recorded(what: str, recording: Recording, pooled: list[TiltErrors]) -> Iter
     against = "VQF is not installed" if theirs is None else (
         f"{tilt.rms_deg / theirs.inclination_rms_deg:.2f} of VQF's {theirs.inclination_rms_deg:.2f}"
     )  # fmt: skip
-    says = f"stated {tilt.stated_deg:.2f}, {100 * tilt.within:.0f} % within 95 %"
-    yield Row(f"{what}: inclination", tilt.rms_deg, "deg rms", f"{against}; {says}")
+    stated_text = f"stated {tilt.stated_deg:.2f}, {100 * tilt.within:.0f} % within 95 %"
+    yield Row(f"{what}: inclination", tilt.rms_deg, "deg rms", f"{against}; {stated_text}")
     errors = Errors.of(found, recording)
     note = f"{_rms(errors.heading_deg):.2f} deg rms against its begin"
     if theirs is not None:
@@ -261,8 +261,12 @@ def _simulated(part: str, rest_s: float, pooled: list[TiltErrors]) -> Iterator[R
     name = f"simulated {part}, {'rested' if rest_s else 'never at rest'}"
     rms, within = _rms(np.array([one.rms_deg for one in tilt])), np.mean([one.within for one in tilt])
     against = f"VQF {_rms(np.array(theirs)):.2f}" if theirs else "VQF is not installed"
-    says = f"stated {_rms(np.array([one.stated_deg for one in tilt])):.2f}, {100 * within:.0f} % within 95 %"
-    yield Row(f"{name}: inclination", rms, "deg rms", f"{len(_SEEDS)} arms, a minute each; {against}; {says}")
+    stated_text = (
+        f"stated {_rms(np.array([one.stated_deg for one in tilt])):.2f}, {100 * within:.0f} % within 95 %"
+    )
+    yield Row(
+        f"{name}: inclination", rms, "deg rms", f"{len(_SEEDS)} arms, a minute each; {against}; {stated_text}"
+    )
     note = f"{_rms(np.array(surprise)):.1f} of what heading_sigma_rad says (rms)"
     yield Row(f"{name}: heading", _rms(np.array(drift)), "deg/min", note)
 

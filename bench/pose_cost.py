@@ -146,7 +146,7 @@ class Played:
         for datagram, to in self._master.due():
             for name, slave in self._slaves.items():
                 if to == _BROADCAST:
-                    slave.hear_beacon(datagram, _MASTER, t_ns)
+                    slave.receive_beacon(datagram, _MASTER, t_ns)
                 elif to == self._address[name]:
                     slave.receive(datagram, _MASTER, t_ns)
         for name, slave in self._slaves.items():

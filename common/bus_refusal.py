@@ -1,4 +1,4 @@
-"""Say why an encrypted bus does not come about: zenoh keeps silent about a certificate that was refused."""
+"""Notify why an encrypted bus does not come about: zenoh keeps silent about a certificate that was refused."""
 
 import logging
 import socket
@@ -56,11 +56,11 @@ def why_refused(endpoint: str, identity: Identity) -> str:
             " somebody who plays the master"
         )
     except ssl.SSLError as error:
-        said = (error.reason or str(error)).lower().replace("_", " ")
-        if "certificate expired" in said:
+        message = (error.reason or str(error)).lower().replace("_", " ")
+        if "certificate expired" in message:
             return _why_expired_there(identity)
         return (
-            f"who listens there refused the certificate of {identity.name!r}, or speaks no TLS ({said}): keys of"
+            f"who listens there refused the certificate of {identity.name!r}, or speaks no TLS ({message}): keys of"
             " another rig?"
         )
     except OSError as error:
@@ -69,7 +69,7 @@ def why_refused(endpoint: str, identity: Identity) -> str:
 
 
 def _why_invalid(endpoint: str, identity: Identity) -> str:
-    """Say which certificate is not valid by the clock of this machine.
+    """Notify which certificate is not valid by the clock of this machine.
 
     It is that of the rig, or that of who listens.
     """
@@ -86,7 +86,7 @@ def _why_invalid(endpoint: str, identity: Identity) -> str:
 
 
 def _why_expired_there(identity: Identity) -> str:
-    """Say why who listens refused our certificate as not valid now.
+    """Notify why who listens refused our certificate as not valid now.
 
     By our clock it is not valid either, or the clock there is wrong.
     """
@@ -113,7 +113,7 @@ def _shown_there(endpoint: str) -> Shown | None:
         return None
 
 
-def say_why_alone(
+def log_why_alone(
     peers: Callable[[], int], reason: Callable[[], str], where: str, closing: threading.Event
 ) -> threading.Thread:
     """Log, on a thread, why nobody is connected when it is so for two seconds, and again when the reason is another.
@@ -126,16 +126,16 @@ def say_why_alone(
     """
 
     def watch() -> None:
-        said, since = "", time.monotonic()
+        message, since = "", time.monotonic()
         while not closing.wait(_POLL_S):
             now = time.monotonic()
             if peers():
-                said, since = "", now
+                message, since = "", now
             elif now - since > _ALONE_S:
                 why, since = reason(), now
-                if why and why != said and not closing.is_set():
+                if why and why != message and not closing.is_set():
                     _LOG.warning("bus (%s): %s", where, why)
-                said = why
+                message = why
 
     thread = threading.Thread(target=watch, name="bus alone", daemon=True)
     thread.start()

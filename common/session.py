@@ -185,7 +185,7 @@ class RigKeys:
         """Return the body of a handshake datagram if its seal fits, else None."""
         return unseal(ChaCha20Poly1305(self._process_key(header.key_id)), header, datagram)
 
-    def hear(self, header: Header, datagram: bytes, expected: type[HandshakeT]) -> HandshakeT | Refusal:
+    def open_as(self, header: Header, datagram: bytes, expected: type[HandshakeT]) -> HandshakeT | Refusal:
         """Return the message of a handshake datagram, or why it is refused."""
         body = self.open(header, datagram)
         if body is None:

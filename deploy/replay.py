@@ -47,13 +47,13 @@ class ReplaySettings:
     times: Path | None = None
 
 
-def run_replay(settings: ReplaySettings, say: Callable[[str], None]) -> dict[str, object]:
+def run_replay(settings: ReplaySettings, notify: Callable[[str], None]) -> dict[str, object]:
     """Detect in every camera and solve, and return the summary.
 
     Raises:
         ReplayError: The recording is unreadable, or a step failed (its own message is on stderr).
     """
-    folder = _recording_of(settings, say)
+    folder = _recording_of(settings, notify)
     rigs = _rigs(folder, settings.only)
     if settings.solver_mode is not None and all(rig.kind != "wrist" for rig in rigs):
         raise ReplayError(f"--solver-mode: {folder} is of no wrist device, which alone has levels")
@@ -71,10 +71,10 @@ def run_replay(settings: ReplaySettings, say: Callable[[str], None]) -> dict[str
     hand = [] if settings.hand is None else ["--hand", str(settings.hand)]
     for camera, kind in {camera: rig.kind for rig in rigs for camera in rig.cameras}.items():
         what, needs = ("markers", []) if kind == "markers" else ("fingers", hand)
-        say(f"detecting {what} in camera {camera} ...")
+        notify(f"detecting {what} in camera {camera} ...")
         target = ["-o", str(out / f"detections_{camera}.npz")]
         _step("slave", "detect", recording, "--camera", camera, *calibration, *needs, *target)
-    say("solving ...")
+    notify("solving ...")
     which = [] if settings.only is None else ["--only", settings.only]
     which += [] if settings.solver_mode is None else ["--solver-mode", settings.solver_mode]
     which += [] if settings.solver is None else ["--solver", settings.solver]
@@ -83,7 +83,7 @@ def run_replay(settings: ReplaySettings, say: Callable[[str], None]) -> dict[str
     return cast(dict[str, object], json.loads((out / "summary.json").read_text()))
 
 
-def _recording_of(settings: ReplaySettings, say: Callable[[str], None]) -> Path:
+def _recording_of(settings: ReplaySettings, notify: Callable[[str], None]) -> Path:
     """The recording, made of videos or pictures in OUT/recording if need be.
 
     Raises:
@@ -101,7 +101,7 @@ def _recording_of(settings: ReplaySettings, say: Callable[[str], None]) -> Path:
         raise ReplayError(
             "videos and pictures need --calibration DIR: lenses, places and colours of their cameras"
         )
-    say("reading the videos or pictures ...")
+    notify("reading the videos or pictures ...")
     made = settings.out / "recording"
     options = ["--calibration", str(settings.calibration), "-o", str(made)]
     options += [text for camera in settings.cameras for text in ("--camera", camera)]

@@ -56,15 +56,15 @@ class Cameras:
             newest_ns: Camera -> when its last frame is that was taken [ns].
             t_ns: When the frame is that is taken now [ns].
         """
-        heard = [
+        received = [
             name
             for name in self.centre_ns
             if name in waiting or t_ns - newest_ns.get(name, t_ns - self.silent_ns) < self.silent_ns
         ]
-        if not all(name in waiting for name in heard):
+        if not all(name in waiting for name in received):
             return False
-        next_ns = waiting[heard[0]].oldest_ns + self.centre_ns[heard[0]]
-        return all(waiting[name].newest_ns + self.centre_ns[name] >= next_ns for name in heard)
+        next_ns = waiting[received[0]].oldest_ns + self.centre_ns[received[0]]
+        return all(waiting[name].newest_ns + self.centre_ns[name] >= next_ns for name in received)
 
 
 class Hurry:

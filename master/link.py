@@ -158,9 +158,9 @@ class MasterLink:
             if header is Refusal.VERSION:
                 self.turned_away.other_version(datagram, address[0], t_ns)
         elif header.kind is Kind.HELLO:
-            result = self._hear_hello(header, datagram, address, t_ns)
+            result = self._on_hello(header, datagram, address, t_ns)
         elif header.kind in (Kind.ECHO_ANSWER, Kind.STARTED, Kind.DATA):
-            result = self._hear_slave(header, datagram, t_ns)
+            result = self._on_slave(header, datagram, t_ns)
         else:
             result = Refusal.UNEXPECTED
         if isinstance(result, Refusal):
@@ -199,13 +199,15 @@ class MasterLink:
         of = self._senders[sender]
         if of.live is None:
             return State.IDLE if of.pending is None else State.PENDING
-        return State.LIVE if t_ns - of.live.heard_ns < WELL_NS else State.SILENT
+        return State.LIVE if t_ns - of.live.received_ns < WELL_NS else State.SILENT
 
     def connected(self) -> frozenset[str]:
         """Return the senders heard in a live session within the last second."""
         t_ns = self._clock.now_ns()
         live = ((name, sender.live) for name, sender in self._senders.items())
-        return frozenset(name for name, link in live if link is not None and t_ns - link.heard_ns < SILENT_NS)
+        return frozenset(
+            name for name, link in live if link is not None and t_ns - link.received_ns < SILENT_NS
+        )
 
     def clock_of(self, sender: str) -> ClockEstimate | None:
         """Return how the clock of `sender` runs, or None before its first echo."""
@@ -246,8 +248,8 @@ class MasterLink:
         known = {name: session.key_id for name, session in live.items() if session is not None}
         return Beacon(self._nonce, self._zenoh_endpoint, known)
 
-    def _hear_hello(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
-        hello = self._keys.hear(header, datagram, Hello)
+    def _on_hello(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
+        hello = self._keys.open_as(header, datagram, Hello)
         if isinstance(hello, Refusal):
             return hello
         sender = self._senders.get(hello.name)
@@ -301,14 +303,14 @@ class MasterLink:
         sealer = self._keys.session_sealer(keys.to_slave, keys.key_id)
         return Session(
             hello.name, hello, session_nonce, keys.proof, keys.key_id, address, sealer, Opener(keys.to_master),
-            since_ns=t_ns, heard_ns=t_ns, next_echo_ns=t_ns, next_start_ns=t_ns,
+            since_ns=t_ns, received_ns=t_ns, next_echo_ns=t_ns, next_start_ns=t_ns,
         )  # fmt: skip
 
     def _welcome(self, session: Session) -> None:
         welcome = Welcome(self._nonce, session.hello.slave_nonce, session.session_nonce, session.proof)
         self._outbox.append((seal(self._sealer, welcome), session.address))
 
-    def _hear_slave(self, header: Header, datagram: bytes, t_ns: int) -> Taken | Refusal | None:
+    def _on_slave(self, header: Header, datagram: bytes, t_ns: int) -> Taken | Refusal | None:
         session = self._sessions.get(header.key_id)
         if session is None:
             return Refusal.STALE
@@ -330,7 +332,7 @@ class MasterLink:
             if opened is Refusal.DUPLICATE:
                 sender.main.sequence.duplicate()
             return opened
-        session.heard_ns = t_ns
+        session.received_ns = t_ns
         if sender.pending is session:
             self._confirm(sender, session, t_ns)
         if opened.reordered:
@@ -397,7 +399,7 @@ class MasterLink:
         t_ns = self._clock.now_ns()  # asked for each: it is the time stamp itself
         if t_ns < session.next_echo_ns:
             return
-        if t_ns - session.heard_ns > SILENT_NS:
+        if t_ns - session.received_ns > SILENT_NS:
             period = ECHO_NS
         elif not session.clock.settled or t_ns - session.since_ns < FAST_NS:
             period = ECHO_FAST_NS

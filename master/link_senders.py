@@ -38,7 +38,7 @@ class Session:
     sealer: Sealer
     opener: Opener
     since_ns: int
-    heard_ns: int
+    received_ns: int
     next_echo_ns: int
     next_start_ns: int
     started: bool = False

@@ -79,7 +79,7 @@ def run_live(
     key: LinkKey | bytes,
     settings: LiveSettings,
     stop: threading.Event,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
 ) -> dict[str, object]:
     """Track until `stop` is set.
 
@@ -102,14 +102,14 @@ def run_live(
     hurry = Hurry(setups)
     pipelines = [LivePipeline(setup, stages, Shedding(hurry)) for setup in setups]
     world = World(setups, pipelines, stages)
-    tuning = None if settings.files is None else RigTuning(settings.files, setups, pipelines, say, world)
+    tuning = None if settings.files is None else RigTuning(settings.files, setups, pipelines, notify, world)
     with ExitStack() as stack:
         bus = host_bus(settings.bus, devices_of(setups))
         stack.callback(bus.close)
         tap = Tap(bus, clock, always=settings.record is not None)
         stack.callback(tap.close)
         if settings.record is not None and settings.files is not None:
-            recorder = RecorderProcess(settings.record, settings.files, settings.bus, say, tap.end_always)
+            recorder = RecorderProcess(settings.record, settings.files, settings.bus, notify, tap.end_always)
             stack.callback(recorder.close)
             recorder.wait_ready(bus)
         ingest = ingest_of(setups, key, clock, settings)
@@ -133,7 +133,7 @@ def run_live(
             figures,
             tap,
             stop,
-            say,
+            notify,
         )
         files = None if settings.files is None else FileWatch(settings.files.calibration, settings.files.rigs)
         writes_to = Path.cwd() if settings.poses is None else settings.poses.parent
@@ -158,8 +158,8 @@ def run_live(
         for thread in threads:
             thread.start()
         for one in world.unplaced:
-            say(unplaced_line(one.name, one.tracker or ""))
-        say(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
+            notify(unplaced_line(one.name, one.tracker or ""))
+        notify(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
         source = Tapped(DevicePoses(ingest.queue, bus), tap, hurry)

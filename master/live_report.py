@@ -42,14 +42,14 @@ class Reporter:
         figures: RunFigures,
         tap: Tap,
         stop: threading.Event,
-        say: Callable[[str], None],
+        notify: Callable[[str], None],
     ) -> None:
         """Be there on the bus from now on; `work` belongs to a thread."""
         self.session = secrets.randbits(63)
         self._cameras, self._trackers, self._clock, self._bus = cameras, trackers, clock, bus
         self._ingest, self._world, self._figures = ingest, world, figures
         self._tuning, self._watch, self._extrinsics = tuning, watch, extrinsics
-        self._tap, self._stop, self._say = tap, stop, say
+        self._tap, self._stop, self._notify = tap, stop, notify
         self._mismatched: frozenset[str] = frozenset()
         bus.announce(MASTER)
         bus.serve(MASTER, self.answer)
@@ -95,19 +95,19 @@ class Reporter:
                 if self._stop.is_set():
                     return  # the run has ended
                 raise
-            heard = self._ingest.connected
-            if heard != connected:
-                connected = heard
-                self._say(cameras_line(self._cameras, connected, self._trackers))
+            received = self._ingest.connected
+            if received != connected:
+                connected = received
+                self._notify(cameras_line(self._cameras, connected, self._trackers))
             if self._ingest.started and not started:
                 started = True
-                self._say("started")
+                self._notify("started")
             if self._figures.poses and not poses:
-                self._say("tracking")
+                self._notify("tracking")
             if started:
-                self._say(f"rate {self._figures.poses - poses} poses/s")
+                self._notify(f"rate {self._figures.poses - poses} poses/s")
             for line in lines:
-                self._say(line)
+                self._notify(line)
             poses = self._figures.poses
 
     def _looked(self) -> list[str]:

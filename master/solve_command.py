@@ -8,8 +8,8 @@ import typer
 from common.frame_recording import open_recording
 from master.options import Hand
 from master.rig import setups_with_hands
-from master.said import progress, say
 from master.solve import rigs_to_solve, solve_hands
+from master.terminal import print_line, progress
 
 SolverMode = Literal["fk", "ik", "auto"]
 Solver = Literal["estimator", "fabrik"]
@@ -70,4 +70,4 @@ def solve(
     setups = setups_with_hands(rigs, opened.manifest.cameras, calibration, hand, opened.manifest.objects)
     out.mkdir(parents=True, exist_ok=True)
     solve_hands(opened, setups, detections, out, lambda done, total: progress("solving", done, total))
-    say(f"wrote {out / 'poses.npz'} and {out / 'summary.json'}")
+    print_line(f"wrote {out / 'poses.npz'} and {out / 'summary.json'}")

@@ -182,14 +182,14 @@ class RigTuning:
         files: RigFiles,
         setups: Sequence[RigSetup],
         pipelines: Sequence[LivePipeline],
-        say: Callable[[str], None],
+        notify: Callable[[str], None],
         world: World | None = None,
     ) -> None:
-        """Follow `files`, which say `setups`, and change `pipelines`; `say` is told one line for each change.
+        """Follow `files`, which say `setups`, and change `pipelines`; `notify` is told one line for each change.
 
         Objects and gestures are those of `world`; None: nobody asks for any.
         """
-        self._files, self._say, self._world = files, say, world
+        self._files, self._notify, self._world = files, notify, world
         self._setups, self._pipelines = tuple(setups), tuple(pipelines)
         self._watched = WatchedFiles()
         self._lock = threading.Lock()
@@ -213,7 +213,7 @@ class RigTuning:
         try:
             self.reload()
         except PhalanxError as error:
-            self._say(f"changed files are not used: {error}")
+            self._notify(f"changed files are not used: {error}")
 
     def reload(self) -> None:
         """Use the files as they are now, those of all hands or none.
@@ -224,7 +224,7 @@ class RigTuning:
         with self._lock:
             changed = self._use(self._files.load)
         if changed:
-            self._say("changed files are in use")
+            self._notify("changed files are in use")
 
     def try_filter(self, body: str) -> None:
         """Use another 1 € filter for one rig, until its files change or `reload` (body: `FilterTrial`).

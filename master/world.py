@@ -130,7 +130,7 @@ class World:
         Raises:
             CalibrationError: An object does not fit its rig.
         """
-        self._stage, self._say_gestures = stage, gestures
+        self._stage, self._gesture_begins = stage, gestures
         self._hands = tuple(zip(setups, lines, strict=True))
         self._watching = {
             name: [
@@ -207,7 +207,7 @@ class World:
         Raises:
             CalibrationError: An object does not fit its rig; nothing has changed.
         """
-        new = _Auxiliary.of(setups, self._counts, gestures=self._say_gestures)
+        new = _Auxiliary.of(setups, self._counts, gestures=self._gesture_begins)
         return lambda: self._next.append(new)
 
     def _take_over(self, new: _Auxiliary) -> Iterator[Gesture]:
@@ -243,8 +243,8 @@ class World:
             yield from near
         if (gestures := self._now.gestures.get(pose.hand)) is not None:
             with self._stage("gestures"):
-                said = gestures.push(pose)
-            for gesture in said:
+                messages = gestures.push(pose)
+            for gesture in messages:
                 self._remember(gesture)
                 yield gesture
 

@@ -62,8 +62,8 @@ def forearm_tilt(poses: Poses, scene: WristScene, epoch_ns: int) -> dict[str, fl
     for k, row in enumerate(rows):
         t_s = (int(poses.t_ns[row]) - epoch_ns) * 1e-9
         true_up[k] = up @ OnForearm(scene.motion).at(t_s).T_rig_palm[:3, :3]
-    said_up = quaternion_to_matrix(poses.palm_world_wxyz[rows])[:, 2]
-    off_rad: Float = np.arccos(np.clip((true_up * said_up).sum(axis=1), -1.0, 1.0))
+    stated_up = quaternion_to_matrix(poses.palm_world_wxyz[rows])[:, 2]
+    off_rad: Float = np.arccos(np.clip((true_up * stated_up).sum(axis=1), -1.0, 1.0))
     return {"forearm_tilt_deg": round(float(np.degrees(np.sqrt((off_rad**2).mean()))), 4)}
 
 

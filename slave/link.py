@@ -74,7 +74,7 @@ class _Offer:
     beacon: Beacon
     beacon_counter: int
     address: Address
-    heard_ns: int
+    received_ns: int
     next_ns: int
     since_ns: int
     drawn_ns: int  # its nonce
@@ -93,7 +93,7 @@ class _Session:
     sealer: Sealer
     opener: Opener
     since_ns: int
-    heard_ns: int
+    received_ns: int
     start_t_ns: int | None = None
 
 
@@ -133,7 +133,7 @@ class SlaveLink:
         """Return how far the session with a master is at `t_ns`, on this slave's clock."""
         if self._session is None:
             return State.IDLE if self._offer is None else State.OFFERED
-        return State.LIVE if t_ns - self._session.heard_ns < WELL_NS else State.SILENT
+        return State.LIVE if t_ns - self._session.received_ns < WELL_NS else State.SILENT
 
     @property
     def started(self) -> bool:
@@ -141,7 +141,7 @@ class SlaveLink:
         session = self._session
         if session is None or session.start_t_ns is None:
             return False
-        return self._clock.now_ns() - session.heard_ns < VANISHED_NS
+        return self._clock.now_ns() - session.received_ns < VANISHED_NS
 
     @property
     def start_t_ns(self) -> int | None:
@@ -156,9 +156,9 @@ class SlaveLink:
         """
         return None if self._session is None else self._session.zenoh_endpoint
 
-    def hear_beacon(self, datagram: bytes, address: Address, t_ns: int) -> None:
+    def receive_beacon(self, datagram: bytes, address: Address, t_ns: int) -> None:
         """Take a datagram from the beacon's port."""
-        self._count(self._hear_beacon(datagram, address, t_ns))
+        self._count(self._on_beacon(datagram, address, t_ns))
 
     def receive(self, datagram: bytes, address: Address, t_ns: int) -> None:
         """Take a datagram from the port of this slave that arrived at `t_ns`."""
@@ -166,11 +166,11 @@ class SlaveLink:
         if isinstance(header, Refusal):
             self._count(header)
         elif header.kind is Kind.WELCOME:
-            self._count(self._hear_welcome(header, datagram, address, t_ns))
+            self._count(self._on_welcome(header, datagram, address, t_ns))
         elif header.kind is Kind.UNPROVEN:
-            self._count(self._hear_unproven(header, datagram, address, t_ns))
+            self._count(self._on_unproven(header, datagram, address, t_ns))
         elif header.kind in (Kind.START, Kind.ECHO_ASK):
-            self._count(self._hear_master(header, datagram, t_ns))
+            self._count(self._on_master(header, datagram, t_ns))
         else:
             self._count(Refusal.UNEXPECTED)
 
@@ -192,10 +192,10 @@ class SlaveLink:
         # A clock that was set back is no reason to be silent until it is there again.
         if (
             offer is not None
-            and t_ns - offer.heard_ns < OFFER_NS
+            and t_ns - offer.received_ns < OFFER_NS
             and not 0 < offer.next_ns - t_ns <= HELLO_AGAIN_NS
         ):
-            self._say_hello(offer, t_ns)
+            self._send_hello(offer, t_ns)
         outbox, self._outbox = self._outbox, []
         return outbox
 
@@ -203,7 +203,7 @@ class SlaveLink:
         if refusal is not None:
             self.refused[refusal] += 1
 
-    def _hear_beacon(self, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
+    def _on_beacon(self, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
         header = parse(datagram, self._keys.rig_tag)
         if isinstance(header, Refusal):
             if header is Refusal.VERSION:
@@ -211,7 +211,7 @@ class SlaveLink:
             return header
         if header.kind is not Kind.BEACON:
             return Refusal.UNEXPECTED
-        beacon = self._keys.hear(header, datagram, Beacon)
+        beacon = self._keys.open_as(header, datagram, Beacon)
         if isinstance(beacon, Refusal):
             return beacon
         rule = self._rule(self._beacon_event(beacon, header.counter, t_ns), t_ns)
@@ -227,7 +227,7 @@ class SlaveLink:
         session = self._session
         if session is None or beacon.master_nonce != session.master_nonce:
             return Event.BEACON_OTHER
-        vanished = t_ns - session.heard_ns >= VANISHED_NS  # then no counter is worth being deaf for it
+        vanished = t_ns - session.received_ns >= VANISHED_NS  # then no counter is worth being deaf for it
         if counter <= session.beacon_counter and not vanished:
             return Event.BEACON_OLD
         session.beacon_counter = counter
@@ -241,7 +241,7 @@ class SlaveLink:
         if (
             old is not None
             and old.beacon.master_nonce == beacon.master_nonce
-            and t_ns - old.heard_ns < OFFER_NS
+            and t_ns - old.received_ns < OFFER_NS
         ):
             since_ns = old.since_ns
         if old is not None and 0 <= t_ns - old.drawn_ns < NONCE_NS:
@@ -249,7 +249,7 @@ class SlaveLink:
         else:
             nonce, drawn_ns = self._random(NONCE_BYTES), t_ns
         self._offer = _Offer(nonce, beacon, counter, address, t_ns, t_ns, since_ns, drawn_ns)
-        self._say_hello(self._offer, t_ns)
+        self._send_hello(self._offer, t_ns)
 
     def _has_twin(self, beacon: Beacon, t_ns: int) -> Refusal | None:
         """Whether the master says no more than that it has somebody of this name already."""
@@ -261,7 +261,7 @@ class SlaveLink:
         return Refusal.TWIN
 
     def _answer_stranger(self, datagram: bytes, address: Address, t_ns: int) -> None:
-        """Say who we are to a master of this rig that cannot understand us; its word is not proven, so seldom."""
+        """Notify who we are to a master of this rig that cannot understand us; its word is not proven, so seldom."""
         if len(datagram) < OVERHEAD:
             return
         _, version, kind, _, rig, _, _ = HEADER.unpack_from(datagram)
@@ -275,15 +275,15 @@ class SlaveLink:
         hello = self._keys.hello(self._name, self.process, *nonces)
         self._outbox.append((seal(self._sealer, hello), address))
 
-    def _say_hello(self, offer: _Offer, t_ns: int) -> None:
+    def _send_hello(self, offer: _Offer, t_ns: int) -> None:
         offer.next_ns = t_ns + HELLO_AGAIN_NS
         self._outbox.append((seal(self._sealer, self._hello(offer)), offer.address))
 
     def _hello(self, offer: _Offer) -> Hello:
         return self._keys.hello(self._name, self.process, offer.slave_nonce, offer.beacon.master_nonce)
 
-    def _hear_welcome(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
-        welcome = self._keys.hear(header, datagram, Welcome)
+    def _on_welcome(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
+        welcome = self._keys.open_as(header, datagram, Welcome)
         if isinstance(welcome, Refusal):
             return welcome
         offer = self._offer
@@ -303,7 +303,7 @@ class SlaveLink:
             self._keys.session_sealer(keys.to_master, keys.key_id),
             Opener(keys.to_slave),
             since_ns=t_ns,
-            heard_ns=t_ns,
+            received_ns=t_ns,
         )
         self._offer = None
         return None
@@ -317,9 +317,9 @@ class SlaveLink:
             return Event.WELCOME_STALE  # a beacon of another life came meanwhile, and hello went there
         return Event.WELCOME if compare_digest(keys.proof, welcome.proof) else Event.WELCOME_UNPROVEN
 
-    def _hear_unproven(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
+    def _on_unproven(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
         """Why there is no welcome. It changes nothing here: whoever has the rig key can say it."""
-        unproven = self._keys.hear(header, datagram, Unproven)
+        unproven = self._keys.open_as(header, datagram, Unproven)
         if isinstance(unproven, Refusal):
             return unproven
         ours = self._offer is not None and unproven.slave_nonce == self._offer.slave_nonce
@@ -330,7 +330,7 @@ class SlaveLink:
             self._wrong = t_ns, why.format(self._name, address[0])
         return self._rule(Event.UNPROVEN if ours else Event.UNPROVEN_UNASKED, t_ns).refusal
 
-    def _hear_master(self, header: Header, datagram: bytes, t_ns: int) -> Refusal | None:
+    def _on_master(self, header: Header, datagram: bytes, t_ns: int) -> Refusal | None:
         session = self._session
         if session is None or header.key_id != session.key_id:
             return Refusal.STALE
@@ -338,7 +338,7 @@ class SlaveLink:
         if isinstance(opened, Refusal):
             return opened
         message = read(header.kind, opened.body)
-        session.heard_ns = t_ns
+        session.received_ns = t_ns
         if isinstance(message, EchoAsk):
             answer = EchoAnswer(message.t1_ns, t_ns, self._clock.now_ns())
             self._outbox.append((seal(session.sealer, answer), session.address))

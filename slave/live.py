@@ -61,7 +61,7 @@ def run_live(
     scan: Scan,
     engine: Engine | WristEngine,
     stop: threading.Event,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
     service: Service,
     access: Access,
     raw_frames: RawSettings | None = None,
@@ -111,7 +111,7 @@ def run_live(
     try:
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
-        say("ready, waiting for the master")
+        notify("ready, waiting for the master")
         service.ready(lambda: uplink.started)
         if wait_for_start(uplink, stop, service.waiting):
             line.run()
@@ -123,7 +123,7 @@ def run_live(
         source.close()
         raw.close()
         workers.shutdown(cancel_futures=True)
-    say(f"{line.numbers.counts()['frames']} frames, sent {uplink.counts['sent']}")
+    notify(f"{line.numbers.counts()['frames']} frames, sent {uplink.counts['sent']}")
 
 
 @dataclass(frozen=True, slots=True)

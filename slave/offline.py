@@ -143,7 +143,7 @@ def calibrate_colours(
     auto: bool = False,
     like: Path | None = None,
     hand: Path | None = None,
-    say: Callable[[str], None] = lambda _text: None,
+    notify: Callable[[str], None] = lambda _text: None,
 ) -> list[ColourRow]:
     """Make the colour ranges of one camera from a recording and write its camera file.
 
@@ -192,19 +192,19 @@ def calibrate_colours(
     else:
         profile = Path("calib_json/hands") / f"{rig.hand}.json" if hand is None else hand
         if like is not None:
-            namer = by_hues(load(like, CameraCalibration).markers, rig.markers, str(like), say)
+            namer = by_hues(load(like, CameraCalibration).markers, rig.markers, str(like), notify)
             if hand is not None or profile.exists():
                 shape = load(profile, HandProfile)
                 if hand is not None or shape.markers.keys() >= set(rig.markers):
-                    namer = checked(namer, by_hand(shape, rig.markers, say), say)
+                    namer = checked(namer, by_hand(shape, rig.markers, notify), notify)
         elif hand is None and not missing:
             namer = by_clicks(clicks, rig.markers, own.width_px)
         else:
-            namer = by_hand(load(profile, HandProfile), rig.markers, say)
+            namer = by_hand(load(profile, HandProfile), rig.markers, notify)
         chosen = spread(len(rows), frames_for(own.width_px * own.height_px))
-        say(f"{camera}: reading {len(chosen)} of {len(rows)} frames")
+        notify(f"{camera}: reading {len(chosen)} of {len(rows)} frames")
         images = [pictures.read(rows[k].file) for k in chosen]
-        table = calibrate_moving(images, rig.markers, namer, say)
+        table = calibrate_moving(images, rig.markers, namer, notify)
     make_folder(output.parent)
     save(output, msgspec.structs.replace(own, markers={row.name: row.range for row in table}))
     return table

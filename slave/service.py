@@ -82,7 +82,7 @@ class Service:
         """The loop came round, but there is no master yet."""
         now_ns = self._now_ns()
         if now_ns >= self._due_ns or self._patient:
-            self._say(WAITING, now_ns)
+            self._notify(WAITING, now_ns)
 
     def working(self) -> None:
         """The loop came round with one of what it is for."""
@@ -93,11 +93,11 @@ class Service:
         if now_ns < self._due_ns and not self._patient:
             return
         if self._patient:
-            self._say(f"{self._noun} come", now_ns)
+            self._notify(f"{self._noun} come", now_ns)
             return
         rate_hz = (self._rounds - 1) * 1e9 / max(1, now_ns - self._since_ns)
         alone = "" if self._linked() else ", but the master is away"
-        self._say(f"{rate_hz:.3g} {self._noun}/s{alone}", now_ns)
+        self._notify(f"{rate_hz:.3g} {self._noun}/s{alone}", now_ns)
 
     def away(self, what: str, patience_s: float = AWAY_S) -> None:
         """A device is lost, or something else takes time: the next round may be so late [s]."""
@@ -116,7 +116,7 @@ class Service:
         """It ends because of an error; the last line of status tells which."""
         self._send(f"STATUS=failed: {one_line(why)}")
 
-    def _say(self, doing: str, now_ns: int) -> None:
+    def _notify(self, doing: str, now_ns: int) -> None:
         """What it does; from now on with no more patience than usual."""
         if self._send(f"STATUS={one_line(doing)}{self._fed(self._period_us if self._patient else 0)}"):
             self._patient = False

@@ -167,9 +167,9 @@ class CameraTuning:
     def figures(self) -> dict[str, float]:
         """What the camera has and does now, and what the content in use says of settings, size and colours."""
         used = self._used
-        said = {WANTED + name: value for name, value in figures(used.camera).items()}
-        said |= in_use(used.camera, used.rig.markers)
-        return said if self._source is None else self._source.figures() | said
+        stated = {WANTED + name: value for name, value in figures(used.camera).items()}
+        stated |= in_use(used.camera, used.rig.markers)
+        return stated if self._source is None else self._source.figures() | stated
 
     def look(self) -> None:
         """Apply the files if they were changed; where that fails, say so once and go on as before."""

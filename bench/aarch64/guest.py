@@ -101,7 +101,7 @@ class _Wire:
         self.datagrams: list[bytes] = []
         for _ in range(200):
             for datagram, _to in master.due():
-                self._link.hear_beacon(datagram, MASTER, clock.now_ns())
+                self._link.receive_beacon(datagram, MASTER, clock.now_ns())
                 self._link.receive(datagram, MASTER, clock.now_ns())
             for datagram, _to in self._link.due():
                 master.receive(datagram, SLAVE, clock.now_ns())

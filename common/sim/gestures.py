@@ -51,7 +51,7 @@ _LOOSEN_DEG = np.array([[14.0, -14.0, -14.0], *[[0.0, -17.0, -16.0]] * 4])
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class Annotation:
     """One thing that the hand says.
 
     Attributes:
@@ -125,7 +125,7 @@ class Gestures:
         self._shown = Track(np.array(_SHOWN_DEG["dial"][0]))
         self._knobs: list[tuple[float, Knob]] = []
         self._keys = reachable_keys(model, self._own)
-        self.said: tuple[Said, ...] = ()
+        self.annotations: tuple[Annotation, ...] = ()
         self._now = 0.6
         second = self._ways.integers(0, 2, len(_SHOWN_DEG))
         for k in range(2):
@@ -210,8 +210,8 @@ class Gestures:
             self._steady.to(np.array([steady]), self._now, stop)
         self._now = stop + rest_s
 
-    def _say(self, kind: GestureKind, name: str, start_s: float) -> None:
-        self.said = (*self.said, Said(kind, name, start_s, self._now))
+    def _record_begin(self, kind: GestureKind, name: str, start_s: float) -> None:
+        self.annotations = (*self.annotations, Annotation(kind, name, start_s, self._now))
 
     def _order(self, first: int, end: int) -> list[int]:
         """The numbers from one to before the other, shuffled."""
@@ -227,7 +227,7 @@ class Gestures:
             posture = pinch_posture(self._model, finger, self._own)
             self._go(posture, self._some(0.28, 0.5), self._some(0.25, 0.6), 1.0)
             self._go(relaxed, self._some(0.28, 0.45), self._some(0.1, 0.2), 0.0)
-            self._say("pinch", FINGERS[finger], start)
+            self._record_begin("pinch", FINGERS[finger], start)
 
     def _dial(self) -> None:
         knob, start = self._grip(), self._now
@@ -258,7 +258,7 @@ class Gestures:
         self._go(knob.posture_deg + 1.6 * _LOOSEN_DEG, 0.35, 0.0, 1.0)
         self._rotate_palm(0.0, 0.6)
         self._go(np.array(REST), 0.4, 0.3, 0.0)
-        self._say("dial", "dial", start_s)
+        self._record_begin("dial", "dial", start_s)
 
     def _rotate_palm(self, to_rad: float, seconds: float) -> None:
         self._rotation_vector.to(np.array([to_rad]), self._now, self._now + seconds)
@@ -284,7 +284,7 @@ class Gestures:
             start = self._now
             self._go(key.posture_deg, self._some(0.12, 0.18), self._some(0.04, 0.1), 1.0)
             self._go(hover, self._some(0.12, 0.18), self._some(0.1, 0.2), 1.0)
-            self._say("tap", KEY_NAMES[key.finger - 1][key.segment], start)
+            self._record_begin("tap", KEY_NAMES[key.finger - 1][key.segment], start)
         self._go(door, 0.25, 0.05, 1.0)
         self._go(aside, 0.25, 0.05, 1.0)
         self._go(np.array(REST), 0.5, 0.1, 0.0)
@@ -297,7 +297,7 @@ class Gestures:
         self._place.to(rotation_vector, self._now, self._now + 0.6)
         self._go(np.array(POSES["pointing"]), self._some(0.4, 0.6), self._some(1.0, 1.4), 0.0)
         self._go(np.array(REST), self._some(0.4, 0.6), 0.2, 0.0)
-        self._say("point", "point", start)
+        self._record_begin("point", "point", start)
 
     def _free(self) -> None:
         """Fingers from posture to posture, the palm from place to place."""

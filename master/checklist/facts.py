@@ -49,7 +49,7 @@ class SenderNow:
     """One camera or IMU, as the master hears it.
 
     Attributes:
-        connected: Heard within the last second.
+        connected: Received within the last second.
         received, missed: Messages that were taken, and that were sent and could not be (lost, or too late), so far.
         clock_sigma_ns: Standard deviation of its clock's offset now [ns]; None: not known.
         twin: Where a second process under its name was turned away lately; None: there was none.

@@ -26,7 +26,7 @@ EVERY_NS = 1_000_000_000  # and at once where it changes
 DEPTH = 64  # reports of slaves that may wait for a look: 32 senders, twice a second
 
 
-class Heard(Protocol):
+class Received(Protocol):
     """What the master hears; an `Ingest`."""
 
     @property
@@ -81,7 +81,7 @@ class ChecklistFeed:
         self,
         bus: Bus,
         clock: Clock,
-        heard: Heard,
+        received: Received,
         setups: Sequence[RigSetup],
         pipelines: Sequence[Counting],
         files: FileWatch | None,
@@ -103,7 +103,7 @@ class ChecklistFeed:
         Raises:
             BusError: The bus is closed.
         """
-        self._bus, self._clock, self._heard, self._files = bus, clock, heard, files
+        self._bus, self._clock, self._received, self._files = bus, clock, received, files
         self._setups, self._pipelines = tuple(setups), tuple(pipelines)
         self._plan = plan_of(setups)
         self._watch = ChecklistWatch(self._plan)
@@ -123,7 +123,7 @@ class ChecklistFeed:
                 raise
             except Exception as error:  # noqa: BLE001
                 # What a device reports may make a rule fail; the list goes on with the next report.
-                self._heard.quarantine.note(MASTER, error)
+                self._received.quarantine.note(MASTER, error)
 
     def look(self, setups: Sequence[RigSetup] | None = None) -> tuple[CheckItem, ...]:
         """Look once, and publish where it is due; `setups` that are in use now, None: as before.
@@ -148,12 +148,12 @@ class ChecklistFeed:
         return items
 
     def _now(self, t_ns: int) -> MasterNow:
-        connected = self._heard.connected
-        turned_away, markers = self._heard.turned_away(), self._heard.marker_counts()
+        connected = self._received.connected
+        turned_away, markers = self._received.turned_away(), self._received.marker_counts()
         names = (*(camera.name for camera in self._plan.cameras), *self._plan.imus)
         senders: dict[str, SenderNow] = {}
         for name in names:
-            counts, clock = self._heard.counts_of(name), self._heard.clock_of(name)
+            counts, clock = self._received.counts_of(name), self._received.clock_of(name)
             sigma_ns = None if clock is None else clock.sigma_at(t_ns)
             missed = counts.lost + counts.late
             twin, stranger, unproven = (of.get(name) for of in turned_away)
@@ -165,7 +165,7 @@ class ChecklistFeed:
             if setup.has_markers
         ]
         found = () if self._files is None else self._files.look(self._plan)
-        return MasterNow(self._heard.started, senders, groups, self._machine.disk_free_mb(), found)
+        return MasterNow(self._received.started, senders, groups, self._machine.disk_free_mb(), found)
 
 
 def _keys(items: tuple[CheckItem, ...] | None) -> list[tuple[str, str]] | None:

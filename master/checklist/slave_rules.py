@@ -6,7 +6,7 @@ from math import log
 from common.camera_settings import WANTED
 from master.checklist.facts import CameraPlan, Verdict, beyond
 from master.checklist.link_rules import disk_verdict
-from master.checklist.said import Said
+from master.checklist.slave_reports import SlaveReports
 from master.checklist.unseen import UnseenMarkers
 
 # Setting -> relative and absolute distance from which what is read back is another setting. Cameras round exposure to
@@ -44,33 +44,33 @@ class SlaveRules:
         self._judged = -1
         self._kept: list[Verdict] = []
 
-    def look(self, name: str, said: Said, t_ns: int) -> Iterator[Verdict]:
+    def look(self, name: str, reports: SlaveReports, t_ns: int) -> Iterator[Verdict]:
         """All that its last reports tell; nothing where they are old."""
-        if not said.is_recent(t_ns):
+        if not reports.is_recent(t_ns):
             return
-        if said.number != self._judged:
-            self._judged = said.number
-            self._kept = [] if self._camera is None else list(self._of_two(self._camera, said))
+        if reports.number != self._judged:
+            self._judged = reports.number
+            self._kept = [] if self._camera is None else list(self._of_two(self._camera, reports))
         yield from self._kept
         if self._camera is not None:
-            yield from _settings(name, said)
-            yield from _light(name, said)
-            yield from _collisions(self._camera, said)
-            yield from _file(self._camera, said)
-        yield from _machine(name, said)
+            yield from _settings(name, reports)
+            yield from _light(name, reports)
+            yield from _collisions(self._camera, reports)
+            yield from _file(self._camera, reports)
+        yield from _machine(name, reports)
 
-    def _of_two(self, camera: CameraPlan, said: Said) -> Iterator[Verdict]:
+    def _of_two(self, camera: CameraPlan, reports: SlaveReports) -> Iterator[Verdict]:
         """What happened between two reports."""
         for unseen in self._unseen:
-            yield from unseen.push(said)
-        yield from _background(camera, said)
+            yield from unseen.push(reports)
+        yield from _background(camera, reports)
         if camera.wrist:
-            yield from _strobe(camera.name, said)
+            yield from _strobe(camera.name, reports)
 
 
-def _settings(name: str, said: Said) -> Iterator[Verdict]:
+def _settings(name: str, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether the camera has what it was told."""
-    gauges = said.gauges
+    gauges = reports.gauges
     wrong: list[str] = []
     for setting, (share, least) in OFF.items():
         want, got = gauges.get(WANTED + setting), gauges.get(setting)
@@ -93,9 +93,9 @@ def _settings(name: str, said: Said) -> Iterator[Verdict]:
     )
 
 
-def _light(name: str, said: Said) -> Iterator[Verdict]:
+def _light(name: str, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether the picture is as bright as at calibration."""
-    exposure = said.gauges.get("light_exposure")
+    exposure = reports.gauges.get("light_exposure")
     if exposure is None or exposure <= 0.0:
         return
     yield Verdict(
@@ -107,10 +107,10 @@ def _light(name: str, said: Said) -> Iterator[Verdict]:
     )
 
 
-def _collisions(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
+def _collisions(camera: CameraPlan, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether two markers share colours, by their ranges or by their looks."""
     name = camera.name
-    for gauge, hues in said.gauges.items():
+    for gauge, hues in reports.gauges.items():
         if gauge.startswith(OVERLAP):
             pair = tuple(gauge.removeprefix(OVERLAP).split(BETWEEN))
             what = f"the colour ranges of {' and '.join(pair)} overlap by {hues:.0f} hues"
@@ -132,10 +132,10 @@ def _collisions(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
         )
 
 
-def _file(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
+def _file(camera: CameraPlan, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether the slave has colours, and a file of the same camera as the master's."""
     name = camera.name
-    bare = tuple(marker for marker in camera.markers if UNCOLOURED + marker in said.counts)
+    bare = tuple(marker for marker in camera.markers if UNCOLOURED + marker in reports.counts)
     yield Verdict(
         "calibration_absent",
         name,
@@ -145,7 +145,7 @@ def _file(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
         (name,),
         bare,
     )
-    width, height = said.gauges.get("width_px"), said.gauges.get("height_px")
+    width, height = reports.gauges.get("width_px"), reports.gauges.get("height_px")
     if width is None or height is None:
         return
     yield Verdict(
@@ -158,17 +158,17 @@ def _file(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
     )
 
 
-def _background(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
+def _background(camera: CameraPlan, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether things beside the hand have the colour of a marker."""
-    frames = said.increase("frames")
+    frames = reports.increase("frames")
     if not frames:
         return
     for marker in camera.markers:
         event = AMBIGUOUS + marker
-        if event not in said.counts:
+        if event not in reports.counts:
             continue
-        share = (said.increase(event) or 0) / frames
-        u, v = said.gauges.get(f"{event}.u"), said.gauges.get(f"{event}.v")
+        share = (reports.increase(event) or 0) / frames
+        u, v = reports.gauges.get(f"{event}.u"), reports.gauges.get(f"{event}.v")
         where = "" if u is None or v is None else f", near pixel {u:.0f}, {v:.0f}"
         yield Verdict(
             "background_in_range",
@@ -181,9 +181,11 @@ def _background(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
         )
 
 
-def _strobe(name: str, said: Said) -> Iterator[Verdict]:
+def _strobe(name: str, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether laser and LEDs are on in the frames in which they should be."""
-    frames, out, unlit = (said.increase(event) for event in ("frames", "strobe.out_of_step", "strobe.unlit"))
+    frames, out, unlit = (
+        reports.increase(event) for event in ("frames", "strobe.out_of_step", "strobe.unlit")
+    )
     if not frames or out is None:
         return
     cycles = frames / CYCLE
@@ -199,9 +201,9 @@ def _strobe(name: str, said: Said) -> Iterator[Verdict]:
     )
 
 
-def _machine(name: str, said: Said) -> Iterator[Verdict]:
+def _machine(name: str, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether the slave's computer is hot, throttled, or its disk full."""
-    gauges = said.gauges
+    gauges = reports.gauges
     now, limit = gauges.get("temperature_c"), gauges.get("temperature_limit_c")
     hot: bool | None = False
     why: list[str] = []

@@ -16,7 +16,7 @@ from common.messages import MAX_CHECKS, CheckCode, CheckItem, Health
 from master.checklist.facts import MasterNow, Plan, Verdict
 from master.checklist.link_rules import LinkRules
 from master.checklist.moved_rule import MovedRule
-from master.checklist.said import Said
+from master.checklist.slave_reports import SlaveReports
 from master.checklist.slave_rules import SlaveRules
 
 CODES: tuple[CheckCode, ...] = get_args(CheckCode)
@@ -77,7 +77,7 @@ class ChecklistWatch:
     def __init__(self, plan: Plan) -> None:
         """Watch who is to be there by `plan`."""
         self._links = LinkRules()
-        self._said: dict[str, Said] = {}
+        self._reports: dict[str, SlaveReports] = {}
         self._latches: dict[tuple[CheckCode, str], _Latch] = {}
         self._causes: dict[tuple[CheckCode, str], tuple[Verdict, int]] = {}
         self._now: MasterNow | None = None
@@ -93,7 +93,7 @@ class ChecklistWatch:
     def push_health(self, health: Health, t_ns: int) -> None:
         """Take the report of a slave that came at `t_ns` [ns]; of anybody else it is left."""
         if health.source in self._slaves:
-            self._said.setdefault(health.source, Said()).push(health, t_ns)
+            self._reports.setdefault(health.source, SlaveReports()).push(health, t_ns)
 
     def push(self, now: MasterNow) -> None:
         """Take what the master counted by now."""
@@ -129,10 +129,10 @@ class ChecklistWatch:
         """All rules, those of the master's own files first."""
         for item in now.files:
             yield Verdict(item.code, item.subject, True, item.sentence, item.fix)
-        yield from self._links.look(self._plan, now, self._said, t_ns)
+        yield from self._links.look(self._plan, now, self._reports, t_ns)
         for name, rules in self._slaves.items():
-            if self._links.present(name) and (said := self._said.get(name)) is not None:
-                yield from rules.look(name, said, t_ns)
+            if self._links.present(name) and (reports := self._reports.get(name)) is not None:
+                yield from rules.look(name, reports, t_ns)
         for (cameras, markers), counts, rule in zip(self._plan.groups, now.groups, self._moved, strict=True):
             if all(self._links.present(name) for name in cameras):
                 yield from rule.look(cameras, markers, counts, t_ns)

@@ -87,7 +87,7 @@ class Door:
     tls: ssl.SSLContext | None = None
 
 
-def door_of(settings: ConsoleSettings, folder: Path, say: Callable[[str], None]) -> Door:
+def door_of(settings: ConsoleSettings, folder: Path, notify: Callable[[str], None]) -> Door:
     """The door of a console: none on this machine alone; elsewhere a password, and TLS unless it is to be open.
 
     Args:
@@ -102,29 +102,29 @@ def door_of(settings: ConsoleSettings, folder: Path, say: Callable[[str], None])
     if settings.password_file is not None:
         password = password_from(settings.password_file)
     else:
-        password = None if here else kept_password(folder, say)
+        password = None if here else kept_password(folder, notify)
     if here:
         return Door(password)
     if settings.open_links:
-        say(
+        notify(
             "console: WARNING: --open: the page is not encrypted; whoever listens to the network reads the password"
         )
         return Door(password)
     certificate = page_certificate(folder, settings.host)
-    say(
+    notify(
         "console: the browser asks once whether to trust this page: compare what it shows with SHA-256"
         f" {certificate.fingerprint}"
     )
     return Door(password, certificate.context)
 
 
-def run_console(settings: ConsoleSettings, stop: threading.Event, say: Callable[[str], None]) -> None:
+def run_console(settings: ConsoleSettings, stop: threading.Event, notify: Callable[[str], None]) -> None:
     """Serve the console until `stop` is set.
 
     Raises:
         PhalanxError: The address cannot be bound, or its password or certificate cannot be used.
     """
-    door = door_of(settings, private_folder(os.environ), say)
+    door = door_of(settings, private_folder(os.environ), notify)
     listening = _listen(settings.host, settings.port)
     host, port = listening.getsockname()[:2]
     state = ConsoleState(settings)
@@ -133,7 +133,7 @@ def run_console(settings: ConsoleSettings, stop: threading.Event, say: Callable[
         server = console_server(console_app(state, settings.host, port, door), door.tls)
         threading.Thread(target=_end_with, args=(stop, server), name="console stop", daemon=True).start()
         scheme = "http" if door.tls is None else "https"
-        say("console: " + " ".join(f"{scheme}://{place}:{port}/" for place in places_of(host)))
+        notify("console: " + " ".join(f"{scheme}://{place}:{port}/" for place in places_of(host)))
         server.run(sockets=[listening])
     finally:
         stop.set()

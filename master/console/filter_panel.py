@@ -80,7 +80,7 @@ def filter_panel(state: ConsoleState, rig: str) -> None:
         for name, _, _, factor, *_ in _PARAMETERS:
             settings[name].show(float(msgspec.structs.asdict(now)[name]) / factor)
 
-    def do(step: Callable[[], None], said: str) -> None:
+    def do(step: Callable[[], None], text: str) -> None:
         async def work() -> None:
             try:
                 await asyncio.to_thread(step)
@@ -90,7 +90,7 @@ def filter_panel(state: ConsoleState, rig: str) -> None:
                 return
             show(now)
             error.set_visibility(False)
-            status.set_text(said)
+            status.set_text(text)
 
         background_tasks.create(work(), name=f"filter {rig}")
 

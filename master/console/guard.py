@@ -97,8 +97,8 @@ def _unframed(send: Send) -> Send:
     async def send_unframed(message: Message) -> None:
         if message["type"] == "http.response.start":
             headers = list(message.get("headers", ()))
-            said = {name.lower() for name, _ in headers}
-            headers += [one for one in (*_FRAMES, _NO_FRAMES) if one[0] not in said]
+            have = {name.lower() for name, _ in headers}
+            headers += [one for one in (*_FRAMES, _NO_FRAMES) if one[0] not in have]
             message = {**message, "headers": headers}
         await send(message)
 

@@ -135,14 +135,14 @@ class LoginRequired:
         ended = asyncio.ensure_future(_end(session, self._clock()))
 
         async def receive_or_end() -> Message:
-            hearing = asyncio.ensure_future(receive())
+            receiving = asyncio.ensure_future(receive())
             try:
-                await asyncio.wait((hearing, ended), return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait((receiving, ended), return_when=asyncio.FIRST_COMPLETED)
                 if ended.done():
                     return {"type": "websocket.disconnect", "code": 1008}
-                return hearing.result()
+                return receiving.result()
             finally:
-                hearing.cancel()
+                receiving.cancel()
 
         try:
             await self._app(scope, receive_or_end, send)

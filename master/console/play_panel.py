@@ -55,9 +55,9 @@ def start_playing(state: ConsoleState, name: str) -> None:
 class Controls:
     """Pause, position and speed of whichever player is on the bus. Holds what the page shows of it."""
 
-    def __init__(self, state: ConsoleState, say: Callable[[str], object]) -> None:
-        """Build them in the present slot; `say` is told why a command was refused, or nothing."""
-        self._state, self._say = state, say
+    def __init__(self, state: ConsoleState, notify: Callable[[str], object]) -> None:
+        """Build them in the present slot; `notify` is told why a command was refused, or nothing."""
+        self._state, self._notify = state, notify
         self._answer: Health | None = None
         self._at, self._speed, self._paused = 0.0, 1.0, False
         self._wanted_s: float | None = None
@@ -70,7 +70,7 @@ class Controls:
                 self._words = ui.label("").classes("mono play-at")
             self._speeds = ui.select(_SPEEDS, value=1.0, label="Speed").props("dense outlined")
             self._speeds.classes("known-poses")
-        self._telling = Telling(self._tell, self._told, say)
+        self._telling = Telling(self._tell, self._told, notify)
         self._pause.on_click(lambda: self._telling.change("resume" if self._paused else "pause", None))
         self._slider.on_value_change(self._dragged)
         self._slider.on("change", self._sought)  # when it is let go, or its key
@@ -115,7 +115,7 @@ class Controls:
 
     def _told(self, answer: Health | None) -> None:
         self._answer = answer
-        self._say("")
+        self._notify("")
 
     def _dragged(self) -> None:
         value = self._slider.value
@@ -145,7 +145,7 @@ def play_panel(state: ConsoleState) -> None:
             play = ui.button("Play", icon="play_circle").props("unelevated")
         error = ui.label("").classes("problem").props('role="alert"')
         controls = Controls(state, error.set_text)
-        said = ui.label("").classes("mono").props('role="log" aria-label="What the player says"')
+        log = ui.label("").classes("mono").props('role="log" aria-label="What the player says"')
 
     async def toggle() -> None:
         error.set_text("")
@@ -171,7 +171,7 @@ def play_panel(state: ConsoleState) -> None:
             which.set_options(names, value=which.value if which.value in names else None)
         controls.update()
         process = state.local.get(PROCESS)
-        said.set_text("" if process is None else "\n".join(process.tail(3)) or "starting …" * running)
+        log.set_text("" if process is None else "\n".join(process.tail(3)) or "starting …" * running)
 
     update()
     ui.timer(_UPDATE_S, update)

@@ -39,7 +39,7 @@ class Shown:
         self.ready = True
         self.mask: tuple[str, ...] = ()
 
-    def hear(self, text: str) -> None:
+    def on_text(self, text: str) -> None:
         """Take one message of the page; what is none of ours is left alone."""
         if text == "next":
             self.ready = True
@@ -84,7 +84,7 @@ async def _page(socket: WebSocket) -> AsyncGenerator[Shown]:
     async def listen() -> None:
         try:
             while True:
-                shown.hear(await socket.receive_text())
+                shown.on_text(await socket.receive_text())
         except (WebSocketDisconnect, RuntimeError, KeyError):
             if sending is not None:
                 sending.cancel()

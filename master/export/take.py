@@ -194,12 +194,12 @@ class MessageTake:
     @property
     def remarks(self) -> tuple[str, ...]:
         """Whether the file is whole."""
-        said: list[str] = []
+        lines: list[str] = []
         if self._recording.cut:
-            said.append("the recording has no end (it broke off); all up to there is exported")
+            lines.append("the recording has no end (it broke off); all up to there is exported")
         if self._recording.broken:
-            said.append(f"{self._recording.broken} parts of the recording cannot be read and are left out")
-        return tuple(said)
+            lines.append(f"{self._recording.broken} parts of the recording cannot be read and are left out")
+        return tuple(lines)
 
     def count(self, hand: str) -> int:
         """As of `Take`."""

@@ -1,4 +1,4 @@
-"""Say that kernels are compiled, two minutes on a version's first start."""
+"""Notify that kernels are compiled, two minutes on a version's first start."""
 
 import logging
 import threading

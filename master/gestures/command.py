@@ -102,7 +102,7 @@ def teach(
     target = path if out is None else out
     target.parent.mkdir(parents=True, exist_ok=True)
     save(target, with_pose(known, name, taught, source))
-    for line in (*taught.said, f"wrote {target}"):
+    for line in (*taught.stated, f"wrote {target}"):
         typer.echo(line)
 
 
@@ -113,7 +113,7 @@ def read(
     calibration: Calibration = CALIB_JSON,
     every: Annotated[bool, typer.Option(help="Every message as a line of JSON, too.")] = False,
 ) -> None:
-    """Say what a recorded hand says: its gestures, from when to when.
+    """Notify what a recorded hand says: its gestures, from when to when.
 
     Examples:
 
@@ -124,12 +124,12 @@ def read(
     path = _settings_path(calibration, settings)
     known = load(path, GestureSettings) if settings is not None else _settings(path)
     rows = load_poses(poses)
-    said = read_gestures(rows, known, _model(hand, rows.hand, calibration))
+    stated = read_gestures(rows, known, _model(hand, rows.hand, calibration))
     if every:
-        for gesture in said:
+        for gesture in stated:
             typer.echo(lines_of(gesture))
     begin_ns = int(rows.t_ns[0]) if len(rows) else 0
-    for span in spans_of(said):
+    for span in spans_of(stated):
         typer.echo(span.line(begin_ns))
 
 

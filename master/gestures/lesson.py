@@ -28,7 +28,7 @@ def lesson(
     name: str,
     count: int,
     clock: Clock,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
 ) -> list[Example]:
     """Blend a person through `count` examples of the pose `name`.
 
@@ -46,24 +46,24 @@ def lesson(
     out: list[Example] = []
     for number in range(count):
         for _ in range(_TRIES):
-            say(f"{number + 1} of {count}: show {name!r}, as you will later")
+            notify(f"{number + 1} of {count}: show {name!r}, as you will later")
             for left in range(COUNT_DOWN_S, 0, -1):
-                say(f"{left} ...")
+                notify(f"{left} ...")
                 during(receive, clock, 1.0)
-            say(f"hold still ({HOLD_S:g} s)")
+            notify(f"hold still ({HOLD_S:g} s)")
             during(receive, clock, _STARTED_S)
             frames = held(during(receive, clock, HOLD_S), model)
             lacking = what_lacks(frames)
             if not lacking:
                 out.append(Example.of(frames))
                 break
-            say(f"{lacking}; once more")
+            notify(f"{lacking}; once more")
         else:
             raise FitError(
                 f"example {number + 1}: not seen at rest in {_TRIES} tries; the poses that were there stay"
             )
         if number + 1 < count:
-            say("good; open the hand, move it, turn it a little")
+            notify("good; open the hand, move it, turn it a little")
             during(receive, clock, _REST_S)
     return out
 

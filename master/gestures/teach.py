@@ -89,7 +89,7 @@ class Taught:
     """
 
     shape: PoseShape
-    said: tuple[str, ...]
+    stated: tuple[str, ...]
     residual: dict[str, float]
 
 
@@ -117,9 +117,9 @@ def learn(
     _refuse_alike(name, shape, examples, others, within)
     agree = _agreement(name, examples)
     asked = [f"{span.low:.4g} to {span.high:.4g} {quantity}" for quantity, span in shape.ranges.items()]
-    said = [f"{name}: told by {', '.join(asked)}", f"each example fits the others by {agree:.2f} or better"]
-    said += [_difference(other, of, examples) for other, of in others.items()]
-    return Taught(shape, tuple(said), {"examples": float(len(examples)), "agreement": round(agree, 3)})
+    stated = [f"{name}: told by {', '.join(asked)}", f"each example fits the others by {agree:.2f} or better"]
+    stated += [_difference(other, of, examples) for other, of in others.items()]
+    return Taught(shape, tuple(stated), {"examples": float(len(examples)), "agreement": round(agree, 3)})
 
 
 def _shape(name: str, examples: Sequence[Example], weight: float) -> PoseShape:

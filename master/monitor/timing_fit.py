@@ -142,10 +142,10 @@ def fit_offset(blocks: Float) -> TimeOffset | None:
         if total <= 0.0:
             return None
         offset = float((weight * ze).sum()) / total
-    told, said, weight_of_rays = (
+    told, lagged, weight_of_rays = (
         (weight[:, None] * blocks[..., part]).sum(axis=2).ravel() for part in (1, 2, 3)
     )
-    scatter = [_scatter(told, said - offset * told, length) for length in _LENGTHS]
+    scatter = [_scatter(told, lagged - offset * told, length) for length in _LENGTHS]
     if scatter[0][1] < _BATCHES_AT_LEAST:
         return None
     sigma, count = max([scatter[0], *(of for of in scatter[1:] if of[1] >= _LONG_BATCHES_AT_LEAST)])

@@ -60,7 +60,7 @@ class GesturesLayer:
                 self._states.at(one.t_ns)
                 self._rec.log(
                     rr.new_entity_path([EVENTS, one.hand]),
-                    rr.TextLog(f"{one.phase} {one.kind}: {said(one)}", level="INFO"),
+                    rr.TextLog(f"{one.phase} {one.kind}: {label_of(one)}", level="INFO"),
                 )
 
     def _lasting(self, root: str, one: Gesture, at: Float) -> None:
@@ -99,7 +99,7 @@ class GesturesLayer:
         closed = 0.35 + 0.65 * (one.strength if isfinite(one.strength) else 0.0)
         bright = [round(part * closed) for part in colour]
         line = rr.LineStrips3D(
-            [strip], radii=2 * _LINE_M, colors=[bright], labels=[said(one)], show_labels=True
+            [strip], radii=2 * _LINE_M, colors=[bright], labels=[label_of(one)], show_labels=True
         )
         self._rec.log(path, line)
 
@@ -112,7 +112,7 @@ class GesturesLayer:
         rotated = _DIAL_M * arc(one.direction, one.angle_rad) + one.origin_m
         strip = np.concatenate([one.origin_m[None], rotated, one.origin_m[None]])
         thick = rr.LineStrips3D(
-            [strip], radii=2.0 * _LINE_M, colors=[colour], labels=[said(one)], show_labels=True
+            [strip], radii=2.0 * _LINE_M, colors=[colour], labels=[label_of(one)], show_labels=True
         )
         self._rec.log(f"{path}/turned", thick)
 
@@ -127,7 +127,7 @@ def arc(axis: Float, angle_rad: float) -> Float:
     return np.cos(angles) * first + np.sin(angles) * np.cross(axis, first)
 
 
-def said(one: Gesture) -> str:
+def label_of(one: Gesture) -> str:
     """A gesture in words."""
     if one.kind == "pinch":
         return f"{one.name} {one.distance_m * 1e3:.0f} mm" if isfinite(one.distance_m) else one.name

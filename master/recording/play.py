@@ -57,7 +57,7 @@ def run_play(
     settings: PlaySettings,
     bus: Bus | None,
     stop: threading.Event,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
     show: Callable[[float, float], None] = lambda _position_s, _length_s: None,
 ) -> Passed:
     """Play until the end, or until stopped.
@@ -78,7 +78,7 @@ def run_play(
         PhalanxError: The stretch or speed is none.
     """
     recording = open_messages(settings.path)
-    _check(recording, settings, say)
+    _check(recording, settings, notify)
     setups = recorded_setups(recording)
     with ExitStack() as stack:
         sinks: list[Sink] = [] if bus is None else [BusSink(bus)]
@@ -110,7 +110,7 @@ def run_play(
                 solved=settings.solved,
                 again=again,
                 taken=(lambda _message: None) if tap is None else tap.show,
-                say=say,
+                notify=notify,
             )
         except ValueError as error:
             raise PhalanxError(f"{settings.path}: {error}") from error
@@ -118,13 +118,13 @@ def run_play(
         stack.callback(host.close)
         passed = player.run()
         while settings.loop and not stop.is_set():
-            say("again from the beginning")
+            notify("again from the beginning")
             passed = player.run()
         show(host.position_s, host.length_s)
         return passed
 
 
-def _check(recording: MessageRecording, settings: PlaySettings, say: Callable[[str], None]) -> None:
+def _check(recording: MessageRecording, settings: PlaySettings, notify: Callable[[str], None]) -> None:
     """Refuse what cannot be played, and say what has to be known of what can.
 
     Raises:
@@ -137,11 +137,11 @@ def _check(recording: MessageRecording, settings: PlaySettings, say: Callable[[s
     if not recording.counts.get(wanted):
         raise RecordingError(f"{recording.path}: nothing to play: it has no messages of stream {wanted!r}")
     if recording.cut:
-        say("the recording was not ended: it is played up to the cut")
+        notify("the recording was not ended: it is played up to the cut")
     if recording.broken:
-        say(f"{recording.broken} chunks or files of the recording are broken and left out")
+        notify(f"{recording.broken} chunks or files of the recording are broken and left out")
     if recording.about.get("wire") != str(WIRE_VERSION):
-        say(
+        notify(
             f"recorded with wire version {recording.about.get('wire', '?')}, this program speaks {WIRE_VERSION}:"
             " messages that it does not know are left out"
         )

@@ -59,7 +59,7 @@ def play(
 
     connection = None if no_bus else host_bus(bus)
     try:
-        passed = run_play(settings, connection, stop, _player_says, show)
+        passed = run_play(settings, connection, stop, _player_status, show)
     finally:
         if connection is not None:
             connection.close()
@@ -86,5 +86,5 @@ def _speed(text: str) -> float:
     return factor
 
 
-def _player_says(line: str) -> None:
+def _player_status(line: str) -> None:
     typer.echo(f"play: {line}")

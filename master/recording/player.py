@@ -83,7 +83,7 @@ class Player:
         solved: bool = False,
         again: Callable[[str, str, Message], None] = lambda _stream, _name, _message: None,
         taken: Callable[[Message], None] = lambda _message: None,
-        say: Callable[[str], None] = lambda _line: None,
+        notify: Callable[[str], None] = lambda _line: None,
     ) -> None:
         """Stand at the beginning.
 
@@ -102,7 +102,7 @@ class Player:
             ValueError: The speed is none, or the stretch is empty.
         """
         self._recording, self._setups, self._sinks, self._solved = recording, setups, sinks, solved
-        self._again, self._taken, self._say = again, taken, say
+        self._again, self._taken, self._notify = again, taken, notify
         self.first_ns = recording.begin_t_ns if from_ns is None else max(from_ns, recording.begin_t_ns)
         self.last_ns = recording.end_t_ns if to_ns is None else min(to_ns, recording.end_t_ns)
         if self.first_ns > self.last_ns:
@@ -111,7 +111,7 @@ class Player:
         self._changed = threading.Condition()
         self._jump: int | None = None
         self._stopped = False
-        self._said: set[str] = set()
+        self._notified: set[str] = set()
         self._unsolved: set[tuple[str, str]] = set()
         self.poses = 0
         self.at_ns = self.first_ns
@@ -251,7 +251,7 @@ class Player:
         except Exception as error:  # noqa: BLE001 -- a file may hold whatever makes the solver raise
             kind = type(error).__name__
             if (name, kind) not in self._unsolved:
-                self._say(f"messages of {name} cannot be solved and are left out: {kind}: {error}")
+                self._notify(f"messages of {name} cannot be solved and are left out: {kind}: {error}")
             self._unsolved.add((name, kind))
             return ()
 
@@ -270,9 +270,9 @@ class Player:
 
     def _tell_events(self, lines: Sequence[str]) -> None:
         for line in lines:
-            if line not in self._said:  # not again with every jump
-                self._said.add(line)
-                self._say(line)
+            if line not in self._notified:  # not again with every jump
+                self._notified.add(line)
+                self._notify(line)
 
 
 def _plain(solved: Solved) -> Told:

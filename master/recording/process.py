@@ -67,7 +67,7 @@ def run_recorder(
     settings: RecordSettings,
     connect: Callable[[threading.Event], Bus | None],
     stop: threading.Event,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
     show: Callable[[Progress, int], None],
 ) -> Progress:
     """Record until stopped, until the length is reached, or until the disk is full.
@@ -94,7 +94,7 @@ def run_recorder(
     raw = RawAsker(
         settings.path.stem,
         cameras if settings.raw else (),
-        say,
+        notify,
         lambda told: recorder.offer("health", told, clock.now_ns()),
     )
     about = {"rigs": rigs_text(settings.files.rigs)}
@@ -102,7 +102,7 @@ def run_recorder(
         about["raw"] = raw_text(settings.path.stem, cameras)
     writer = MessageWriter(settings.path, carried, about)
     recorder = MessageRecorder(writer, settings.path.absolute().parent, settings.reserve_bytes)
-    run = _Run(settings, cameras, clock, recorder, raw, stop, say, show)
+    run = _Run(settings, cameras, clock, recorder, raw, stop, notify, show)
     try:
         while not run.over and (bus := connect(stop)) is not None:
             try:
@@ -127,14 +127,14 @@ class _Run:
         recorder: MessageRecorder,
         raw: RawAsker,
         stop: threading.Event,
-        say: Callable[[str], None],
+        notify: Callable[[str], None],
         show: Callable[[Progress, int], None],
     ) -> None:
-        self._settings, self._recorder, self._stop, self._say, self._show = (
+        self._settings, self._recorder, self._stop, self._notify, self._show = (
             settings,
             recorder,
             stop,
-            say,
+            notify,
             show,
         )
         self._cameras, self._raw = cameras, raw
@@ -224,20 +224,20 @@ class _Run:
             bus.publish("health", NAME, self.health())
             self._show(self._recorder.progress(), self._lost())
         if missed:
-            self._say("the master is gone; waiting for it")
+            self._notify("the master is gone; waiting for it")
 
     def _look(self, told: Health) -> None:
-        """Say what the player of this file has to know, and keep in the file where a master was started anew."""
+        """Notify what the player of this file has to know, and keep in the file where a master was started anew."""
         if told.session != self._master:
             self._recorder.offer("health", told, self._clock.now_ns())
             if self._master is None:
-                self._say(f"recording into {self._settings.path}")
+                self._notify(f"recording into {self._settings.path}")
             else:
-                self._say("the master was started again; recording goes on")
+                self._notify("the master was started again; recording goes on")
             self._master, self._reloads = told.session, told.counts.get("reload.applied", 0)
         if told.counts.get("reload.applied", 0) != self._reloads:
             self._reloads = told.counts.get("reload.applied", 0)
-            self._say("files of the rig were changed: from here on a replay is not what was told live")
+            self._notify("files of the rig were changed: from here on a replay is not what was told live")
 
     def _lost(self) -> int:
         return self._gone_lost + (0 if self._lease is None else self._lease.lost)

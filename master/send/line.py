@@ -44,11 +44,11 @@ class OutputLine:
         name: str,
         make: Callable[[], Sink],
         tally: Tally,
-        say: Callable[[str], None],
+        notify: Callable[[str], None],
         clock: Clock | None = None,
     ) -> None:
         """Begin at once; `make` opens the sink and is called on the line's own thread, again after each failure."""
-        self._name, self._make, self._tally, self._say = name, make, tally, say
+        self._name, self._make, self._tally, self._notify = name, make, tally, notify
         self._clock: Clock = SystemClock() if clock is None else clock
         self._queue: deque[Told] = deque()
         self._changed = threading.Condition()
@@ -87,7 +87,7 @@ class OutputLine:
             self._changed.notify()
         self._thread.join(_JOIN_S)
         if self._thread.is_alive():
-            self._say(f"{self._name}: hangs and was left behind")
+            self._notify(f"{self._name}: hangs and was left behind")
 
     def _work(self) -> None:
         try:
@@ -108,7 +108,7 @@ class OutputLine:
             self._failed(error)
             return
         if self._tally.trouble:
-            self._say(f"{self._name}: open again")
+            self._notify(f"{self._name}: open again")
         self._tally.trouble, self._wait_s = "", FIRST_RETRY_S
 
     def _pause(self) -> None:
@@ -145,12 +145,12 @@ class OutputLine:
         try:
             sink.close()
         except (PhalanxError, OSError) as error:
-            self._say(f"{self._name}: closing: {error}")
+            self._notify(f"{self._name}: closing: {error}")
 
     def _failed(self, error: Exception) -> None:
         """Count it, and say it once: the same trouble again is not news."""
         self._tally.failed += 1
         text = str(error)
         if text != self._tally.trouble:
-            self._say(f"{self._name}: {text}; tried again")
+            self._notify(f"{self._name}: {text}; tried again")
         self._tally.trouble = text

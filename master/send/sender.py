@@ -55,7 +55,7 @@ class Sender:
         self,
         settings: OutputSettings,
         only: Collection[str],
-        say: Callable[[str], None],
+        notify: Callable[[str], None],
         clock: Clock | None = None,
     ) -> None:
         """Switch on what the settings have on, or, whatever they say, exactly what `only` names.
@@ -64,7 +64,7 @@ class Sender:
             PhalanxError: `only` names an output that there is not.
         """
         refuse_unknown(only)
-        self._settings, self._say = settings, say
+        self._settings, self._notify = settings, notify
         self._clock: Clock = SystemClock() if clock is None else clock
         self._only = frozenset(only)
         self._session = secrets.randbits(63)
@@ -106,7 +106,7 @@ class Sender:
             elif on:
                 make, settings = OUTPUTS[name].make, self._settings
                 self._lines[name] = OutputLine(
-                    name, lambda: make(settings, self.times), self.tallies[name], self._say
+                    name, lambda: make(settings, self.times), self.tallies[name], self._notify
                 )
         if line is not None and not on:
             line.close()
@@ -127,7 +127,7 @@ class Sender:
             on = is_on[name] if switched else name in self.on
             self.switch(name, on=False)
             self.switch(name, on=on)
-            self._say(f"{name}: {self.where(name)}" if on else f"{name}: off")
+            self._notify(f"{name}: {self.where(name)}" if on else f"{name}: off")
 
     def push(self, message: Told) -> None:
         """Give a message to every output that is on and takes it; never waits."""
@@ -165,7 +165,7 @@ class Sender:
                     f'{command.verb}: body {command.body!r}: {error}; write {{"output": "osc"}}'
                 ) from error
             self.switch(body.output, on=command.verb == "on")
-            self._say(f"{body.output}: {self.where(body.output) if command.verb == 'on' else 'off'}")
+            self._notify(f"{body.output}: {self.where(body.output) if command.verb == 'on' else 'off'}")
         elif command.verb not in ("report", "stop"):
             raise PhalanxError(f"unknown verb {command.verb!r}; there are on, off, report, stop")
 
@@ -189,7 +189,7 @@ class Housekeeping:
         self._watched.changed([path])  # as it was read
         self._clock = SystemClock()
 
-    def step(self, say: Callable[[str], None]) -> None:
+    def step(self, notify: Callable[[str], None]) -> None:
         """Once: use the file if it changed, ask the master for its time, publish the report.
 
         Raises:
@@ -199,7 +199,7 @@ class Housekeeping:
             try:
                 self._sender.use(settings_of(self._path))
             except PhalanxError as error:
-                say(f"{error}; the settings stay as they were")
+                notify(f"{error}; the settings stay as they were")
         self._echo()
         self._bus.publish("health", NAME, self.health())
 
@@ -222,7 +222,7 @@ def run_sender(
     path: Path,
     only: Collection[str],
     stop: threading.Event,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
 ) -> None:
     """Send until `stop` is set or the command `stop` comes. The bus belongs to the caller.
 
@@ -231,7 +231,7 @@ def run_sender(
         PhalanxError: `only` names an output that there is not.
     """
     feeds = [bus.subscribe(stream, depth=_DEPTH) for stream in STREAMS]
-    sender = Sender(settings, only, say)
+    sender = Sender(settings, only, notify)
     housekeeping = Housekeeping(sender, bus, path, feeds)
 
     def obey(command: Command) -> Health:
@@ -243,11 +243,11 @@ def run_sender(
     bus.serve(NAME, obey)
     bus.announce(NAME)
     for name in sender.on:
-        say(f"{name}: {sender.where(name)}")
+        notify(f"{name}: {sender.where(name)}")
     if not sender.on:
-        say(f"all outputs are off; switch them on in {path}, or name them: --only osc,vmc")
+        notify(f"all outputs are off; switch them on in {path}, or name them: --only osc,vmc")
     thread = threading.Thread(
-        target=lambda: _report_until(housekeeping, stop, say), name="outputs report", daemon=True
+        target=lambda: _report_until(housekeeping, stop, notify), name="outputs report", daemon=True
     )
     thread.start()
     try:
@@ -261,10 +261,10 @@ def run_sender(
             feed.close()
 
 
-def _report_until(housekeeping: Housekeeping, stop: threading.Event, say: Callable[[str], None]) -> None:
+def _report_until(housekeeping: Housekeeping, stop: threading.Event, notify: Callable[[str], None]) -> None:
     while not stop.wait(1.0):
         try:
-            housekeeping.step(say)
+            housekeeping.step(notify)
         except BusError:
             return  # closing
 

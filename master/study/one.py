@@ -34,7 +34,7 @@ CAUSES: tuple[Condition, ...] = (
 GUIDED, TRIALS = "guided", "trials"  # recordings
 KNOWN: tuple[Known, ...] = get_args(Known)
 INPUTS: tuple[Inputs, ...] = get_args(Inputs)
-DONE, RIG, HAND, SAID = "made.json", "rig.json", "hand.json", "calibration.json"
+DONE, RIG, HAND, CALIBRATED = "made.json", "rig.json", "hand.json", "calibration.json"
 _KNUCKLES_M = np.array([0.0, 0.0, 0.08])  # palm frame
 
 
@@ -82,7 +82,7 @@ class Calibrated(Struct, frozen=True, kw_only=True):
         nominal_rotation_deg, nominal_shift_mm: The same of the rig file.
     """
 
-    said: tuple[str, ...]
+    report: tuple[str, ...]
     refused: bool
     rotation_deg: float
     shift_mm: float
@@ -132,7 +132,7 @@ def run_participant(task: Task, number: int) -> Outcome:
     if not task.keep:
         for recording in (GUIDED, TRIALS):
             shutil.rmtree(folder / recording / camera, ignore_errors=True)
-    calibrated = load(folder / "calibrated" / SAID, Calibrated) if "calibrated" in asked else None
+    calibrated = load(folder / "calibrated" / CALIBRATED, Calibrated) if "calibrated" in asked else None
     return Outcome(
         participant=who.name, reflectance=round(who.reflectance, 3), calibrated=calibrated, trials=trials
     )
@@ -199,7 +199,7 @@ def _knowledge(
             rig, hand = who.rig, who.hand
         elif known == "calibrated":
             rig, hand, told = _calibrated(task, who, folder / GUIDED, there)
-            save(there / SAID, told)
+            save(there / CALIBRATED, told)
         save(there / RIG, rig)
         save(there / HAND, hand)
     return load(there / RIG, RigCalibration), load(there / HAND, HandProfile)
@@ -215,13 +215,13 @@ def _calibrated(
     detect(guided, task.camera.name, there / "measured.json", there)
     try:
         found = calibrate_subject(list(recorded_cycles(there, task.camera.name)), rig, task.camera, hand)
-        rig, hand, said = found.rig, found.hand, tuple(found.report)
+        rig, hand, report = found.rig, found.hand, tuple(found.report)
     except FitError as error:
-        said, refused = (str(error),), True
+        report, refused = (str(error),), True
     rotation, shift = _off(rig, who.rig)
     nominal_rotation, nominal_shift = _off(task.rig, who.rig)
     told = Calibrated(
-        said=said,
+        report=report,
         refused=refused,
         rotation_deg=round(rotation, 3),
         shift_mm=round(shift, 3),

@@ -136,8 +136,8 @@ def _named(row: Cell | Repeated) -> dict[str, object]:
 def _error_row(finger: str, cells: list[Cell]) -> str:
     texts = [_error_text(cell) for cell in cells]
     low_high = paper.MEAN_RANGE_DEG.get(finger)
-    said = f"{low_high[0]}–{low_high[1]}" if low_high else f"< {paper.MEAN_LIMIT_DEG:g}"
-    return f"| {finger} | " + " | ".join(texts) + f" | {said} |"
+    report = f"{low_high[0]}–{low_high[1]}" if low_high else f"< {paper.MEAN_LIMIT_DEG:g}"
+    return f"| {finger} | " + " | ".join(texts) + f" | {report} |"
 
 
 def _error_text(cell: Cell) -> str:
@@ -239,7 +239,7 @@ def _calibration_lines(calibrated: Mapping[str, Calibrated]) -> list[str]:
         "|---|--:|--:|---|",
     ]
     for name, one in calibrated.items():
-        note = f"refused: {one.said[0]}" if one.refused else ""
+        note = f"refused: {one.report[0]}" if one.refused else ""
         lines.append(
             f"| {name} | {one.nominal_rotation_deg:.1f}°, {one.nominal_shift_mm:.1f} mm"
             f" | {one.rotation_deg:.1f}°, {one.shift_mm:.1f} mm | {note} |"

@@ -137,9 +137,9 @@ def wait_in_step(
         if stopped():
             raise CameraError(f"{where}: stopped while it waited for {other}")
         if clock.now_ns() > end_ns:
-            heard = "no server was heard" if timer is None else f"{timer} us were left"
+            received = "no server was heard" if timer is None else f"{timer} us were left"
             raise CameraError(
-                f"{where}: --sync {role}: not in step after {timeout_s:g} s, {heard}. "
+                f"{where}: --sync {role}: not in step after {timeout_s:g} s, {received}. "
                 "Exactly one camera of the rig is the server, all have the same frame_rate_hz, clients start "
                 "first, and UDP multicast 239.255.255.250:10000 must pass between the machines"
             )

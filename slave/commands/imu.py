@@ -72,14 +72,14 @@ def _add_csv(add: Callable[..., argparse.Action]) -> None:
     )
 
 
-def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
+def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     """Send samples until it is told to end, or take in a recording.
 
     Raises:
         PhalanxError: A file, the IMU, a key or the network is not as it must be.
     """
     if options.csv is not None:
-        return _take_in(options, say)
+        return _take_in(options, notify)
     from slave.imu.live import run_live
     from slave.imu.synthetic import SyntheticImu
     from slave.simulated import imu_of
@@ -95,7 +95,7 @@ def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     key, access = secrets_of(options)
 
     def tell(line: str) -> None:
-        say(f"{options.name}: {line}")
+        notify(f"{options.name}: {line}")
 
     service = Service(os.environ, noun="samples")
     with stop_by_signal() as stop:
@@ -110,10 +110,10 @@ def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     return 0
 
 
-def _take_in(options: argparse.Namespace, say: Callable[[str], None]) -> int:
+def _take_in(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     from common.imu_csv import read_csv
     from slave.imu.importing import import_table
 
     units = {what: unit for what in (TIME, GYRO, ACCEL, MAG) if (unit := getattr(options, f"{what}_unit"))}
-    import_table(read_csv(options.csv, units, options.rate_hz), options.name, options.out, say)
+    import_table(read_csv(options.csv, units, options.rate_hz), options.name, options.out, notify)
     return 0

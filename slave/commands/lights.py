@@ -31,8 +31,8 @@ def add_options(command: argparse.ArgumentParser) -> None:
     act.add_argument("--off", action="store_true", help="switch both off")
 
 
-def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
-    """Say the budget; switch lights only where that is asked for.
+def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
+    """Notify the budget; switch lights only where that is asked for.
 
     Raises:
         PhalanxError: A file is missing or broken, or the lights cannot be opened or switched.
@@ -42,7 +42,7 @@ def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     rig = rig_of(options)
     camera = load(camera_path(options, rig.cameras[0]), CameraCalibration)
     if not (options.blink or options.off):
-        say(budget(rig, camera))
+        notify(budget(rig, camera))
         return 0
     if options.lights is None:
         raise LightsError(f"--blink and --off need the lights: --lights {SWITCHED}")
@@ -50,10 +50,10 @@ def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
         guard = open_guarded(options.lights, rig)  # dark from here on
         try:
             if options.blink:
-                say(budget(rig, camera))
+                notify(budget(rig, camera))
                 blink(guard, rig, camera, stop, options.blink)
         finally:
             guard.close()
     events = ", ".join(f"{event} {count}" for event, count in guard.events().items())
-    say(events if options.blink else "dark")
+    notify(events if options.blink else "dark")
     return 0

@@ -82,7 +82,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
     )
 
 
-def run(options: argparse.Namespace, say: Callable[[str], None], aside: Callable[[str], None]) -> int:
+def run(options: argparse.Namespace, notify: Callable[[str], None], aside: Callable[[str], None]) -> int:
     """Record until the length is reached, or it is told to end.
 
     Raises:
@@ -110,7 +110,7 @@ def run(options: argparse.Namespace, say: Callable[[str], None], aside: Callable
         raise failure
     if not done.frames:
         raise CameraError(f"camera {options.name!r} gave no frame; nothing was recorded")
-    say(f"{options.name}: recorded in {options.output}")
+    notify(f"{options.name}: recorded in {options.output}")
     return 0
 
 

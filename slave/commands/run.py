@@ -101,7 +101,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
     )
 
 
-def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
+def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     """Detect and send until it is told to end.
 
     Raises:
@@ -126,7 +126,7 @@ def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
 
     def tell(line: str) -> None:
-        say(f"{options.name}: {line}")
+        notify(f"{options.name}: {line}")
 
     run_live(
         options.name,

@@ -46,7 +46,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
     add_simulated(command.add_argument_group("synthetic tracker").add_argument)
 
 
-def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
+def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     """Send poses until it is told to end.
 
     Raises:
@@ -62,7 +62,7 @@ def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     key, access = secrets_of(options)
 
     def tell(line: str) -> None:
-        say(f"{options.name}: {line}")
+        notify(f"{options.name}: {line}")
 
     service = Service(os.environ, noun="poses")
     with stop_by_signal() as stop:

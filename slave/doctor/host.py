@@ -48,9 +48,9 @@ def _bits() -> Finding:
 
 def _release(system: System) -> Finding:
     text = system.text("/etc/os-release") or ""
-    said = dict(re.findall(r'^(\w+)="?([^"\n]*)"?$', text, re.MULTILINE))
-    name = said.get("PRETTY_NAME", "unknown")
-    if said.get("VERSION_CODENAME") in RELEASES:
+    stated = dict(re.findall(r'^(\w+)="?([^"\n]*)"?$', text, re.MULTILINE))
+    name = stated.get("PRETTY_NAME", "unknown")
+    if stated.get("VERSION_CODENAME") in RELEASES:
         return ok("system", name)
     return warn(
         "system", f"{name}: not tried with it", f"Raspberry Pi OS or Debian {' or '.join(sorted(RELEASES))}"
@@ -76,8 +76,8 @@ def _gauges(system: System) -> Iterator[Finding]:
     if free_mb is None:
         yield unseen("disk", f"{folder}: not known")
     elif free_mb < FEW_MB:
-        say = fail if free_mb < NO_MB else warn
-        yield say(
+        level = fail if free_mb < NO_MB else warn
+        yield level(
             "disk", f"{free_mb:.0f} MB free", "delete recordings or old releases in /opt/phalanx/releases"
         )
     else:
@@ -116,9 +116,9 @@ def _throttled(system: System) -> Finding:
     before = [text for bit, text in BITS.items() if flags >> (bit + SINCE) & 1 and text not in now]
     if not now and not before:
         return ok("throttling", "none since the start")
-    said = [*(f"{text} now" for text in now), *(f"{text} since the start" for text in before)]
+    stated = [*(f"{text} now" for text in now), *(f"{text} since the start" for text in before)]
     fix = SUPPLY if flags & (1 | 1 << SINCE) else COOL
-    return warn("throttling", ", ".join(said), fix)
+    return warn("throttling", ", ".join(stated), fix)
 
 
 def _flags(system: System) -> int | None:

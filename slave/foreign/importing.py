@@ -58,7 +58,7 @@ class _Taken:
     simultaneous: bool
 
 
-def import_pictures(wish: Wish, out: Path, say: Callable[[str], None]) -> dict[str, int]:
+def import_pictures(wish: Wish, out: Path, notify: Callable[[str], None]) -> dict[str, int]:
     """Write the recording; a former import in the same folder is replaced, nothing else is.
 
     Returns:
@@ -81,24 +81,24 @@ def import_pictures(wish: Wish, out: Path, say: Callable[[str], None]) -> dict[s
         raise RecordingError(f"--camera {unknown[0]}: rig {rig.name!r} has {', '.join(rig.cameras)}")
     sources = [Source(camera, path) for camera, path in wish.named.items()]
     if paths:
-        sources += sources_of(paths, rig, say)
+        sources += sources_of(paths, rig, notify)
     if twice := {s.camera for s in sources if [o.camera for o in sources].count(s.camera) > 1}:
         raise RecordingError(f"--camera {min(twice)}: is given twice")
     if absent := [name for name in rig.cameras if all(source.camera != name for source in sources)]:
-        say(f"rig {rig.name!r} has {', '.join(absent)}, too, of which there is nothing")
+        notify(f"rig {rig.name!r} has {', '.join(absent)}, too, of which there is nothing")
     rig = _only(rig, sources)
     cameras: dict[str, CameraCalibration] = {}
     for source in sources:
         file = wish.calibration / "cameras" / f"{source.camera}.json"
         cameras[source.camera] = load(file, CameraCalibration)
-    taken = [_taken(s, cameras[s.camera], wish, say) for s in sources]
+    taken = [_taken(s, cameras[s.camera], wish, notify) for s in sources]
     own = [one.source for one in taken if one.simultaneous]
     if own and len(own) < len(taken):
         raise RecordingError(
             f"{own[0].path}: no table of times, but others have one: give one for every camera"
         )
     if len(own) > 1:
-        say(
+        notify(
             "the first frames of all cameras are taken as simultaneous; where they are not, give their --times"
         )
     _clear(out)
@@ -123,7 +123,7 @@ def _only(rig: RigCalibration, sources: Sequence[Source]) -> RigCalibration:
     return msgspec.structs.replace(rig, cameras=names, T_rig_camera=places)
 
 
-def _taken(source: Source, camera: CameraCalibration, wish: Wish, say: Callable[[str], None]) -> _Taken:
+def _taken(source: Source, camera: CameraCalibration, wish: Wish, notify: Callable[[str], None]) -> _Taken:
     """Numbers, names and times of the frames of one camera, said in a line.
 
     Raises:
@@ -147,7 +147,7 @@ def _taken(source: Source, camera: CameraCalibration, wish: Wish, say: Callable[
             f"{source.path}: has no times and no frame rate; give --times FILE.csv (frame,time)"
         )
     seconds = 1e-9 * float(timed.t_ns[-1] - timed.t_ns[0])
-    say(
+    notify(
         f"{source.camera}: {source.path}: {len(timed.number)} frames in {seconds:.2f} s ({timed.note}){faults}"
     )
     return _Taken(source, files, timed, table is None)

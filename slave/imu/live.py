@@ -84,7 +84,7 @@ def run_live(
     uplink: Uplink,
     clock: Clock,
     stop: threading.Event,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
     service: Service,
     access: Access,
 ) -> None:
@@ -111,7 +111,7 @@ def run_live(
     try:
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
-        say("ready, waiting for the master")
+        notify("ready, waiting for the master")
         service.ready(lambda: uplink.started)
         if wait_for_start(source, uplink, stop, orientation, service.waiting, tally.failed):
             run(source, uplink, tally, stop, orientation, service.working)
@@ -120,4 +120,4 @@ def run_live(
         reporter.close()
         uplink.close()
         source.close()
-    say(f"{tally.counts()['samples']} samples, sent {uplink.counts['sent']}")
+    notify(f"{tally.counts()['samples']} samples, sent {uplink.counts['sent']}")

@@ -31,7 +31,7 @@ class ListPlaces(argparse.Action):
         super().__init__(option_strings, dest, nargs=0, default=argparse.SUPPRESS, **others)
 
     def __call__(self, parser: argparse.ArgumentParser, *_others: object) -> None:
-        """Say it."""
+        """Notify it."""
         sys.stdout.write(places() + "\n")
         parser.exit()
 

@@ -178,9 +178,9 @@ class Ximu3Imu:
     def _begin(self) -> None:
         pong = self._ask("ping", None)
         if pong is None:
-            heard = f", though {self._bytes} bytes came" if self._bytes else ""
+            received = f", though {self._bytes} bytes came" if self._bytes else ""
             raise ImuError(
-                f"{self._place.path}: no x-IMU3 answers{heard}: is it switched on, is it another device, or has it "
+                f"{self._place.path}: no x-IMU3 answers{received}: is it switched on, is it another device, or has it "
                 "another baud rate (behind @)? `phalanx-slave imu --list` says what is there"
             )
         told = [str(pong.fields.get(part, "?")) for part in ("name", "sn", "interface")]
@@ -198,10 +198,10 @@ class Ximu3Imu:
             raise ImuError(f"{self._place.path}: the x-IMU3 does not answer to {key}={value}")
         if answer.value == value:
             return
-        said = answer.fields.get("error", f"it has {answer.value}")
+        text = answer.fields.get("error", f"it has {answer.value}")
         if key in NEEDED:
-            raise ImuError(f"{self._place.path}: the x-IMU3 refused {key}={value}: {said}")
-        _LOG.warning("%s: the x-IMU3 refused %s=%s: %s", self._place.path, key, value, said)
+            raise ImuError(f"{self._place.path}: the x-IMU3 refused {key}={value}: {text}")
+        _LOG.warning("%s: the x-IMU3 refused %s=%s: %s", self._place.path, key, value, text)
 
     def _ask(self, key: str, value: bool | int | None) -> Answer | None:
         """What it answers to a command; None: nothing, though asked repeatedly."""

@@ -18,7 +18,7 @@ _POLL_S = 1.0
 
 
 @contextlib.contextmanager
-def alone(root: Path, say: Callable[[str], None], sleep: Callable[[float], None]) -> Generator[None]:
+def alone(root: Path, notify: Callable[[str], None], sleep: Callable[[float], None]) -> Generator[None]:
     """Hold the machine below `root` for oneself.
 
     Args:
@@ -38,7 +38,9 @@ def alone(root: Path, say: Callable[[str], None], sleep: Callable[[float], None]
                 break
             except BlockingIOError:
                 if look == 0:
-                    say(f"another installation runs on this machine: waiting for its end, at most {WAIT_S} s")
+                    notify(
+                        f"another installation runs on this machine: waiting for its end, at most {WAIT_S} s"
+                    )
                 sleep(_POLL_S)
         else:
             raise InstallError(

@@ -96,7 +96,7 @@ class Source:
         return f"{versions[-1]}-{digest.hexdigest()[:8]}"
 
 
-def make(root: Path, name: str, source: Source, say: Callable[[str], None]) -> bool:
+def make(root: Path, name: str, source: Source, notify: Callable[[str], None]) -> bool:
     """Make the release `name` if it is not there whole; whether it had to be made.
 
     Raises:
@@ -110,7 +110,7 @@ def make(root: Path, name: str, source: Source, say: Callable[[str], None]) -> b
         shutil.rmtree(left, ignore_errors=True)
     _check_room(releases, source)
     fresh = releases / f".new-{name}"
-    say(f"making release {name}")
+    notify(f"making release {name}")
     try:
         venv.EnvBuilder(system_site_packages=True, symlinks=True, with_pip=False).create(fresh)
         if source.wheels is not None:

@@ -43,7 +43,7 @@ class Strober:
         self._on: Pulse | None = None
         self._number = -1
         self._rest_until_ns: int | None = None
-        self._said_ns: int | None = None
+        self._logged_ns: int | None = None
         self.counts: Counter[str] = Counter(dict.fromkeys(EVENTS, 0))
 
     def step(self) -> int | None:
@@ -56,7 +56,7 @@ class Strober:
         except LightsError as error:
             self._rest_until_ns = now_ns + FAILED_NS
             self._on = None
-            self._say(now_ns, error)
+            self._log_fault(now_ns, error)
             return self._rest_until_ns
 
     def dark(self) -> None:
@@ -65,7 +65,7 @@ class Strober:
         try:
             self._guard.end()
         except LightsError as error:
-            self._say(self._clock.now_ns(), error)
+            self._log_fault(self._clock.now_ns(), error)
 
     def _step(self, now_ns: int) -> int | None:
         if self._on is not None:
@@ -96,9 +96,9 @@ class Strober:
         """The frames are counted anew."""
         self._number = -1
 
-    def _say(self, now_ns: int, error: LightsError) -> None:
-        if self._said_ns is None or now_ns - self._said_ns >= LOG_EVERY_NS:
-            self._said_ns = now_ns
+    def _log_fault(self, now_ns: int, error: LightsError) -> None:
+        if self._logged_ns is None or now_ns - self._logged_ns >= LOG_EVERY_NS:
+            self._logged_ns = now_ns
             _LOG.warning("lights: %s", error)
 
 

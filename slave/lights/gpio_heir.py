@@ -27,11 +27,11 @@ def main() -> int:
     for number in (signal.SIGABRT, signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     lines, longest_s = int(sys.argv[1]), float(sys.argv[2])
-    said = DARK
-    while said:
-        heard, _, _ = select.select([0], [], [], longest_s if said.endswith(LIT) else None)
-        if heard:
-            said = os.read(0, 4096)
+    state = DARK
+    while state:
+        received, _, _ = select.select([0], [], [], longest_s if state.endswith(LIT) else None)
+        if received:
+            state = os.read(0, 4096)
         else:  # again and again until it says that it is dark: it may light late, when it goes on
             darken(lines)
     return darken(lines)

@@ -110,11 +110,11 @@ class Guard:
                 if (left_s := (self._until_ns - self._clock.now_ns()) * 1e-9) > 0.0:
                     return left_s
                 self.counts["off_by_watchdog"] += 1
-            said = self._failing
+            was_failing = self._failing
             try:
                 self.end()
             except LightsError as error:
-                if not said:
+                if not was_failing:
                     _LOG.error("laser or LEDs cannot be switched off: %s", error)
                 return RETRY_S
             return None

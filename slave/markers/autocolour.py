@@ -53,7 +53,7 @@ TWIN_SIZE, TWIN_SHARE = (
 BACKGROUND_FRAMES = 12  # from which the background's share is counted
 UNUSUAL = 0.55, 0.4  # of a thing's median saturation and value; below is rim or highlight, not paint
 
-Say = Callable[[str], None]
+Notify = Callable[[str], None]
 Namer = Callable[[Sequence["MarkerColour"], Float], tuple[str, ...]]
 """(M paints, centroids (F, M, 2) [px] NaN where not seen) -> their names. Raises FitError when not certain."""
 
@@ -85,7 +85,7 @@ class MarkerColour:
 
 
 def calibrate_moving(
-    images: Sequence[Image], names: tuple[str, ...], namer: Namer, say: Say = lambda _text: None
+    images: Sequence[Image], names: tuple[str, ...], namer: Namer, notify: Notify = lambda _text: None
 ) -> list[ColourRow]:
     """Ranges and collisions of all markers, in the order of `names`.
 
@@ -105,13 +105,13 @@ def calibrate_moving(
         )
     background = background_of(images)
     around = surroundings_of(images, background, skin_of(images, background))
-    say(f"skin: hue {around.skin.hue:.0f}, saturation {around.skin.saturation[0]:.0f}.."
+    notify(f"skin: hue {around.skin.hue:.0f}, saturation {around.skin.saturation[0]:.0f}.."
         f"{around.skin.saturation[1]:.0f}; {len(around.clutter)} coloured things stand still")  # fmt: skip
     things = [things_of(image, k, around) for k, image in enumerate(images)]
     colours = find_colours(things, len(names), around)
     for colour in colours:
         at_rest = "" if colour.moved else "; it rests, skin around it tells that it is paint"
-        say(f"paint of hue {colour.hue:.0f}: in {len(colour.things)} of {len(images)} frames{at_rest}")
+        notify(f"paint of hue {colour.hue:.0f}: in {len(colour.things)} of {len(images)} frames{at_rest}")
     named = namer(colours, places(colours, len(images)))
     if sorted(named) != sorted(names):
         raise ValueError(f"the namer gave {named}, the rig has {names}")

@@ -22,7 +22,7 @@ from common.arrays import Float, Int
 from common.calibration import HandProfile, HsvRange
 from common.errors import CalibrationError, FitError
 from common.hand_model import HandModel
-from slave.markers.autocolour import MarkerColour, Namer, Say
+from slave.markers.autocolour import MarkerColour, Namer, Notify
 from slave.markers.classify import HUES
 
 Complex = npt.NDArray[np.complex128]
@@ -40,7 +40,7 @@ _OPEN = (
 CLICK_REACH = 6.0  # px between a click and the nearest pixel of its paint
 
 
-def by_hand(profile: HandProfile, names: tuple[str, ...], say: Say = lambda _text: None) -> Namer:
+def by_hand(profile: HandProfile, names: tuple[str, ...], notify: Notify = lambda _text: None) -> Namer:
     """Names from the picture of an open hand, its back to the camera.
 
     Raises:
@@ -74,7 +74,7 @@ def by_hand(profile: HandProfile, names: tuple[str, ...], say: Say = lambda _tex
             raise FitError(
                 f"the frames disagree about the names ({share:.0%} of {len(votes)} votes for the best order): {_OPEN}"
             )
-        say(f"names by the shape of the hand: {share:.0%} of {len(votes)} votes")
+        notify(f"names by the shape of the hand: {share:.0%} of {len(votes)} votes")
         return tuple(names[int(k)] for k in orders[best])
 
     return name
@@ -130,7 +130,10 @@ def _unit(z: Complex) -> Complex:
 
 
 def by_hues(
-    markers: Mapping[str, HsvRange] | None, names: tuple[str, ...], where: str, say: Say = lambda _text: None
+    markers: Mapping[str, HsvRange] | None,
+    names: tuple[str, ...],
+    where: str,
+    notify: Notify = lambda _text: None,
 ) -> Namer:
     """Names from the hues of a camera file, of another camera or from before the lamp was changed.
 
@@ -159,14 +162,14 @@ def by_hues(
                 f"{where}: its hues fit in two orders alike: the light is too different; give clicks, or leave the "
                 f"names to the shape of the hand"
             )
-        say(f"names by the hues of {where}: the farthest is {worst:.0f} away")
+        notify(f"names by the hues of {where}: the farthest is {worst:.0f} away")
         named = dict(zip(order, np.roll(np.array(around), best).tolist(), strict=True))
         return tuple(str(named[k]) for k in range(len(colours)))
 
     return name
 
 
-def checked(namer: Namer, shape: Namer, say: Say = lambda _text: None) -> Namer:
+def checked(namer: Namer, shape: Namer, notify: Notify = lambda _text: None) -> Namer:
     """Names of `namer`, refused where the shape of the hand is certain of others.
 
     Raises:
@@ -178,7 +181,7 @@ def checked(namer: Namer, shape: Namer, say: Say = lambda _text: None) -> Namer:
         try:
             shaped = shape(colours, uv)
         except FitError as error:
-            say(f"names not checked by the shape of the hand: {error}")
+            notify(f"names not checked by the shape of the hand: {error}")
             return named
         if named != shaped:
             wrong = ", ".join(

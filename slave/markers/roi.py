@@ -1,4 +1,4 @@
-"""Say where a tracked marker is expected, and whether a blob there may be it.
+"""Notify where a tracked marker is expected, and whether a blob there may be it.
 
 The region of interest is the marker's last box, moved by its velocity and widened by `roi_margin` of the camera file
 (Kalbfleisch: "40 px at 640x480 was best"), more the longer it was not seen. It decides *which* blob is the marker, and

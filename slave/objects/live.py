@@ -66,7 +66,7 @@ def run_live(
     uplink: Uplink,
     clock: Clock,
     stop: threading.Event,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
     service: Service,
     access: Access,
     recorded: bool = False,
@@ -94,7 +94,7 @@ def run_live(
     try:
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
-        say("ready, waiting for the master")
+        notify("ready, waiting for the master")
         service.ready(lambda: uplink.started)
         if wait_for_start(source, uplink, stop, recorded, service.waiting):
             run(source, uplink, tally, stop, service.working)
@@ -104,4 +104,4 @@ def run_live(
         uplink.close()
         source.close()
     counts = tally.counts()
-    say(f"{counts['poses']} poses, {counts['nowhere']} of them nowhere, sent {uplink.counts['sent']}")
+    notify(f"{counts['poses']} poses, {counts['nowhere']} of them nowhere, sent {uplink.counts['sent']}")

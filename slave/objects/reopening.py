@@ -24,7 +24,7 @@ from slave.service import Away, nobody
 
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 10.0  # each try leaves 100 kB in openvr (ValveSoftware/openvr, issue 1221)
-SAY_LOST_S = 0.25
+LOG_LOST_S = 0.25
 
 
 class ReopeningTracker:
@@ -73,7 +73,7 @@ class ReopeningTracker:
         while not (self._closed.is_set() or self._stop.is_set()):
             source = self._source if self._source is not None else self._return()
             if source is None:
-                self._stop.wait(SAY_LOST_S)
+                self._stop.wait(LOG_LOST_S)
                 return self._numbered(self._nowhere())
             try:
                 pose = source.read()
@@ -152,7 +152,7 @@ class ReopeningTracker:
         return self._source
 
     def _nowhere(self) -> TrackerPose:
-        t_ns = max(self._clock.now_ns() - round(0.5e9 * SAY_LOST_S), self._last_ns + 1)
+        t_ns = max(self._clock.now_ns() - round(0.5e9 * LOG_LOST_S), self._last_ns + 1)
         return TrackerPose(self._name, 0, 0, t_ns, np.full(3, np.nan), np.full(4, np.nan))
 
     def _numbered(self, pose: TrackerPose) -> TrackerPose:

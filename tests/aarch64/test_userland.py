@@ -32,9 +32,9 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Told, Told, bytes]:
         here = subprocess.run(
             [sys.executable, *program], capture_output=True, text=True, cwd=ROOT, check=True
         )
-        said, errors = there.communicate(timeout=600)
+        output, errors = there.communicate(timeout=600)
     assert there.returncode == 0, errors
-    return json.loads(said), json.loads(here.stdout), bodies
+    return json.loads(output), json.loads(here.stdout), bodies
 
 
 def test_it_is_the_other_architecture(both: tuple[Told, Told, bytes]) -> None:

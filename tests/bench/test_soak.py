@@ -110,9 +110,9 @@ def test_a_step_is_found_in_the_minute_in_which_it_came(at_s: float) -> None:
 
 
 def test_a_step_after_the_start_is_no_pass_though_the_slope_leaves_it_out() -> None:
-    said = verdict(stepped(66.0, 34.0))
-    assert said["memory of master"] is True
-    assert said["steps of master"] is False
+    output = verdict(stepped(66.0, 34.0))
+    assert output["memory of master"] is True
+    assert output["steps of master"] is False
 
 
 def test_a_leak_noise_and_a_process_that_settles_are_no_steps() -> None:

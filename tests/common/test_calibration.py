@@ -269,14 +269,14 @@ def test_the_samples_of_this_file_are_valid(kind: type[msgspec.Struct]) -> None:
     ],
 )
 def test_a_wrong_key_or_value_is_refused_with_file_and_key(
-    kind: type[msgspec.Struct], path: str, value: object, said: str | None, tmp_path: Path
+    kind: type[msgspec.Struct], path: str, value: object, output: str | None, tmp_path: Path
 ) -> None:
     file = tmp_path / "some.json"
     file.write_bytes(changed(SAMPLES[kind], path, value))
-    if said is None:
+    if output is None:
         load(file, kind)
         return
-    with pytest.raises(CalibrationError, match=said) as caught:
+    with pytest.raises(CalibrationError, match=output) as caught:
         load(file, kind)
     assert str(caught.value).startswith(str(file))
 

@@ -83,9 +83,9 @@ def test_a_course_goes_straight_jumps_and_stays() -> None:
         (lambda: LightSchedule(((0.0, 5000.0, 1.0),), calibrated_kelvin=1700.0), "no blue"),
     ],
 )
-def test_an_impossible_light_is_refused(make: object, says: str) -> None:
+def test_an_impossible_light_is_refused(make: object, expected: str) -> None:
     assert callable(make)
-    with pytest.raises(PhalanxError, match=says):
+    with pytest.raises(PhalanxError, match=expected):
         make()
 
 

@@ -120,8 +120,8 @@ def test_what_was_not_measured_is_nan_and_counted_and_late_rows_are_left_out(tmp
         ("hello\n", "line 1: no header"),
     ],
 )
-def test_what_cannot_be_read_is_refused_with_its_place(text: str, says: str, tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=says):
+def test_what_cannot_be_read_is_refused_with_its_place(text: str, expected: str, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=expected):
         read(tmp_path, text)
 
 

@@ -71,9 +71,9 @@ def test_field_and_orientation_may_be_left_out(header: tuple[str, ...], tmp_path
         (f"{FULL}\n{ROW}\n{ROW}\n", r"line 3: t_ns: 1000 is not after 1000"),
     ],
 )
-def test_a_broken_table_is_refused_with_file_line_and_column(text: str, said: str, tmp_path: Path) -> None:
+def test_a_broken_table_is_refused_with_file_line_and_column(text: str, output: str, tmp_path: Path) -> None:
     (tmp_path / "imu.csv").write_text(text)
-    with pytest.raises(RecordingError, match=said) as caught:
+    with pytest.raises(RecordingError, match=output) as caught:
         read_imu(tmp_path, "imu")
     assert str(tmp_path) in str(caught.value)
 

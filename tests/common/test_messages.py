@@ -681,9 +681,9 @@ def test_texts_of_a_device_are_printable(text: str) -> None:
     for field in ("host", "version"):
         with pytest.raises(MessageError):
             decode(msgspec.msgpack.encode(content | {field: text}))
-    said = decode(encode(Health("left", 1, 2, {}, {}, text, text)))
-    assert isinstance(said, Health)
-    assert said.host == said.version == printable(text) != text
+    output = decode(encode(Health("left", 1, 2, {}, {}, text, text)))
+    assert isinstance(output, Health)
+    assert output.host == output.version == printable(text) != text
 
 
 def test_a_report_can_be_read_whatever_was_counted() -> None:

@@ -88,12 +88,12 @@ def test_the_size_of_every_jpeg_and_of_none_that_is_cut(flags: list[int]) -> Non
         (b"II*\0\xff\xff\xff\xff", "TIFF whose header is cut"),
     ],
 )
-def test_what_is_no_picture_or_an_absurd_one_is_refused(data: bytes, says: str) -> None:
-    with pytest.raises(PictureError, match=says):
+def test_what_is_no_picture_or_an_absurd_one_is_refused(data: bytes, expected: str) -> None:
+    with pytest.raises(PictureError, match=expected):
         size_of(data)
-    with pytest.raises(PictureError, match=says):
+    with pytest.raises(PictureError, match=expected):
         decode_file(data)
-    with pytest.raises(PictureError, match=f"{says}|is no JPEG or PNG"):
+    with pytest.raises(PictureError, match=f"{expected}|is no JPEG or PNG"):
         picture(data, (16, 16))
 
 

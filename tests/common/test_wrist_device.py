@@ -59,8 +59,10 @@ PERSPECTIVE = ((1.0, 0, 0, 0), (0, 1.0, 0, 0), (0, 0, 1.0, 0), (0, 0, 0.1, 1.0))
         ),
     ],
 )
-def test_a_rig_that_does_not_fit_is_refused_alike(side: str, change: dict[str, object], says: str) -> None:
-    with pytest.raises(CalibrationError, match=f"rig 'wrist': .*{says}"):
+def test_a_rig_that_does_not_fit_is_refused_alike(
+    side: str, change: dict[str, object], expected: str
+) -> None:
+    with pytest.raises(CalibrationError, match=f"rig 'wrist': .*{expected}"):
         SIDES[side](replace(RIG, **change), CAMERA)
 
 
@@ -95,7 +97,7 @@ def test_slave_and_master_place_the_same_plane_and_palm_also_where_the_file_is_r
         (Laser(forward=(0.0, 1.0, 0.0)), "laser.forward: leaves laser_plane"),
     ],
 )
-def test_a_laser_whose_light_goes_nowhere_or_out_of_its_plane_is_refused(laser: Laser, says: str) -> None:
+def test_a_laser_whose_light_goes_nowhere_or_out_of_its_plane_is_refused(laser: Laser, expected: str) -> None:
     data = msgspec.json.encode(replace(RIG, laser=laser))
-    with pytest.raises(CalibrationError, match=f"rig.json: {says}"):
+    with pytest.raises(CalibrationError, match=f"rig.json: {expected}"):
         parse(data, RigCalibration, "rig.json")

@@ -72,11 +72,11 @@ def test_everything_declared_holds_again_after_the_master_restarts() -> None:
                 assert master.ask(Command("left", "report"), timeout_s=5).counts == {"frames": 3}
                 assert until(lambda bus=master: "left" in bus.alive())
 
-                def heard(bus: ZenohBus = master) -> bool:
+                def received(bus: ZenohBus = master) -> bool:
                     bus.publish("health", "master", health("master"))
                     return inbox.get(0.05) is not None
 
-                assert until(heard)
+                assert until(received)
             finally:
                 master.close()
             assert until(lambda: slave.peers == 0)

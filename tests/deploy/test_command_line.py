@@ -54,11 +54,11 @@ def test_a_folder_that_is_no_recording_is_named(tmp_path: Path, capsys: pytest.C
     ],
 )
 def test_a_recording_of_no_known_kind_is_refused_by_name(
-    rigs: list[object], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    rigs: list[object], expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "recording.json").write_text(json.dumps({"rigs": rigs}))
     assert main(["replay", str(tmp_path), "--out", str(tmp_path / "out")]) == 1
-    assert says in capsys.readouterr().err
+    assert expected in capsys.readouterr().err
 
 
 def steps_of_replay(
@@ -292,9 +292,9 @@ def test_of_both_kinds_each_sensor_has_its_rig_and_one_master_runs_all(tmp_path:
     ],
 )
 def test_rigs_that_cannot_be_played_together_are_refused(
-    rigs: tuple[str, ...], scene: str, says: str, tmp_path: Path
+    rigs: tuple[str, ...], scene: str, expected: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(sensors.DemoError, match=says):
+    with pytest.raises(sensors.DemoError, match=expected):
         rows(rigs, ROOT / "calib_json", tmp_path, scene)
 
 

@@ -95,7 +95,7 @@ class Wires:
         t_ns = self.clock.now_ns()
         if to == BROADCAST:
             for slave in self.slaves.values():
-                slave.hear_beacon(datagram, source, slave._clock.now_ns())
+                slave.receive_beacon(datagram, source, slave._clock.now_ns())
         elif to == MASTER and self.master is not None:
             message = self.master.receive(datagram, source, t_ns)
             if isinstance(message, ImuSample):
@@ -294,7 +294,7 @@ def test_a_hello_that_was_kept_back_cannot_end_the_session_of_the_restarted_slav
     master, left, _ = started_pair(wires)
     beacon = next(d for d, _, to in reversed(wires.seen) if to == BROADCAST)
     swallowed = wires.new_slave("left")
-    swallowed.hear_beacon(beacon, MASTER, wires.clock.now_ns())
+    swallowed.receive_beacon(beacon, MASTER, wires.clock.now_ns())
     hello = swallowed.due()[0][0]
     wires.remove(swallowed)
     live = master._senders["left"].live

@@ -75,7 +75,7 @@ class Room:
             self.solve()
 
     def attack(self, attack: Attack) -> None:
-        """Say it, and solve what comes of it."""
+        """Notify it, and solve what comes of it."""
         session = self._stolen._session
         assert session is not None
         body = self._speaker.body(attack, self._stolen.process, self.wires.clock.t_ns)

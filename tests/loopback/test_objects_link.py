@@ -264,11 +264,11 @@ def test_nobody_waits_for_a_tracker_and_it_alone_starts_nothing() -> None:
 
 def test_one_name_is_not_for_two() -> None:
     wires = Wires()
-    for imus, trackers, says in (
+    for imus, trackers, expected in (
         ((), ("left",), "'left' is a camera and a tracker"),
         (("puck",), ("puck",), "'puck' is an IMU and a tracker"),
     ):
-        with pytest.raises(ValueError, match=says):
+        with pytest.raises(ValueError, match=expected):
             MasterLink(("left",), KEY, wires.clock, BROADCAST, "", S, seeded(1), imus, (), trackers)
 
 

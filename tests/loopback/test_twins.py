@@ -104,7 +104,7 @@ class Versions:
         while wires.clock.t_ns < end:
             for datagram, to in self.master.due():
                 if to == BROADCAST:
-                    self._old(lambda d=datagram: self.slave.hear_beacon(d, MASTER, wires.clock.now_ns()))
+                    self._old(lambda d=datagram: self.slave.receive_beacon(d, MASTER, wires.clock.now_ns()))
             for datagram, _ in self._old(self.slave.due):
                 self.hellos += 1
                 assert HEADER.unpack_from(datagram)[1:3] == (OTHER, Kind.HELLO)
@@ -149,5 +149,5 @@ def test_only_a_hello_of_this_rig_makes_a_name_known(monkeypatch: pytest.MonkeyP
     ) + bytes(72)
     slave.due()
     for _ in range(1000):
-        slave.hear_beacon(forged, ("6.6.6.6", 6), now_ns)
+        slave.receive_beacon(forged, ("6.6.6.6", 6), now_ns)
     assert len(slave.due()) <= 1

@@ -180,5 +180,5 @@ def test_stages_are_means_and_survive_an_error() -> None:
         (["right", "left"], "cameras: left, right"),
     ],
 )
-def test_who_is_waited_for_is_said(connected: list[str], said: str) -> None:
-    assert cameras_line(("left", "right"), frozenset(connected)) == said
+def test_who_is_waited_for_is_said(connected: list[str], output: str) -> None:
+    assert cameras_line(("left", "right"), frozenset(connected)) == output

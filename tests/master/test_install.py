@@ -71,10 +71,10 @@ def test_systemd_has_nothing_to_say_about_the_unit(tmp_path: Path) -> None:
         ("phalanx-master run", "phalanx run", "not executable"),
     ],
 )
-def test_a_slip_in_the_unit_would_be_said(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_a_slip_in_the_unit_would_be_said(tmp_path: Path, old: str, new: str, output: str) -> None:
     text = text_of(tmp_path, "--rig", "desk")
     assert old in text
-    assert said in verified(tmp_path, text.replace(old, new, 1))
+    assert output in verified(tmp_path, text.replace(old, new, 1))
 
 
 @NEEDS_SYSTEMD
@@ -96,10 +96,10 @@ def test_exposure_of_the_unit(tmp_path: Path, drop: str | None, passes: bool) ->
 
 
 def test_the_unit_starts_again_and_is_bounded(tmp_path: Path) -> None:
-    said = dict(re.findall(r"^(\w+)=(.*)$", text_of(tmp_path), re.MULTILINE))
-    assert (said["Type"], said["Restart"], said["RestartSec"]) == ("notify", "on-failure", "100ms")
-    assert said["StartLimitIntervalSec"] == "0"
-    assert (said["MemoryMax"], said["MemorySwapMax"], said["TasksMax"]) == ("1G", "0", "256")
+    output = dict(re.findall(r"^(\w+)=(.*)$", text_of(tmp_path), re.MULTILINE))
+    assert (output["Type"], output["Restart"], output["RestartSec"]) == ("notify", "on-failure", "100ms")
+    assert output["StartLimitIntervalSec"] == "0"
+    assert (output["MemoryMax"], output["MemorySwapMax"], output["TasksMax"]) == ("1G", "0", "256")
 
 
 @pytest.mark.parametrize(

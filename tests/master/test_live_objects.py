@@ -167,5 +167,5 @@ def drained(master: Master, name: str) -> list[object]:
 
 
 def test_who_is_there_is_said_by_kind() -> None:
-    said = cameras_line(("left",), frozenset({"left", "palm", "puck"}), ("puck", "other"))
-    assert said == "cameras: left; IMU: palm; tracker: puck"
+    output = cameras_line(("left",), frozenset({"left", "palm", "puck"}), ("puck", "other"))
+    assert output == "cameras: left; IMU: palm; tracker: puck"

@@ -14,7 +14,7 @@ from common.object_profile import Bead, BoxShape, CylinderShape, ObjectProfile, 
 from master.outputs.object_appearance import ObjectAppearance
 from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
-from master.outputs.rerun_gestures import arc, said
+from master.outputs.rerun_gestures import arc, output
 from tests.master.test_outputs_rerun import SETUP, STEP_NS, Viewing, moving_hand, rows_of
 
 START_NS = 10**15
@@ -193,8 +193,8 @@ def test_an_arc_is_a_turn_about_its_axis(axis: list[float]) -> None:
 
 
 def test_what_is_not_known_is_said_without_a_number() -> None:
-    assert said(gesture(0, "pinch", "begin")) == "index"
-    assert said(gesture(0, "dial", "begin")) == "dial"
+    assert output(gesture(0, "pinch", "begin")) == "index"
+    assert output(gesture(0, "dial", "begin")) == "dial"
 
 
 def test_the_viewer_shows_what_is_on_the_bus_and_an_object_nobody_described(tmp_path: Path) -> None:

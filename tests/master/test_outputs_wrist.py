@@ -167,10 +167,10 @@ def test_the_scene_is_turned_as_the_forearm_is_held(
     held = replace(poses, palm_world_wxyz=matrix_to_quaternion(np.array(world_camera) @ camera_palm))
     held.palm_world_wxyz[3] = np.nan
     write_rrd(tmp_path / "held.rrd", held, setup)
-    times, said = column(tmp_path / "held.rrd", "/world", "Transform3D:quaternion")
+    times, output = column(tmp_path / "held.rrd", "/world", "Transform3D:quaternion")
     known = [k for k in range(len(poses)) if k != 3]
     assert times == poses.t_ns[known].tolist()
-    xyzw = np.array(said, np.float64)[:, 0]
+    xyzw = np.array(output, np.float64)[:, 0]
     rotated = quaternion_to_matrix(xyzw[:, [3, 0, 1, 2]])
     up = np.array([R[2] for R in world_camera])[known]  # in the camera's frame
     np.testing.assert_allclose(

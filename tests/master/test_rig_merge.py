@@ -118,9 +118,9 @@ def test_cameras_together_are_placed_as_well_as_the_worst(bench: RigSetup) -> No
     ],
 )
 def test_marker_rigs_that_contradict_each_other_are_refused(
-    changes: dict[str, object], says: str, bench: RigSetup
+    changes: dict[str, object], expected: str, bench: RigSetup
 ) -> None:
-    with pytest.raises(CalibrationError, match=says):
+    with pytest.raises(CalibrationError, match=expected):
         RigSetup.joined([bench, aside(**changes)])
 
 
@@ -211,9 +211,9 @@ def test_a_marker_is_of_one_hand() -> None:
         ({"kind": "wrist", "cameras": ("left",), "T_world_rig": rows(ASIDE)}, "T_world_rig: of marker rigs"),
     ],
 )
-def test_a_rig_file_that_contradicts_itself_is_refused(changes: dict[str, object], says: str) -> None:
+def test_a_rig_file_that_contradicts_itself_is_refused(changes: dict[str, object], expected: str) -> None:
     raw = msgspec.json.encode(msgspec.structs.replace(rig_file(), **changes))
-    with pytest.raises(CalibrationError, match=says):
+    with pytest.raises(CalibrationError, match=expected):
         parse(raw, RigCalibration, "rig.json")
 
 

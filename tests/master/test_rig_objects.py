@@ -63,10 +63,10 @@ def test_a_rig_has_its_objects_and_its_gestures(tree: Path) -> None:
     ],
 )
 def test_files_that_do_not_fit_are_refused_with_the_key(
-    tree: Path, path: str, changes: dict[str, object], says: str
+    tree: Path, path: str, changes: dict[str, object], expected: str
 ) -> None:
     changed(tree, path, **changes)
-    with pytest.raises(CalibrationError, match=says):
+    with pytest.raises(CalibrationError, match=expected):
         load_setups(tree, ("desk-wand",))
 
 
@@ -86,13 +86,13 @@ def test_two_objects_share_nothing_that_they_are_seen_by(tree: Path) -> None:
     wand = load(tree / "objects/wand.json", ObjectProfile)
     cube = load(tree / "objects/cube.json", ObjectProfile)
     puck = msgspec.structs.replace(cube, name="wand", tags=None, tracker="puck")
-    for one, says in (
+    for one, expected in (
         (wand, "'wand' and 'twin' both have marker 'wand1'"),
         (msgspec.structs.replace(cube, name="wand"), "both have tag 0 of"),
         (puck, "both have tracker 'puck'"),
     ):
         both = {"wand": one, "twin": msgspec.structs.replace(one, name="twin")}
-        with pytest.raises(CalibrationError, match=says):
+        with pytest.raises(CalibrationError, match=expected):
             objects_of(rig, both)
 
 
@@ -143,8 +143,8 @@ class Running:
         setups = self.files.load()
         self.lines = [LivePipeline(setup, StageTimes()) for setup in setups]
         self.world = World(setups, self.lines, StageTimes())
-        self.said: list[str] = []
-        self.tuning = RigTuning(self.files, setups, self.lines, self.said.append, self.world)
+        self.output: list[str] = []
+        self.tuning = RigTuning(self.files, setups, self.lines, self.output.append, self.world)
         self.tuning.look()
 
 
@@ -156,7 +156,7 @@ def test_files_of_objects_and_gestures_are_followed_and_the_hand_is_left_alone(t
     larger = {name: Bead(position_m=one.position_m, radius_m=0.011) for name, one in wand.markers.items()}
     save(tree / "objects/wand.json", msgspec.structs.replace(wand, markers=larger))
     running.tuning.look()
-    assert running.said == ["changed files are in use"]
+    assert running.output == ["changed files are in use"]
     assert not running.lines[0]._next, "no hand was built anew"
     assert len(running.world._next) == 1
     list(running.world.push(sample("nobody", 1, 1)))
@@ -166,7 +166,7 @@ def test_files_of_objects_and_gestures_are_followed_and_the_hand_is_left_alone(t
     assert len(running.world._next) == 1
     (tree / "objects/wand.json").write_text("{")
     running.tuning.look()
-    assert running.said[-1].startswith("changed files are not used")
+    assert running.output[-1].startswith("changed files are not used")
     assert running.tuning.counts() == {"reload.applied": 2, "reload.refused": 1}
 
 

@@ -105,12 +105,12 @@ def strange_solver(rig: dict[str, Any]) -> None:
     ids=["no numbers", "turned cameras", "law against places", "IMU", "no such solver"],
 )
 def test_what_does_not_fit_is_refused_with_its_reason_and_what_to_do(
-    change: Change, says: tuple[str, ...], tree: Path
+    change: Change, expected: tuple[str, ...], tree: Path
 ) -> None:
     changed(tree, change)
     ended = started(tree, "desk")
     assert ended.code == 1, ended.text
-    for part in says:
+    for part in expected:
         assert part in ended.err
     assert "Traceback" not in ended.text
 

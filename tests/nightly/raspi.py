@@ -87,13 +87,17 @@ def started(
         stdin=subprocess.DEVNULL,
     ) as board:
         try:
-            while END not in (said := log.read_text(errors="replace") if log.exists() else ""):
-                if board.poll() is not None or "Kernel panic" in said or time.monotonic() - begin > timeout_s:
-                    raise RuntimeError(f"the board's program did not end:\n{said[-3000:]}")
+            while END not in (output := log.read_text(errors="replace") if log.exists() else ""):
+                if (
+                    board.poll() is not None
+                    or "Kernel panic" in output
+                    or time.monotonic() - begin > timeout_s
+                ):
+                    raise RuntimeError(f"the board's program did not end:\n{output[-3000:]}")
                 time.sleep(0.5)
         finally:
             board.kill()
-    return said, time.monotonic() - begin
+    return output, time.monotonic() - begin
 
 
 def _kernel() -> tuple[Path, Path]:

@@ -185,7 +185,7 @@ def test_a_bus_that_cannot_be_opened_is_tried_again_and_never_ends_the_slave() -
     ],
 )
 def test_a_slave_without_a_master_says_what_it_hears(
-    counts: dict[str, int], said: str, caplog: pytest.LogCaptureFixture
+    counts: dict[str, int], output: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     wire = Wire()
     wire.counts = counts
@@ -197,7 +197,7 @@ def test_a_slave_without_a_master_says_what_it_hears(
         assert looked.wait(60.0)
     finally:
         reporter.close()
-    assert said in caplog.text
+    assert output in caplog.text
 
 
 class Seen(Tally):

@@ -136,10 +136,10 @@ def test_things_of_a_paints_colour_on_the_desk_are_counted() -> None:
 
 
 def test_what_was_found_is_said() -> None:
-    said: list[str] = []
-    calibrate_moving(opening().images, NAMES, by_hand(HANDS["right"], NAMES, said.append), said.append)
-    assert sum(line.startswith("paint of hue") for line in said) == 6
-    assert any("votes" in line for line in said)
+    output: list[str] = []
+    calibrate_moving(opening().images, NAMES, by_hand(HANDS["right"], NAMES, output.append), output.append)
+    assert sum(line.startswith("paint of hue") for line in output) == 6
+    assert any("votes" in line for line in output)
 
 
 def stopped(frames: Moving) -> Moving:
@@ -249,17 +249,17 @@ def test_too_few_or_too_many_markers_need_another_way_to_be_named(names: tuple[s
 
 
 def test_names_that_the_shape_of_the_hand_contradicts_are_refused() -> None:
-    said: list[str] = []
+    output: list[str] = []
     unsure = by_hand(HANDS["right"], NAMES[:4])
     colours = colours_at(92.0, 68.0, 113.0, 136.0, 172.0, 42.0)
     hues = by_hues(ranges_at(92.0, 68.0, 113.0, 136.0, 172.0, 42.0), NAMES, "old.json")
-    assert named(checked(hues, lambda _colours, _uv: NAMES, said.append), colours) == NAMES
-    assert said == []
-    assert named(checked(hues, unsure, said.append), colours) == NAMES
-    assert "not checked" in said[0]
+    assert named(checked(hues, lambda _colours, _uv: NAMES, output.append), colours) == NAMES
+    assert output == []
+    assert named(checked(hues, unsure, output.append), colours) == NAMES
+    assert "not checked" in output[0]
     swapped = ("index", "thumb", *NAMES[2:])
     with pytest.raises(FitError, match=r"hue 92: thumb or index, hue 68: index or thumb"):
-        named(checked(hues, lambda _colours, _uv: swapped, said.append), colours)
+        named(checked(hues, lambda _colours, _uv: swapped, output.append), colours)
 
 
 @pytest.fixture(scope="module")

@@ -116,14 +116,14 @@ def test_a_click_next_to_a_small_marker_is_meant_for_it() -> None:
     ],
 )
 def test_a_click_that_makes_no_colour_says_what_to_do(
-    marker: str, uv: tuple[float, float], says: str
+    marker: str, uv: tuple[float, float], expected: str
 ) -> None:
     image = PICTURE.copy()
     image[300:, 440:] = (20, 160, 20)  # a wall of paint
     across = np.array([[(100 + k * 17 // 60, 200, 150) for k in range(60)]], np.uint8)
     image[400:440, 70:130] = cv2.cvtColor(across, cv2.COLOR_HSV2BGR)
     image[29:31, 599:601] = (20, 160, 20)
-    with pytest.raises(FitError, match=says):
+    with pytest.raises(FitError, match=expected):
         SampledColours().sample(image, SAME, marker, uv, picked(PICTURE, "index"))
 
 

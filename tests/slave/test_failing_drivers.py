@@ -64,7 +64,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reopening, "FROZEN_NS", 30_000_000)
     monkeypatch.setattr(imu_reopening, "FIRST_WAIT_S", 0.001)
     monkeypatch.setattr(objects_reopening, "FIRST_WAIT_S", 0.001)
-    monkeypatch.setattr(objects_reopening, "SAY_LOST_S", 0.001)
+    monkeypatch.setattr(objects_reopening, "LOG_LOST_S", 0.001)
 
 
 class Wire:

@@ -250,9 +250,9 @@ def not_there(folder: Path) -> list[Path]:
     ],
 )
 def test_what_does_not_belong_together_is_named_and_nothing_is_written(
-    spoil: Spoil, said: str, tmp_path: Path
+    spoil: Spoil, output: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(RecordingError, match=said):
+    with pytest.raises(RecordingError, match=output):
         join_recordings(spoil(tmp_path), tmp_path / "wave", by_wall_clock=True)
     assert not (tmp_path / "wave").exists()
 

@@ -95,11 +95,11 @@ def pinned(name: str, value: object, after: int) -> Callable[[int, dict[str, Any
     ],
 )
 def test_what_a_pi_camera_does_not_take_is_named_and_the_old_settings_come_back(
-    name: str, value: object, says: str, monkeypatch: pytest.MonkeyPatch
+    name: str, value: object, expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = pi(monkeypatch, Sensor(tamper=pinned(name, value, 10)))
     with reading(source):
-        with pytest.raises(CameraError, match=says) as error:
+        with pytest.raises(CameraError, match=expected) as error:
             source.tune(changed(exposure_us=9000.0, analogue_gain=2.0))
         assert str(error.value).endswith("the settings before are back")
         got = source.figures()
@@ -126,11 +126,11 @@ def test_settings_that_do_not_come_back_are_said_to_be_lost(monkeypatch: pytest.
     ],
 )
 def test_what_is_out_of_range_is_refused_before_anything_is_written(
-    changes: dict[str, Any], says: str, monkeypatch: pytest.MonkeyPatch
+    changes: dict[str, Any], expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sensor = Sensor()
     source = pi(monkeypatch, sensor)
-    with reading(source), pytest.raises(CameraError, match=says):
+    with reading(source), pytest.raises(CameraError, match=expected):
         source.tune(changed(**changes))
     written = {value for _, controls in sensor.opened[0]._changes for value in controls.values()}
     assert written <= {5000, 1.25, (0.83, 1.24), (33333, 33333)}, "what it had"

@@ -128,9 +128,9 @@ def test_other_drivers_are_not_its_business() -> None:
     ],
 )
 def test_an_option_that_would_be_ignored_is_refused(
-    driver: str, arguments: tuple[str, ...], says: str
+    driver: str, arguments: tuple[str, ...], expected: str
 ) -> None:
-    with pytest.raises(CameraError, match=says):
+    with pytest.raises(CameraError, match=expected):
         opened(driver, *arguments)
 
 

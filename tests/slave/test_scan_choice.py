@@ -53,9 +53,9 @@ def test_windows_are_chosen_where_whole_frames_do_not_fit_and_left_where_they_fi
         assert modes[JUDGED : JUDGED + PROBE_EVERY] == [True] * PROBE_EVERY
         assert modes[JUDGED:].count(False) == 4, "a whole frame now and then: does it fit?"
         assert choice.frames == modes.count(True)
-        (said,) = caplog.messages
-        assert said.startswith("left: to scan a whole frame takes 21.7 ms of the 16.7 ms of a frame")
-        assert "--scan auto" in said
+        (output,) = caplog.messages
+        assert output.startswith("left: to scan a whole frame takes 21.7 ms of the 16.7 ms of a frame")
+        assert "--scan auto" in output
         machine.whole_ms = 0.5 * PERIOD_MS
         modes = machine.frames(choice, (2 * PROBES + 1) * (PROBE_EVERY + 1))
         assert modes[-PROBE_EVERY:] == [False] * PROBE_EVERY

@@ -148,9 +148,9 @@ def test_set_changes_what_it_names_and_nothing_else(tuning: CameraTuning, knobs:
     ],
 )
 def test_a_wrong_body_is_refused_with_the_reason(
-    verb: str, body: str, says: str, tuning: CameraTuning, knobs: Knobs
+    verb: str, body: str, expected: str, tuning: CameraTuning, knobs: Knobs
 ) -> None:
-    with pytest.raises(CalibrationError, match=says):
+    with pytest.raises(CalibrationError, match=expected):
         tuning.commands()[verb](body)
     assert knobs.tuned == []
 

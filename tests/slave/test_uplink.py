@@ -10,7 +10,7 @@ import pytest
 from common.clock import SystemClock
 from common.errors import BusError
 from common.messages import Health, MarkerDetections
-from slave.uplink import SAY_NS, News, Uplink
+from slave.uplink import LOG_NS, News, Uplink
 from tests.network_helpers import detections, free_udp_port, until
 
 KEY = bytes(range(32))
@@ -102,11 +102,11 @@ def test_a_line_is_said_once_and_who_alternates_two_does_not_fill_the_log() -> N
         False,
         False,
     ]
-    said = [
+    output = [
         t
-        for t in range(0, 10 * SAY_NS, SAY_NS // 100)
-        if news.is_new("ab"[t * 100 // SAY_NS % 2], SAY_NS + t)
+        for t in range(0, 10 * LOG_NS, LOG_NS // 100)
+        if news.is_new("ab"[t * 100 // LOG_NS % 2], LOG_NS + t)
     ]
-    assert 1 < len(said) <= 10
-    assert not news.is_new("c", 10 * SAY_NS + SAY_NS // 2)
+    assert 1 < len(output) <= 10
+    assert not news.is_new("c", 10 * LOG_NS + LOG_NS // 2)
     assert news.is_new("c", 0)  # a clock that was set back makes it no quieter

@@ -26,7 +26,7 @@ from master.ingest import Ingest
 ROUND_S = 0.3
 ANSWER_NS = 1_000_000_000
 _ASK_S = 0.5
-_SAY_NS = 2_000_000_000  # the same words are not said more often
+_LOG_NS = 2_000_000_000  # the same words are not said more often
 NOTES = "capture.json"
 
 
@@ -53,7 +53,7 @@ def capture(
     folder: Path,
     wanted: int,
     stop: threading.Event,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
     advise: Callable[[], str] = lambda: "",
 ) -> int:
     """Keep views until there are enough or `stop` is set; return how many.
@@ -70,7 +70,7 @@ def capture(
     Raises:
         CalibrationError: The folder cannot be written.
     """
-    said, said_ns = "", now_ns()
+    previous, notified_ns = "", now_ns()
     spread: list[float] = []
     while len(live.views) < wanted and not stop.is_set():
         began_ns = now_ns()
@@ -81,10 +81,10 @@ def capture(
             view = live.views[-1]
             spread.append(round_.spread_ms)
             _keep(folder, view.name, {name: round_.stills[name] for name in view.observations})
-            say(f"view {len(live.views)} of {wanted}: {text}{_then(advise())}")
-        elif text != said or began_ns - said_ns > _SAY_NS:
-            say(text)
-            said, said_ns = text, began_ns
+            notify(f"view {len(live.views)} of {wanted}: {text}{_then(advise())}")
+        elif text != previous or began_ns - notified_ns > _LOG_NS:
+            notify(text)
+            previous, notified_ns = text, began_ns
         stop.wait(max(0.0, ROUND_S - (now_ns() - began_ns) * 1e-9))
     if live.views:
         _note(folder, live, spread)

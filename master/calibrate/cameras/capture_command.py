@@ -109,14 +109,14 @@ def _wait(ingest: Ingest, cameras: tuple[str, ...], stop: threading.Event) -> No
     Raises:
         CalibrationError: Told to stop before.
     """
-    said: frozenset[str] | None = None
+    previous: frozenset[str] | None = None
     rounds = 0
     while not ingest.started:
         here = ingest.connected
-        if here != said:
+        if here != previous:
             absent = ", ".join(name for name in cameras if name not in here)
             typer.echo(f"waiting for {absent or 'the start'}")
-            said = here
+            previous = here
         rounds += 1
         if rounds % _HINT_ROUNDS == 0 and not here:
             typer.echo(

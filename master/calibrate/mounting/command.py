@@ -13,7 +13,7 @@ from common.frame_recording import FrameRecording, open_recording
 from common.imu_fusion import OrientationFilter
 from common.imu_recording import IMU, read_imu
 from common.messages import HandPose, ImuSample
-from master.calibrate.wrist.device import device_of, say, write_device
+from master.calibrate.wrist.device import device_of, print_line, write_device
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.recorded import recorded_cycles, recorded_detections
 from master.rig import load_hand
@@ -89,7 +89,7 @@ def mounting(
         )
     except FitError as error:
         raise FitError(f"{recording}: {error}") from error
-    say(found.report)
+    print_line(found.report)
     if picture is not None:
         from master.calibrate.mounting.picture import draw_mounting  # matplotlib takes a second to import
 

@@ -13,7 +13,7 @@ _DEPTH = 512  # poses that may wait while a line is printed
 
 
 def observe_live(
-    bus: str, rig: RigCalibration, names: Sequence[str], longest_s: float, say: Callable[[str], None]
+    bus: str, rig: RigCalibration, names: Sequence[str], longest_s: float, notify: Callable[[str], None]
 ) -> Seen:
     """Blend the user through the motion.
 
@@ -38,6 +38,6 @@ def observe_live(
             # A wrist device alone tells of hands without markers.
             return message if isinstance(message, HandPose) and len(message.markers_raw_m) else None
 
-        return guide(receive, rig, names, SystemClock(), say, longest_s)
+        return guide(receive, rig, names, SystemClock(), notify, longest_s)
     finally:
         link.close()

@@ -11,7 +11,9 @@ from master.master_bus import join_bus
 _DEPTH = 1024  # poses that may wait while a line is printed
 
 
-def observe_live(bus: str, profile: ObjectProfile, longest_s: float, say: Callable[[str], None]) -> Session:
+def observe_live(
+    bus: str, profile: ObjectProfile, longest_s: float, notify: Callable[[str], None]
+) -> Session:
     """Blend the user through the motion.
 
     Args:
@@ -33,6 +35,6 @@ def observe_live(bus: str, profile: ObjectProfile, longest_s: float, say: Callab
             message = objects.get(0.0) or devices.get(timeout_s)
             return message if isinstance(message, ObjectPose | TrackerPose) else None
 
-        return guide(receive, SystemClock(), say, longest_s)
+        return guide(receive, SystemClock(), notify, longest_s)
     finally:
         link.close()

@@ -17,7 +17,7 @@ from master.calibrate.cameras.boards import Board
 from master.calibrate.cameras.options import Dictionary, MarkerMm, Size, SquareMm, board_of
 from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.board_pose import board_pose
-from master.calibrate.wrist.device import Device, device_of, say, write_device
+from master.calibrate.wrist.device import Device, device_of, print_line, write_device
 from master.calibrate.wrist.line import line_on_board
 from master.calibrate.wrist.lit_views import LitView, lit_views, told_by_reason
 from master.calibrate.wrist.plane import PlaneFit, ViewLine, fit_plane
@@ -75,7 +75,7 @@ def laser_plane(
     except FitError as error:
         reasons = "".join(f"\n  {reason}" for reason in told_by_reason(seen.refused))
         raise FitError(f"{source}: {error}{reasons}") from error
-    say(report_lines(fit, seen, len(views)))
+    print_line(report_lines(fit, seen, len(views)))
     if picture is not None:
         from master.calibrate.wrist.picture import draw_plane  # matplotlib takes a second to import
 

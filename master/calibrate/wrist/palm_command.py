@@ -18,7 +18,7 @@ from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.cameras.options import Dictionary, MarkerMm, board_of
 from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.board_pose import BoardPose, board_pose
-from master.calibrate.wrist.device import Device, device_of, say, write_device
+from master.calibrate.wrist.device import Device, device_of, print_line, write_device
 from master.calibrate.wrist.lit_views import lit_views, told_by_reason
 from master.calibrate.wrist.palm_board import Mounting, PalmFit, palm_from_board
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
@@ -76,7 +76,7 @@ def palm(
         fit = _by_board(source, board_of(board, square_mm, marker_mm, dictionary), mounting, device)
     except FitError as error:
         raise FitError(f"{source}: {error}") from error
-    say(report_lines(fit))
+    print_line(report_lines(fit))
     written = write_device(out, device, rig_with_palm(device, fit), "T_camera_palm")
     if json_file is not None:
         told: dict[str, object] = {
@@ -97,7 +97,7 @@ def _by_board(source: Path, board: Board, mounting: Mounting, device: Device) ->
             placed.append(board_pose(view, board, device.optics))
         except FitError as error:
             refused[view.name] = str(error)
-    say(f"left out: {reason}" for reason in told_by_reason(refused))
+    print_line(f"left out: {reason}" for reason in told_by_reason(refused))
     return palm_from_board(placed, board, mounting)
 
 

@@ -12,7 +12,7 @@ from common.calibration import HandProfile, load
 from common.errors import CalibrationError, FitError
 from common.hand_model import FINGERS
 from master.calibrate.tree_files import write_hand
-from master.calibrate.wrist.device import Device, device_of, say, write_device
+from master.calibrate.wrist.device import Device, device_of, print_line, write_device
 from master.calibrate.wrist.subject import Subject, calibrate_subject
 from master.calibrate.wrist.subject_model import Unknown
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
@@ -72,7 +72,7 @@ def subject(
         found = calibrate_subject(cycles, device.rig, device.camera, profile, device.source)
     except FitError as error:
         raise FitError(f"{recording}: {error}") from error
-    say(found.report)
+    print_line(found.report)
     if picture is not None:
         from master.calibrate.wrist.subject_picture import draw_subject  # matplotlib takes a second to import
 

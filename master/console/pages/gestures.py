@@ -25,7 +25,7 @@ def build(state: ConsoleState) -> None:
     """Fill the page."""
     with ui.element("div").classes("gesture-grid"):
         _now(state)
-        _said(state)
+        _show_events(state)
         _poses(state)
 
 
@@ -86,7 +86,7 @@ def _dial(angle_rad: float | None) -> str:
     )
 
 
-def _said(state: ConsoleState) -> None:
+def _show_events(state: ConsoleState) -> None:
     with ui.element("section").classes("panel").props('aria-label="Said last"'):
         ui.label("Said last").classes("panel-title")
         content = ui.html("", sanitize=False).classes("gesture-said")
@@ -94,9 +94,9 @@ def _said(state: ConsoleState) -> None:
     def update() -> None:
         now_s = time.monotonic()
         lines = [
-            f"<li><span class='soft'>{now_s - said.heard_s:.0f} s ago</span> {escape(readable(said.gesture.hand))}:"
-            f" {escape(_phase(said.gesture))}</li>"
-            for said in state.gestures_heard.events()[:14]
+            f"<li><span class='soft'>{now_s - received.received_s:.0f} s ago</span> {escape(readable(received.gesture.hand))}:"
+            f" {escape(_phase(received.gesture))}</li>"
+            for received in state.received_gestures.events()[:14]
         ]
         content.set_content(
             "<ul>" + "".join(lines) + "</ul>" if lines else "<p class='soft'>Nothing yet.</p>"

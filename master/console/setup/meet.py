@@ -49,14 +49,14 @@ def meet(
         stack.callback(link.close)
         ingest = Ingest(cameras, link_key(os.environ, key_file), SystemClock(), *ends, bus, _START_S)
         stack.callback(ingest.close)
-        said: frozenset[str] | None = None
+        previous: frozenset[str] | None = None
         while not stop.wait(_POLL_S):
             while ingest.get(0.0) is not None:
                 pass  # nothing is tracked
-            if (here := ingest.connected) != said:
+            if (here := ingest.connected) != previous:
                 absent = ", ".join(name for name in cameras if name not in here)
                 typer.echo(f"waiting for {absent}" if absent else f"all {len(cameras)} cameras are there")
-                said = here
+                previous = here
 
 
 def main() -> None:

@@ -88,7 +88,7 @@ def _put(path: Path, text: str) -> None:
 
 @pytest.mark.parametrize(("code", "subject", "says", "change"), CHANGES)
 def test_a_file_that_is_wrong_is_told_and_mended_it_is_not(
-    code: str, subject: str, says: str, change: Callable[[Path], None], tree: Path, tmp_path: Path
+    code: str, subject: str, expected: str, change: Callable[[Path], None], tree: Path, tmp_path: Path
 ) -> None:
     plan, watch = _plan(tree), FileWatch(tree, ("desk",))
     assert watch.look(plan) == ()
@@ -96,7 +96,7 @@ def test_a_file_that_is_wrong_is_told_and_mended_it_is_not(
     change(tree)
     (item,) = watch.look(plan)
     assert (item.code, item.subject) == (code, subject)
-    assert says in item.sentence
+    assert expected in item.sentence
     assert item.fix
     shutil.copytree(tmp_path / "before", tree, dirs_exist_ok=True)
     assert watch.look(plan) == ()

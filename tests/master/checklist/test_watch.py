@@ -23,7 +23,7 @@ class Case:
     subject: str
     put: Callable[[Bench], object]
     take: Callable[[Bench], object]
-    says: str
+    expected: str
     fix: str
 
 
@@ -294,7 +294,7 @@ def test_a_fault_shows_alone_within_two_seconds_and_is_gone_within_two(case: Cas
         if s >= first:
             assert [(item.code, item.subject) for item in items] == [(case.code, case.subject)], s
     item = told[-1][1][0]
-    assert case.says in item.sentence
+    assert case.expected in item.sentence
     assert case.subject.split(".")[0].split("-")[0] in item.sentence
     assert case.fix in item.fix
     case.take(bench)

@@ -13,13 +13,13 @@ from common.messages import Command, Gesture, Health
 from common.output_settings import OutputSettings
 from master.console.elements import full_frame_uv
 from master.console.filter_trial import save_filter, try_filter
-from master.console.gestures_heard import KEPT, GesturesHeard
 from master.console.guard import names_of, refusal
 from master.console.history import History
 from master.console.looking import Looking
 from master.console.output_files import change_output
 from master.console.own_copy import update_copy
 from master.console.play_panel import start_playing
+from master.console.received_gestures import KEPT, ReceivedGestures
 from master.console.recording_panel import recording_path
 from master.console.state import ConsoleSettings, ConsoleState, Newest
 from master.console.tuner import Range, Tuner
@@ -149,21 +149,21 @@ def test_history_keeps_a_minute_and_parts_what_masters_and_senders_say() -> None
 
 
 def test_gestures_last_until_they_end_or_are_not_heard_and_events_are_bounded() -> None:
-    heard = GesturesHeard()
+    received = ReceivedGestures()
 
-    def say(phase: str, now_s: float, kind: str = "pinch") -> None:
-        heard.push(Gesture("me", 0, kind, "index", phase, 0, 1.0), now_s)  # pyright: ignore[reportArgumentType]
+    def publish(phase: str, now_s: float, kind: str = "pinch") -> None:
+        received.push(Gesture("me", 0, kind, "index", phase, 0, 1.0), now_s)  # pyright: ignore[reportArgumentType]
 
-    say("begin", 1.0)
-    say("update", 1.2)
-    assert set(heard.lasting(1.4)) == {("me", "pinch")}
-    assert not heard.lasting(1.8), "not repeated: over"
-    say("end", 2.0)
-    assert not heard.lasting(2.0)
+    publish("begin", 1.0)
+    publish("update", 1.2)
+    assert set(received.lasting(1.4)) == {("me", "pinch")}
+    assert not received.lasting(1.8), "not repeated: over"
+    publish("end", 2.0)
+    assert not received.lasting(2.0)
     for k in range(100):
-        say("end", 3.0 + k, "tap")
-    assert len(heard.events()) == KEPT
-    assert heard.events()[0].heard_s == 102.0
+        publish("end", 3.0 + k, "tap")
+    assert len(received.events()) == KEPT
+    assert received.events()[0].received_s == 102.0
 
 
 def test_the_bus_cannot_fill_the_memory_with_names() -> None:

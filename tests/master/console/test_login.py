@@ -120,17 +120,17 @@ def test_a_password_fits_itself_alone_and_its_hash_survives_a_file() -> None:
 
 
 def test_a_password_is_made_and_said_once(tmp_path: Path) -> None:
-    said: list[str] = []
+    output: list[str] = []
     folder = tmp_path / "phalanx"
-    made = kept_password(folder, said.append)
-    password = said[0].split("password is ")[1].split()[0]
+    made = kept_password(folder, output.append)
+    password = output[0].split("password is ")[1].split()[0]
     assert made.fits(password)
     assert made.n >= 2**15
     assert len(set(password.replace("-", ""))) > 5
     assert stat.S_IMODE((folder / HASH_FILE).stat().st_mode) == 0o600
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-    assert kept_password(folder, said.append) == made
-    assert password not in said[1]
+    assert kept_password(folder, output.append) == made
+    assert password not in output[1]
     assert new_password() != new_password()
 
 
@@ -223,9 +223,9 @@ def test_the_right_password_opens_and_logout_closes() -> None:
         assert status(await ask(app, "/login", "POST", body=form("wrong"))) == 403
         opened = await ask(app, "/login?next=/live", "POST", body=form(PASSWORD))
         assert (status(opened), header(opened, b"location")) == (303, "/live")
-        said = header(opened, b"set-cookie").lower()
-        assert "httponly" in said
-        assert "samesite=strict" in said
+        output = header(opened, b"set-cookie").lower()
+        assert "httponly" in output
+        assert "samesite=strict" in output
         cookie = token(opened)
         assert status(await ask(app, "/live", cookie=cookie)) == 299
         assert status(await ask(app, "/live", cookie=f"a=b; {cookie}; c=d")) == 299
@@ -295,13 +295,13 @@ def test_guessing_is_slowed_down_also_when_it_comes_at_once() -> None:
 
 
 def test_a_socket_ends_with_its_session() -> None:
-    heard: list[Message] = []
+    received: list[Message] = []
     app = FastAPI(openapi_url=None)
 
     async def echo(socket: WebSocket) -> None:
         await socket.accept()
         while (message := await socket.receive())["type"] != "websocket.disconnect":
-            heard.append(message)
+            received.append(message)
 
     app.add_api_websocket_route("/echo", echo)
 
@@ -309,9 +309,9 @@ def test_a_socket_ends_with_its_session() -> None:
         guarded = door(app=app)
         assert status(await ask(guarded, "/echo", kind="websocket")) == 403
         cookie = token(await ask(guarded, "/login", "POST", body=form(PASSWORD)))
-        said = [{"type": "websocket.receive", "text": "hello"}]
-        open_socket = asyncio.create_task(ask(guarded, "/echo", kind="websocket", cookie=cookie, then=said))
-        while not heard:
+        output = [{"type": "websocket.receive", "text": "hello"}]
+        open_socket = asyncio.create_task(ask(guarded, "/echo", kind="websocket", cookie=cookie, then=output))
+        while not received:
             await asyncio.sleep(0.001)
         await ask(guarded, "/logout", "POST", cookie=cookie)
         told = await asyncio.wait_for(open_socket, 30.0)
@@ -381,17 +381,17 @@ def test_the_walk_sees_a_path_that_is_open() -> None:
 
 
 def test_elsewhere_there_is_a_password_and_tls_unless_it_is_open(tmp_path: Path) -> None:
-    said: list[str] = []
-    here = door_of(ConsoleSettings(tmp_path), tmp_path, said.append)
-    assert (here, said) == (Door(), [])
-    elsewhere = door_of(ConsoleSettings(tmp_path, host="192.0.2.1"), tmp_path, said.append)
+    output: list[str] = []
+    here = door_of(ConsoleSettings(tmp_path), tmp_path, output.append)
+    assert (here, output) == (Door(), [])
+    elsewhere = door_of(ConsoleSettings(tmp_path, host="192.0.2.1"), tmp_path, output.append)
     assert elsewhere.password is not None
     assert elsewhere.tls is not None
-    assert "SHA-256" in said[-1]
-    plain = door_of(ConsoleSettings(tmp_path, host="0.0.0.0", open_links=True), tmp_path, said.append)
+    assert "SHA-256" in output[-1]
+    plain = door_of(ConsoleSettings(tmp_path, host="0.0.0.0", open_links=True), tmp_path, output.append)
     assert plain.password is not None
     assert plain.tls is None
-    assert "WARNING" in said[-1]
+    assert "WARNING" in output[-1]
 
 
 def test_only_the_own_user_is_answered_without_a_password(tmp_path: Path) -> None:

@@ -69,7 +69,7 @@ class Arm:
         """(3, 3) in the rig."""
         return self.forearm(t_ms) @ forearm_palm(self.wrist_angles(t_ms))
 
-    def said(self, t_ms: int) -> Float:
+    def output(self, t_ms: int) -> Float:
         """What the IMU says (4,)."""
         world_forearm = axis_rotation(2, -self.heading_rad) @ RIG_WORLD.T @ self.forearm(t_ms)
         return matrix_to_quaternion(world_forearm @ PALM_IMU)
@@ -137,7 +137,7 @@ class WristCase:
     ) -> None:
         """Samples every 8 ms, epochs every 16, two samples late; stamped `shift_ms` later."""
         for t_ms in times_ms[::8]:
-            self.forearm.push((t_ms + shift_ms) * MS, arm.said(t_ms), drift)
+            self.forearm.push((t_ms + shift_ms) * MS, arm.output(t_ms), drift)
             if t_ms % FRAME_MS == 0 and t_ms - 16 >= times_ms.start:
                 self.epoch(arm, t_ms - 16, seen=seen, shift_ms=shift_ms)
 
@@ -192,7 +192,7 @@ def test_a_heading_that_the_file_knows_is_there_at_once(root: Path) -> None:
     arm = Arm(heading_rad=0.05)
     wrist_case = WristCase.of(root, msgspec.structs.replace(IMU, heading_sigma_rad=0.1))
     assert wrist_case.heading_sigma_deg == pytest.approx(np.degrees(0.1))
-    wrist_case.forearm.push(48 * MS, arm.said(48))
+    wrist_case.forearm.push(48 * MS, arm.output(48))
     orientation = wrist_case.orientation(48)
     assert orientation is not None
     assert degrees(orientation.rotation, arm.forearm(48)) < 4.0
@@ -204,7 +204,7 @@ def test_a_palm_that_is_hidden_is_turned_as_the_forearm_is_and_doubted_more_and_
     spread: list[float] = []
     off_deg = 0.0
     for t_ms in range(6_000, 9_000, FRAME_MS):
-        wrist_case.forearm.push(t_ms * MS, arm.said(t_ms))
+        wrist_case.forearm.push(t_ms * MS, arm.output(t_ms))
         hand = found(wrist_case.epoch(arm, t_ms, seen=False).solution)
         off_deg = degrees(hand.T_rig_palm[:3, :3], arm.palm(t_ms))
         if t_ms < 6_100:
@@ -260,7 +260,7 @@ def test_a_palm_that_contradicts_is_the_markers_alone(root: Path) -> None:
     arm, wrist_case = Arm(), WristCase.of(root)
     wrist_case.played(arm, range(0, 4_000))
     arm.heading_rad += 2.5
-    wrist_case.forearm.push(4_000 * MS, arm.said(4_000))
+    wrist_case.forearm.push(4_000 * MS, arm.output(4_000))
     before, cov = wrist_case.estimator.extras.copy(), wrist_case.estimator.extras_cov.copy()
     hand = wrist_case.epoch(arm, 4_000)
     assert hand.rotation_rejected

@@ -326,8 +326,8 @@ def test_an_orientation_without_heading_does_not_tell_the_palm_by_one_finger(
     run(machine, range(5))
     cov = 0.03**2 * np.eye(3) + (heading_rad**2 - 0.03**2) * np.outer(up, up)
     points = bent_points(bent(5 / 60.0), tuple(m for m in range(6) if m != MARKER_INDEX))
-    said = orientation_of(palm()[:3, :3], cov, sure=told)
-    hand = [push(machine, k * STEP_NS, points, orientation=said) for k in range(5, 10)][-1]
+    output = orientation_of(palm()[:3, :3], cov, sure=told)
+    hand = [push(machine, k * STEP_NS, points, orientation=output) for k in range(5, 10)][-1]
     assert region_m(hand)[TIPS[INDEX]] < DEFAULT.tracked_m
     assert (hand.sources[5] > 0) == told
     assert hand.source[PALM] == (Source.SOLVED if told else Source.HELD)

@@ -122,7 +122,7 @@ def test_markers_of_a_rig_are_compared(source: Path, tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_is_refused(
-    source: Path, exact: Path, tmp_path: Path, options: list[str], kind: type[Exception], said: str
+    source: Path, exact: Path, tmp_path: Path, options: list[str], kind: type[Exception], output: str
 ) -> None:
     joints = hand_at(TRUTH_S).position_m
     files = {
@@ -134,4 +134,4 @@ def test_what_cannot_be_is_refused(
     }
     with pytest.raises(kind) as caught:
         run(str(source), *(str(files.get(option, option)) for option in options))
-    assert said in str(caught.value)
+    assert output in str(caught.value)

@@ -67,10 +67,10 @@ def test_a_taught_pose_is_known_again_and_changes_no_other(count: int) -> None:
 
 
 def test_what_tells_it_apart_is_said() -> None:
-    said = learn("horns", examples(4), SETTINGS).said
-    pointing = next(line for line in said if line.startswith("from pointing"))
+    stated = learn("horns", examples(4), SETTINGS).stated
+    pointing = next(line for line in stated if line.startswith("from pointing"))
     assert "little_bend_deg" in pointing
-    assert any(line.startswith("each example fits") for line in said)
+    assert any(line.startswith("each example fits") for line in stated)
 
 
 def test_a_pose_like_another_is_refused_and_named() -> None:
@@ -140,10 +140,10 @@ class Stage:
 
 
 def test_the_lesson_counts_down_and_collects_holds() -> None:
-    stage, said = Stage(), list[str]()
-    taken = lesson(stage.receive, RIGHT, "horns", 3, stage, said.append)
+    stage, stated = Stage(), list[str]()
+    taken = lesson(stage.receive, RIGHT, "horns", 3, stage, stated.append)
     assert len(taken) == 3
-    assert [line for line in said if line[0].isdigit() and line.endswith("...")] == [
+    assert [line for line in stated if line[0].isdigit() and line.endswith("...")] == [
         "3 ...",
         "2 ...",
         "1 ...",
@@ -153,10 +153,10 @@ def test_the_lesson_counts_down_and_collects_holds() -> None:
 
 @pytest.mark.parametrize(("stage", "why"), [(Stage(moving=True), "moved"), (Stage(silent=True), "no hand")])
 def test_a_hand_that_moves_or_is_not_there_is_asked_again_and_then_given_up(stage: Stage, why: str) -> None:
-    said = list[str]()
+    stated = list[str]()
     with pytest.raises(FitError, match="example 1: not seen at rest in 3 tries"):
-        lesson(stage.receive, RIGHT, "horns", 3, stage, said.append)
-    assert sum(why in line for line in said) == 3
+        lesson(stage.receive, RIGHT, "horns", 3, stage, stated.append)
+    assert sum(why in line for line in stated) == 3
     assert what_lacks([]) != ""
 
 

@@ -41,9 +41,9 @@ def told(
 
 
 def test_what_is_lifted_and_turned_is_carried_and_stays_so_at_rest() -> None:
-    said = told(5.0)
-    assert not any(said[:60])  # at rest beside a hand at rest: nobody knows
-    assert all(said[60 + 30 :])  # half a second after it begins to move
+    output = told(5.0)
+    assert not any(output[:60])  # at rest beside a hand at rest: nobody knows
+    assert all(output[60 + 30 :])  # half a second after it begins to move
 
 
 def test_a_hand_that_rests_next_to_what_others_move_carries_nothing() -> None:
@@ -59,9 +59,9 @@ def test_what_moves_alike_but_far_away_is_not_carried() -> None:
 
 
 def test_fingers_that_are_seen_to_be_away_let_go() -> None:
-    said = told(5.0, away_s=4.0)
-    assert said[239]
-    assert not any(said[240:])
+    output = told(5.0, away_s=4.0)
+    assert output[239]
+    assert not any(output[240:])
 
 
 def test_a_palm_that_moves_on_has_left_it() -> None:
@@ -70,9 +70,9 @@ def test_a_palm_that_moves_on_has_left_it() -> None:
     def palm(t_s: float) -> Float:
         return transform(object_at(t_s), PALM_M) + np.array([0.0, 0.0, -0.1 * max(t_s - 4.0, 0.0)])
 
-    said = told(5.0, palm)
-    assert said[240]
-    assert not any(said[240 + 24 :])
+    output = told(5.0, palm)
+    assert output[240]
+    assert not any(output[240 + 24 :])
 
 
 @pytest.mark.parametrize("lost", [np.full(3, np.nan)])

@@ -75,8 +75,8 @@ def test_what_a_master_that_fell_behind_left_out_is_left_out_again(tmp_path: Pat
     bursts = [*[2] * 6, 16, 4, 4, 4, *[2] * 4]
     (path, live), shed = overloaded_run(tmp_path / "run.mcap", root / "calib_json", bursts)
     recording = open_messages(path)
-    said = [one.message for one in recording.read(["taken"]) if isinstance(one.message, Backlog)]
-    assert [one.reject for one in said] == 4 * [MOST, 0]
+    output = [one.message for one in recording.read(["taken"]) if isinstance(one.message, Backlog)]
+    assert [one.reject for one in output] == 4 * [MOST, 0]
     assert (shed, live.counts["poses"]) == (10, FRAMES - 10)
     setups = recorded_setups(recording)
     for passed in (Player(recording, setups, []).run(), Player(recording, setups, [], speed=2.0).run()):
@@ -105,12 +105,12 @@ def test_a_stretch_begins_settled(run: RecordedRun, whole: tuple[Passed, list[Ha
 
 def test_a_master_that_was_started_again_is_so_in_the_replay(twice: RecordedRun) -> None:
     recording = open_messages(twice.path)
-    said: list[str] = []
-    passed = Player(recording, recorded_setups(recording), [], say=said.append).run()
+    output: list[str] = []
+    passed = Player(recording, recorded_setups(recording), [], notify=output.append).run()
     assert passed.digest.lines() == twice.live.lines()
-    assert said == events_of(recording)
-    assert len(said) == 1
-    assert "started again" in said[0]
+    assert output == events_of(recording)
+    assert len(output) == 1
+    assert "started again" in output[0]
 
 
 def played(

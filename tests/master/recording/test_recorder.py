@@ -190,13 +190,13 @@ class FakeMaster:
 
 
 def recording(
-    settings: RecordSettings, connect: Callable[[threading.Event], Bus | None], said: list[str]
+    settings: RecordSettings, connect: Callable[[threading.Event], Bus | None], output: list[str]
 ) -> tuple[threading.Event, threading.Thread, list[Progress | RecordingError]]:
     stop, out = threading.Event(), list[Progress | RecordingError]()
 
     def work() -> None:
         try:
-            out.append(run_recorder(settings, connect, stop, said.append, lambda _now, _lost: None))
+            out.append(run_recorder(settings, connect, stop, output.append, lambda _now, _lost: None))
         except RecordingError as error:
             out.append(error)
 
@@ -223,12 +223,12 @@ def test_a_recorder_keeps_what_a_master_takes_and_tells(
 
     for name in ("left", "right"):
         asker.serve(name, camera)
-    path, said = tmp_path / "a.mcap", list[str]()
+    path, output = tmp_path / "a.mcap", list[str]()
     files = RigFiles(root / "calib_json", ("desk",))
     settings = RecordSettings(path, files, frames_hz=20.0, previews=True, reserve_bytes=0)
-    stop, thread, out = recording(settings, lambda _stop: hub.join(), said)
+    stop, thread, out = recording(settings, lambda _stop: hub.join(), output)
     try:
-        assert until(lambda: NAME in asker.alive() and len(asked) == 4 and bool(said))
+        assert until(lambda: NAME in asker.alive() and len(asked) == 4 and bool(output))
         for message in frames(30):
             master.tap.show(message)
         asker.publish("preview", "left", Preview("left", 5, TINY))
@@ -261,27 +261,27 @@ def test_a_recorder_outlives_its_master_and_tells_what_a_replay_cannot_repeat(
     monkeypatch.setattr(process, "_PERIOD_NS", 20_000_000)
     hub = LoopbackBus()
     first = FakeMaster(hub.join())
-    path, said = tmp_path / "a.mcap", list[str]()
+    path, output = tmp_path / "a.mcap", list[str]()
     settings = RecordSettings(path, RigFiles(root / "calib_json", ("desk",)), reserve_bytes=0)
-    stop, thread, _ = recording(settings, lambda _stop: hub.join(), said)
+    stop, thread, _ = recording(settings, lambda _stop: hub.join(), output)
     try:
-        assert until(lambda: len(said) == 1)
+        assert until(lambda: len(output) == 1)
         first.tap.show(frames(1)[0])
         first.reloads = 1
         hub.publish("health", MASTER, first.answer(Command(MASTER, "tap")))
-        assert until(lambda: len(said) == 2)
+        assert until(lambda: len(output) == 2)
         first.tap.drain()
         first.bus.close()
-        assert until(lambda: len(said) == 3)
+        assert until(lambda: len(output) == 3)
         second = FakeMaster(hub.join(), session=6)
-        assert until(lambda: len(said) == 4)
+        assert until(lambda: len(output) == 4)
         second.tap.show(frames(1, 7)[0])
         second.tap.drain()
     finally:
         stop.set()
         thread.join(60.0)
     assert [
-        word for line, word in zip(said, ("into", "changed", "gone", "again"), strict=True) if word in line
+        word for line, word in zip(output, ("into", "changed", "gone", "again"), strict=True) if word in line
     ] == [
         "into",
         "changed",
@@ -312,18 +312,18 @@ def test_a_connection_that_is_dead_is_opened_anew(
                 return opened[-1]
         return None
 
-    path, said = tmp_path / "a.mcap", list[str]()
+    path, output = tmp_path / "a.mcap", list[str]()
     settings = RecordSettings(path, RigFiles(root / "calib_json", ("desk",)), reserve_bytes=0)
-    stop, thread, out = recording(settings, connect, said)
+    stop, thread, out = recording(settings, connect, output)
     try:
-        assert until(lambda: len(said) == 1)
+        assert until(lambda: len(output) == 1)
         first.tap.show(frames(1)[0])
         first.tap.drain()
         assert until(lambda: first.bus.ask(Command(NAME, "report"), 5.0).counts.get("taken") == 1)
         first.bus.close()
-        assert until(lambda: any("is gone" in line for line in said))
+        assert until(lambda: any("is gone" in line for line in output))
         second = FakeMaster(ZenohBus(end, None), session=6)
-        assert until(lambda: any("started again" in line for line in said))
+        assert until(lambda: any("started again" in line for line in output))
         second.tap.show(frames(1, 7)[0])
         second.tap.drain()
         assert until(lambda: second.bus.ask(Command(NAME, "report"), 5.0).counts.get("taken") == 2)

@@ -73,8 +73,8 @@ def sinks(monkeypatch: pytest.MonkeyPatch) -> dict[str, Kept]:
 
 
 def sender(settings: OutputSettings, *only: str) -> tuple[Sender, list[str]]:
-    said: list[str] = []
-    return Sender(settings, only, said.append), said
+    output: list[str] = []
+    return Sender(settings, only, output.append), output
 
 
 def counts(one: Sender, name: str) -> tuple[int, int, int, bool]:
@@ -137,11 +137,11 @@ def test_what_is_on_gets_what_it_is_for_and_what_is_off_nothing(sinks: dict[str,
 
 
 def test_what_is_named_is_on_whatever_the_file_says(sinks: dict[str, Kept]) -> None:
-    one, said = sender(OSC_ON, "vmc")
+    one, output = sender(OSC_ON, "vmc")
     assert one.on == ("vmc",)
     one.use(replace(default_outputs(), osc=OscOutput(on=True, port=9009), vmc=VmcOutput(port=9010)))
     assert one.on == ("vmc",)
-    assert said == ["osc: off", "vmc: udp 127.0.0.1:9010"]
+    assert output == ["osc: off", "vmc: udp 127.0.0.1:9010"]
     one.close()
     with pytest.raises(PhalanxError, match=r"output 'osk': unknown; there are osc, vmc"):
         sender(OSC_ON, "osk")
@@ -152,7 +152,7 @@ def test_an_output_that_breaks_says_so_once_is_opened_again_and_the_others_go_on
     sinks: dict[str, Kept], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("master.send.line.FIRST_RETRY_S", 0.01)
-    one, said = sender(OSC_ON, "osc", "vmc")
+    one, output = sender(OSC_ON, "osc", "vmc")
     eventually(lambda: sinks.keys() == {"osc", "vmc"})
     eventually(lambda: all(one.health().gauges[f"open.{name}"] for name in sinks))
     sinks["osc"].broken = True
@@ -161,23 +161,23 @@ def test_an_output_that_breaks_says_so_once_is_opened_again_and_the_others_go_on
     eventually(lambda: sinks["osc"] is not first and one.health().gauges["open.osc"] == 1.0)
     one.push(hand_pose("left"))
     one.close()
-    assert said == ["osc: the cable is out; put it in; tried again", "osc: open again"]
+    assert output == ["osc: the cable is out; put it in; tried again", "osc: open again"]
     assert first.closed == 1
     assert (counts(one, "osc")[:3], counts(one, "vmc")[:3]) == ((1, 1, 1), (2, 0, 0))
 
 
 def test_an_output_that_cannot_open_costs_its_messages_and_says_why_once() -> None:
-    said: list[str] = []
+    output: list[str] = []
     tally = Tally()
 
     def refuse() -> Kept:
         raise OSError("no such device")
 
-    line = OutputLine("lsl", refuse, tally, said.append)
+    line = OutputLine("lsl", refuse, tally, output.append)
     eventually(lambda: tally.failed == 1)
     line.offer(hand_pose("left"))
     line.close()
-    assert said == ["lsl: no such device; tried again"]
+    assert output == ["lsl: no such device; tried again"]
     assert (tally.sent, tally.dropped) == (0, 1)
 
 
@@ -222,12 +222,12 @@ def test_the_process_obeys_follows_its_file_and_reports(sinks: dict[str, Kept], 
     master, asker, stop = bus.join(), bus.join(), threading.Event()
     master.serve(MASTER, lambda command: Health(MASTER, 1, time.monotonic_ns() + 10**12, {}, {}))
     reports = asker.subscribe("health", NAME, depth=64)
-    said: list[str] = []
-    thread = threading.Thread(target=run_sender, args=(bus, default_outputs(), path, (), stop, said.append))
+    output: list[str] = []
+    thread = threading.Thread(target=run_sender, args=(bus, default_outputs(), path, (), stop, output.append))
     thread.start()
     try:
         eventually(lambda: NAME in asker.alive())
-        assert said == [f"all outputs are off; switch them on in {path}, or name them: --only osc,vmc"]
+        assert output == [f"all outputs are off; switch them on in {path}, or name them: --only osc,vmc"]
         answer = asker.ask(Command(NAME, "on", '{"output": "osc"}'), 1.0)
         assert answer.gauges["on.osc"] == 1.0
         eventually(lambda: asker.ask(Command(NAME, "report"), 1.0).gauges["open.osc"] == 1.0)
@@ -239,7 +239,7 @@ def test_the_process_obeys_follows_its_file_and_reports(sinks: dict[str, Kept], 
         eventually(lambda: "vmc" in sinks)
         assert asker.ask(Command(NAME, "off", '{"output": "osc"}'), 1.0).gauges["on.osc"] == 0.0
         path.write_text("{")
-        eventually(lambda: any("the settings stay as they were" in line for line in said))
+        eventually(lambda: any("the settings stay as they were" in line for line in output))
         report = reports.get(60.0)
         assert isinstance(report, Health)
         assert report.source == NAME
@@ -258,7 +258,7 @@ def test_the_process_obeys_follows_its_file_and_reports(sinks: dict[str, Kept], 
     finally:
         stop.set()
         thread.join(30.0)
-    assert "vmc: udp 127.0.0.1:39539" in said
+    assert "vmc: udp 127.0.0.1:39539" in output
     assert sinks["vmc"].closed == 1
 
 

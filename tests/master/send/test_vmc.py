@@ -21,7 +21,7 @@ from master.send.sides import Side, side_of
 from master.send.times import MasterTimes
 from master.send.vmc import VmcSink
 from tests.master.send.hands import MODELS, hand_pose, pose_of
-from tests.master.send.osc_reader import Heard, packet_of
+from tests.master.send.osc_reader import Received, packet_of
 
 SIDES: tuple[Side, ...] = ("left", "right")
 # The bones of one hand in Unity's HumanBodyBones, and the joints of OpenXR at which they begin and end.
@@ -46,15 +46,15 @@ class Bone:
 
 @pytest.fixture(scope="module")
 def ear() -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard:
-        heard.bind(("127.0.0.1", 0))
-        heard.settimeout(10.0)
-        yield heard
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as received:
+        received.bind(("127.0.0.1", 0))
+        received.settimeout(10.0)
+        yield received
 
 
 def sent(
     ear: socket.socket, pose: HandPose, output: VmcOutput = FACING
-) -> tuple[list[Heard], dict[str, Bone]]:
+) -> tuple[list[Received], dict[str, Bone]]:
     """What arrives of one pose: the messages about the whole avatar, and the bones."""
     sink = VmcSink(replace(output, port=ear.getsockname()[1]), MasterTimes())
     sink.write(pose)

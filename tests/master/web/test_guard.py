@@ -68,9 +68,9 @@ def test_who_shows_the_key_is_served_by_tls_and_nobody_else(tmp_path: Path) -> N
             assert got(path).status == 401, path
         opened = got(f"/?key={key}")
         assert opened.status == 200
-        said = opened.headers["Set-Cookie"]
-        assert {"HttpOnly", "Secure", "SameSite=Strict"} <= set(said.split("; "))
-        ((name, morsel),) = SimpleCookie(said).items()
+        output = opened.headers["Set-Cookie"]
+        assert {"HttpOnly", "Secure", "SameSite=Strict"} <= set(output.split("; "))
+        ((name, morsel),) = SimpleCookie(output).items()
         assert got("/page.js", f"a=b; {name}={morsel.value}").status == 200
         assert got("/page.js", f"{name}=x").status == 401
         # The server hangs up behind its 401, which a client that is slow to read may lose.

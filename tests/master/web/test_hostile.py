@@ -54,18 +54,18 @@ class Feed:
 
 def spoken(port: int, frame: bytes, wait_s: float) -> bytes:
     """Open a WebSocket, say this, and return all that is said until the server says the end, or in so many seconds."""
-    said, deadline = b"", time.monotonic() + wait_s
+    output, deadline = b"", time.monotonic() + wait_s
     with socket.create_connection(("127.0.0.1", port), timeout=WAIT_S) as one, suppress(OSError):
         one.sendall(UPGRADE)
-        while b"\r\n\r\n" not in said:
-            said += one.recv(4096)
+        while b"\r\n\r\n" not in output:
+            output += one.recv(4096)
         one.sendall(frame)
         one.settimeout(wait_s)
         while (piece := one.recv(65_536)) and time.monotonic() < deadline:
-            said += piece
+            output += piece
             if CLOSE in piece:
                 break
-    return said
+    return output
 
 
 def test_three_hundred_strangers_and_broken_frames_leave_the_reader_its_poses() -> None:

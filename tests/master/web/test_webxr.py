@@ -83,8 +83,8 @@ def test_turned_axes_say_the_same_rotation_as_the_pose(side: str) -> None:
     message = told(pose)
     half_rotation = Rotation.from_euler("x", 180, degrees=True)
     expected = half_rotation * Rotation.from_quat(pose.orientation_wxyz[1:], scalar_first=True)
-    said = Rotation.from_quat([joint["orientation"] for joint in message["joints"]])
-    assert np.degrees((expected.inv() * said).magnitude()).max() < 1e-3
+    output = Rotation.from_quat([joint["orientation"] for joint in message["joints"]])
+    assert np.degrees((expected.inv() * output).magnitude()).max() < 1e-3
     points = np.array([joint["position"] for joint in message["joints"]])
     assert np.abs(half_rotation.apply(pose.position_m[1:].copy()) - points).max() < 1e-6
     assert message["side"] == side

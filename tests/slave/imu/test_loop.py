@@ -196,7 +196,7 @@ def test_it_reports_and_stops_on_the_bus() -> None:
 )
 def test_what_it_cannot_be_is_said_at_the_start(
     option: list[str],
-    says: str,
+    expected: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -213,4 +213,4 @@ def test_what_it_cannot_be_is_said_at_the_start(
             (files / kept).symlink_to(ROOT / "calib_json" / kept)
     command = ["imu", "--rig", "wrist", "--imu", "synthetic", "--calibration", str(files)]
     assert main([*command, *option, "--bind", "127.0.0.1"]) == 1
-    assert says in capsys.readouterr().err
+    assert expected in capsys.readouterr().err

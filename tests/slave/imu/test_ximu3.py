@@ -154,12 +154,12 @@ def test_behind_a_uart_the_wire_takes_its_time(link: Path) -> None:
     ],
 )
 def test_who_does_not_answer_or_refuses_is_told(
-    behaviour: dict[str, object], says: str, link: Path, monkeypatch: pytest.MonkeyPatch
+    behaviour: dict[str, object], expected: str, link: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if "mute" in behaviour:
         monkeypatch.setattr("slave.imu.ximu3.ANSWER_S", 0.05)
     device = FakeXimu3(link, **behaviour)
-    with pytest.raises(ImuError, match=says):
+    with pytest.raises(ImuError, match=expected):
         opened(link)
     device.unplug()
 

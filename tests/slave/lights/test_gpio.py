@@ -250,9 +250,11 @@ def test_a_line_that_does_not_follow_is_said(kernel: FakeGpio) -> None:
         ("0:,27", None, "line ''"),
     ],
 )
-def test_what_cannot_be_opened_says_why(kernel: FakeGpio, place: str, fails: int | None, says: str) -> None:
+def test_what_cannot_be_opened_says_why(
+    kernel: FakeGpio, place: str, fails: int | None, expected: str
+) -> None:
     kernel.fails = fails
-    with pytest.raises(LightsError, match=says):
+    with pytest.raises(LightsError, match=expected):
         GpioLights(place, LONGEST_S)
 
 
@@ -265,8 +267,8 @@ def test_the_command_blinks_within_the_limits_and_ends_dark(
     assert (kernel.level[17], kernel.level[27]) == (0, 0)
     assert capsys.readouterr().out == "dark\n"
     assert main([*command, "--blink", "0.2"]) == 0
-    said = capsys.readouterr().out
-    pulses = re.search(r"^pulses (\d+), refused", said, re.MULTILINE)
+    output = capsys.readouterr().out
+    pulses = re.search(r"^pulses (\d+), refused", output, re.MULTILINE)
     assert pulses is not None
     assert 1 <= int(pulses[1]) <= 14  # 18 frames, 12 of them lit; fewer on a busy machine
     assert (kernel.level[17], kernel.level[27]) == (0, 0)
@@ -307,10 +309,10 @@ def test_the_heir_of_a_killed_slave_darkens_both_lines() -> None:
     os.kill(heir, signal.SIGTERM)  # a service's stop reaches both: the slave is to end first
     os.kill(heir, signal.SIGABRT)  # as does that of its watchdog
     slave.kill()
-    said = slave.stdout.read()  # ends when the heir has ended, too
+    output = slave.stdout.read()  # ends when the heir has ended, too
     slave.wait()
     slave.stdout.close()
-    assert said == f"9 {0xC010B40F} {struct.pack('=QQ', 0, 3)!r}\n"
+    assert output == f"9 {0xC010B40F} {struct.pack('=QQ', 0, 3)!r}\n"
 
 
 # The heir by itself, its call of the kernel printed.

@@ -149,7 +149,7 @@ def test_real_frames_go_through_the_loop_into_messages() -> None:
 )
 def test_what_a_wrist_device_cannot_have_is_said_at_the_start(
     option: list[str],
-    says: str,
+    expected: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -158,4 +158,4 @@ def test_what_a_wrist_device_cannot_have_is_said_at_the_start(
     monkeypatch.chdir(tmp_path)
     command = ["run", "--name", "wrist", "--rig", "wrist", "--calibration", str(ROOT / "calib_json")]
     assert main([*command, *option, "--bind", "127.0.0.1"]) == 1
-    assert says in capsys.readouterr().err
+    assert expected in capsys.readouterr().err

@@ -119,7 +119,7 @@ def test_a_short_motion_tells_no_posture() -> None:
         ("giant", FitError, "expected 0.1 to 0.25 m"),
     ],
 )
-def test_what_makes_no_hand_is_refused(change: str, kind: type[Exception], said: str) -> None:
+def test_what_makes_no_hand_is_refused(change: str, kind: type[Exception], output: str) -> None:
     joints, without = hand_at(T_S).position_m, tuple[str, ...]()
     if change == "no tips":
         without = tuple(name for name in JOINTS if name.endswith("tip"))
@@ -136,7 +136,7 @@ def test_what_makes_no_hand_is_refused(change: str, kind: type[Exception], said:
         joints = RIGHT.forward(np.tile(np.eye(4), (len(T_S), 1, 1)), angles).position_m
     with pytest.raises(kind) as caught:
         hand_from_motion(motion_of(joints, T_S, without), "again")
-    assert said in str(caught.value)
+    assert output in str(caught.value)
 
 
 def test_a_user_makes_a_hand_file(tmp_path: Path) -> None:

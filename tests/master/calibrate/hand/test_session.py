@@ -29,7 +29,7 @@ class Person:
 
     def __init__(self, hidden: tuple[int, ...] = (), first_s: float = 0.0, last_s: float = 0.0) -> None:
         self.t_ns = 0
-        self.said: list[str] = []
+        self.output: list[str] = []
         self._hidden, self._first_s, self._last_s = hidden, first_s, last_s
 
     def now_ns(self) -> int:
@@ -41,13 +41,13 @@ class Person:
         return pose_at(self.t_ns, self._hidden if dark else ())
 
     def guide(self) -> Track:
-        return guide(self.receive, TIPS, NAMES, self, self.said.append)
+        return guide(self.receive, TIPS, NAMES, self, self.output.append)
 
 
 def test_all_steps_are_told_in_order_and_kept() -> None:
     person = Person()
     t_ns, points, cov = person.guide().arrays()
-    told = [line for line in person.said if f" of {len(STEPS)}: " in line]
+    told = [line for line in person.output if f" of {len(STEPS)}: " in line]
     assert [line.split(": ")[0] for line in told] == [
         f"{n} of {len(STEPS)}" for n in range(1, len(STEPS) + 1)
     ]
@@ -59,7 +59,7 @@ def test_all_steps_are_told_in_order_and_kept() -> None:
 def test_a_step_that_is_not_seen_is_done_again_and_its_first_try_is_dropped() -> None:
     person, other = Person(hidden=(2,), first_s=6.0, last_s=11.0), Person()
     track, whole = person.guide(), other.guide()
-    assert any("middle in" in line and "this step again" in line for line in person.said)
+    assert any("middle in" in line and "this step again" in line for line in person.output)
     assert person.t_ns > other.t_ns + 5e9
     assert np.isfinite(track.arrays()[1]).mean() > 0.97
     assert abs((track.t_ns[-1] - track.t_ns[0]) - (whole.t_ns[-1] - whole.t_ns[0])) < 1e9

@@ -83,8 +83,8 @@ def test_from_a_kept_motion_to_files_that_the_line_takes(
         )
         == 0
     )
-    said = capsys.readouterr().out
-    assert "an object's pose by the tracker is then known to" in said
+    output = capsys.readouterr().out
+    assert "an object's pose by the tracker is then known to" in output
     assert picture.read_bytes().startswith(b"\x89PNG")
     rig = load(tree / "rigs" / "desk-cube.json", RigCalibration)
     cube = load(tree / "objects" / "cube.json", ObjectProfile)
@@ -209,15 +209,15 @@ def played(
 
 
 def test_the_guided_motion_ends_by_itself_and_says_what_is_missing_until_then() -> None:
-    motion, clock, said = Motion(9, seconds=40.0), Clock(), list[str]()
+    motion, clock, output = Motion(9, seconds=40.0), Clock(), list[str]()
     held = replace(motion.objects()[0], tracked=False, source=ObjectSource.HELD)
-    session = guide(played([held, *motion.objects(), *motion.tracked()], clock), clock, said.append, 60.0)
+    session = guide(played([held, *motion.objects(), *motion.tracked()], clock), clock, output.append, 60.0)
     assert 15.0 < 1e-9 * (clock.t_ns - ZERO_NS) < 30.0
-    assert "as well" in " ".join(said[1:4])
-    assert said[-1].startswith("100 %")
-    assert said[-1].endswith("done")
+    assert "as well" in " ".join(output[1:4])
+    assert output[-1].startswith("100 %")
+    assert output[-1].endswith("done")
     assert all(one.tracked for one in session.objects)
-    assert said[0].startswith("hold the object")
+    assert output[0].startswith("hold the object")
 
 
 @pytest.mark.parametrize(
@@ -230,15 +230,15 @@ def test_the_guided_motion_ends_by_itself_and_says_what_is_missing_until_then() 
     ],
 )
 def test_who_is_silent_is_said(rejected: str, text: str) -> None:
-    motion, clock, said = Motion(9, seconds=8.0), Clock(), list[str]()
+    motion, clock, output = Motion(9, seconds=8.0), Clock(), list[str]()
     nowhere = [replace(one, position_m=np.full(3, np.nan)) for one in motion.tracked()]
     messages: list[ObjectPose | TrackerPose] = [] if rejected in ("object", "both") else [*motion.objects()]
     messages += {"tracker": [], "both": [], "place": nowhere}.get(rejected, motion.tracked())
     try:
-        guide(played(messages, clock), clock, said.append, 7.0)
+        guide(played(messages, clock), clock, output.append, 7.0)
     except FitError as error:
-        said.append(str(error))
-    assert any(text in line for line in said)
+        output.append(str(error))
+    assert any(text in line for line in output)
 
 
 def test_what_a_tracker_says_goes_on_the_bus_as_it_came() -> None:
@@ -250,13 +250,13 @@ def test_what_a_tracker_says_goes_on_the_bus_as_it_came() -> None:
             return self.messages.pop(0) if self.messages else None
 
     bus = LoopbackBus()
-    heard = bus.subscribe("device", "tracker")
+    received = bus.subscribe("device", "tracker")
     passing = DevicePoses(Source(), bus)
     taken = [passing.get(0.0) for _ in range(5)]
     assert taken[3:] == ["a frame", None]
     for was in taken[:3]:
-        came = heard.get(0.1)
+        came = received.get(0.1)
         assert isinstance(was, TrackerPose)
         assert isinstance(came, TrackerPose)
         assert came.t_ns == was.t_ns
-    assert heard.get(0.0) is None
+    assert received.get(0.0) is None

@@ -5,7 +5,7 @@ import sys
 import typer
 
 
-def say(line: str) -> None:
+def print_line(line: str) -> None:
     """A line to whoever started the master."""
     typer.echo(f"master: {line}")
 

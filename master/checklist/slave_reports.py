@@ -10,7 +10,7 @@ LEAST_NS = (
 )
 
 
-class Said:
+class SlaveReports:
     """Push machine. Holds the newest report of one process, and the one that it is compared with.
 
     Attributes:

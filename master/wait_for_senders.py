@@ -44,10 +44,10 @@ _APPEAR_S = 1.5  # whoever has just connected is not known everywhere yet
 _POLL_S = 0.1
 _START_S = 1.0
 _RATE_S = 1.0  # how long datagrams are counted after the first of each
-Heard = dict[str, float]
+Received = dict[str, float]
 
 
-def hear(
+def wait_for_senders(
     names: Annotated[list[str], typer.Option("--name", help="Camera or IMU; once for each.")],
     rig: Rig = "desk",
     calibration: Calibration = CALIB_JSON,
@@ -74,22 +74,24 @@ def hear(
     connection = _running(bus)
     if connection is not None:
         try:
-            heard = at_master(connection, names, seconds, stop)
+            received = at_master(connection, names, seconds, stop)
         finally:
             connection.close()
     else:
         setup = load(calibration / "rigs" / f"{rig}.json", RigCalibration)
-        heard = here(names, setup, link_key(os.environ, key_file), address(beacon, "--beacon"),
+        received = here(names, setup, link_key(os.environ, key_file), address(beacon, "--beacon"),
                      address(bind, "--bind"), seconds, stop)  # fmt: skip
     if as_json:
-        typer.echo(json.dumps({"heard": heard, "master": connection is not None}))
+        typer.echo(json.dumps({"heard": received, "master": connection is not None}))
     for name in names if not as_json else ():
-        typer.echo(f"{name}: {f'{heard[name]:.0f} datagrams a second' if name in heard else 'not heard'}")
-    if len(heard) < len(set(names)):
+        typer.echo(
+            f"{name}: {f'{received[name]:.0f} datagrams a second' if name in received else 'not received'}"
+        )
+    if len(received) < len(set(names)):
         raise typer.Exit(1)
 
 
-def at_master(bus: Bus, names: Sequence[str], seconds: float, stop: threading.Event) -> Heard:
+def at_master(bus: Bus, names: Sequence[str], seconds: float, stop: threading.Event) -> Received:
     """What the master that runs takes of them: name -> datagrams a second, of those whose count rises.
 
     Raises:
@@ -97,9 +99,9 @@ def at_master(bus: Bus, names: Sequence[str], seconds: float, stop: threading.Ev
     """
     inbox = bus.subscribe("health", MASTER)
     first: Health | None = None
-    heard: Heard = {}
+    received: Received = {}
     end = time.monotonic() + seconds
-    while len(heard) < len(set(names)) and time.monotonic() < end and not stop.is_set():
+    while len(received) < len(set(names)) and time.monotonic() < end and not stop.is_set():
         health = inbox.get(_POLL_S)
         if not isinstance(health, Health):
             continue
@@ -109,14 +111,14 @@ def at_master(bus: Bus, names: Sequence[str], seconds: float, stop: threading.Ev
                     f"the master that runs here does not know {name!r}: does it run with --rig of that?"
                 )
         if first is None or first.session != health.session:
-            first, heard = health, {}
+            first, received = health, {}
         passed_s = (health.t_ns - first.t_ns) * 1e-9
         for name in names:
             count = health.counts[f"{name}.received"] - first.counts[f"{name}.received"]
             if count > 0 and passed_s > 0.0:
-                heard[name] = count / passed_s
+                received[name] = count / passed_s
     inbox.close()
-    return heard
+    return received
 
 
 def here(
@@ -127,7 +129,7 @@ def here(
     bind: Address,
     seconds: float,
     stop: threading.Event,
-) -> Heard:
+) -> Received:
     """Give the start, and count what comes: name -> datagrams a second, of those that are heard.
 
     Raises:
@@ -149,11 +151,11 @@ def here(
         ingest.close()
 
 
-def _counted(ingest: Ingest, names: Sequence[str], seconds: float, stop: threading.Event) -> Heard:
+def _counted(ingest: Ingest, names: Sequence[str], seconds: float, stop: threading.Event) -> Received:
     began = time.monotonic()
     first: dict[str, float] = {}
-    heard: Heard = {}
-    while time.monotonic() - began < seconds and len(heard) < len(set(names)) and not stop.is_set():
+    received: Received = {}
+    while time.monotonic() - began < seconds and len(received) < len(set(names)) and not stop.is_set():
         ingest.get(_POLL_S)
         while ingest.get(0.0) is not None:
             pass  # that it came is enough
@@ -163,8 +165,8 @@ def _counted(ingest: Ingest, names: Sequence[str], seconds: float, stop: threadi
             if count:
                 passed_s = now - first.setdefault(name, now)
                 if passed_s >= _RATE_S or now - began > seconds - _POLL_S:
-                    heard[name] = count / max(passed_s, _RATE_S)
-    return heard
+                    received[name] = count / max(passed_s, _RATE_S)
+    return received
 
 
 def _running(endpoint: str) -> ZenohBus | None:
@@ -185,9 +187,9 @@ def _running(endpoint: str) -> ZenohBus | None:
 
 
 def main() -> None:
-    """`python -m master.hear`: the same, without loading what else the master's program can do."""
+    """`python -m master.wait_for_senders`: the same, without loading what else the master's program can do."""
     try:
-        typer.run(hear)
+        typer.run(wait_for_senders)
     except PhalanxError as error:
         raise SystemExit(f"hear: {error}") from error
 

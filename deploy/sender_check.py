@@ -1,7 +1,7 @@
 """Whether the senders of a deployment are heard: before it, as a measure of how soon that shows, and after it.
 
 A new version that runs and sends nothing costs the stream for as long as it is listened for. So where a master runs and
-took all of them before, it is listened twice as long as that took, or as the slave's own start did; else `HEAR_S`.
+took all of them before, it is listened twice as long as that took, or as the slave's own start did; else `WAIT_SENDERS_S`.
 """
 
 import json
@@ -15,7 +15,7 @@ from typing import cast
 
 from deploy.remote import run_bounded
 
-HEAR_S = (
+WAIT_SENDERS_S = (
     12.0  # from READY=1 to the first datagram is a second; each one of waiting is a second without pictures
 )
 LEAST_S = 4.0  # a master tells its counts once a second, a beacon comes as often
@@ -36,11 +36,11 @@ class Ears:
 
     options: tuple[str, ...]
     keys: Path
-    seconds: float = HEAR_S
+    seconds: float = WAIT_SENDERS_S
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class Received:
     """What was heard.
 
     Attributes:
@@ -54,20 +54,28 @@ class Heard:
     master: bool = False
 
 
-def heard_of(names: Sequence[str], ears: Ears, ended: threading.Event | None = None) -> Heard:
+def received_of(names: Sequence[str], ears: Ears, ended: threading.Event | None = None) -> Received:
     """Ask `phalanx-master hear` which of the senders are heard; it ends early if `ended` is set."""
-    words = [sys.executable, "-m", "master.hear", "--json", "--seconds", str(ears.seconds), *ears.options]
+    words = [
+        sys.executable,
+        "-m",
+        "master.wait_for_senders",
+        "--json",
+        "--seconds",
+        str(ears.seconds),
+        *ears.options,
+    ]
     words += [word for name in names for word in ("--name", name)]
     lines: list[str] = []
     environment = {"PHALANX_KEYS": str(ears.keys)}
     code, errors = run_bounded(words, b"", lines.append, ears.seconds + _END_S, environment, ended)
     results = [line for line in lines if line.startswith('{"heard"')]
     if not results:
-        said = [*lines, *errors] or [f"phalanx-master hear ended with {code}"]
-        return Heard(cause=f"cannot listen for it: {said[-1]}")
+        lines = [*lines, *errors] or [f"phalanx-master hear ended with {code}"]
+        return Received(cause=f"cannot listen for it: {lines[-1]}")
     told = cast(dict[str, object], json.loads(results[-1]))
     rates = cast(dict[str, float], told["heard"])
-    return Heard({name: float(rate) for name, rate in rates.items()}, None, told.get("master") is True)
+    return Received({name: float(rate) for name, rate in rates.items()}, None, told.get("master") is True)
 
 
 class Before:
@@ -76,7 +84,7 @@ class Before:
     def __init__(self, names: Sequence[str], ears: Ears) -> None:
         """Begin to listen."""
         self._names, self._ears = tuple(names), ears
-        self._heard, self._took_s = Heard(), 0.0
+        self._received, self._took_s = Received(), 0.0
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._listen, daemon=True)
         self._thread.start()
@@ -85,7 +93,7 @@ class Before:
     def at_master(self) -> bool:
         """Whether a master runs, so that each machine can be listened for by itself. Waits for the end."""
         self._thread.join()
-        return self._heard.master
+        return self._received.master
 
     def ears(self, start_s: float | None) -> Ears:
         """How to listen for one machine afterwards.
@@ -94,7 +102,7 @@ class Before:
             start_s: How long its slaves took to start before [s]; None: they did not run.
         """
         self._thread.join()
-        if start_s is None or not self._heard.master or set(self._heard.rates) < set(self._names):
+        if start_s is None or not self._received.master or set(self._received.rates) < set(self._names):
             return self._ears
         seconds = max(LEAST_S, _TIMES * self._took_s, _TIMES * start_s)
         return replace(self._ears, seconds=min(self._ears.seconds, seconds))
@@ -106,5 +114,5 @@ class Before:
     def _listen(self) -> None:
         began = time.monotonic()
         ears = replace(self._ears, seconds=min(_BEFORE_S, self._ears.seconds))
-        self._heard = heard_of(self._names, ears, self._ended)
+        self._received = received_of(self._names, ears, self._ended)
         self._took_s = time.monotonic() - began

@@ -12,39 +12,41 @@ _MOST = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class ReceivedGesture:
     """One thing that a hand said: when it was heard [s, monotonic], and the message that began or ended it."""
 
-    heard_s: float
+    received_s: float
     gesture: Gesture
 
 
-class GesturesHeard:
+class ReceivedGestures:
     """Holds the newest message of each gesture that lasts, and the last begins, ends and taps."""
 
     def __init__(self) -> None:
         """Nothing was said."""
-        self._lasting: dict[tuple[str, str], Said] = {}
-        self._events: deque[Said] = deque(maxlen=KEPT)
+        self._lasting: dict[tuple[str, str], ReceivedGesture] = {}
+        self._events: deque[ReceivedGesture] = deque(maxlen=KEPT)
 
     def push(self, gesture: Gesture, now_s: float) -> None:
         """Hear one message at `now_s` [s], monotonic."""
         key = (gesture.hand, gesture.kind)
-        said = Said(now_s, gesture)
+        received = ReceivedGesture(now_s, gesture)
         if gesture.phase != "update":
-            self._events.append(said)
+            self._events.append(received)
         if gesture.phase == "end":
             self._lasting.pop(key, None)
         elif key in self._lasting or len(self._lasting) < _MOST:
-            self._lasting[key] = said
+            self._lasting[key] = received
 
     def lasting(self, now_s: float | None = None) -> dict[tuple[str, str], Gesture]:
         """(hand, kind) -> what lasts at `now_s` [s], by default now."""
         now_s = time.monotonic() if now_s is None else now_s
         return {
-            key: said.gesture for key, said in list(self._lasting.items()) if now_s - said.heard_s < LASTS_S
+            key: received.gesture
+            for key, received in list(self._lasting.items())
+            if now_s - received.received_s < LASTS_S
         }
 
-    def events(self) -> list[Said]:
+    def events(self) -> list[ReceivedGesture]:
         """The last begins, ends and taps, newest first."""
         return list(self._events)[::-1]
