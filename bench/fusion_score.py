@@ -6,7 +6,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from bench.fusion_scene import Shown
-from bench.fusion_solved import Away, Solved
+from bench.fusion_solved import RejectedPeer, Solved
 from common.arrays import Bool, Float, Int
 from common.hand_model import CHAINS
 
@@ -41,7 +41,7 @@ class Sighted:
     hand_over: Bool
 
     @classmethod
-    def of(cls, shown: Shown, solved: Solved, away: Away | None) -> Self:
+    def of(cls, shown: Shown, solved: Solved, away: RejectedPeer | None) -> Self:
         """Of a pipeline's poses: what its own sensors have in sight."""
         t_s = solved.t_s
         gone = (np.zeros(len(t_s), np.bool_),) * 2 if away is None else away.at(t_s)

@@ -127,7 +127,7 @@ def solve(setup: RigSetup, messages: Iterable[Observed]) -> list[HandPose]:
 
 
 @dataclass(frozen=True, slots=True)
-class Away:
+class RejectedPeer:
     """Which streams are cut off when: every so many seconds one of the two, for a while, in turn.
 
     Attributes:

@@ -21,7 +21,7 @@ from typing import Protocol
 from common.clock import Clock
 from common.streams import sender_of
 from master.app import Solved
-from master.link_senders import Taken
+from master.link_senders import SensorMessage
 from master.quarantine import Quarantine
 
 RECENT = 64  # messages that are solved again: about ten frames of each camera of a usual rig
@@ -30,7 +30,7 @@ RECENT = 64  # messages that are solved again: about ten frames of each camera o
 class Solving(Protocol):
     """What messages are pushed into."""
 
-    def push(self, message: Taken, /) -> Iterator[Solved]:
+    def push(self, message: SensorMessage, /) -> Iterator[Solved]:
         """Take one message; give what it completes."""
         ...
 
@@ -68,10 +68,10 @@ class SolverGuard:
         """
         self._solver, self._quarantine, self._clock = solver, quarantine, clock
         self._renew, self._fresh = renew, fresh
-        self._recent: deque[Taken] = deque(maxlen=RECENT)
+        self._recent: deque[SensorMessage] = deque(maxlen=RECENT)
         self._repair: threading.Thread | None = None
 
-    def push(self, message: Taken) -> Iterator[Solved]:
+    def push(self, message: SensorMessage) -> Iterator[Solved]:
         """Take one message; give what it completes.
 
         That is nothing where its sender is silenced or it cannot be used.
@@ -98,7 +98,7 @@ class SolverGuard:
         )
         self._repair.start()
 
-    def _mend(self, messages: Sequence[Taken], sender: str, error: Exception) -> None:
+    def _mend(self, messages: Sequence[SensorMessage], sender: str, error: Exception) -> None:
         try:
             self._renew(sender)
             found = culprit(messages, lambda: self._fresh(sender))
@@ -110,7 +110,7 @@ class SolverGuard:
             self._quarantine.fault(found, error, self._clock.now_ns())
 
 
-def culprit(messages: Sequence[Taken], fresh: Callable[[], Replayed]) -> str | None:
+def culprit(messages: Sequence[SensorMessage], fresh: Callable[[], Replayed]) -> str | None:
     """The sender without whose messages nothing raises.
 
     None: there is no such one, or more than one.
@@ -126,7 +126,7 @@ def culprit(messages: Sequence[Taken], fresh: Callable[[], Replayed]) -> str | N
     return found[0] if len(found) == 1 else None
 
 
-def _raises(messages: Sequence[Taken], solver: Replayed) -> bool:
+def _raises(messages: Sequence[SensorMessage], solver: Replayed) -> bool:
     try:
         for message in messages:
             for _ in solver.push(message):

@@ -58,10 +58,10 @@ from common.session import (
 )
 from common.streams import sender_of
 from master.admission import SenderLimits
-from master.link_senders import ASKED, Sender, Session, Taken, not_admitted, on_master_clock
+from master.link_senders import ASKED, Sender, SensorMessage, Session, not_admitted, on_master_clock
 from master.quarantine import Quarantine
+from master.rejected_peers import RejectedPeers
 from master.sequence import CYCLE_FRAMES, CameraCounts
-from master.turned_away import TurnedAway
 
 BEACON_NS = 100_000_000
 ECHO_FAST_NS = 10_000_000  # in the first two seconds, and until the clock is settled
@@ -125,7 +125,7 @@ class MasterLink:
         self._start_timeout_ns = start_timeout_ns
         self._nonce = random(NONCE_BYTES)
         self._sealer = self._keys.sealer(new_process_id(random(8)))
-        kinds: tuple[tuple[tuple[str, ...], dict[type[Taken], int | None]], ...] = (
+        kinds: tuple[tuple[tuple[str, ...], dict[type[SensorMessage], int | None]], ...] = (
             (cameras, {MarkerDetections: 1, TagDetections: None}),
             (wrists, {WristDetections: CYCLE_FRAMES}),
             (imus, {ImuSample: 1}),
@@ -148,15 +148,15 @@ class MasterLink:
         self.refused: Counter[Refusal] = Counter()
         self.unsynchronised = 0
         self.quarantine = Quarantine()
-        self.turned_away = TurnedAway(self._keys, self._senders)
+        self.rejected_peers = RejectedPeers(self._keys, self._senders)
 
-    def receive(self, datagram: bytes, address: Address, t_ns: int) -> Taken | None:
+    def receive(self, datagram: bytes, address: Address, t_ns: int) -> SensorMessage | None:
         """Take one datagram that arrived from `address` at `t_ns`; return what it brought."""
         header = parse(datagram, self._keys.rig_tag)
         if isinstance(header, Refusal):
             result = header
             if header is Refusal.VERSION:
-                self.turned_away.other_version(datagram, address[0], t_ns)
+                self.rejected_peers.other_version(datagram, address[0], t_ns)
         elif header.kind is Kind.HELLO:
             result = self._on_hello(header, datagram, address, t_ns)
         elif header.kind in (Kind.ECHO_ANSWER, Kind.STARTED, Kind.DATA):
@@ -257,10 +257,10 @@ class MasterLink:
             return Refusal.UNKNOWN if hello.master_nonce == self._nonce else Refusal.REPLAYED
         event = self._hello_event(hello, sender)
         rule = RULES[Role.MASTER, self.state(hello.name, t_ns), event]
-        if rule.refusal is Refusal.TWIN:
-            self.turned_away.twin(hello.name, address[0], WIRE_VERSION, t_ns)
+        if rule.refusal is Refusal.DUPLICATE_SENDER:
+            self.rejected_peers.duplicate(hello.name, address[0], WIRE_VERSION, t_ns)
         if rule.reply is Kind.UNPROVEN:
-            self.turned_away.unproven(hello.name, address[0], WIRE_VERSION, t_ns)
+            self.rejected_peers.unproven(hello.name, address[0], WIRE_VERSION, t_ns)
             unproven = Unproven(self._nonce, hello.slave_nonce, self._keys.has_secrets)
             self._outbox.append((seal(self._sealer, unproven), address))
         if rule.reply is Kind.WELCOME:
@@ -310,7 +310,7 @@ class MasterLink:
         welcome = Welcome(self._nonce, session.hello.slave_nonce, session.session_nonce, session.proof)
         self._outbox.append((seal(self._sealer, welcome), session.address))
 
-    def _on_slave(self, header: Header, datagram: bytes, t_ns: int) -> Taken | Refusal | None:
+    def _on_slave(self, header: Header, datagram: bytes, t_ns: int) -> SensorMessage | Refusal | None:
         session = self._sessions.get(header.key_id)
         if session is None:
             return Refusal.STALE
@@ -326,7 +326,7 @@ class MasterLink:
 
     def _opened(
         self, session: Session, sender: Sender, header: Header, datagram: bytes, t_ns: int
-    ) -> Taken | Refusal | None:
+    ) -> SensorMessage | Refusal | None:
         opened = session.opener.open(header, datagram)
         if isinstance(opened, Refusal):
             if opened is Refusal.DUPLICATE:
@@ -367,7 +367,7 @@ class MasterLink:
 
     def _take_data(
         self, session: Session, sender: Sender, opened: Opened, counter: int, now_ns: int
-    ) -> Taken | Refusal | None:
+    ) -> SensorMessage | Refusal | None:
         if self.quarantine.holds(session.name, now_ns):
             return Refusal.FAULTY
         try:
@@ -376,7 +376,7 @@ class MasterLink:
             return Refusal.OUT_OF_BOUNDS
         except MessageError:
             return Refusal.UNDECODABLE
-        if not isinstance(message, Taken):
+        if not isinstance(message, SensorMessage):
             return Refusal.UNDECODABLE
         name = sender_of(message)
         kind = sender.kinds.get(type(message))
@@ -384,7 +384,7 @@ class MasterLink:
             return Refusal.IMPOSTOR
         if (why := not_admitted(message, session, sender, now_ns)) is not None:
             if why is Refusal.MARKER_COUNT and isinstance(message, MarkerDetections):
-                self.turned_away.marker_count(name, len(message.area), sender.limits.markers or 0, now_ns)
+                self.rejected_peers.marker_count(name, len(message.area), sender.limits.markers or 0, now_ns)
             return why
         session.started = True
         if opened.reordered:

@@ -18,9 +18,9 @@ from master.app import Observed, RunFigures, run
 from master.checklist.feed import ChecklistFeed
 from master.checklist.files import FileWatch
 from master.guard import SolverGuard
-from master.hurry import Hurry, Shedding
 from master.ingest import Ingest
 from master.live_report import Reporter, cameras_line, unplaced_line
+from master.load_shedding import LoadShedding, Shedding
 from master.loop_watch import WatchedLoop
 from master.master_bus import host_bus
 from master.odd_watch import OddWatch
@@ -99,8 +99,8 @@ def run_live(
     """
     clock: Clock = SystemClock()
     stages, figures = StageTimes(), RunFigures()
-    hurry = Hurry(setups)
-    pipelines = [LivePipeline(setup, stages, Shedding(hurry)) for setup in setups]
+    load_shedding = LoadShedding(setups)
+    pipelines = [LivePipeline(setup, stages, Shedding(load_shedding)) for setup in setups]
     world = World(setups, pipelines, stages)
     tuning = None if settings.files is None else RigTuning(settings.files, setups, pipelines, notify, world)
     with ExitStack() as stack:
@@ -114,7 +114,7 @@ def run_live(
             recorder.wait_ready(bus)
         ingest = ingest_of(setups, key, clock, settings)
         stack.callback(ingest.close)
-        hurry.waiting = ingest.queue.frame_spans
+        load_shedding.waiting = ingest.queue.frame_spans
         sinks = _sinks(setups, settings, bus)
         for sink in sinks:
             stack.callback(sink.close)
@@ -162,7 +162,7 @@ def run_live(
         notify(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
-        source = Tapped(DevicePoses(ingest.queue, bus), tap, hurry)
+        source = Tapped(DevicePoses(ingest.queue, bus), tap, load_shedding)
         run(WatchedLoop(source, ServiceManager(os.environ)), guard, sinks, clock, figures, stop)
         source.flush()
         tap.drain()

@@ -14,9 +14,9 @@ from master.app import RunFigures, health
 from master.ingest import Ingest
 from master.odd_watch import OddWatch
 from master.recording.tap import Tap
+from master.rejected_peers import MarkerCounts
 from master.time_watch import TimeWatch
 from master.tuning import LivePipeline, RigTuning
-from master.turned_away import MarkerCounts
 from master.world import World
 
 _REPORT_S = 1.0

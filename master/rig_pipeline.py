@@ -167,7 +167,7 @@ def build_pipeline(
     continuous: bool = True,
     side: WristSide | None = None,
     counts: Counter[str] | None = None,
-    shed: Callable[[], bool] | None = None,
+    dropped_epochs: Callable[[], bool] | None = None,
 ) -> MarkerPipeline:
     """The pipeline this marker rig's file describes; of a wrist device beside it nothing is used but through `side`.
 
@@ -208,7 +208,7 @@ def build_pipeline(
             side=side,
             counts=counts,
             stage=stage,
-            shed=shed,
+            dropped_epochs=dropped_epochs,
         )
 
 
@@ -217,7 +217,7 @@ def pipeline_of(
     stage: Stage,
     *,
     continuous: bool = True,
-    shed: Callable[[], bool] | None = None,
+    dropped_epochs: Callable[[], bool] | None = None,
 ) -> Pipeline:
     """The pipeline of a rig of either kind, or of both; arguments and errors as of `build_pipeline`.
 
@@ -225,14 +225,18 @@ def pipeline_of(
     what those of the other kind do.
     """
     if setup.wrist is None:
-        return cast(Pipeline, build_pipeline(setup, stage, continuous=continuous, shed=shed))
+        return cast(
+            Pipeline, build_pipeline(setup, stage, continuous=continuous, dropped_epochs=dropped_epochs)
+        )
     try:
         if setup.has_markers:
             counts = Counter[str]()
             cubic = CubicLaw(setup.wrist) if setup.wrist.cubic else None
             reader = CycleReader(setup.wrist, cubic, counts)
             side = WristSide(setup.wrist, reader, counts, continuous=continuous)
-            markers = build_pipeline(setup, stage, continuous=continuous, side=side, counts=counts, shed=shed)
+            markers = build_pipeline(
+                setup, stage, continuous=continuous, side=side, counts=counts, dropped_epochs=dropped_epochs
+            )
             return FusedPipeline(
                 markers, side, min(setup.cameras[name].frame_rate_hz for name in setup.models)
             )

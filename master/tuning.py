@@ -67,16 +67,18 @@ class LivePipeline:
     Holds it, its setup, what it was told last, and the one that is to take over with the next message.
     """
 
-    def __init__(self, setup: RigSetup, stage: Stage, shed: Callable[[], bool] | None = None) -> None:
-        """Begin with the pipeline of `setup`; `stage` measures the stages of whichever is in use, `shed` is asked for
+    def __init__(
+        self, setup: RigSetup, stage: Stage, dropped_epochs: Callable[[], bool] | None = None
+    ) -> None:
+        """Begin with the pipeline of `setup`; `stage` measures the stages of whichever is in use, `dropped_epochs` is asked for
         each of its instants whether it is left out.
 
         Raises:
             CalibrationError: The depth model does not fit the rig.
         """
-        self._stage, self._shed = stage, shed
+        self._stage, self._dropped_epochs = stage, dropped_epochs
         self._setup: RigSetup = setup
-        self._now = pipeline_of(setup, stage, shed=shed)
+        self._now = pipeline_of(setup, stage, dropped_epochs=dropped_epochs)
         per_frame = _told_per_frame(setup)
         self._close = _CLOSE_FRAMES * per_frame
         self._recent: deque[tuple[int, Detections | _OrientationSample]] = deque(
@@ -136,8 +138,12 @@ class LivePipeline:
         """
         stage = _WhenOpen(self._stage)
         # What it is shown to warm up has been solved by the other already: nothing of it is left out.
-        shed = self._shed
-        new = pipeline_of(setup, stage, shed=None if shed is None else lambda: stage.open and shed())
+        dropped_epochs = self._dropped_epochs
+        new = pipeline_of(
+            setup,
+            stage,
+            dropped_epochs=None if dropped_epochs is None else lambda: stage.open and dropped_epochs(),
+        )
 
         def take() -> None:
             shown = self._warm(new)

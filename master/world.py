@@ -30,7 +30,7 @@ from common.messages import (
 from master.app import Solved
 from master.estimator.pipeline import SolvedPose, Stage
 from master.gestures.recogniser import GestureRecogniser
-from master.link_senders import Taken
+from master.link_senders import SensorMessage
 from master.objects.contact import ContactWatch
 from master.objects.line import SolvedObject
 from master.rig_pipeline import pipeline_of
@@ -171,7 +171,7 @@ class World:
         """Objects with a tracker that is not registered: what it says is of no use."""
         return tuple(one for one in self._now.objects if one.unplaced)
 
-    def push(self, message: Taken) -> Iterator[Solved]:
+    def push(self, message: SensorMessage) -> Iterator[Solved]:
         """Take one message; give what it completes, of each hand and object oldest first."""
         if self._next:
             yield from self._take_over(self._next.popleft())
@@ -217,7 +217,7 @@ class World:
         for gesture in begun:
             yield msgspec.structs.replace(gesture, phase="end")
 
-    def _seen(self, message: Taken) -> Iterator[SolvedObject]:
+    def _seen(self, message: SensorMessage) -> Iterator[SolvedObject]:
         """Poses of objects that a message completes."""
         if isinstance(message, TrackerPose):
             if (carried := self._now.trackers.get(message.source)) is not None:

@@ -111,8 +111,12 @@ class LightReport:
             return dict(self._others.gauges())
         blue, green, red = np.exp(self._detector.log_gains).tolist()
         light = {"light_red": red / green, "light_blue": blue / green, "light_exposure": green}
-        return {**self._others.gauges(), **light, **_twins(self._detector.warnings)}
+        return {**self._others.gauges(), **light, **_ambiguous(self._detector.warnings)}
 
 
-def _twins(warnings: list[ColourWarning]) -> dict[str, float]:
-    return {f"twins.{one.marker}..{one.twin}"[:NAME]: one.hues for one in warnings if one.twin is not None}
+def _ambiguous(warnings: list[ColourWarning]) -> dict[str, float]:
+    return {
+        f"twins.{one.marker}..{one.ambiguous}"[:NAME]: one.hues
+        for one in warnings
+        if one.ambiguous is not None
+    }

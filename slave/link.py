@@ -46,10 +46,12 @@ UNLISTED_NS = 1_000_000_000
 HELLO_AGAIN_NS = 50_000_000
 OFFER_NS = 1_000_000_000  # how long hello is repeated after the last beacon
 NONCE_NS = 2_000_000_000
-TWIN_NS = 1_000_000_000  # unanswered for so long while the beacons list the name: another process has it
+DUPLICATE_SENDER_NS = (
+    1_000_000_000  # unanswered for so long while the beacons list the name: another process has it
+)
 STRANGE_NS = 1_000_000_000  # between two hellos to a master of another wire version
 LATELY_NS = 2_500_000_000  # so long after it was last seen something is told to be wrong
-_TWIN = "the master has another process that is {!r}: two of one name, end one of them"
+_DUPLICATE_SENDER = "the master has another process that is {!r}: two of one name, end one of them"
 _OTHER_VERSION = "the master at {} speaks wire version {}, this slave {}: install one version on both"
 
 _SECRET = (
@@ -207,7 +209,7 @@ class SlaveLink:
         header = parse(datagram, self._keys.rig_tag)
         if isinstance(header, Refusal):
             if header is Refusal.VERSION:
-                self._answer_stranger(datagram, address, t_ns)
+                self._answer_other_version(datagram, address, t_ns)
             return header
         if header.kind is not Kind.BEACON:
             return Refusal.UNEXPECTED
@@ -218,7 +220,7 @@ class SlaveLink:
         if rule.reply is not Kind.HELLO:
             return rule.refusal
         self._answer(beacon, header.counter, address, t_ns)
-        return self._has_twin(beacon, t_ns)
+        return self._has_duplicate(beacon, t_ns)
 
     def _rule(self, event: Event, t_ns: int) -> Rule:
         return RULES[Role.SLAVE, self.state(t_ns), event]
@@ -251,16 +253,20 @@ class SlaveLink:
         self._offer = _Offer(nonce, beacon, counter, address, t_ns, t_ns, since_ns, drawn_ns)
         self._send_hello(self._offer, t_ns)
 
-    def _has_twin(self, beacon: Beacon, t_ns: int) -> Refusal | None:
+    def _has_duplicate(self, beacon: Beacon, t_ns: int) -> Refusal | None:
         """Whether the master says no more than that it has somebody of this name already."""
         listed = beacon.sessions.get(self._name)
         ours = None if self._session is None else self._session.key_id
-        if self._offer is None or listed in (None, ours) or not t_ns - self._offer.since_ns >= TWIN_NS:
+        if (
+            self._offer is None
+            or listed in (None, ours)
+            or not t_ns - self._offer.since_ns >= DUPLICATE_SENDER_NS
+        ):
             return None
-        self._wrong = t_ns, _TWIN.format(self._name)
-        return Refusal.TWIN
+        self._wrong = t_ns, _DUPLICATE_SENDER.format(self._name)
+        return Refusal.DUPLICATE_SENDER
 
-    def _answer_stranger(self, datagram: bytes, address: Address, t_ns: int) -> None:
+    def _answer_other_version(self, datagram: bytes, address: Address, t_ns: int) -> None:
         """Notify who we are to a master of this rig that cannot understand us; its word is not proven, so seldom."""
         if len(datagram) < OVERHEAD:
             return

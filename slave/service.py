@@ -16,22 +16,22 @@ from common.service_manager import WATCHDOG, ServiceManager, one_line
 
 FEEDS = 4  # in a period of the watchdog
 STATUS_NS = 5_000_000_000  # between two lines of status where there is no watchdog
-AWAY_S = 90.0  # to open a camera again takes seconds, with all its settings checked; one that hangs is given up then
+LOST_PATIENCE_S = 90.0  # to open a camera again takes seconds, with all its settings checked; one that hangs is given up then
 COMPILE_S = 180.0  # numba compiles 15 s on a desktop processor, more than a minute on a Raspberry Pi
 NEVER_NS = 2**63
 WAITING = "waits for the master"
 
 
-class Away(Protocol):
-    """Told that a device is lost, before it is given back and at each try to open it; `Service.away`."""
+class ConnectionLost(Protocol):
+    """Told that a device is lost, before it is given back and at each try to open it; `Service.connection_lost`."""
 
-    def __call__(self, what: str, patience_s: float = AWAY_S) -> None:
+    def __call__(self, what: str, patience_s: float = LOST_PATIENCE_S) -> None:
         """`what` is lost; the next try may take so long [s]."""
         ...
 
 
-def nobody(what: str, patience_s: float = AWAY_S) -> None:
-    """An `Away` that tells nobody."""
+def nobody(what: str, patience_s: float = LOST_PATIENCE_S) -> None:
+    """An `ConnectionLost` that tells nobody."""
 
 
 class Service:
@@ -99,7 +99,7 @@ class Service:
         alone = "" if self._linked() else ", but the master is away"
         self._notify(f"{rate_hz:.3g} {self._noun}/s{alone}", now_ns)
 
-    def away(self, what: str, patience_s: float = AWAY_S) -> None:
+    def connection_lost(self, what: str, patience_s: float = LOST_PATIENCE_S) -> None:
         """A device is lost, or something else takes time: the next round may be so late [s]."""
         if not self._ready:
             self.starting(patience_s, what)

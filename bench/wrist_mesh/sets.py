@@ -16,7 +16,7 @@ from common.arrays import Float
 from common.calibration import HandProfile, load
 from common.frame_recording import Manifest, load_manifest
 from common.hand_model import WEBXR_JOINTS, HandModel
-from common.sim.record import ANGLE_NAMES, FIRST_NS, TakenFrame, write_frames, write_truth
+from common.sim.record import ANGLE_NAMES, FIRST_NS, RenderedFrame, write_frames, write_truth
 
 PERIOD_S = 1.0 / 90.0
 STRAIGHT = np.zeros(2)
@@ -119,7 +119,7 @@ def write_set(one: Set, datasets: Path, folder: Path, seed: int) -> None:
 
 def _frames(
     one: Set, device: Device, room: Room, folder: Path, truths: list[Arrays], rng: np.random.Generator
-) -> Iterator[TakenFrame]:
+) -> Iterator[RenderedFrame]:
     """All frames; beside them the label pictures are written and the truths are gathered, of the laser's moment."""
     for k, cycle in enumerate(one.moments):
         last: View | None = None
@@ -131,7 +131,7 @@ def _frames(
                 cv2.imwrite(str(folder / f"label_{k:06d}.png"), label)
                 truths.append(device.truth(last, label))
             t_ns = FIRST_NS + round((3 * k + i) * PERIOD_S * 1e9)
-            yield TakenFrame(device.camera.name, 3 * k + i, t_ns, lit, device.frame(last, room, lit, rng))
+            yield RenderedFrame(device.camera.name, 3 * k + i, t_ns, lit, device.frame(last, room, lit, rng))
 
 
 def _meta(one: Set, device: Device, manifest: Manifest, seed: int) -> dict[str, object]:

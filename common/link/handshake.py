@@ -109,7 +109,7 @@ def _master() -> dict[Key, Rule]:
         (State.IDLE, Event.HELLO): Rule(State.PENDING, Kind.WELCOME),
         (State.PENDING, Event.SEALED): Rule(State.LIVE),
         (State.PENDING, Event.EXPIRED): Rule(State.IDLE),
-        (State.LIVE, Event.HELLO_OTHER_PROCESS): Rule(State.LIVE, refusal=Refusal.TWIN),
+        (State.LIVE, Event.HELLO_OTHER_PROCESS): Rule(State.LIVE, refusal=Refusal.DUPLICATE_SENDER),
         (State.SILENT, Event.HELLO_OTHER_PROCESS): Rule(State.SILENT, Kind.WELCOME),
         (State.LIVE, Event.SILENCE): Rule(State.SILENT),
     }

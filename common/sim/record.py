@@ -38,7 +38,7 @@ ANGLE_NAMES = (
 Arrays = dict[str, npt.NDArray[Any]]
 
 
-class TakenFrame(NamedTuple):
+class RenderedFrame(NamedTuple):
     """A frame as its camera delivers it: counter, stamp [ns], what lit it, picture."""
 
     camera: str
@@ -113,7 +113,7 @@ class SceneTake:
             objects={name: scene.objects[name] for name in scene.rig.objects},
         )
 
-    def frames(self) -> Iterator[TakenFrame]:
+    def frames(self) -> Iterator[RenderedFrame]:
         """All frames, row by row."""
         scene = self._scene
         for k in range(self.count):
@@ -122,7 +122,7 @@ class SceneTake:
             for name, renderer, t in zip(scene.rig.cameras, self._renderers, times, strict=True):
                 image, view = renderer.observe(t)
                 views.append(view)
-                yield TakenFrame(name, k, FIRST_NS + round(t * 1e9), Illumination.NONE, image)
+                yield RenderedFrame(name, k, FIRST_NS + round(t * 1e9), Illumination.NONE, image)
             at_s = times[0] + self._centre_s
             self._rows.append(
                 _Row(tuple(views), times, scene.truth(at_s), scene.motion.at(at_s).wrist_angles_rad)
@@ -208,7 +208,7 @@ def record_scene(
     return take.count
 
 
-def write_frames(folder: Path, manifest: Manifest, frames: Iterable[TakenFrame]) -> None:
+def write_frames(folder: Path, manifest: Manifest, frames: Iterable[RenderedFrame]) -> None:
     """Write a recording without its truth, frames in the order in which they come.
 
     Raises:

@@ -4,8 +4,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from common.messages import CheckCode, CheckItem
+from master.rejected_peers import MarkerCounts, RejectedPeer
 from master.rig_setup import RigSetup
-from master.turned_away import Away, MarkerCounts
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,9 +62,9 @@ class SenderNow:
     received: int
     missed: int
     clock_sigma_ns: float | None
-    twin: Away | None = None
-    stranger: Away | None = None
-    unproven: Away | None = None
+    duplicate: RejectedPeer | None = None
+    unknown_peer: RejectedPeer | None = None
+    unproven: RejectedPeer | None = None
     markers: MarkerCounts | None = None
 
 

@@ -17,9 +17,9 @@ from master.checklist.facts import MasterNow, SenderNow, plan_of
 from master.checklist.files import FileWatch
 from master.checklist.watch import ChecklistWatch
 from master.quarantine import Quarantine
+from master.rejected_peers import MarkerCounts, RejectedPeer
 from master.rig_setup import RigSetup
 from master.sequence import CameraCounts
-from master.turned_away import Away, MarkerCounts
 
 POLL_S = 0.2
 EVERY_NS = 1_000_000_000  # and at once where it changes
@@ -52,7 +52,9 @@ class Received(Protocol):
         """How its clock runs."""
         ...
 
-    def turned_away(self) -> tuple[Mapping[str, Away], Mapping[str, Away], Mapping[str, Away]]:
+    def rejected_peers(
+        self,
+    ) -> tuple[Mapping[str, RejectedPeer], Mapping[str, RejectedPeer], Mapping[str, RejectedPeer]]:
         """Sender -> where a second process of its name was turned away lately; where it speaks another version; where
         somebody says hello without its secret."""
         ...
@@ -149,15 +151,15 @@ class ChecklistFeed:
 
     def _now(self, t_ns: int) -> MasterNow:
         connected = self._received.connected
-        turned_away, markers = self._received.turned_away(), self._received.marker_counts()
+        rejected_peers, markers = self._received.rejected_peers(), self._received.marker_counts()
         names = (*(camera.name for camera in self._plan.cameras), *self._plan.imus)
         senders: dict[str, SenderNow] = {}
         for name in names:
             counts, clock = self._received.counts_of(name), self._received.clock_of(name)
             sigma_ns = None if clock is None else clock.sigma_at(t_ns)
             missed = counts.lost + counts.late
-            twin, stranger, unproven = (of.get(name) for of in turned_away)
-            links = name in connected, counts.received, missed, sigma_ns, twin, stranger, unproven
+            duplicate, unknown_peer, unproven = (of.get(name) for of in rejected_peers)
+            links = name in connected, counts.received, missed, sigma_ns, duplicate, unknown_peer, unproven
             senders[name] = SenderNow(*links, markers.get(name))
         groups = [
             line.counts

@@ -81,32 +81,32 @@ class LinkRules:
                 yield self._camera_absent(camera, sender, reports.get(camera.name), t_ns)
                 yield self._slow(camera, reports.get(camera.name), t_ns)
                 yield from self._way(camera.name, sender, t_ns)
-                yield from self._turned_away(camera.name, sender)
+                yield from self._rejected_peers(camera.name, sender)
         for name in plan.imus:
             sender = now.senders.get(name)
             if sender is not None:
                 yield self._imu_silent(name, sender, t_ns)
                 yield from self._way(name, sender, t_ns)
-                yield from self._turned_away(name, sender)
+                yield from self._rejected_peers(name, sender)
         if now.disk_free_mb is not None:
             yield disk_verdict("master", now.disk_free_mb)
 
-    def _turned_away(self, name: str, sender: SenderNow) -> Iterator[Verdict]:
+    def _rejected_peers(self, name: str, sender: SenderNow) -> Iterator[Verdict]:
         """Who says that it is `name` and is not taken."""
-        twin, stranger = sender.twin, sender.stranger
-        host = None if twin is None else twin.host
+        duplicate, unknown_peer = sender.duplicate, sender.unknown_peer
+        host = None if duplicate is None else duplicate.host
         yield Verdict(
             "twin_sender",
             name,
-            twin is not None,
+            duplicate is not None,
             f"Two processes say that they are {name}; the one at {host} is not taken while the other is well.",
             "End one of them, or give it its own name (--name) and files.",
         )
-        host, version = (None, None) if stranger is None else stranger
+        host, version = (None, None) if unknown_peer is None else unknown_peer
         yield Verdict(
             "version_mismatch",
             name,
-            stranger is not None,
+            unknown_peer is not None,
             f"{name} at {host} speaks wire version {version}, this master {WIRE_VERSION}: neither takes the other.",
             "Install the same version of Phalanx on both, for example by phalanx deploy.",
         )
@@ -130,7 +130,7 @@ class LinkRules:
             " file here has changed since it began.",
         )
 
-    def _away(self, name: str, sender: SenderNow, t_ns: int) -> bool | None:
+    def _is_silent(self, name: str, sender: SenderNow, t_ns: int) -> bool | None:
         """Whether it is not heard: at once where it was there, after a grace where it never was."""
         assert self._first_ns is not None
         if sender.connected:
@@ -146,13 +146,13 @@ class LinkRules:
     def _camera_absent(
         self, camera: CameraPlan, sender: SenderNow, reports: SlaveReports | None, t_ns: int
     ) -> Verdict:
-        name, away = camera.name, self._away(camera.name, sender, t_ns)
-        if away or away is None:
+        name, silent = camera.name, self._is_silent(camera.name, sender, t_ns)
+        if silent or silent is None:
             never = not self._received[name].ever
             return Verdict(
                 "camera_absent",
                 name,
-                away,
+                silent,
                 f"Camera {name} {'was never received' if never else 'is not received any more'}.",
                 f"Is its slave running (phalanx-slave run --name {name}), on this network, with the same rig key?",
             )
@@ -170,8 +170,8 @@ class LinkRules:
         )
 
     def _imu_silent(self, name: str, sender: SenderNow, t_ns: int) -> Verdict:
-        away, never = self._away(name, sender, t_ns), not self._received[name].ever
-        if away is False and self._mute(name, t_ns):
+        silent, never = self._is_silent(name, sender, t_ns), not self._received[name].ever
+        if silent is False and self._mute(name, t_ns):
             return Verdict(
                 "imu_silent",
                 name,
@@ -182,7 +182,7 @@ class LinkRules:
         return Verdict(
             "imu_silent",
             name,
-            away,
+            silent,
             f"IMU {name} {'was never received' if never else 'is not received any more'}.",
             f"Is its slave running (phalanx-slave imu --name {name}), and the IMU plugged in?",
         )

@@ -22,7 +22,7 @@ BRIGHT, BRIGHT_WELL = (
     1.5,
     1.35,
 )  # against calibration, either way; the slave follows up to 2.5 (docs/light.md)
-TWIN = "twins."  # gauges of the slave: hues between two markers as they are seen,
+DUPLICATE_SENDER = "twins."  # gauges of the slave: hues between two markers as they are seen,
 OVERLAP = "overlap."  # and by which the ranges in use of two markers overlap
 BETWEEN = ".."  # the names of the two
 AMBIGUOUS = "ambiguous."  # count: frames in which something beside the hand had the colour of a marker
@@ -114,8 +114,8 @@ def _collisions(camera: CameraPlan, reports: SlaveReports) -> Iterator[Verdict]:
         if gauge.startswith(OVERLAP):
             pair = tuple(gauge.removeprefix(OVERLAP).split(BETWEEN))
             what = f"the colour ranges of {' and '.join(pair)} overlap by {hues:.0f} hues"
-        elif gauge.startswith(TWIN):
-            pair = tuple(gauge.removeprefix(TWIN).split(BETWEEN))
+        elif gauge.startswith(DUPLICATE_SENDER):
+            pair = tuple(gauge.removeprefix(DUPLICATE_SENDER).split(BETWEEN))
             what = f"{' and '.join(pair)} look alike, {hues:.0f} hues apart"
         else:
             continue

@@ -78,20 +78,23 @@ class EpochSteps:
         self._ground, self._lines_of_sight = self._space["ground"], self._space["belief"]["sights"]
         hand, device = boxed(self._rig.hand), boxed(device)
         self._model = Model(hand, boxed(settings.record()), mounts, self._rig.cameras, device)
-        self.at.room.search.wrist_share[0] = settings.wrist_share
+        self.at.scratch.search.wrist_share[0] = settings.wrist_share
         self.at.belief.z_info[0, 0] = 1.0  # of a rig without wrist device: one extra that means nothing
         if wrist is not None:
             self._lay_out(wrist)
         nothing, own = np.full((len(cameras), len(markers), 2), np.nan), np.zeros((len(markers), 3, 3))
-        room, none = (np.empty((26, 3)), np.empty((26, 3, 3)), np.empty((count, 3))), np.full((5, 2), np.nan)
+        scratch, none = (
+            (np.empty((26, 3)), np.empty((26, 3, 3)), np.empty((count, 3))),
+            np.full((5, 2), np.nan),
+        )
         each = none[:, 0].copy()
         self._rays = bound(observe_rays, nothing, nothing[..., 0].copy(), own, self.on_hand, observed)
-        self._points = bound(observe_points, room[2], own[self.on_hand], 0.0, observed)
+        self._points = bound(observe_points, scratch[2], own[self.on_hand], 0.0, observed)
         self._count = bound(count_rows, mounts, observed, self._ground)
         self._cycle = bound(
             observe_wrist, device, none, each, each, none, each, each, 0.0, 0.0, 0.0, self._lines_of_sight
         )
-        self._pose = bound(pose, hand, mounts, _AT_ORIGIN, np.zeros(20), self._work, *room)
+        self._pose = bound(pose, hand, mounts, _AT_ORIGIN, np.zeros(20), self._work, *scratch)
         rig, state, space = self._model, self._state, self._space
         self._prepare = bound(prepare_epoch, rig, state, space)
         self._predict = bound(predict_epoch, rig, state, observed, space)

@@ -32,8 +32,8 @@ from master.estimator.wrist_device import EXTRAS, HEADING, LED_SCALE, RATE, TILT
 _CONSTANT_S = 1e4
 
 
-class ExtrasRoom:
-    """Room for the extras' steps."""
+class ExtrasScratch:
+    """Scratch for the extras' steps."""
 
     M: Float  # (K, K)
     A: Float  # (K, K)
@@ -41,7 +41,7 @@ class ExtrasRoom:
     L: Float  # (K, K)
 
     @classmethod
-    def empty(cls, extras: int) -> "ExtrasRoom":
+    def empty(cls, extras: int) -> "ExtrasScratch":
         """Allocate it."""
         K = extras
         return record(cls, M=(K, K), A=(K, K), B=(K, K), L=(K, K))
@@ -81,7 +81,7 @@ def predict_extras(
     dt_s: float,
     process_noise_rad2: float,
     belief: Belief,
-    room: ExtrasRoom,
+    scratch: ExtrasScratch,
 ) -> None:
     """Step the extras to an epoch, in the state, and write `Belief.z` and `z_info`.
 
@@ -92,7 +92,7 @@ def predict_extras(
         process_noise_rad2: Variance of what the heading has drifted in that time.
         belief, room: Written.
     """
-    K, z, P, M = state.z.shape[0], state.z, state.z_cov, room.M
+    K, z, P, M = state.z.shape[0], state.z, state.z_cov, scratch.M
     if K < EXTRAS:
         belief.z[0], belief.z_info[0, 0] = 0.0, 1.0
         return
@@ -116,15 +116,15 @@ def predict_extras(
             for k in range(K):
                 stationary = state.stationary[k] if k == j and k != HEADING else 0.0
                 inside += M[i, k] * (P[k, j] - stationary)
-            room.A[i, j] = inside
-        room.B[0, i] = total
+            scratch.A[i, j] = inside
+        scratch.B[0, i] = total
     for i in range(K):
-        z[i] = room.B[0, i]
+        z[i] = scratch.B[0, i]
     for i in range(K):
         for j in range(K):
             total = 0.0
             for k in range(K):
-                total += room.A[i, k] * M[j, k]
+                total += scratch.A[i, k] * M[j, k]
             P[i, j] = total
     for i in range(K):
         if i != HEADING:
@@ -135,9 +135,9 @@ def predict_extras(
     for i in range(K):
         belief.z[i] = z[i]
         for j in range(i + 1):
-            room.A[i, j] = 0.5 * (P[i, j] + P[j, i])
-    if cholesky(room.A, K, room.L):
-        inverse(room.L, K, room.B, belief.z_info)
+            scratch.A[i, j] = 0.5 * (P[i, j] + P[j, i])
+    if cholesky(scratch.A, K, scratch.L):
+        inverse(scratch.L, K, scratch.B, belief.z_info)
         return
     for i in range(K):  # by rounding: nothing is known
         for j in range(K):
@@ -154,7 +154,7 @@ def keep_extras(
     z: Float,
     cov: Float,
     scale: float,
-    room: ExtrasRoom,
+    scratch: ExtrasScratch,
 ) -> None:
     """Take over what an epoch leaves of the extras.
 
@@ -167,9 +167,9 @@ def keep_extras(
         belief: What was believed before.
         z: (K,) their mean.
         cov: (N, N) covariance, with theirs last, and `scale` by how much the misfit has scaled it.
-        room: Room.
+        room: Scratch.
     """
-    K, P, A, B, new = state.z.shape[0], state.z_cov, room.A, room.B, room.M[0]
+    K, P, A, B, new = state.z.shape[0], state.z_cov, scratch.A, scratch.B, scratch.M[0]
     if K < EXTRAS:
         return
     first = cov.shape[0] - K
@@ -179,25 +179,25 @@ def keep_extras(
         new[i] = 1.0 - exp(-min(dt_s, 10.0) / errs_s)
         for j in range(K):
             A[i, j] = cov[first + i, first + j] / scale
-    if not cholesky(A, K, room.L):
+    if not cholesky(A, K, scratch.L):
         return
-    inverse(room.L, K, B, A)  # the posterior's information
+    inverse(scratch.L, K, B, A)  # the posterior's information
     for i in range(K):
         pull = 0.0
         for j in range(K):
             pull += A[i, j] * (z[j] - belief.z[j])
-        room.M[1, i] = new[i] * pull
+        scratch.M[1, i] = new[i] * pull
     for i in range(K):
         for j in range(K):
             gained = A[i, j] - belief.z_info[i, j]
             B[i, j] = belief.z_info[i, j] + sqrt(new[i] * new[j]) * gained
-    if not cholesky(B, K, room.L):
+    if not cholesky(B, K, scratch.L):
         return
-    inverse(room.L, K, A, P)
+    inverse(scratch.L, K, A, P)
     for i in range(K):
         state.z[i] = belief.z[i]
         for j in range(K):
-            state.z[i] += P[i, j] * room.M[1, j]
+            state.z[i] += P[i, j] * scratch.M[1, j]
     share = 1.0 - exp(-min(dt_s, 10.0) / settings.habit_s)
     for b in range(2):
         state.habit[b] += share * (state.z[WRIST_ANGLES + b] - state.habit[b])

@@ -37,7 +37,7 @@ _STRETCH = 0.5  # share of the finger's breadth that one chord may span: more is
 
 
 class Surface:
-    """Room for one finger."""
+    """Scratch for one finger."""
 
     S: Float  # (8, 3) spheres
     Q: Float  # (9, 3) ridge

@@ -39,7 +39,7 @@ class Posterior:
 
     @classmethod
     def empty(cls, n: int, extras: int, markers: int) -> "Posterior":
-        """Room for one."""
+        """Scratch for one."""
         N = 6 + n + extras
         return record(
             cls,
@@ -99,7 +99,7 @@ class Hypothesis:
 
     @classmethod
     def empty(cls, n: int, extras: int, markers: int) -> "Hypothesis":
-        """Room for one."""
+        """Scratch for one."""
         N = 6 + n + extras
         return record(
             cls,
@@ -118,8 +118,8 @@ class Hypothesis:
         )
 
 
-class Room:
-    """Room for both hypotheses of N = 6 + n + K unknowns and M markers."""
+class Scratch:
+    """Scratch for both hypotheses of N = 6 + n + K unknowns and M markers."""
 
     each: Sequence[Hypothesis]  # (2,) natural and free
     start_T: Float  # (4, 4)
@@ -136,7 +136,7 @@ class Room:
     search: Search
 
     @classmethod
-    def empty(cls, n: int, extras: int, markers: int) -> "Room":
+    def empty(cls, n: int, extras: int, markers: int) -> "Scratch":
         """Allocate it."""
         N, M = 6 + n + extras, markers
         return record(
@@ -158,6 +158,6 @@ class Room:
 
 
 @inlined
-def likelier(room: Room) -> int:
+def likelier(scratch: Scratch) -> int:
     """The hypothesis with the larger probability."""
-    return 0 if room.each[0].share[0] >= room.each[1].share[0] else 1
+    return 0 if scratch.each[0].share[0] >= scratch.each[1].share[0] else 1

@@ -21,7 +21,7 @@ PLACE, DIRECTION = constant(0), constant(1)
 
 
 class Scratch:
-    """Room for the intermediate results of kernels; holds nothing from one call to the next."""
+    """Scratch for the intermediate results of kernels; holds nothing from one call to the next."""
 
     uv: Float  # (2,)
     J: Float  # (2, 3)

@@ -37,7 +37,7 @@ class Ground:
 
     @classmethod
     def empty(cls) -> "Ground":
-        """Room for one."""
+        """Scratch for one."""
         return record(
             cls,
             shown=("u1", 5),

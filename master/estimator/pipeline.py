@@ -88,7 +88,7 @@ class MarkerPipeline:
         side: "WristSideOf | None" = None,
         counts: Counter[str] | None = None,
         stage: Stage = lambda name: nullcontext(),
-        shed: Callable[[], bool] | None = None,
+        dropped_epochs: Callable[[], bool] | None = None,
     ) -> None:
         """Join the parts.
 
@@ -107,7 +107,7 @@ class MarkerPipeline:
             side: Wrist device and IMU on the forearm of this hand; None: there are none.
             counts: Counted into; None: counts of its own.
             stage: Opens a timer by stage name.
-            shed: Asked for each epoch whether it is left out, for newer ones wait (`master.hurry`); None: none is.
+            shed: Asked for each epoch whether it is left out, for newer ones wait (`master.load_shedding`); None: none is.
         """
         self.model, self.markers = model, markers
         self.counts: Counter[str] = Counter() if counts is None else counts
@@ -120,7 +120,7 @@ class MarkerPipeline:
         joints = [model.mount(name).joint for name in self._hand_markers]
         self._joint = np.array([0 if joint is None else joint for joint in joints])  # 0: the palm
         self._finger_of = Mounts.of(model, self._hand_markers).finger
-        self._stage, self._volume, self._shed, self._side = stage, volume, shed, side
+        self._stage, self._volume, self._dropped_epochs, self._side = stage, volume, dropped_epochs, side
         self._orientation = None if imu is None or not imu.placed else OrientationTrack(imu, self.counts)
         self._last_ns = -(2**63)
         self._late_ns = {name: round(1e3 * us) for name, us in (stamp_offset_us or {}).items()}
@@ -134,8 +134,8 @@ class MarkerPipeline:
             message = restamped(message, t_ns=message.t_ns + late_ns)
         with self._stage("frame_sync"):
             sets = self._line.sync.push(message)
-        if self._line.sync.outdated:
-            self.counts["instants_outdated"] = self._line.sync.outdated
+        if self._line.sync.stale:
+            self.counts["instants_outdated"] = self._line.sync.stale
         return self._solved(sets)
 
     def no_observation(self, t_ns: int, ready_t_ns: int) -> SolvedPose | None:
@@ -165,7 +165,7 @@ class MarkerPipeline:
                 self.counts["instants_late"] += 1
                 continue
             self._last_ns = frames.t_ns
-            if self._shed is not None and self._shed():
+            if self._dropped_epochs is not None and self._dropped_epochs():
                 self.counts["instants_shed"] += 1
                 continue
             poses.append(self._solve(frames))

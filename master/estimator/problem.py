@@ -89,7 +89,7 @@ class Belief:
 
 
 class Search:
-    """Room for a search, of N = 6 + n + K unknowns: the palm, n free angles, K extras."""
+    """Scratch for a search, of N = 6 + n + K unknowns: the palm, n free angles, K extras."""
 
     gradient: Float  # (N,)
     normal: Float  # (N, N)
@@ -126,7 +126,7 @@ class Search:
     def empty(cls, n: int, extras: int, markers: int) -> "Search":
         """Allocate it."""
         N = 6 + n + extras
-        room = record(
+        scratch = record(
             cls,
             gradient=N,
             normal=(N, N),
@@ -159,5 +159,5 @@ class Search:
             outliers=1,
             rows=Scratch.empty(),
         )
-        room.wrist_share[0] = 1.0
-        return room
+        scratch.wrist_share[0] = 1.0
+        return scratch

@@ -75,7 +75,7 @@ class Reinitialiser:
     def _begin_with(self, at: Epoch, shown: frozenset[int], like: frozenset[int]) -> float:
         """As `begin`, while the hidden fingers of `like` are bent as their neighbours."""
         steps, outliers, start = self._steps, frozenset(range(5)) - shown - like, at.start
-        task, belief, room = steps.at.task, steps.at.belief, steps.at.room
+        task, belief, scratch = steps.at.task, steps.at.belief, steps.at.scratch
         belief.past_w2[:], belief.past[:], belief.palm_w2[:], belief.depth_w2[:] = 0.0, 0.0, 0.0, 0.0
         fingers = np.isin(np.arange(5), list(outliers))
         belief.own_w2[:], belief.own[:] = curled(self._parameters, self._settings, fingers)
@@ -85,19 +85,19 @@ class Reinitialiser:
             if start is not None:
                 shows = steps.at.ground.shown[self._finger_of_free] > 0
                 x = np.where(shows, self._parameters.of_angles(start.angles_rad), self._natural)
-                room.start_T[:], room.start_x[:] = start.T_rig_palm, self._as_told(x)
+                scratch.start_T[:], scratch.start_x[:] = start.T_rig_palm, self._as_told(x)
                 chi2 = steps.fit(habits)
                 if steps.at.found.steps[0] < MAX_ITERATIONS and not steps.unexplained():
                     return chi2
             ends = list[tuple[float, Float, Float]]()
             starts = self._starts(at)
             if len(starts) == 1:
-                room.start_T[:], room.start_x[:] = starts[0]
+                scratch.start_T[:], scratch.start_x[:] = starts[0]
                 return steps.fit(habits)
             for T, x in starts:
                 task.palm[:], task.x[:] = T, x
                 ends.append((steps.fit(habits, rough=True), task.palm.copy(), task.x.copy()))
-            _, room.start_T[:], room.start_x[:] = min(ends, key=lambda end: end[0])
+            _, scratch.start_T[:], scratch.start_x[:] = min(ends, key=lambda end: end[0])
             return steps.fit(habits)
         finally:
             belief.own_w2[:] = 0.0

@@ -51,7 +51,7 @@ class Observations(NamedTuple):
 
     @classmethod
     def empty(cls, cameras: int, markers: int) -> "Observations":
-        """Room for one epoch; nothing is seen yet."""
+        """Scratch for one epoch; nothing is seen yet."""
         return cls(
             np.zeros((cameras, markers, 2)),
             np.zeros((cameras, markers)),

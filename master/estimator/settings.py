@@ -289,8 +289,8 @@ class Settings(NamedTuple):
         settings = cls()
         for change in changes:
             name, equals, value = change.partition("=")
-            room, dot, name = name.partition(".")
-            if not (room == "estimator" and dot and equals):
+            scratch, dot, name = name.partition(".")
+            if not (scratch == "estimator" and dot and equals):
                 raise CalibrationError(f"--set {change!r}: expected estimator.NAME=VALUE")
             try:
                 number = float(value)

@@ -81,9 +81,9 @@ class HandOneEuro:
         tables = HandTables.of(model, HandParameters.of(model))
         self._hand, self._tables = boxed(tables), fields(tables)
         twist_boxed(self._hand, np.zeros(5))  # compiled now
-        sources, cov, room = np.zeros(6, np.int64), np.zeros((len(markers), 3, 3)), Pose.empty()
+        sources, cov, scratch = np.zeros(6, np.int64), np.zeros((len(markers), 3, 3)), Pose.empty()
         none = np.zeros(26, np.bool_)
-        self._kernel = bound(smooth, self._hand, self._state, WHOLE, 0, sources, cov, room, room, none)
+        self._kernel = bound(smooth, self._hand, self._state, WHOLE, 0, sources, cov, scratch, scratch, none)
 
     def push(self, t_ns: int, hand: Fitted, cov_m2: Float, points_m: Float | None = None) -> Fitted:
         """Filter palm, angles and joints of a hand; the rest of it stays.

@@ -33,7 +33,7 @@ class Pose(NamedTuple):
 
     @classmethod
     def empty(cls) -> "Pose":
-        """Room for one."""
+        """Scratch for one."""
         joint = np.empty((26, 3)), np.empty((26, 3, 3)), np.empty((26, 3, 3))
         return cls(np.empty((4, 4)), np.empty((5, 4)), *joint)
 

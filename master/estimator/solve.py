@@ -183,7 +183,7 @@ def linearise(
         h: Hypothesis.
         palm, x, z: (4, 4), (n,), (K,) the hand.
         gradient, normal: Written.
-        search: Room.
+        search: Scratch.
     """
     work = search.rows
     cost = _believed(habits, belief, h, T, x, z, gradient, normal, search)
@@ -304,7 +304,7 @@ def descend(
         tolerance, share: A search ends where a step gains less than tolerance and that share of the cost.
         palm, x, z: (4, 4), (n,), (K,) where it begins, inside the limits, and then where it ended.
         gradient, normal: Written: (N,), (N, N) there, or before the last step.
-        search: Room.
+        search: Scratch.
     """
     n, K, hand = x.shape[0], z.shape[0], rig.hand
     cost = linearise(rig, habits, belief, observed, h, T, x, z, gradient, normal, search)

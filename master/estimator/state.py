@@ -158,7 +158,7 @@ class Hidden:
 
     @classmethod
     def none(cls, n: int) -> "Hidden":
-        """Room for one hand."""
+        """Scratch for one hand."""
         return record(cls, angles=20, sigma=20, gone_s=5, own=5, x=n, K=(4, 4), L=(4, 4), weight=4, ahead=20)
 
 

@@ -24,7 +24,7 @@ _ON_LIMIT_RAD = 1e-9
 
 
 class Cut:
-    """Room for the mean within limits, of N unknowns, of which n are angles."""
+    """Scratch for the mean within limits, of N unknowns, of which n are angles."""
 
     weight: Float  # (n,)
     push: Float  # (n,)
@@ -73,7 +73,7 @@ def mean_within(hand: HandTables, normal: Float, gradient: Float, x: Float, cut:
         normal: (N, N) normal matrix of the cost at the likeliest hand.
         gradient: (N,) there; counts where the angles stand at a limit, elsewhere it is 0.
         x: (n,) its angles.
-        cut: Room.
+        cut: Scratch.
         mean: Written: turn [rad], shift [m] and angles [rad]; the angles stay within the limits.
     """
     n, N = x.shape[0], cut.pull.shape[0]

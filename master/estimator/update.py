@@ -57,7 +57,7 @@ class Estimate(NamedTuple):
 
     @classmethod
     def empty(cls) -> "Estimate":
-        """Room for one."""
+        """Scratch for one."""
         return cls(
             palm=np.empty((4, 4)),
             angles=np.empty(20),
@@ -173,27 +173,27 @@ def predict_epoch(model: Model, boxed_state: Any, observed: Observations, boxed_
         no motion explains them, but it does.
     """
     state, space, settings = boxed_state[0], boxed_space[0], model.settings[0]
-    rig, task, belief, room = (
+    rig, task, belief, scratch = (
         Rig(model.hand[0], model.mounts, model.cameras, model.device[0]),
         space.task,
         space.belief,
-        space.room,
+        space.scratch,
     )
     t_ns, limit = task.t_ns[0], np.inf
     dt_s = (t_ns - state.t_ns[0]) * 1e-9
     if task.may_leave[0] > 0:
         free_of(rig.hand, task.angles, task.x)
-        limit = chi_square(rig, observed, task.palm, task.x, 0.0, room.search) + settings.misled
+        limit = chi_square(rig, observed, task.palm, task.x, 0.0, scratch.search) + settings.misled
         process_noise_m = settings.palm_process_noise_m_s * dt_s
-        if chi_square(rig, observed, state.palm, state.x, process_noise_m, room.search) > limit:
+        if chi_square(rig, observed, state.palm, state.x, process_noise_m, scratch.search) > limit:
             return -1.0
     predict(rig.hand, settings, state, t_ns, space.ground.shown, space.hidden, belief)
-    _rotate_on(state, belief, room.search)
+    _rotate_on(state, belief, scratch.search)
     task.natural[0], task.counts[0] = state.natural[0], exp(-dt_s / settings.habit_memory_s)
-    copy(belief.palm, room.start_T)
+    copy(belief.palm, scratch.start_T)
     for c in range(state.x.shape[0]):
-        room.start_x[c] = state.x[c]
-    start_scanned(rig.hand, space.scan, task.scanned, room.search.x, room.start_x)
+        scratch.start_x[c] = state.x[c]
+    start_scanned(rig.hand, space.scan, task.scanned, scratch.search.x, scratch.start_x)
     return limit
 
 
@@ -225,20 +225,20 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
     Args:
         model, habits: What is the same at every epoch.
         observed: What is measured.
-        blank: Room.
+        blank: Scratch.
         boxed_space: (1,) `Workspace`, with the task and what is believed; what is found is in its `found`.
 
     Returns:
         Chi square of the markers; of a rough search its cost.
     """
     space, settings = boxed_space[0], model.settings[0]
-    rig, task, belief, room = (
+    rig, task, belief, scratch = (
         Rig(model.hand[0], model.mounts, model.cameras, model.device[0]),
         space.task,
         space.belief,
-        space.room,
+        space.scratch,
     )
-    search, found = room.search, space.found
+    search, found = scratch.search, space.found
     if task.rough[0] > 0:
         cost, _ = descend(
             rig,
@@ -250,9 +250,9 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
             settings.tolerance_share,
             task.palm,
             task.x,
-            room.start_z,
-            room.each[0].gradient,
-            room.each[0].normal,
+            scratch.start_z,
+            scratch.each[0].gradient,
+            scratch.each[0].normal,
             search,
         )
         return cost
@@ -262,14 +262,14 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
         habits,
         belief,
         observed,
-        room.start_T,
-        room.start_x,
-        room.start_z,
+        scratch.start_T,
+        scratch.start_x,
+        scratch.start_z,
         task.natural[0],
         task.counts[0],
         space.ground.numbers[0],
         blank,
-        room,
+        scratch,
         found,
     )
     if found.z.shape[0] == EXTRAS:
@@ -312,7 +312,7 @@ def take_over_epoch(
     state, space, settings = boxed_state[0], boxed_space[0], model.settings[0]
     rig, task = Rig(model.hand[0], model.mounts, model.cameras, model.device[0]), space.task
     t_ns, shown, palm_shown = task.t_ns[0], space.ground.shown, task.palm_shown[0] > 0
-    found, hidden, room, work = space.found, space.hidden, space.certainty, space.room.search.rows
+    found, hidden, scratch, work = space.found, space.hidden, space.certainty, space.scratch.search.rows
     hand, n = rig.hand, found.x.shape[0]
     angles_of(hand, found.x, work.angles, work.by)
     clamp(hand, work.angles)
@@ -332,17 +332,17 @@ def take_over_epoch(
         for part in range(6):  # what was measured was another hand
             state.told_ns[part] = NEVER_NS
     if goes_on and lost:
-        now = space.room.cov
+        now = space.scratch.cov
         copy(found.cov, now)
         only_limits(hand, found.x, hidden, now)
-        surer(now, state.cov, room, space.room.A)
-        copy(space.room.A, state.cov)
+        surer(now, state.cov, scratch, space.scratch.A)
+        copy(space.scratch.A, state.cov)
     else:
         copy(found.cov, state.cov)
     chains(hand, found.palm, work.angles, work.R, work.P)
     joints(hand, found.palm, work.R, work.P, out.position, out.rotation)
-    linear(hand, found.palm, state.cov, work, room, out.cov)
-    tilts(hand, settings, found.palm, found.cov, work, room, out.tilt, out.tilt_process_noise)
+    linear(hand, found.palm, state.cov, work, scratch, out.cov)
+    tilts(hand, settings, found.palm, found.cov, work, scratch, out.tilt, out.tilt_process_noise)
     if task.second_order[0] > 0:
         add_arcs(
             rig,
@@ -350,9 +350,9 @@ def take_over_epoch(
             found.palm,
             state.cov,
             observed.seen,
-            space.room.each[likelier(space.room)].information,
+            space.scratch.each[likelier(space.scratch)].information,
             work,
-            room,
+            scratch,
             out.cov,
         )
     _depth_noise(settings, state, t_ns, space.ground, space.belief, out)
@@ -368,10 +368,10 @@ def take_over_epoch(
     # With tilt and heading as this epoch leaves them, so that what is learnt of these is no motion.
     state.measured_rotation_known[0] = space.belief.oriented[0] > 0.0
     if state.measured_rotation_known[0] > 0:
-        sensed_palm(space.belief, state.z, space.room.search)
+        sensed_palm(space.belief, state.z, space.scratch.search)
         for i in range(3):
             for j in range(3):
-                state.measured_rotation[i, j] = space.room.search.palm[i, j]
+                state.measured_rotation[i, j] = space.scratch.search.palm[i, j]
     for f in range(5):
         pip = 6 + hand.first[f] + 2
         pip_open = state.cov[pip, pip] > settings.tracked_pip_rad**2

@@ -6,10 +6,10 @@ from common.arrays import Bool, Code, Float, Int
 from common.records import record
 from master.estimator.cameras import CameraArrays
 from master.estimator.certainty import Certainty
-from master.estimator.extras import ExtrasRoom
+from master.estimator.extras import ExtrasScratch
 from master.estimator.finger_scan import Prior, Scan
 from master.estimator.hand_tables import Mounts
-from master.estimator.hypotheses import Posterior, Room
+from master.estimator.hypotheses import Posterior, Scratch
 from master.estimator.observation_sources import Ground
 from master.estimator.problem import Belief
 from master.estimator.state import Hidden
@@ -55,7 +55,7 @@ class Task:
 
     @classmethod
     def empty(cls, n: int) -> "Task":
-        """Room for one."""
+        """Scratch for one."""
         return record(
             cls,
             t_ns=("i8", 1),
@@ -79,18 +79,18 @@ class Task:
 
 
 class Workspace:
-    """Room for all kernels of one hand, what is to be done, and what is believed at the epoch."""
+    """Scratch for all kernels of one hand, what is to be done, and what is believed at the epoch."""
 
     task: Task
     ground: Ground
     belief: Belief
     hidden: Hidden
     found: Posterior
-    room: Room
+    scratch: Scratch
     certainty: Certainty
     prior: Prior
     scan: Scan
-    extras: ExtrasRoom
+    extras: ExtrasScratch
 
     @classmethod
     def empty(cls, n: int, extras: int, markers: int) -> "Workspace":
@@ -102,11 +102,11 @@ class Workspace:
             belief=Belief.none(n, extras),
             hidden=Hidden.none(n),
             found=Posterior.empty(n, extras, markers),
-            room=Room.empty(n, extras, markers),
+            scratch=Scratch.empty(n, extras, markers),
             certainty=Certainty.empty(6 + n + extras, markers),
             prior=Prior.empty(),
             scan=Scan.empty(),
-            extras=ExtrasRoom.empty(extras),
+            extras=ExtrasScratch.empty(extras),
         )
 
 

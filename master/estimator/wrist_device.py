@@ -99,7 +99,7 @@ class Device:
 
     @classmethod
     def none(cls) -> "Device":
-        """Room of the same shape, of a rig without wrist device."""
+        """Scratch of the same shape, of a rig without wrist device."""
         return record(
             cls,
             palm=(4, 4),

@@ -103,7 +103,7 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
     predict_extras(settings, state, dt_s, task.process_noise_rad2[0], belief, space.extras)
     state.z_ns[0] = task.t_ns[0]
     for i in range(state.z.shape[0]):
-        space.room.start_z[i] = state.z[i]
+        space.scratch.start_z[i] = state.z[i]
     for f in range(5):
         scan.known[f] = lines_of_sight.teaches[f] = 0.0
         task.refused[f] = task.off[f] = task.ambiguous[f] = False

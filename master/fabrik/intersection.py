@@ -344,6 +344,6 @@ def triangulate(
     observed[..., :2], observed[..., 2] = uv, sigma_px
     points, cov, errors = np.empty((markers, 3)), np.empty((markers, 3, 3)), np.empty((2, markers))
     outliers = np.empty(markers, np.bool_)
-    none, room = np.zeros((count, markers), np.bool_), Rays.empty(count)
-    intersect(cameras, rays_px, limits_of(count), observed, none, room, points, cov, errors, outliers)
+    none, scratch = np.zeros((count, markers), np.bool_), Rays.empty(count)
+    intersect(cameras, rays_px, limits_of(count), observed, none, scratch, points, cov, errors, outliers)
     return Triangulation(points, cov, errors[0], errors[1], outliers)

@@ -85,7 +85,7 @@ class FrameSync:
         count, period_ns = len(models), int(1e9 / min(rates))
         self._markers, self._continuous = markers, continuous
         self._centre_row_ns = [round(0.5 * (model.height_px - 1) * model.row_time_ns) for model in models]
-        self._deadline_ns, self._outdated_ns = int(1.25 * period_ns), SILENT_FRAMES * period_ns
+        self._deadline_ns, self._stale_ns = int(1.25 * period_ns), SILENT_FRAMES * period_ns
         self._half_ns = [int(0.5e9 / rate) for rate in rates]
         self._slack_ns = self._half_ns if policy == "predict" else [0] * count
         far_ns = int((OBSERVATIONS + 0.25) * period_ns) if continuous else -1
@@ -109,7 +109,7 @@ class FrameSync:
         self._awaited = 0  # the camera that was waited for when an instant was last asked for
         self._pending: deque[int] = deque()
         self._newest_ns = self._last_ns = NEVER  # of all frames, of all instants
-        self.outdated = 0
+        self.stale = 0
 
     def push(self, message: MarkerDetections) -> list[FrameSet]:
         """Take one camera's detections; return the instants that became complete or due, oldest first.
@@ -128,7 +128,7 @@ class FrameSync:
         if centre_ns <= self._newest_of[c]:
             return []  # a restarted slave's first clock estimate may step back: wait until time goes on
         self._hold(c, centre_ns, message)
-        self._behind[c] = self._newest_ns - centre_ns > self._outdated_ns
+        self._behind[c] = self._newest_ns - centre_ns > self._stale_ns
         self._newest_of[c] = centre_ns
         self._newest_ns = max(self._newest_ns, centre_ns)
         if self._silent(c):
@@ -195,8 +195,8 @@ class FrameSync:
             if not (flush or waited_ns > self._deadline_ns or self._complete(t_ns)):
                 break
             self._pending.popleft()
-            if self._continuous and waited_ns > self._outdated_ns and self._lonely(t_ns):
-                self.outdated += 1
+            if self._continuous and waited_ns > self._stale_ns and self._lonely(t_ns):
+                self.stale += 1
             else:
                 out.append(self.at(t_ns))
         return out
@@ -226,7 +226,6 @@ class FrameSync:
         From half a period before it to a while after.
         """
         return any(
-            not self._silent(c)
-            and not any(-self._half_ns[c] <= s - t_ns <= self._outdated_ns for s in centres)
+            not self._silent(c) and not any(-self._half_ns[c] <= s - t_ns <= self._stale_ns for s in centres)
             for c, centres in enumerate(self._history.times_ns[:, :, 0].tolist())
         )

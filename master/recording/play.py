@@ -109,7 +109,7 @@ def run_play(
                 to_ns=at(settings.to_s),
                 solved=settings.solved,
                 again=again,
-                taken=(lambda _message: None) if tap is None else tap.show,
+                observed=(lambda _message: None) if tap is None else tap.show,
                 notify=notify,
             )
         except ValueError as error:

@@ -16,8 +16,8 @@ from common.errors import PhalanxError
 from common.messages import Backlog, Contact, Gesture, HandPose, Message, Told
 from common.recording import MessageRecording, Recorded
 from master.app import Solved
-from master.hurry import Hurry, Shedding
-from master.link_senders import Taken
+from master.link_senders import SensorMessage
+from master.load_shedding import LoadShedding, Shedding
 from master.outputs.sink import Sink
 from master.recording.clock import ReplayClock
 from master.recording.digest import ToldDigest
@@ -55,14 +55,14 @@ class Passed:
         return self.digest.counts["poses"] / max(self.seconds, 1e-9)
 
 
-def world_of(setups: Sequence[RigSetup], hurry: Hurry) -> World:
-    """The world as a live master builds it, which leaves out instants as `hurry` says.
+def world_of(setups: Sequence[RigSetup], load_shedding: LoadShedding) -> World:
+    """The world as a live master builds it, which leaves out instants as `load_shedding` says.
 
     Raises:
         CalibrationError: The files do not fit together.
     """
     stages = StageTimes()
-    return World(setups, [LivePipeline(setup, stages, Shedding(hurry)) for setup in setups], stages)
+    return World(setups, [LivePipeline(setup, stages, Shedding(load_shedding)) for setup in setups], stages)
 
 
 class Player:
@@ -82,7 +82,7 @@ class Player:
         to_ns: int | None = None,
         solved: bool = False,
         again: Callable[[str, str, Message], None] = lambda _stream, _name, _message: None,
-        taken: Callable[[Message], None] = lambda _message: None,
+        observed: Callable[[Message], None] = lambda _message: None,
         notify: Callable[[str], None] = lambda _line: None,
     ) -> None:
         """Stand at the beginning.
@@ -102,7 +102,7 @@ class Player:
             ValueError: The speed is none, or the stretch is empty.
         """
         self._recording, self._setups, self._sinks, self._solved = recording, setups, sinks, solved
-        self._again, self._taken, self._notify = again, taken, notify
+        self._again, self._observed, self._notify = again, observed, notify
         self.first_ns = recording.begin_t_ns if from_ns is None else max(from_ns, recording.begin_t_ns)
         self.last_ns = recording.end_t_ns if to_ns is None else min(to_ns, recording.end_t_ns)
         if self.first_ns > self.last_ns:
@@ -189,8 +189,8 @@ class Player:
 
     def _pass(self, start_ns: int, digest: ToldDigest) -> bool:
         """Play from `start_ns`; False: not to the end."""
-        hurry = Hurry()
-        world = None if self._solved else world_of(self._setups, hurry)
+        load_shedding = LoadShedding()
+        world = None if self._solved else world_of(self._setups, load_shedding)
         events = EventWatch(self._recording.begin_t_ns)
         with self._changed:
             self._clock.seek(start_ns, now_ns())  # to build a world took its time
@@ -202,10 +202,10 @@ class Player:
             if one.stream == "health":
                 self._tell_events(events.push(one.t_ns, one.message))
                 if events.restarted and world is not None:
-                    hurry = Hurry()
-                    world = world_of(self._setups, hurry)
+                    load_shedding = LoadShedding()
+                    world = world_of(self._setups, load_shedding)
             if isinstance(one.message, Backlog):
-                hurry.reject = one.message.reject
+                load_shedding.reject = one.message.reject
             told = self._told(world, one)
             if not silent:
                 self._write(told, digest)
@@ -237,9 +237,9 @@ class Player:
             return (cast(Told, one.message),)
         if one.stream != "taken" or world is None or isinstance(one.message, Backlog):
             return ()
-        return self._solve(world, cast(Taken, one.message), one.name)
+        return self._solve(world, cast(SensorMessage, one.message), one.name)
 
-    def _solve(self, world: World, message: Taken, name: str) -> Iterable[Told]:
+    def _solve(self, world: World, message: SensorMessage, name: str) -> Iterable[Told]:
         """What the world makes of a message.
 
         Nothing of one that it cannot solve, which the recording may hold.
@@ -264,7 +264,7 @@ class Player:
 
     def _auxiliary(self, one: Recorded) -> None:
         if one.stream == "taken":
-            self._taken(one.message)
+            self._observed(one.message)
         elif one.stream in AUXILIARY and one.name not in _OWN:
             self._again(one.stream, one.name, one.message)
 

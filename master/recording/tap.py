@@ -16,16 +16,16 @@ from common.clock import Clock
 from common.errors import BusError
 from common.messages import Backlog, Message
 from common.streams import MASTER, sender_of
-from master.hurry import Hurry
+from master.load_shedding import LoadShedding
 from master.outputs.devices import Taking
 
 LEASE_NS = 3_000_000_000
-ROOM = 20_000  # messages, some seconds
+CAPACITY = 20_000  # messages, some seconds
 _DRAIN_S = 5.0
 _STEP_S = 0.01
 _TOGETHER_S = 0.2  # to wake a thread and a link for each message would cost several times as much
 
-TakenT = TypeVar("TakenT", bound=Message)
+ReceivedT = TypeVar("ReceivedT", bound=Message)
 
 
 class Tap:
@@ -42,7 +42,7 @@ class Tap:
         self._queue: deque[Message] = deque()
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
-        self._hurry = threading.Event()
+        self._load_shedding = threading.Event()
         self._busy = self._closed = False
         self._shown = self._dropped = 0
         self._rejected, self._again = 0, False  # as was shown last; a reader may not have been there
@@ -79,7 +79,7 @@ class Tap:
 
     def _put(self, message: Message) -> None:
         self._shown += 1
-        if len(self._queue) >= ROOM:
+        if len(self._queue) >= CAPACITY:
             self._dropped += 1
         else:
             self._queue.append(message)  # nobody is woken: the thread looks by itself
@@ -91,18 +91,18 @@ class Tap:
     def drain(self) -> None:
         """Wait until all that was shown is on its way, at most some seconds."""
         self._start()
-        self._hurry.set()
+        self._load_shedding.set()
         deadline = time.monotonic() + _DRAIN_S
         while (self._queue or self._busy) and time.monotonic() < deadline:
             time.sleep(_STEP_S)
-        self._hurry.clear()
+        self._load_shedding.clear()
 
     def close(self) -> None:
         """Show nothing any more. Safe to call twice."""
         with self._lock:
             self._closed, thread = True, self._thread
         self._queue.clear()
-        self._hurry.set()
+        self._load_shedding.set()
         if thread is not None:
             thread.join(_DRAIN_S)
 
@@ -127,7 +127,7 @@ class Tap:
                 if self._closed or not (self._always or self._until_ns or self._queue):
                     self._thread = None
                     return
-            self._hurry.wait(_STEP_S if self._hurry.is_set() else _TOGETHER_S)
+            self._load_shedding.wait(_STEP_S if self._load_shedding.is_set() else _TOGETHER_S)
 
 
 def came_ns(message: Message, now_ns: int) -> int:
@@ -135,27 +135,27 @@ def came_ns(message: Message, now_ns: int) -> int:
     return getattr(message, "ready_t_ns", None) or getattr(message, "t_ns", now_ns)
 
 
-class Tapped(Generic[TakenT]):
+class Tapped(Generic[ReceivedT]):
     """A source of messages that shows each when the next is asked for: what reads it has made of it all it can by then.
 
     With each message it sees how far behind the master is, which holds until the next. Holds the last message.
     """
 
-    def __init__(self, source: Taking[TakenT], tap: Tap, hurry: Hurry) -> None:
+    def __init__(self, source: Taking[ReceivedT], tap: Tap, load_shedding: LoadShedding) -> None:
         """Stand between a source and who reads it."""
-        self._source, self._tap, self._hurry = source, tap, hurry
-        self._last: TakenT | None = None
+        self._source, self._tap, self._load_shedding = source, tap, load_shedding
+        self._last: ReceivedT | None = None
 
-    def get(self, timeout_s: float) -> TakenT | None:
+    def get(self, timeout_s: float) -> ReceivedT | None:
         """The next message, or None when none came in time."""
         self.flush()
         self._last = self._source.get(timeout_s)
         if self._last is not None:
-            self._hurry.look(self._last)
+            self._load_shedding.look(self._last)
         return self._last
 
     def flush(self) -> None:
         """At the end: the last message, too."""
         last, self._last = self._last, None
         if last is not None:
-            self._tap.show(last, self._hurry.reject)
+            self._tap.show(last, self._load_shedding.reject)

@@ -21,7 +21,7 @@ from slave.cameras.repeated import RepeatedPictures
 from slave.cameras.settings import Tunable
 from slave.cameras.source import Frame, FrameSource
 from slave.failures import Failures
-from slave.service import Away, nobody
+from slave.service import ConnectionLost, nobody
 
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 1.0  # what is plugged in again tracks within two seconds
@@ -41,7 +41,7 @@ class ReopeningCamera:
         camera: CameraCalibration,
         clock: Clock,
         stop: threading.Event,
-        away: Away = nobody,
+        connection_lost: ConnectionLost = nobody,
     ) -> None:
         """Open the camera.
 
@@ -59,7 +59,7 @@ class ReopeningCamera:
         self._camera = camera
         self._clock = clock
         self._stop = stop
-        self._away = away
+        self._connection_lost = connection_lost
         self._closed = threading.Event()
         self._source: FrameSource | None = opener(camera)
         self._base = 0  # added to the camera's own numbers
@@ -88,7 +88,7 @@ class ReopeningCamera:
                 if self._closed.is_set():  # under its hands
                     return None
                 self.lost += 1
-                self._away(f"camera lost: {self._failures.log('lost', error)}")
+                self._connection_lost(f"camera lost: {self._failures.log('lost', error)}")
                 self._drop()
             if self._stop.is_set():
                 return None
@@ -171,7 +171,7 @@ class ReopeningCamera:
             try:
                 self._source, self._fresh = self._open(self._camera), True
             except Exception as error:  # noqa: BLE001 - as above
-                self._away(f"camera away: {self._failures.log('still away', error)}")
+                self._connection_lost(f"camera away: {self._failures.log('still connection_lost', error)}")
                 continue
             if self._closed.is_set():  # while it was being opened
                 self._drop()

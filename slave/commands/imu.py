@@ -104,7 +104,9 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
             imu = imu_of(options.imu, *world_of(options, rig), options.scene, options.seed)
             source: ImuSource = SyntheticImu(imu, epoch_ns, clock, stop)
         else:
-            source = opening.open_real(options.name, options.imu, rig.imu.rate_hz, clock, stop, service.away)
+            source = opening.open_real(
+                options.name, options.imu, rig.imu.rate_hz, clock, stop, service.connection_lost
+            )
         uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
         run_live(options.name, source, orientation, uplink, clock, stop, tell, service, access)
     return 0

@@ -122,7 +122,7 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     key, access = secrets_of(options)
     raw = _raw_settings(options, true_clock)
     engine = (wrist_engine if files.rig.kind == "wrist" else marker_engine).engine_named(options.engine)
-    source = open_lit(options, files.rig, files.camera, clock, true_clock, stop, service.away)
+    source = open_lit(options, files.rig, files.camera, clock, true_clock, stop, service.connection_lost)
     uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
 
     def tell(line: str) -> None:

@@ -21,7 +21,7 @@ from slave.commands.options import (
 )
 from slave.objects import opening
 from slave.objects.source import TrackerSource
-from slave.service import Away, Service
+from slave.service import ConnectionLost, Service
 from slave.stopping import stop_by_signal
 
 PURPOSE = "send where a Vive tracker is"
@@ -66,7 +66,7 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
 
     service = Service(os.environ, noun="poses")
     with stop_by_signal() as stop:
-        source = _open(options, rig, profile, clock, true_clock, stop, service.away)
+        source = _open(options, rig, profile, clock, true_clock, stop, service.connection_lost)
         try:
             uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
         except PhalanxError:
@@ -84,11 +84,11 @@ def _open(
     clock: SkewedClock,
     true_clock: SystemClock,
     stop: threading.Event,
-    away: Away,
+    connection_lost: ConnectionLost,
 ) -> TrackerSource:
     if options.device != "synthetic":
         named = options.device, options.serial, options.program
-        return opening.open_real(options.name, *named, clock, stop, away)
+        return opening.open_real(options.name, *named, clock, stop, connection_lost)
     from slave.objects.synthetic import SyntheticTracker
     from slave.simulated import tracker_of
 

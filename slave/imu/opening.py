@@ -13,7 +13,7 @@ from common.errors import CalibrationError, ImuError
 from common.imu_fusion import OrientationFilter
 from slave.imu.reopening import ReopeningImu
 from slave.imu.source import ImuSource
-from slave.service import Away, nobody
+from slave.service import ConnectionLost, nobody
 
 if TYPE_CHECKING:  # the drivers are imported where one is opened: other commands start without them
     from slave.imu.lsm6dsox import I2cPlace
@@ -61,7 +61,12 @@ def orientation_of(imu: ImuCalibration) -> OrientationFilter:
 
 
 def open_real(
-    name: str, driver: str, rate_hz: float, clock: Clock, stop: threading.Event, away: Away = nobody
+    name: str,
+    driver: str,
+    rate_hz: float,
+    clock: Clock,
+    stop: threading.Event,
+    connection_lost: ConnectionLost = nobody,
 ) -> ReopeningImu:
     """Open the IMU that `--imu DRIVER:PLACE` names; until `stop` is set, it is opened again when it was lost.
 
@@ -90,7 +95,7 @@ def open_real(
         opener = lambda: lsm6dsox.Lsm6dsoxImu(name, wires, rate_hz, clock, stop)  # noqa: E731
     else:
         raise ImuError(f"--imu {driver}: no such driver; there are {IMUS}")
-    return ReopeningImu(opener, true_hz, clock, stop, away)
+    return ReopeningImu(opener, true_hz, clock, stop, connection_lost)
 
 
 def places() -> str:

@@ -16,7 +16,7 @@ from common.clock import Clock
 from common.messages import ImuSample
 from slave.failures import Failures
 from slave.imu.source import ImuSource, Telling
-from slave.service import Away, nobody
+from slave.service import ConnectionLost, nobody
 
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 1.0  # what is plugged in again tracks within two seconds
@@ -34,7 +34,7 @@ class ReopeningImu:
         rate_hz: float,
         clock: Clock,
         stop: threading.Event,
-        away: Away = nobody,
+        connection_lost: ConnectionLost = nobody,
     ) -> None:
         """Open the IMU.
 
@@ -49,7 +49,7 @@ class ReopeningImu:
             ImuError: It is not there, or refused a setting.
         """
         self._open, self._rate_hz, self._clock, self._stop = opener, rate_hz, clock, stop
-        self._away = away
+        self._connection_lost = connection_lost
         self._closed = threading.Event()
         self._source: ImuSource | None = opener()
         self._base: int | None = 0  # added to the own numbers of the IMU; None: of one that was just opened
@@ -105,7 +105,7 @@ class ReopeningImu:
         if self._away_ns is None:
             self._away_ns = self._clock.now_ns()
             self._counts["lost"] += 1
-        self._away(f"IMU lost: {self._failures.log('lost', error)}")
+        self._connection_lost(f"IMU lost: {self._failures.log('lost', error)}")
         self._drop()
 
     def _drop(self) -> None:
@@ -122,7 +122,7 @@ class ReopeningImu:
             try:
                 self._source = self._open()
             except Exception as error:  # noqa: BLE001 - as above
-                self._away(f"IMU away: {self._failures.log('still away', error)}")
+                self._connection_lost(f"IMU away: {self._failures.log('still connection_lost', error)}")
                 continue
             if self._closed.is_set():  # while it was being opened
                 self._drop()

@@ -108,7 +108,7 @@ def make(root: Path, name: str, source: Source, notify: Callable[[str], None]) -
     releases.mkdir(parents=True, exist_ok=True)
     for left in releases.glob(".new-*"):
         shutil.rmtree(left, ignore_errors=True)
-    _check_room(releases, source)
+    _check_space(releases, source)
     fresh = releases / f".new-{name}"
     notify(f"making release {name}")
     try:
@@ -148,7 +148,7 @@ def remove(root: Path, name: str) -> None:
     shutil.rmtree(left, ignore_errors=True)
 
 
-def _check_room(releases: Path, source: Source) -> None:
+def _check_space(releases: Path, source: Source) -> None:
     """Raises InstallError: there is too little."""
     if source.wheels is not None:
         sizes = [zipfile.ZipFile(wheel).infolist() for wheel in source.wheels.glob("*.whl")]

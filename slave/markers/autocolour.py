@@ -46,7 +46,7 @@ SEEN_SHARE = 0.1  # of the frames in which a paint must be seen,
 SEEN_LEAST = 4  # and at least so many
 SIZE_SHARE = 0.25  # of the typical area of all; a smaller thing is the fringe of another
 ALTERNATIVE = 0.5  # a further hue seen this often, relative to the rarest paint, leaves a doubt
-TWIN_SIZE, TWIN_SHARE = (
+AMBIGUOUS_SIZE, AMBIGUOUS_SHARE = (
     0.3,
     0.4,
 )  # a second thing this large, in this share of the frames: two paints of one hue
@@ -154,7 +154,7 @@ def find_colours(things: Sequence[Sequence[Thing]], count: int, around: Surround
             f"back to the camera, all markers in view, and move it by more than its width"
             f"{_why_fewer(every, around)}"
         )
-    _refuse_twins(things, found[:count])
+    _refuse_ambiguous(things, found[:count])
     if len(found) > count and len(found[count].things) >= ALTERNATIVE * len(found[count - 1].things):
         raise FitError(
             f"{len(found)} colours move with the hand (hues {hues}), the rig has {count} markers: take off or cover "
@@ -217,17 +217,17 @@ def _by_hue(things: Sequence[Sequence[Thing]]) -> list[MarkerColour]:
     return colours
 
 
-def _refuse_twins(things: Sequence[Sequence[Thing]], colours: Sequence[MarkerColour]) -> None:
+def _refuse_ambiguous(things: Sequence[Sequence[Thing]], colours: Sequence[MarkerColour]) -> None:
     for colour in colours:
         double = 0
         for largest in colour.things:
             others = [
                 t for t in things[largest.frame]
-                if t is not largest and t.area > TWIN_SIZE * largest.area
+                if t is not largest and t.area > AMBIGUOUS_SIZE * largest.area
                 and hue_separation(t.hue, colour.hue) < HUE_SEPARATION
             ]  # fmt: skip
             double += bool(others)
-        if double > TWIN_SHARE * len(colour.things):
+        if double > AMBIGUOUS_SHARE * len(colour.things):
             raise FitError(
                 f"two things of hue {colour.hue:.0f} move with the hand in {double} of {len(colour.things)} frames: "
                 f"two paints look the same (repaint one), or clothing has a paint's colour (cover it)"

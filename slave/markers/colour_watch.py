@@ -39,7 +39,7 @@ class ColourWarning:
 
     marker: str | None
     text: str
-    twin: str | None = None
+    ambiguous: str | None = None
     hues: float = 0.0
 
 
@@ -95,7 +95,7 @@ class ColourWatch:
         with np.errstate(invalid="ignore"):
             self._warned = np.where(np.isnan(room), self._warned, room < np.where(self._warned, WELL, ROOM))
         warned = [self._of(int(m), float(room[m])) for m in np.flatnonzero(self._warned)]
-        return warned + self._twins()
+        return warned + self._ambiguous()
 
     def room(self) -> Float:
         """Room (M,) of each marker's colour to the nearest border of its range, in spreads; NaN: not watched long."""
@@ -125,7 +125,7 @@ class ColourWatch:
             f"under this light",
         )
 
-    def _twins(self) -> list[ColourWarning]:
+    def _ambiguous(self) -> list[ColourWarning]:
         hue = (self._mean[:, 0] + self._middle) % HUES
         apart = np.abs(hue[:, None] - hue[None, :])
         apart = np.minimum(apart, HUES - apart)

@@ -89,7 +89,7 @@ def rows_of(paint: Mapping[str, Image], skin: Image, background: Image, frames: 
         FitError: Two paints have the same hue.
     """
     hue = {name: circular_median(pixels[:, 0]) for name, pixels in paint.items()}
-    _refuse_twins(hue)
+    _refuse_ambiguous(hue)
     skin_hue = circular_median(skin[:, 0]) if len(skin) else None
     rows: list[ColourRow] = []
     for name, pixels in paint.items():
@@ -177,7 +177,7 @@ def hue_distance(hues: npt.NDArray[np.number], hue: float) -> Float:
     return np.minimum(d, HUES - d)
 
 
-def _refuse_twins(hue: Mapping[str, float]) -> None:
+def _refuse_ambiguous(hue: Mapping[str, float]) -> None:
     names = sorted(hue, key=lambda name: hue[name])
     for a, b in zip(names, names[1:] + names[:1], strict=True):
         if a != b and hue_separation(hue[a], hue[b]) < HUE_SEPARATION:

@@ -11,7 +11,7 @@ from common.errors import CalibrationError, TrackerError
 from common.object_profile import ObjectProfile
 from slave.objects.reopening import ReopeningTracker
 from slave.objects.source import TrackerSource
-from slave.service import Away, nobody
+from slave.service import ConnectionLost, nobody
 
 REAL = "openvr | survive | survive:FILE"
 DEVICES = f"{REAL} | synthetic"
@@ -55,7 +55,7 @@ def open_real(
     program: str,
     clock: Clock,
     stop: threading.Event,
-    away: Away = nobody,
+    connection_lost: ConnectionLost = nobody,
 ) -> TrackerSource:
     """Open the tracker that `--device` names; one that is no recording is opened again when it was lost.
 
@@ -87,4 +87,4 @@ def open_real(
         opener = lambda: OpenVrTracker(name, serial, clock, stop)  # noqa: E731
     else:
         raise TrackerError(f"--device {device}: no such system; there are {DEVICES}")
-    return ReopeningTracker(name, opener, clock, stop, away)
+    return ReopeningTracker(name, opener, clock, stop, connection_lost)

@@ -20,7 +20,7 @@ from common.messages import TrackerPose
 from slave.failures import Failures
 from slave.imu.source import Telling
 from slave.objects.source import TrackerSource
-from slave.service import Away, nobody
+from slave.service import ConnectionLost, nobody
 
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 10.0  # each try leaves 100 kB in openvr (ValveSoftware/openvr, issue 1221)
@@ -39,7 +39,7 @@ class ReopeningTracker:
         opener: Callable[[], TrackerSource],
         clock: Clock,
         stop: threading.Event,
-        away: Away = nobody,
+        connection_lost: ConnectionLost = nobody,
     ) -> None:
         """Open it.
 
@@ -54,7 +54,7 @@ class ReopeningTracker:
             TrackerError: It is not there.
         """
         self._name, self._open, self._clock, self._stop = name, opener, clock, stop
-        self._away = away
+        self._connection_lost = connection_lost
         self._closed = threading.Event()
         self._source: TrackerSource | None = opener()
         self._seq, self._last_ns = -1, -(2**62)
@@ -126,7 +126,7 @@ class ReopeningTracker:
         if self._away_ns is None:
             self._away_ns = now_ns
             self._counts["lost"] += 1
-        self._away(f"tracker lost: {self._failures.log('lost', error)}")
+        self._connection_lost(f"tracker lost: {self._failures.log('lost', error)}")
         self._drop()
         self._try_ns = now_ns + round(1e9 * self._wait_s)
 
@@ -142,7 +142,7 @@ class ReopeningTracker:
         now_ns = self._clock.now_ns()
         if now_ns < self._try_ns:
             return None
-        self._away("tracker lost: opens it again")
+        self._connection_lost("tracker lost: opens it again")
         self._wait_s = min(2.0 * self._wait_s, LONGEST_WAIT_S)  # until a pose has come
         self._try_ns = now_ns + round(1e9 * self._wait_s)
         try:

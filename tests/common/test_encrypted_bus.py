@@ -221,11 +221,11 @@ def test_without_a_certificate_of_the_rig_nobody_comes_in_and_hears_why(
     with pytest.raises(BusError, match="cannot open the bus"):
         ZenohBus(None, plain, beyond=True)
     with caplog.at_level(logging.WARNING):
-        stranger = rig.opened(lambda: ZenohBus(None, rig.endpoint, access("left", foreign)))
+        unknown_peer = rig.opened(lambda: ZenohBus(None, rig.endpoint, access("left", foreign)))
         assert until(lambda: "another rig's" in caplog.text)
-    assert stranger.peers == 0
+    assert unknown_peer.peers == 0
     with pytest.raises(BusError, match="no certificate of this rig's master"):
-        stranger.ask(Command(MASTER, "report"), 0.1)
+        unknown_peer.ask(Command(MASTER, "report"), 0.1)
 
 
 def test_a_certificate_of_the_rig_that_its_authority_did_not_sign_is_refused_by_the_master(

@@ -213,7 +213,7 @@ def test_any_loss_pattern_of_20_percent_still_starts(seed: int) -> None:
     assert wires.run(2.5, wires.all_started)
     assert set(master.refused) <= {
         Refusal.STALE,
-        Refusal.TWIN,
+        Refusal.DUPLICATE_SENDER,
     }  # the restarted slave, while the old one seems well
 
 
@@ -300,7 +300,7 @@ def test_a_hello_that_was_kept_back_cannot_end_the_session_of_the_restarted_slav
     live = master._senders["left"].live
     wires.carry(hello, ("6.6.6.6", 6), MASTER, keep=False)
     assert master._senders["left"].pending is None
-    assert master.refused[Refusal.TWIN] == 1
+    assert master.refused[Refusal.DUPLICATE_SENDER] == 1
     wires.run(1.5)
     assert master._senders["left"].live is live
     assert master._senders["left"].pending is None
@@ -376,9 +376,9 @@ def test_who_speaks_for_another_camera_is_refused() -> None:
 def test_a_camera_that_the_rig_does_not_have_gets_no_session() -> None:
     wires = Wires()
     master = wires.new_master()
-    stranger = wires.new_slave("third")
+    unknown_peer = wires.new_slave("third")
     wires.run(1.0)
-    assert stranger._session is None
+    assert unknown_peer._session is None
     assert master.refused[Refusal.UNKNOWN] > 0
     assert not master._sessions
 
@@ -386,9 +386,9 @@ def test_a_camera_that_the_rig_does_not_have_gets_no_session() -> None:
 def test_without_the_rig_key_nothing_is_said_and_nothing_heard() -> None:
     wires = Wires()
     master = wires.new_master()
-    stranger = wires.new_slave("left", key=bytes(32))
+    unknown_peer = wires.new_slave("left", key=bytes(32))
     wires.run(1.0)
-    assert set(stranger.refused) == {Refusal.FOREIGN}
+    assert set(unknown_peer.refused) == {Refusal.FOREIGN}
     assert all(to == BROADCAST for _, _, to in wires.seen)
     tag = RigKeys(KEY).rig_tag  # the tag is no secret: forge with it
     nonce = bytes(16)

@@ -119,9 +119,9 @@ def test_an_imu_that_the_rig_does_not_have_gets_no_session() -> None:
     wires = Wires()
     master = wires.new_master(cameras=("left",), imus=("palm-imu",))
     wires.new_slave("left")
-    stranger = wires.new_slave("other-imu")
+    unknown_peer = wires.new_slave("other-imu")
     wires.run(1.0)
-    assert stranger._session is None
+    assert unknown_peer._session is None
     assert master.refused[Refusal.UNKNOWN] > 0
 
 

@@ -14,7 +14,7 @@ from common.messages import MarkerDetections, TagDetections, TrackerPose, WristD
 from common.session import RigKeys
 from master.ingest import Ingest
 from master.link import MasterLink
-from master.message_queue import ROOM
+from master.message_queue import CAPACITY
 from slave.link import SlaveLink
 from slave.uplink import Uplink
 from tests.loopback.test_handshake import BROADCAST, KEY, MASTER, S, Wires
@@ -304,13 +304,13 @@ def test_at_overload_each_kind_of_message_keeps_its_newest(stack: ExitStack) -> 
         ("left",), KEY, SystemClock(), ("127.255.255.255", 9), ("127.0.0.1", 0), "", trackers=("puck",)
     )
     stack.callback(ingest.close)
-    count = ROOM["tracker"] + 5
+    count = CAPACITY["tracker"] + 5
     for seq in range(count):
         for message in (detections("left", 1, seq), tags("left", 1, seq), tracker("puck", 1, seq)):
             ingest.queue.put([message])
-    taken = [ingest.get(0.0) for _ in range(sum(ROOM[kind] for kind in ("frame", "tags", "tracker")))]
+    taken = [ingest.get(0.0) for _ in range(sum(CAPACITY[kind] for kind in ("frame", "tags", "tracker")))]
     for kind, room in ((MarkerDetections, "frame"), (TagDetections, "tags"), (TrackerPose, "tracker")):
-        newest = list(range(count - ROOM[room], count))
+        newest = list(range(count - CAPACITY[room], count))
         assert [one.seq for one in taken if isinstance(one, kind)] == newest, kind
     assert ingest.get(0.0) is None
     assert ingest.counts["queue.dropped"] == 3 * count - len(taken)

@@ -118,16 +118,16 @@ def test_long_gap_restarts_from_the_value_itself() -> None:
 
 
 def test_zero_is_a_time_and_a_late_sample_changes_nothing() -> None:
-    machine, twin = OneEuro(PAPER), OneEuro(PAPER)
-    for m in (machine, twin):
+    machine, duplicate = OneEuro(PAPER), OneEuro(PAPER)
+    for m in (machine, duplicate):
         m.push(0, np.array([0.0]))
     second = machine.push(10_000_000, np.array([1.0]))
     assert 0.0 < second[0] < 1.0  # t = 0 was taken as the time before
-    assert twin.push(10_000_000, np.array([1.0])) == second
+    assert duplicate.push(10_000_000, np.array([1.0])) == second
     assert machine.push(10_000_000, np.array([50.0])) == second
     assert machine.push(4, np.array([50.0])) == second
     assert machine.late == 2
-    assert machine.push(20_000_000, np.array([2.0])) == twin.push(20_000_000, np.array([2.0]))
+    assert machine.push(20_000_000, np.array([2.0])) == duplicate.push(20_000_000, np.array([2.0]))
 
 
 @given(st.lists(st.sampled_from([0.3, -1.0, math.nan, math.inf]), min_size=2, max_size=40))

@@ -9,7 +9,7 @@ from common.messages import MarkerDetections
 from common.streams import sender_of
 from master.app import Solved
 from master.guard import SolverGuard, culprit
-from master.link_senders import Taken
+from master.link_senders import SensorMessage
 from master.quarantine import FIRST_NS, LONGEST_NS, MAX_CAUSES, Quarantine
 from tests.network_helpers import ManualClock, detections
 
@@ -24,7 +24,7 @@ class Fragile:
         self._at, self.poisoned = at, False
         self.taken: list[str] = []
 
-    def push(self, message: Taken) -> Iterator[Solved]:
+    def push(self, message: SensorMessage) -> Iterator[Solved]:
         assert isinstance(message, MarkerDetections)
         if message.area[0] == POISON:
             self.poisoned = True
@@ -63,17 +63,17 @@ class Scene:
         self.solver, self.renewed = Fragile(at), list[str]()
         self.guard = SolverGuard(self, self.quarantine, self.clock, self.renew, lambda _sender: Fragile(at))
 
-    def push_inner(self, message: Taken) -> Iterator[Solved]:
+    def push_inner(self, message: SensorMessage) -> Iterator[Solved]:
         return self.solver.push(message)
 
-    def push(self, message: Taken) -> Iterator[Solved]:
+    def push(self, message: SensorMessage) -> Iterator[Solved]:
         yield from self.solver.push(message)
 
     def renew(self, sender: str) -> None:
         self.renewed.append(sender)
         self.solver = Fragile(self.at)
 
-    def send(self, message: Taken) -> None:
+    def send(self, message: SensorMessage) -> None:
         assert list(self.guard.push(message)) == []
         if self.guard._repair is not None:
             self.guard._repair.join()

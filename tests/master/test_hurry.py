@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from common.messages import HandPose, MarkerDetections
-from master.hurry import MOST, Hurry, Shedding
-from master.message_queue import QUEUE, QUEUE_PER_CAMERA, ROOM, MessageQueue, Span, room
+from master.load_shedding import MOST, LoadShedding, Shedding
+from master.message_queue import CAPACITY, QUEUE, QUEUE_PER_CAMERA, MessageQueue, Span, room
 from master.rig_pipeline import build_pipeline
 from master.rig_setup import RigSetup
 from master.stages import StageTimes
@@ -72,7 +72,7 @@ class Lived:
     epochs: list[int]
     begun: list[int]
     told: list[int]
-    shed: int
+    dropped_epochs: int
 
     def ages_ms(self) -> list[float]:
         return [1e-6 * (told - epoch) for told, epoch in zip(self.told, self.epochs, strict=True)]
@@ -85,8 +85,8 @@ def lived(
     pauses: Iterable[tuple[int, int]] = (),
 ) -> Lived:
     """A master whose solver takes so long for each instant, and that stands still in `pauses` (begin, end)."""
-    queue, hurry, pairs, out = MessageQueue(2), Hurry([setup]), Paired(), Lived([], [], [], 0)
-    hurry.waiting, shed = queue.frame_spans, Shedding(hurry)
+    queue, load_shedding, pairs, out = MessageQueue(2), LoadShedding([setup]), Paired(), Lived([], [], [], 0)
+    load_shedding.waiting, dropped_epochs = queue.frame_spans, Shedding(load_shedding)
     waiting, now, still = deque(came), 0, deque(pauses)
     while waiting or queue.frames:
         if still and now >= still[0][0]:
@@ -98,10 +98,10 @@ def lived(
             now = waiting[0].t_ns
             continue
         assert isinstance(message, MarkerDetections)
-        hurry.look(message)
+        load_shedding.look(message)
         for epoch in pairs.push(message):
-            if shed():
-                out.shed += 1
+            if dropped_epochs():
+                out.dropped_epochs += 1
                 continue
             out.epochs.append(epoch)
             out.begun.append(now)
@@ -118,7 +118,7 @@ OFFSETS = pytest.mark.parametrize("offset_ns", [0, 1 * MS, PERIOD_NS // 2, PERIO
 def test_who_keeps_up_leaves_nothing_out(load: float, offset_ns: int) -> None:
     for jitter_ns in (0, 1 * MS, 4 * MS):
         out = lived(arrivals(5.0, offset_ns, jitter_ns), lambda _t: round(load * PERIOD_NS))
-        assert out.shed == 0
+        assert out.dropped_epochs == 0
         assert len(out.epochs) >= 299
 
 
@@ -126,7 +126,7 @@ def test_who_keeps_up_leaves_nothing_out(load: float, offset_ns: int) -> None:
 def test_cameras_of_different_rates_leave_nothing_out_either(rates_hz: tuple[float, float]) -> None:
     setup = setup_of(*rates_hz)
     out = lived(arrivals(5.0, 3 * MS, 3 * MS, rates_hz), lambda _t: round(0.8e9 / rates_hz[0]), setup)
-    assert out.shed == 0
+    assert out.dropped_epochs == 0
 
 
 @OFFSETS
@@ -137,13 +137,15 @@ def test_after_a_pause_the_newest_instant_is_solved_next(offset_ns: int) -> None
     pairs = Paired()
     newest = [t for one in came if one.t_ns <= end for t in pairs.push(one.message)][-1]
     assert next(t for t, begun in zip(out.epochs, out.begun, strict=True) if begun >= end) == newest
-    assert 4 <= out.shed <= 6, "what came in 100 ms, once; it is not behind any more"
+    assert 4 <= out.dropped_epochs <= 6, "what came in 100 ms, once; it is not behind any more"
     assert max(out.ages_ms()[-60:]) < 40.0
 
 
 def test_a_pause_of_a_few_ms_leaves_nothing_out() -> None:
     pauses = [(k * 500 * MS, k * 500 * MS + 8 * MS) for k in range(1, 10)]
-    assert lived(arrivals(5.0, 0, 1 * MS), lambda _t: round(0.75 * PERIOD_NS), pauses=pauses).shed == 0
+    assert (
+        lived(arrivals(5.0, 0, 1 * MS), lambda _t: round(0.75 * PERIOD_NS), pauses=pauses).dropped_epochs == 0
+    )
 
 
 @OFFSETS
@@ -172,50 +174,50 @@ def waits(**spans: tuple[int, int]) -> dict[str, Span]:
     ],
 )
 def test_instants_are_left_out_while_a_newer_one_waits(waiting: dict[str, Span], behind: bool) -> None:
-    hurry = Hurry([SETUP])
-    hurry.look(detections("left", 1, 0, 0))
-    hurry.waiting = lambda: waiting
-    hurry.look(detections("right", 1, 0, 0))
-    assert hurry.reject == (MOST if behind else 0)
+    load_shedding = LoadShedding([SETUP])
+    load_shedding.look(detections("left", 1, 0, 0))
+    load_shedding.waiting = lambda: waiting
+    load_shedding.look(detections("right", 1, 0, 0))
+    assert load_shedding.reject == (MOST if behind else 0)
 
 
 def test_nobody_waits_for_a_camera_that_is_silent() -> None:
-    hurry = Hurry([SETUP])
-    hurry.look(detections("right", 1, 0, 0))
-    hurry.waiting = lambda: waits(left=(21, 23))
-    hurry.look(detections("left", 1, 11, 11 * PERIOD_NS))
-    assert hurry.reject == 0
-    hurry.look(detections("left", 1, 13, 13 * PERIOD_NS))
-    assert hurry.reject == MOST
+    load_shedding = LoadShedding([SETUP])
+    load_shedding.look(detections("right", 1, 0, 0))
+    load_shedding.waiting = lambda: waits(left=(21, 23))
+    load_shedding.look(detections("left", 1, 11, 11 * PERIOD_NS))
+    assert load_shedding.reject == 0
+    load_shedding.look(detections("left", 1, 13, 13 * PERIOD_NS))
+    assert load_shedding.reject == MOST
 
 
 def test_what_is_no_frame_and_who_is_not_known_change_nothing() -> None:
-    hurry = Hurry([SETUP])
-    hurry.waiting = lambda: waits(left=(1, 1), right=(1, 1))
-    hurry.look(detections("third", 1, 0, 0))
-    hurry.look(cycle("wrist", 1, 0, 0))
-    assert hurry.reject == 0
-    hurry.look(detections("left", 1, 0, 0))
-    assert hurry.reject == MOST
+    load_shedding = LoadShedding([SETUP])
+    load_shedding.waiting = lambda: waits(left=(1, 1), right=(1, 1))
+    load_shedding.look(detections("third", 1, 0, 0))
+    load_shedding.look(cycle("wrist", 1, 0, 0))
+    assert load_shedding.reject == 0
+    load_shedding.look(detections("left", 1, 0, 0))
+    assert load_shedding.reject == MOST
 
 
 def test_a_master_that_has_no_time_but_for_messages_tells_some_instants() -> None:
-    hurry = Hurry()
-    hurry.reject, shedding = MOST, Shedding(hurry)
+    load_shedding = LoadShedding()
+    load_shedding.reject, shedding = MOST, Shedding(load_shedding)
     assert [shedding() for _ in range(2 * MOST + 2)] == 2 * [*[True] * MOST, False]
 
 
 def test_what_is_solved_next_to_rejected_frames_is_as_right_as_ever() -> None:
     run, queue = synthetic_run(24), MessageQueue(2)
-    hurry = Hurry([run.setup])
-    hurry.waiting, shed = queue.frame_spans, Shedding(hurry)
-    pipeline = build_pipeline(run.setup, StageTimes(), shed=shed)
+    load_shedding = LoadShedding([run.setup])
+    load_shedding.waiting, dropped_epochs = queue.frame_spans, Shedding(load_shedding)
+    pipeline = build_pipeline(run.setup, StageTimes(), dropped_epochs=dropped_epochs)
     poses: list[HandPose] = []
     for k in range(0, len(run.messages), 4):  # two instants come together, always
         queue.put(run.messages[k : k + 4])
         while (message := queue.get(0.0)) is not None:
             assert isinstance(message, MarkerDetections)
-            hurry.look(message)
+            load_shedding.look(message)
             poses += [one.pose for one in pipeline.push(message)]
     assert pipeline.counts["instants_shed"] == 11, "tracks begin with two frames, and so with two instants"
     assert len(poses) == pipeline.counts["poses"] == 13
@@ -229,4 +231,4 @@ def test_what_is_solved_next_to_rejected_frames_is_as_right_as_ever() -> None:
 
 @pytest.mark.parametrize(("cameras", "frames"), [(1, QUEUE), (2, QUEUE), (16, 16 * QUEUE_PER_CAMERA)])
 def test_many_cameras_have_more_room_and_samples_as_much(cameras: int, frames: int) -> None:
-    assert room(cameras) == ROOM | {"frame": frames, "tags": frames}
+    assert room(cameras) == CAPACITY | {"frame": frames, "tags": frames}

@@ -131,8 +131,8 @@ def test_a_rival_of_the_same_colour_within_reach_is_named() -> None:
 def test_a_thing_near_a_marker_never_seen_before_is_an_alternative_not_a_part_of_it(
     radius: float, gap: float, angle: float
 ) -> None:
-    away = 7.0 + gap + radius
-    thing = 265.0 + away * math.cos(angle), 110.0 + away * math.sin(angle)
+    connection_lost = 7.0 + gap + radius
+    thing = 265.0 + connection_lost * math.cos(angle), 110.0 + connection_lost * math.sin(angle)
     for found in push_all([render([*hand(), Disc(paint(1), *thing, radius)])] * 2):
         place, alternative = (np.hypot(*(uv[1] - (265.0, 110.0))) for uv in (found.uv, found.alternative_uv))
         assert min(place, alternative) < 0.3

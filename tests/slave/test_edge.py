@@ -45,9 +45,9 @@ def test_the_centre_of_a_covered_ellipse_is_found_from_its_own_edge(
     shares, seen_u, seen_v = covered_ellipse(a, a * aspect, rotation, u, v, share, side)
     found = centre_of(shares, moments(a, a * aspect, rotation), seen_u, seen_v)
     assert found is not None
-    away = math.hypot(found.u - u, found.v - v)
-    assert away < 0.3
-    assert away < 0.6 * math.hypot(seen_u - u, seen_v - v)
+    connection_lost = math.hypot(found.u - u, found.v - v)
+    assert connection_lost < 0.3
+    assert connection_lost < 0.6 * math.hypot(seen_u - u, seen_v - v)
 
 
 @given(

@@ -14,7 +14,7 @@ from common.messages import Message
 from slave.app import run, wait_for_start
 from slave.cameras.source import Frame
 from slave.markers.detector import Detections
-from slave.service import AWAY_S, WAITING, Service
+from slave.service import LOST_PATIENCE_S, WAITING, Service
 from slave.tally import Tally
 
 PERIOD_US = 4_000_000
@@ -106,8 +106,8 @@ def test_waiting_for_the_master_is_no_hang(manager: Manager) -> None:
 def test_a_lost_camera_has_more_time_and_the_first_frame_ends_it(manager: Manager) -> None:
     time = Time()
     service = begun(manager, time)
-    service.away("camera lost: no frame\nfor 2 s")
-    patience = f"WATCHDOG_USEC={round(AWAY_S * 1e6)}"
+    service.connection_lost("camera lost: no frame\nfor 2 s")
+    patience = f"WATCHDOG_USEC={round(LOST_PATIENCE_S * 1e6)}"
     assert manager.received() == [["STATUS=camera lost: no frame for 2 s", patience, "WATCHDOG=1"]]
     time.passes(80.0)
     service.working()
@@ -119,7 +119,7 @@ def test_a_lost_camera_has_more_time_and_the_first_frame_ends_it(manager: Manage
 
 def test_before_it_is_ready_a_slow_opening_asks_for_time_to_start(manager: Manager) -> None:
     service = Service(manager.environment(), Time())
-    service.away("opens the camera, in step with others", 150.0)
+    service.connection_lost("opens the camera, in step with others", 150.0)
     status = "STATUS=opens the camera, in step with others: may take 150 s"  # read by slave/install/systemd
     assert manager.received() == [[status, "EXTEND_TIMEOUT_USEC=150000000"]]
 
@@ -155,7 +155,7 @@ def test_on_a_terminal_nothing_is_told(environment: dict[str, str]) -> None:
         time.passes(60.0)
         service.working()
         service.waiting()
-        service.away("camera lost")
+        service.connection_lost("camera lost")
     service.stopping()
 
 

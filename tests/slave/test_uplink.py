@@ -42,10 +42,10 @@ def test_without_a_master_it_waits_and_drops(uplink: Uplink) -> None:
 def test_two_slaves_hear_one_broadcast_on_one_port(uplink: Uplink, port: int) -> None:
     other = Uplink("right", KEY, SystemClock(), port, "127.0.0.1")
     try:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-            stranger.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-            stranger.bind(("127.0.0.1", 0))
-            stranger.sendto(b"not a beacon", ("127.255.255.255", port))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as unknown_peer:
+            unknown_peer.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+            unknown_peer.bind(("127.0.0.1", 0))
+            unknown_peer.sendto(b"not a beacon", ("127.255.255.255", port))
         for slave in (uplink, other):
             assert until(lambda one=slave: one.counts.get("refused.foreign") == 1)
     finally:
@@ -55,8 +55,8 @@ def test_two_slaves_hear_one_broadcast_on_one_port(uplink: Uplink, port: int) ->
 def test_bound_to_every_network_it_hears_loopback_too(port: int) -> None:
     slave = Uplink("left", KEY, SystemClock(), port)
     try:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-            stranger.sendto(b"not a beacon", ("127.0.0.1", port))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as unknown_peer:
+            unknown_peer.sendto(b"not a beacon", ("127.0.0.1", port))
         assert until(lambda: slave.counts.get("refused.foreign") == 1)
     finally:
         slave.close()

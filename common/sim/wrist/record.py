@@ -18,7 +18,7 @@ from common.sim.record import (
     ANGLE_NAMES,
     FIRST_NS,
     Arrays,
-    TakenFrame,
+    RenderedFrame,
     named_angles,
     write_frames,
     write_truth,
@@ -135,12 +135,14 @@ class WristTake:
             note=f"rendered wrist scene, {scene.ambient} light, seed {scene.seed}",
         )
 
-    def frames(self) -> Iterator[TakenFrame]:
+    def frames(self) -> Iterator[RenderedFrame]:
         """All frames that are delivered."""
         renderer = WristRenderer(self._scene, self._name, self._step)
         shots = self._shots if self._faults is None else self._faults(self._shots)
         for shot, seq in _numbered(shots):
-            yield TakenFrame(self._name, seq, self._stamp(seq), shot.lit, renderer.render(shot.t_s, shot.lit))
+            yield RenderedFrame(
+                self._name, seq, self._stamp(seq), shot.lit, renderer.render(shot.t_s, shot.lit)
+            )
 
     def truth(self) -> Arrays:
         """One row per triple: the hand and the line at its laser frame, the finger tips at its LED frame."""

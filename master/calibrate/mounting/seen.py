@@ -54,7 +54,7 @@ class Fit:
         sigma: (T, 4, SEEN) these [m, px].
         shown: (T, 4, SEEN) as fitted.
         marker_m: Rms of what is left at the markers.
-        steps: Taken.
+        steps: SensorMessage.
     """
 
     unknown: Unknown

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from common.messages import CheckItem, Health
 from master.checklist.facts import CameraPlan, MasterNow, Plan, SenderNow
 from master.checklist.watch import ChecklistWatch
-from master.turned_away import Away, MarkerCounts
+from master.rejected_peers import MarkerCounts, RejectedPeer
 
 MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
 CAMERAS = (
@@ -28,9 +28,9 @@ class Bench:
     away: set[str] = field(default_factory=set[str])
     loss: dict[str, float] = field(default_factory=dict[str, float])
     rate: dict[str, float] = field(default_factory=dict[str, float])
-    twin: dict[str, Away | None] = field(default_factory=dict[str, Away | None])
-    stranger: dict[str, Away | None] = field(default_factory=dict[str, Away | None])
-    unproven: dict[str, Away | None] = field(default_factory=dict[str, Away | None])
+    duplicate: dict[str, RejectedPeer | None] = field(default_factory=dict[str, RejectedPeer | None])
+    unknown_peer: dict[str, RejectedPeer | None] = field(default_factory=dict[str, RejectedPeer | None])
+    unproven: dict[str, RejectedPeer | None] = field(default_factory=dict[str, RejectedPeer | None])
     markers: dict[str, MarkerCounts] = field(default_factory=dict[str, MarkerCounts])
     sigma_ns: dict[str, float | None] = field(default_factory=dict[str, float | None])
     disk_mb: float = 9000.0
@@ -100,8 +100,8 @@ class Bench:
                 self._add(name, "received", 0.0),
                 self._add(name, "lost", 0.0),
                 self.sigma_ns.get(name, 5e4),
-                self.twin.get(name),
-                self.stranger.get(name),
+                self.duplicate.get(name),
+                self.unknown_peer.get(name),
                 self.unproven.get(name),
                 self.markers.get(name),
             )

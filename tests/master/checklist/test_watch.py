@@ -9,7 +9,7 @@ from common.messages import CheckItem
 from master.checklist.facts import Verdict
 from master.checklist.moved_rule import MovedRule
 from master.checklist.watch import CODES
-from master.turned_away import Away, MarkerCounts
+from master.rejected_peers import MarkerCounts, RejectedPeer
 from tests.master.checklist.checked import MARKERS, Bench
 
 WITHIN_S = 2.0
@@ -60,12 +60,12 @@ def _disk(free_mb: float) -> Callable[[Bench], object]:
 
 def _stranger(bench: Bench) -> None:
     """Who speaks another version has no session: it is away, too."""
-    bench.stranger["right"] = Away("10.0.0.8", 9)
+    bench.unknown_peer["right"] = RejectedPeer("10.0.0.8", 9)
     bench.away.add("right")
 
 
 def _unproven(bench: Bench) -> None:
-    bench.unproven["right"] = Away("10.0.0.9", 11)
+    bench.unproven["right"] = RejectedPeer("10.0.0.9", 11)
     bench.away.add("right")
 
 
@@ -80,7 +80,7 @@ def _same_rig(bench: Bench) -> None:
 
 
 def _as_ours(bench: Bench) -> None:
-    bench.stranger.clear()
+    bench.unknown_peer.clear()
     bench.unproven.clear()
     bench.away.clear()
 
@@ -246,7 +246,7 @@ CASES = [
     Case(
         "twin_sender",
         "left",
-        _set("twin", "left", Away("10.0.0.7", 10)),
+        _set("twin", "left", RejectedPeer("10.0.0.7", 10)),
         _set("twin", "left", None),
         "the one at 10.0.0.7 is not taken",
         "--name",

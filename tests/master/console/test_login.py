@@ -334,7 +334,7 @@ def paths(routes: Iterable[BaseRoute], before: str = "") -> Iterator[tuple[str, 
             yield ("websocket" if isinstance(route, WebSocketRoute) else "http"), path
 
 
-def open_to_strangers(app: ASGIApp, found: Iterable[tuple[str, str]]) -> set[str]:
+def open_to_anybody(app: ASGIApp, found: Iterable[tuple[str, str]]) -> set[str]:
     """Paths that answer somebody who did not log in with anything but a refusal or the way to the login."""
 
     async def process_noise() -> set[str]:
@@ -366,15 +366,15 @@ def test_nothing_is_reached_without_the_login(state: ConsoleState) -> None:
     assert {page.route for page in PAGES} | {"/console/hands", "/console/camera/{camera}"} <= known
     assert any(path.startswith("/_nicegui_ws") for path in known)
     assert sum("/_nicegui/" in path for path in known) >= 5
-    assert open_to_strangers(app, [*found, ("http", "/nowhere"), ("http", "/openapi.json")]) == set()
-    assert open_to_strangers(app, [("http", "/login")]) == {"GET /login 200", "POST /login 400"}
+    assert open_to_anybody(app, [*found, ("http", "/nowhere"), ("http", "/openapi.json")]) == set()
+    assert open_to_anybody(app, [("http", "/login")]) == {"GET /login 200", "POST /login 400"}
     assert status(asyncio.run(ask(app, "/logout", "POST"))) == 303
 
 
 def test_the_walk_sees_a_path_that_is_open() -> None:
     app = FastAPI(openapi_url=None)
     app.add_api_route("/leak", lambda: "secret")
-    assert open_to_strangers(app, paths(app.routes)) == {"GET /leak 200", "POST /leak 405"}
+    assert open_to_anybody(app, paths(app.routes)) == {"GET /leak 200", "POST /leak 405"}
 
 
 # What the door is

@@ -67,9 +67,9 @@ def mean_within_at(
 
 
 @kernel
-def surer_at(now: Float, past: Float, boxed_room: Any, out: Float) -> None:
+def surer_at(now: Float, past: Float, boxed_scratch: Any, out: Float) -> None:
     """`master.estimator.certainty.surer`; the record in its array."""
-    surer(now, past, boxed_room[0], out)
+    surer(now, past, boxed_scratch[0], out)
 
 
 @kernel
@@ -103,18 +103,18 @@ def joint_covariances(
     seen: Bool,
     information: Float,
     boxed_work: Any,
-    boxed_room: Any,
+    boxed_scratch: Any,
     straight: Float,
     whole: Float,
 ) -> None:
     """Write the joints' covariances (26, 3, 3) [m^2] by derivatives alone, and with arcs."""
-    hand, settings, work, room = model.hand[0], model.settings[0], boxed_work[0], boxed_room[0]
+    hand, settings, work, scratch = model.hand[0], model.settings[0], boxed_work[0], boxed_scratch[0]
     rig = Rig(hand, model.mounts, model.cameras, model.device[0])
     angles_of(hand, x, work.angles, work.by)
     chains(hand, T, work.angles, work.R, work.P)
-    linear(hand, T, cov, work, room, straight)
-    linear(hand, T, cov, work, room, whole)
-    add_arcs(rig, settings, T, cov, seen, information, work, room, whole)
+    linear(hand, T, cov, work, scratch, straight)
+    linear(hand, T, cov, work, scratch, whole)
+    add_arcs(rig, settings, T, cov, seen, information, work, scratch, whole)
 
 
 @kernel
@@ -153,11 +153,11 @@ def predict_extras_at(
     dt_s: float,
     process_noise_rad2: float,
     boxed_belief: Any,
-    boxed_room: Any,
+    boxed_scratch: Any,
 ) -> None:
     """`master.estimator.extras.predict_extras`; records in their arrays."""
     predict_extras(
-        boxed_settings[0], boxed_state[0], dt_s, process_noise_rad2, boxed_belief[0], boxed_room[0]
+        boxed_settings[0], boxed_state[0], dt_s, process_noise_rad2, boxed_belief[0], boxed_scratch[0]
     )
 
 
@@ -170,7 +170,7 @@ def keep_extras_at(
     z: Float,
     cov: Float,
     scale: float,
-    boxed_room: Any,
+    boxed_scratch: Any,
 ) -> None:
     """`master.estimator.extras.keep_extras`; records in their arrays."""
-    keep_extras(boxed_settings[0], boxed_state[0], dt_s, boxed_belief[0], z, cov, scale, boxed_room[0])
+    keep_extras(boxed_settings[0], boxed_state[0], dt_s, boxed_belief[0], z, cov, scale, boxed_scratch[0])

@@ -45,9 +45,9 @@ def covariances(hand: FittedHand, cov: Float, seen: Bool, model: HandModel = RIG
         boxed(Device.none()),
     )
     straight, whole = np.empty((26, 3, 3)), np.empty((26, 3, 3))
-    room, information = Certainty.empty(len(cov), 16), np.asarray(np.linalg.inv(small_cov()), np.float64)
+    scratch, information = Certainty.empty(len(cov), 16), np.asarray(np.linalg.inv(small_cov()), np.float64)
     T, scratch = hand.T_rig_palm, boxed(Scratch.empty())
-    joint_covariances(rig, T, hand.x, cov, seen, information, scratch, boxed(room), straight, whole)
+    joint_covariances(rig, T, hand.x, cov, seen, information, scratch, boxed(scratch), straight, whole)
     return straight, whole
 
 

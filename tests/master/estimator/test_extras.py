@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.records import boxed
-from master.estimator.extras import ExtrasRoom, stationary_of
+from master.estimator.extras import ExtrasScratch, stationary_of
 from master.estimator.problem import Belief
 from master.estimator.settings import DEFAULT
 from master.estimator.state import HandState
@@ -29,7 +29,7 @@ class Extras:
         self.state = HandState.unknown(N, EXTRAS)
         self.state.stationary[:] = stationary_of(DEFAULT, loose=loose, tilt_rad=TILT_RAD)
         self.state.z_cov[:] = np.diag(self.state.stationary)
-        self.belief, self.room = Belief.none(N, EXTRAS), ExtrasRoom.empty(EXTRAS)
+        self.belief, self.scratch = Belief.none(N, EXTRAS), ExtrasScratch.empty(EXTRAS)
 
     @property
     def mean(self) -> Float:
@@ -46,7 +46,7 @@ class Extras:
     def after(self, dt_s: float, process_noise_rad2: float = 0.0) -> "Extras":
         """Step them, in place."""
         boxes = boxed(SETTINGS), boxed(self.state)
-        predict_extras_at(*boxes, dt_s, process_noise_rad2, boxed(self.belief), boxed(self.room))
+        predict_extras_at(*boxes, dt_s, process_noise_rad2, boxed(self.belief), boxed(self.scratch))
         return self
 
     def told(self, dt_s: float, information: Float, measured: Float, scale: float = 1.0) -> "Extras":
@@ -56,7 +56,7 @@ class Extras:
         cov = np.eye(6 + N + EXTRAS)
         cov[-EXTRAS:, -EXTRAS:] = scale * whole
         boxes = boxed(SETTINGS), boxed(self.state)
-        keep_extras_at(*boxes, dt_s, boxed(self.belief), mean, cov, scale, boxed(self.room))
+        keep_extras_at(*boxes, dt_s, boxed(self.belief), mean, cov, scale, boxed(self.scratch))
         return self
 
 

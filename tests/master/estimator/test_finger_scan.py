@@ -122,21 +122,21 @@ def test_what_is_chosen_lies_on_the_valley_and_its_spread_is_that_of_the_density
 def test_where_a_finger_was_decides_between_two_poses_that_look_alike(wrist_case: WristCase) -> None:
     """A finger that comes from either side of a pose with a twin stays on that side."""
     alone = pipeline(wrist_case)
-    twins: list[tuple[float, float, int]] = []
+    duplicates: list[tuple[float, float, int]] = []
     t_ns = 0
     for mcp in (15.0, 20.0, 24.0, 27.0, 30.0):
         for pip in (50.0, 60.0, 70.0, 80.0):
             t_ns += CYCLE_NS
             pose = pushed(alone, wrist_case.message(bent(mcp, pip), t_ns))
-            twins += [(mcp, pip, int(f)) for f in np.flatnonzero(pose.ambiguous)]
-    assert twins
+            duplicates += [(mcp, pip, int(f)) for f in np.flatnonzero(pose.ambiguous)]
+    assert duplicates
     kept = 0
-    for mcp, pip, f in twins:
+    for mcp, pip, f in duplicates:
         line = pipeline(wrist_case, continuous=True)
         for k in range(1, 11):
             pose = pushed(line, wrist_case.message(bent(mcp, pip + 10.0 - k), k * CYCLE_NS, unit=0.5))
         kept += int(abs(np.degrees(pose.angles_rad[f, PIP]) - pip) < 12.0)
-    assert kept >= 0.7 * len(twins)
+    assert kept >= 0.7 * len(duplicates)
 
 
 def test_a_finger_that_is_not_seen_is_not_searched(wrist_case: WristCase) -> None:

@@ -87,9 +87,9 @@ def test_far_from_its_limits_a_hand_stays_where_it_is() -> None:
 @settings(max_examples=50)
 def test_no_step_leaves_the_limits_and_what_cannot_move_does_not(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    low, room = rng.uniform(-1.0, 0.0, FREE), np.ones(FREE)
-    room[2] = 0.0
-    high = low + rng.uniform(0.0, 2.0, FREE) * room
+    low, scratch = rng.uniform(-1.0, 0.0, FREE), np.ones(FREE)
+    scratch[2] = 0.0
+    high = low + rng.uniform(0.0, 2.0, FREE) * scratch
     x = rng.uniform(low, high)
     x[0] = low[0]
     normal = problem(rng) * 10.0 ** rng.uniform(-3, 6)

@@ -127,7 +127,7 @@ def compiled() -> dict[str, int]:
     """How many types of arguments each kernel of line and estimator is compiled for."""
     counts: dict[str, int] = {}
     rooms = (master.fabrik.__path__, "master.fabrik."), (master.estimator.__path__, "master.estimator.")
-    for module in (module for room in rooms for module in pkgutil.iter_modules(*room)):
+    for module in (module for scratch in rooms for module in pkgutil.iter_modules(*scratch)):
         if not module.name.endswith("__main__"):
             kernels: dict[str, Any] = vars(importlib.import_module(module.name))
             counts |= {

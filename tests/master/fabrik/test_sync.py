@@ -299,7 +299,7 @@ def test_what_waited_for_a_partner_while_nothing_came_is_left_out(pause: int, ke
         late[:2] = late[1::-1]
     found = [epoch.t_ns for message in late for epoch in machine.push(message)]
     assert found == [5 * PERIOD] * kept + [back * PERIOD, (back + 1) * PERIOD]
-    assert machine.outdated == (not kept)
+    assert machine.stale == (not kept)
 
 
 def test_a_whole_pair_before_a_pause_is_told_whenever_it_is_complete() -> None:
@@ -309,7 +309,7 @@ def test_a_whole_pair_before_a_pause_is_told_whenever_it_is_complete() -> None:
         machine, [frame(c, k, t * PERIOD) for k, t in enumerate(times) for c in ("left", "right")]
     )
     assert [epoch.t_ns for epoch in found] == [t * PERIOD for t in times]
-    assert machine.outdated == 0
+    assert machine.stale == 0
 
 
 def test_three_cameras_meet_at_the_instant_of_the_first() -> None:

@@ -12,7 +12,7 @@ from common.errors import BusError, PhalanxError, RecordingError
 from common.messages import Backlog, Command, HandPose, Told
 from common.recording import open_messages
 from common.streams import MASTER
-from master.hurry import MOST
+from master.load_shedding import MOST
 from master.outputs.files import load_poses
 from master.recording.clock import ReplayClock
 from master.recording.files import recorded_setups
@@ -73,11 +73,11 @@ def test_every_speed_tells_what_was_told_live(run: RecordedRun, whole: tuple[Pas
 
 def test_what_a_master_that_fell_behind_left_out_is_left_out_again(tmp_path: Path, root: Path) -> None:
     bursts = [*[2] * 6, 16, 4, 4, 4, *[2] * 4]
-    (path, live), shed = overloaded_run(tmp_path / "run.mcap", root / "calib_json", bursts)
+    (path, live), dropped_epochs = overloaded_run(tmp_path / "run.mcap", root / "calib_json", bursts)
     recording = open_messages(path)
     output = [one.message for one in recording.read(["taken"]) if isinstance(one.message, Backlog)]
     assert [one.reject for one in output] == 4 * [MOST, 0]
-    assert (shed, live.counts["poses"]) == (10, FRAMES - 10)
+    assert (dropped_epochs, live.counts["poses"]) == (10, FRAMES - 10)
     setups = recorded_setups(recording)
     for passed in (Player(recording, setups, []).run(), Player(recording, setups, [], speed=2.0).run()):
         assert passed.digest.counts == live.counts

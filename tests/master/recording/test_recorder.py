@@ -17,7 +17,7 @@ from common.messages import Backlog, Command, Health, MarkerDetections, Message,
 from common.recording import MessageWriter, open_messages
 from common.streams import MASTER
 from common.zenoh_bus import ZenohBus
-from master.hurry import Hurry
+from master.load_shedding import LoadShedding
 from master.recording import feed, process
 from master.recording.feed import MasterClock
 from master.recording.lines import ProgressLine, events_of, progress_text
@@ -48,7 +48,7 @@ def test_the_tap_shows_only_while_somebody_asks_and_all_of_it_in_order() -> None
     bus, clock = LoopbackBus(), ManualClock(10)
     shown = bus.subscribe("taken", depth=100)
     tap = Tap(bus, clock)
-    source = Tapped(Listed(frames(9)), tap, Hurry())
+    source = Tapped(Listed(frames(9)), tap, LoadShedding())
     assert tap.counts == {}
     assert source.get(0.0) is not None
     assert source.get(0.0) is not None
@@ -84,7 +84,7 @@ def test_a_tap_from_the_beginning_shows_everything_until_its_recorder_is_gone() 
     tap.close()
 
 
-class Behind(Hurry):
+class Behind(LoadShedding):
     """So far behind, message by message."""
 
     def __init__(self, reject: list[int]) -> None:
@@ -96,10 +96,10 @@ class Behind(Hurry):
 
 
 def test_how_far_behind_the_master_is_comes_before_the_message_it_holds_for() -> None:
-    bus, hurry = LoopbackBus(), Behind([0, 3, 3, 3, 0, 0])
+    bus, load_shedding = LoopbackBus(), Behind([0, 3, 3, 3, 0, 0])
     shown = bus.subscribe("taken", depth=100)
     tap = Tap(bus, ManualClock(10))
-    source = Tapped(Listed(frames(6)), tap, hurry)
+    source = Tapped(Listed(frames(6)), tap, load_shedding)
     tap.lease()
     for number in range(7):
         if number == 3:

@@ -73,16 +73,16 @@ def test_three_hundred_strangers_and_broken_frames_leave_the_reader_its_poses() 
     feed = Feed(server)
     try:
         with connect(f"ws://127.0.0.1:{server.port}/hands", open_timeout=WAIT_S) as reader:
-            stranger = threading.Thread(target=assault, args=(("127.0.0.1", server.port), 300, 100, 3.0))
-            stranger.start()
+            unknown_peer = threading.Thread(target=assault, args=(("127.0.0.1", server.port), 300, 100, 3.0))
+            unknown_peer.start()
             read: list[int] = []
             answers: list[bytes] = []
-            while stranger.is_alive() or len(answers) < len(FRAMES):
+            while unknown_peer.is_alive() or len(answers) < len(FRAMES):
                 if len(answers) < len(FRAMES):
                     frame = len(answers)
                     answers.append(spoken(server.port, FRAMES[frame], WAIT_S if frame in ENDED else 0.5))
                 read.append(int(reader.recv(WAIT_S)))
-            stranger.join()
+            unknown_peer.join()
             last = feed.offered
             while read[-1] < last:  # what it reads is new again at once: nothing waited for the strangers
                 read.append(int(reader.recv(WAIT_S)))

@@ -253,7 +253,7 @@ def test_a_full_disk_is_told_and_leaves_what_runs(
         (big / "ballast").write_bytes(bytes(30_000_000))
         with pytest.raises(InstallError, match=r"MB free, a release needs 92 MB; make room there"):
             board.install(big)
-        monkeypatch.setattr(release, "_check_room", _enough)  # as if somebody else filled it meanwhile
+        monkeypatch.setattr(release, "_check_space", _enough)  # as if somebody else filled it meanwhile
         (disk / "filler").write_bytes(bytes(40_000_000))
         with pytest.raises(InstallError, match="No space left on device"):
             board.install(big)

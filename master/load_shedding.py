@@ -7,7 +7,7 @@ queue, and every other camera has one there that is not older. So what is left o
 what is solved in its place: datagrams that come together, and jitter of less than half a period, leave nothing out
 while the solver takes less than a period (waiting is then never longer than the jitter: Lindley's recursion).
 
-How much waits is looked at once for each message that is taken, and nothing but `Hurry.reject` comes of it: with the
+How much waits is looked at once for each message that is taken, and nothing but `LoadShedding.reject` comes of it: with the
 messages and that number, what is solved can be solved again bit for bit (`master.recording`).
 """
 
@@ -67,7 +67,7 @@ class Cameras:
         return all(waiting[name].newest_ns + self.centre_ns[name] >= next_ns for name in received)
 
 
-class Hurry:
+class LoadShedding:
     """Whether a master is behind. Holds the time of the last frame of each camera.
 
     Attributes:
@@ -103,12 +103,12 @@ class Hurry:
 class Shedding:
     """Asked for each instant of one hand whether it is left out. Holds how many in a row were."""
 
-    def __init__(self, hurry: Hurry) -> None:
-        """Leave out what `hurry` says."""
-        self._hurry = hurry
+    def __init__(self, load_shedding: LoadShedding) -> None:
+        """Leave out what `load_shedding` says."""
+        self._load_shedding = load_shedding
         self._in_a_row = 0
 
     def __call__(self) -> bool:
         """Whether the next instant is left out."""
-        self._in_a_row = self._in_a_row + 1 if self._in_a_row < self._hurry.reject else 0
+        self._in_a_row = self._in_a_row + 1 if self._in_a_row < self._load_shedding.reject else 0
         return self._in_a_row > 0

@@ -20,7 +20,7 @@ _POLL_NS = 100_000_000  # a flood of hellos of another version costs one unseali
 SeenT = TypeVar("SeenT")
 
 
-class Away(NamedTuple):
+class RejectedPeer(NamedTuple):
     """Where somebody who was turned away speaks from: host, and what wire version."""
 
     host: str
@@ -34,25 +34,25 @@ class MarkerCounts(NamedTuple):
     expected: int
 
 
-class TurnedAway:
+class RejectedPeers:
     """Push machine. Holds of each sender of the rig when it was last turned away, and from where."""
 
     def __init__(self, keys: RigKeys, names: Iterable[str]) -> None:
         """Nobody was, yet; `names` are those of the rig."""
         self._keys, self._names = keys, frozenset(names)
-        self._twins: dict[str, tuple[int, Away]] = {}
-        self._versions: dict[str, tuple[int, Away]] = {}
-        self._unproven: dict[str, tuple[int, Away]] = {}
+        self._duplicates: dict[str, tuple[int, RejectedPeer]] = {}
+        self._versions: dict[str, tuple[int, RejectedPeer]] = {}
+        self._unproven: dict[str, tuple[int, RejectedPeer]] = {}
         self._markers: dict[str, tuple[int, MarkerCounts]] = {}
         self._next_ns: int | None = None
 
-    def twin(self, name: str, host: str, version: int, t_ns: int) -> None:
+    def duplicate(self, name: str, host: str, version: int, t_ns: int) -> None:
         """A second process under `name` said hello at `t_ns` [ns] while the first one was well."""
-        self._twins[name] = t_ns, Away(host, version)
+        self._duplicates[name] = t_ns, RejectedPeer(host, version)
 
     def unproven(self, name: str, host: str, version: int, t_ns: int) -> None:
         """Somebody at `host` said hello at `t_ns` [ns] as `name`, without that device's secret."""
-        self._unproven[name] = t_ns, Away(host, version)
+        self._unproven[name] = t_ns, RejectedPeer(host, version)
 
     def marker_count(self, name: str, sent: int, expected: int, t_ns: int) -> None:
         """The slave `name` sent another number of markers than its rig has here.
@@ -71,17 +71,17 @@ class TurnedAway:
         self._next_ns = t_ns + _POLL_NS
         name = self._keys.name_in(Header(Kind.HELLO, key_id, counter), datagram)
         if name in self._names:
-            self._versions[name] = t_ns, Away(host, version)
+            self._versions[name] = t_ns, RejectedPeer(host, version)
 
-    def twins(self, t_ns: int) -> dict[str, Away]:
+    def duplicates(self, t_ns: int) -> dict[str, RejectedPeer]:
         """Name -> where its second process is, as of `t_ns` [ns]."""
-        return _lately(self._twins, t_ns)
+        return _lately(self._duplicates, t_ns)
 
-    def versions(self, t_ns: int) -> dict[str, Away]:
+    def versions(self, t_ns: int) -> dict[str, RejectedPeer]:
         """Name -> where it is and what it speaks, as of `t_ns` [ns]."""
         return _lately(self._versions, t_ns)
 
-    def secrets(self, t_ns: int) -> dict[str, Away]:
+    def secrets(self, t_ns: int) -> dict[str, RejectedPeer]:
         """Name -> where somebody says hello without its secret, as of `t_ns` [ns]."""
         return _lately(self._unproven, t_ns)
 
