@@ -21,7 +21,7 @@ from common.messages import MarkerDetections
 from common.object_profile import ObjectProfile
 from common.sim.scenes import scene_by_name
 from master.gestures.recogniser import GestureRecogniser
-from master.objects.contact import ContactWatch
+from master.objects.contact import ContactMonitor
 from master.objects.line import ObjectLine
 from master.rig import load_setup
 from master.rig_pipeline import build_pipeline
@@ -58,7 +58,7 @@ def costs_of(name: str, seconds: float) -> dict[str, Float]:
     setup = load_setup(CALIBRATION, f"desk-{name}")
     profile = load(CALIBRATION / f"objects/{name}.json", ObjectProfile)
     pipeline, line = build_pipeline(setup, StageTimes()), ObjectLine(profile, setup.rig, setup.models)
-    contact, gestures = ContactWatch(setup.hand, [profile]), GestureRecogniser(setup.gestures, setup.hand)
+    contact, gestures = ContactMonitor(setup.hand, [profile]), GestureRecogniser(setup.gestures, setup.hand)
     told = list(detections(profile, setup.rig.markers, setup.models, _way(OBJECTS[name]), seconds, SEED))
     spent: dict[str, list[float]] = {part: [] for part in ("hand", "object", "contact", "gestures")}
     waits = dict.fromkeys(spent, 0.0)

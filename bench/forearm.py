@@ -153,10 +153,10 @@ class Arm:
 
     def heading(self, sample: ImuSample) -> float:
         """The heading [rad] of the filter's world against the rig, at a sample."""
-        world = (
+        dispatcher = (
             quaternion_to_matrix(sample.orientation_wxyz) @ quaternion_to_matrix(np.array(IMU.q_palm_imu)).T
         )
-        off = quaternion_to_matrix(np.array(_WORLD)).T @ self.lies(sample.seq / IMU.rate_hz) @ world.T
+        off = quaternion_to_matrix(np.array(_WORLD)).T @ self.lies(sample.seq / IMU.rate_hz) @ dispatcher.T
         return atan2(off[1, 0] - off[0, 1], off[0, 0] + off[1, 1])
 
 

@@ -63,7 +63,7 @@ def by_markers(number: int, seconds: float = SECONDS) -> dict[str, Told]:
     model = HandModel.of(who.hand)
     motion = StudyPoses(model, view_centre(four.rig), _MOTION + number)
     scene = Scene.of_motion(four.rig, four.cameras, who.hand, motion, _MOTION + number)
-    messages = _watched(scene, seconds)
+    messages = _monitored(scene, seconds)
     return {name: _told(_known(_setup(name), who), messages, motion) for name in ("desk", "desk4")}
 
 
@@ -81,7 +81,7 @@ def by_both(number: int, seconds: float = SECONDS) -> dict[str, Told]:
     alone = _known(marked, who)
     wrist = RigSetup.of(file, wrist_setup.cameras, alone.hand)
     both = Both("both-poses", seed, scene, device, alone, wrist)
-    markers = _watched(scene, seconds)
+    markers = _monitored(scene, seconds)
     everything = in_order([*markers, *orientations(both, seconds), *cycles_of(both, seconds)[0]])
     return {
         "desk-back3": _told(alone, markers, posed),
@@ -89,7 +89,7 @@ def by_both(number: int, seconds: float = SECONDS) -> dict[str, Told]:
     }
 
 
-def _watched(scene: Scene, seconds: float) -> list[Observed]:
+def _monitored(scene: Scene, seconds: float) -> list[Observed]:
     """What the cameras' slaves send of the scene."""
     out: list[Observed] = []
     for camera in scene.rig.cameras:

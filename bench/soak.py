@@ -15,10 +15,10 @@ from dataclasses import asdict
 from pathlib import Path
 
 from bench.local_rig import join_bus
+from bench.soak_monitor import Minute, SoakHistory, Watch
 from bench.soak_plot import draw
 from bench.soak_rig import SoakSettings, running
 from bench.soak_verdict import Finding, judge
-from bench.soak_watch import Minute, SoakHistory, Watch
 from common.replacing import replacing
 from master.stopping import stop_on_signals
 

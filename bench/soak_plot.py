@@ -7,9 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from bench.soak_monitor import SoakHistory
 from bench.soak_steps import steps_of
 from bench.soak_verdict import memory_slope, slope, warm_up_s
-from bench.soak_watch import SoakHistory
 
 _COLOURS = ("#14507a", "#b0473a", "#e0a030", "#3f8f5b", "#7a5ca8")
 _GREY = "#777777"

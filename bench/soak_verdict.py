@@ -12,8 +12,8 @@ from math import nan, sqrt
 
 import numpy as np
 
+from bench.soak_monitor import Minute, SoakHistory
 from bench.soak_steps import STEP_MB, Step, steps_of
-from bench.soak_watch import Minute, SoakHistory
 from common.arrays import Float
 
 MB_PER_H = 1.0

@@ -125,7 +125,7 @@ def log_why_alone(
         closing: Ends the thread.
     """
 
-    def watch() -> None:
+    def monitor() -> None:
         message, since = "", time.monotonic()
         while not closing.wait(_POLL_S):
             now = time.monotonic()
@@ -137,6 +137,6 @@ def log_why_alone(
                     _LOG.warning("bus (%s): %s", where, why)
                 message = why
 
-    thread = threading.Thread(target=watch, name="bus alone", daemon=True)
+    thread = threading.Thread(target=monitor, name="bus alone", daemon=True)
     thread.start()
     return thread

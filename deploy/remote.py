@@ -177,7 +177,7 @@ def run_bounded(
     assert child.stderr is not None
     errors: list[str] = []
     threads = [
-        threading.Thread(target=_feed, args=(child.stdin, send), daemon=True),
+        threading.Thread(target=_write_input, args=(child.stdin, send), daemon=True),
         threading.Thread(target=_lines, args=(child.stdout, on_line), daemon=True),
         threading.Thread(target=_lines, args=(child.stderr, errors.append), daemon=True),
     ]
@@ -198,7 +198,7 @@ def run_bounded(
     return code, [line for line in errors if line.strip()]
 
 
-def _feed(pipe: IO[bytes], content: bytes) -> None:
+def _write_input(pipe: IO[bytes], content: bytes) -> None:
     with contextlib.suppress(BrokenPipeError), pipe:
         pipe.write(content)
 

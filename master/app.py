@@ -127,11 +127,11 @@ class RunFigures:
 class Observed(Generic[SeenT]):
     """A solver, with measurements of the cameras' messages around it.
 
-    Rates are counted before it; `watch` is called once all is out.
+    Rates are counted before it; `monitor` is called once all is out.
     """
 
-    def __init__(self, solver: Solver[SeenT], rates: CameraRates, watch: Callable[[SeenT], None]) -> None:
-        self._solver, self._rates, self._watch = solver, rates, watch
+    def __init__(self, solver: Solver[SeenT], rates: CameraRates, monitor: Callable[[SeenT], None]) -> None:
+        self._solver, self._rates, self._monitor = solver, rates, monitor
 
     def push(self, message: SeenT | AuxiliaryMessage) -> Iterator[Solved]:
         """Take one message; give what it completes."""
@@ -140,7 +140,7 @@ class Observed(Generic[SeenT]):
             return
         self._rates.push(message)
         yield from self._solver.push(message)
-        self._watch(message)
+        self._monitor(message)
 
 
 def run(
@@ -179,9 +179,9 @@ def health(
     times: Mapping[str, float] | None = None,
 ) -> Health:
     """The master's report; gauges tell what a camera runs at (camera_hz.NAME) from what is solved (poses_per_s)."""
-    gauges = {name: value for name, value in figures.summary().items() if name != "poses"}
-    gauges |= {f"camera_hz.{camera}"[:_NAME]: hz for camera, hz in figures.rates.camera_hz.items()}
-    gauges |= times or {}
+    metrics = {name: value for name, value in figures.summary().items() if name != "poses"}
+    metrics |= {f"camera_hz.{camera}"[:_NAME]: hz for camera, hz in figures.rates.camera_hz.items()}
+    metrics |= times or {}
     told = {name: number for name, number in figures.told.items() if number}
     events = {"poses": figures.poses} | told | counts
-    return Health("master", session, clock.now_ns(), events, gauges, *program())
+    return Health("master", session, clock.now_ns(), events, metrics, *program())

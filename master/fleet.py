@@ -76,7 +76,7 @@ class Roll:
 
     def _device(self, name: str, now_s: float) -> Device:
         master = self._last.get(MASTER)
-        told = {} if master is None else master.gauges
+        told = {} if master is None else master.metrics
         rate = self._rate(name)
         clock = (told.get(f"{name}.clock_offset_us"), told.get(f"{name}.clock_sigma_us"))
         own = self._last.get(name)
@@ -93,14 +93,14 @@ class Roll:
             if rate
             else "waiting"
         )
-        gauges = own.gauges
-        throttled = gauges.get("throttled")
+        metrics = own.metrics
+        throttled = metrics.get("throttled")
         return Device(
             name,
             state,
             own.host,
             own.version,
-            gauges.get("temperature_c"),
+            metrics.get("temperature_c"),
             None if throttled is None else bool(throttled),
             rate,
             *clock,

@@ -11,13 +11,13 @@ from common.streams import MASTER
 from common.zenoh_bus import ZenohBus
 from master.admission import limits_of
 from master.app import RunFigures, health
+from master.clock_monitor import ClockMonitor
+from master.dispatcher import Dispatcher
+from master.extrinsics_monitor import ExtrinsicsMonitor
 from master.ingest import Ingest
-from master.odd_watch import OddWatch
-from master.recording.tap import Tap
+from master.recording.probe import Probe
 from master.rejected_peers import MarkerCounts
-from master.time_watch import TimeWatch
 from master.tuning import LivePipeline, RigTuning
-from master.world import World
 
 _REPORT_S = 1.0
 
@@ -35,21 +35,21 @@ class Reporter:
         clock: Clock,
         bus: ZenohBus,
         ingest: Ingest,
-        world: World,
-        extrinsics: Sequence[tuple[OddWatch, LivePipeline]],
+        dispatcher: Dispatcher,
+        extrinsics: Sequence[tuple[ExtrinsicsMonitor, LivePipeline]],
         tuning: RigTuning | None,
-        watch: TimeWatch,
+        monitor: ClockMonitor,
         figures: RunFigures,
-        tap: Tap,
+        probe: Probe,
         stop: threading.Event,
         notify: Callable[[str], None],
     ) -> None:
         """Be there on the bus from now on; `work` belongs to a thread."""
         self.session = secrets.randbits(63)
         self._cameras, self._trackers, self._clock, self._bus = cameras, trackers, clock, bus
-        self._ingest, self._world, self._figures = ingest, world, figures
-        self._tuning, self._watch, self._extrinsics = tuning, watch, extrinsics
-        self._tap, self._stop, self._notify = tap, stop, notify
+        self._ingest, self._dispatcher, self._figures = ingest, dispatcher, figures
+        self._tuning, self._monitor, self._extrinsics = tuning, monitor, extrinsics
+        self._probe, self._stop, self._notify = probe, stop, notify
         self._mismatched: frozenset[str] = frozenset()
         bus.announce(MASTER)
         bus.serve(MASTER, self.answer)
@@ -59,8 +59,8 @@ class Reporter:
         events = self._ingest.counts | self._bus.counts
         told = {name: number for name, number in events.items() if number or name.endswith("received")}
         changes = {} if self._tuning is None else self._tuning.counts()
-        counts = dict(self._world.counts) | told | changes | self._tap.counts
-        times = dict(self._watch.gauges(self._ingest.clock_of)) | (
+        counts = dict(self._dispatcher.counts) | told | changes | self._probe.counts
+        times = dict(self._monitor.metrics(self._ingest.clock_of)) | (
             {"open_bus": 1.0} if self._bus.open else {}
         )
         return health(self.session, self._clock, self._figures, counts, times)
@@ -73,7 +73,7 @@ class Reporter:
             CalibrationError: The files cannot be used; the old ones still are.
             ValueError: Another verb; the asker reads which ones there are.
         """
-        verbs = {"report": lambda: None, "stop": self._stop.set, "tap": self._tap.lease}
+        verbs = {"report": lambda: None, "stop": self._stop.set, "tap": self._probe.lease}
         if self._tuning is not None:
             tuning = self._tuning
             verbs |= {"reload": tuning.reload, "filter": lambda: tuning.try_filter(command.body)}
@@ -118,9 +118,9 @@ class Reporter:
         try:
             if self._tuning is not None:
                 self._tuning.look()
-                self._watch.follow(self._tuning.setups)
+                self._monitor.follow(self._tuning.setups)
                 self._ingest.limit(limits_of(self._tuning.setups))
-            lines = self._watch.look()
+            lines = self._monitor.look()
             lines += [
                 line for extrinsics, pipeline in self._extrinsics for line in extrinsics.look(pipeline.counts)
             ]

@@ -92,10 +92,10 @@ class LoadShedding:
         """A message was taken: see what waits behind it. Only with a frame it changes what is left out."""
         if not isinstance(message, Detections):
             return
-        waiting, watched = self.waiting(), self._cameras.get(message.camera)
+        waiting, monitored = self.waiting(), self._cameras.get(message.camera)
         self._newest_ns[message.camera] = message.t_ns
-        behind = bool(waiting and watched) and all(
-            cameras.newer_waits(waiting, self._newest_ns, message.t_ns) for cameras in watched or ()
+        behind = bool(waiting and monitored) and all(
+            cameras.newer_waits(waiting, self._newest_ns, message.t_ns) for cameras in monitored or ()
         )
         self.reject = MOST if behind else 0
 

@@ -1,4 +1,4 @@
-"""The same line offline: detections of every camera and a recording's calibration -> all that a `World` tells, scored.
+"""The same line offline: detections of every camera and a recording's calibration -> all that a `Dispatcher` tells, scored.
 
 No clock is read for the poses: messages are pushed in the order of their capture times, so two runs write the
 same bytes. Only the stage times of the summary are measured.
@@ -28,6 +28,7 @@ from common.messages import (
     WristDetections,
 )
 from master.app import Solved
+from master.dispatcher import Dispatcher
 from master.object_score import load_object_truth, score_object, score_objects
 from master.outputs.files import RunFiles, path_of_hand
 from master.outputs.poses import Poses
@@ -43,7 +44,6 @@ from master.sequence import CYCLE_FRAMES
 from master.sequence import Sequence as FrameSequence
 from master.stages import StageTimes
 from master.summary import write_summary
-from master.world import World
 from master.wrist_score import cycles_missed, load_wrist_truth, score_cycles, score_tips, score_wrist
 
 
@@ -124,23 +124,23 @@ def solve_hands(
     pipelines = [
         pipeline_of(setup, stage, continuous=continuous) for setup, stage in zip(setups, stages, strict=True)
     ]
-    world = World(setups, pipelines, stages[0], gestures=continuous)
+    dispatcher = Dispatcher(setups, pipelines, stages[0], gestures=continuous)
     counts = {setup.hand.profile.name: len(setup.markers) for setup in setups}
     files = RunFiles(out / "poses.npz", counts, [one.name for setup in setups for one in setup.objects])
     told = _Told({name: [] for name in counts})
     messages = _messages(recording, setups, detections)
     done = 0
     for message in heapq.merge(*(samples for samples, _ in sensed), messages, key=lambda one: one.t_ns):
-        told.take(world.push(message), files)
+        told.take(dispatcher.push(message), files)
         if not isinstance(message, ImuSample):
             if not isinstance(message, TagDetections):
                 told.rates.push(message)
             progress(done := done + 1, len(messages))
-    told.take(world.flush(), files)
+    told.take(dispatcher.flush(), files)
     files.close()
     summaries: list[dict[str, object]] = []
     for number, (setup, pipeline, stage) in enumerate(zip(setups, pipelines, stages, strict=True)):
-        auxiliary = dict[str, int]() if number else world.auxiliary_counts
+        auxiliary = dict[str, int]() if number else dispatcher.auxiliary_counts
         own = [one for one in messages if not isinstance(one, TagDetections) and one.camera in setup.cameras]
         summary = _summarise(recording, setup, own, told.poses[setup.hand.profile.name]) | {
             "camera_hz": {name: hz for name, hz in told.rates.camera_hz.items() if name in setup.cameras},

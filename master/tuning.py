@@ -1,7 +1,7 @@
 """Other geometry, depth model, filter, hand, object or gestures while the master tracks: a new pipeline takes the old
 one's place.
 
-Each hand has a pipeline, and only those change whose files did; objects and gestures change together (`master.world`).
+Each hand has a pipeline, and only those change whose files did; objects and gestures change together (`master.dispatcher`).
 
 The new pipeline is built on another thread and shown the last messages, so that its tracks, filter and hand stand when
 it takes over, between two messages. An instant is never solved twice: poses go on with rising times.
@@ -20,14 +20,14 @@ from common.arrays import Float
 from common.calibration import FilterCalibration, parse
 from common.calibration_parts import Part
 from common.errors import CalibrationError, PhalanxError
+from common.file_monitor import MonitoredFiles
 from common.messages import Detections, Name
-from common.watching import WatchedFiles
+from master.dispatcher import Dispatcher
 from master.estimator.pipeline import SolvedPose, Stage
 from master.needs_restart import refuse_other_hands, refuse_restart
 from master.rig import RigFiles
 from master.rig_pipeline import Pipeline, pipeline_of
 from master.rig_setup import RigSetup
-from master.world import World
 
 _WARM_FRAMES = 6  # of each camera: tracks need two, and the shipped 1 € filter has settled after 0.1 s
 _CLOSE_FRAMES = 2  # of each camera: what may be left for the loop to catch up with
@@ -189,15 +189,15 @@ class RigTuning:
         setups: Sequence[RigSetup],
         pipelines: Sequence[LivePipeline],
         notify: Callable[[str], None],
-        world: World | None = None,
+        dispatcher: Dispatcher | None = None,
     ) -> None:
         """Follow `files`, which say `setups`, and change `pipelines`; `notify` is told one line for each change.
 
-        Objects and gestures are those of `world`; None: nobody asks for any.
+        Objects and gestures are those of `dispatcher`; None: nobody asks for any.
         """
-        self._files, self._notify, self._world = files, notify, world
+        self._files, self._notify, self._dispatcher = files, notify, dispatcher
         self._setups, self._pipelines = tuple(setups), tuple(pipelines)
-        self._watched = WatchedFiles()
+        self._monitored = MonitoredFiles()
         self._lock = threading.Lock()
         self._applied = self._refused = 0
 
@@ -213,7 +213,7 @@ class RigTuning:
     def look(self) -> None:
         """Use the files if they were changed; where that fails, say so once and go on as before."""
         with self._lock:
-            changed = self._watched.changed(self._files.paths(self._setups))
+            changed = self._monitored.changed(self._files.paths(self._setups))
         if not changed:
             return
         try:
@@ -248,7 +248,7 @@ class RigTuning:
     def renew(self, sender: str) -> None:
         """As the function `renew`, of the setups in use."""
         with self._lock:
-            renew(self._setups, self._pipelines, self._world, sender)
+            renew(self._setups, self._pipelines, self._dispatcher, sender)
 
     def _use(self, get: Callable[[], Sequence[RigSetup]]) -> bool:
         """Have these setups in use, all or none; False if they were."""
@@ -260,10 +260,10 @@ class RigTuning:
                 refuse_restart(old, new)
             changed = [(old, new, line) for old, new, line in both if _content(old) != _content(new)]
             switches = [line.prepare(new) for _, new, line in changed]
-            if self._world is not None and any(
+            if self._dispatcher is not None and any(
                 _auxiliary_inputs(old) != _auxiliary_inputs(new) for old, new, _ in both
             ):
-                switches.append(self._world.prepare(setups))
+                switches.append(self._dispatcher.prepare(setups))
         except PhalanxError:
             self._refused += 1
             raise
@@ -277,7 +277,7 @@ class RigTuning:
 
 
 def renew(
-    setups: Sequence[RigSetup], pipelines: Sequence[LivePipeline], world: World | None, sender: str
+    setups: Sequence[RigSetup], pipelines: Sequence[LivePipeline], dispatcher: Dispatcher | None, sender: str
 ) -> None:
     """Let new solvers take over from all that `sender` feeds: the state of the old ones may be broken.
 
@@ -290,8 +290,8 @@ def renew(
     for setup, pipeline in zip(setups, pipelines, strict=True):
         if sender in setup.senders:
             pipeline.renew()
-    if world is not None:
-        world.prepare(setups)()
+    if dispatcher is not None:
+        dispatcher.prepare(setups)()
 
 
 def _with_filter(setups: Sequence[RigSetup], trial: FilterTrial) -> list[RigSetup]:

@@ -16,6 +16,7 @@ from common.zenoh_bus import ZenohBus
 from slave.app import run, run_wrist, wait_for_start
 from slave.cameras.source import FrameSource
 from slave.colour_sampler import ColourSampler
+from slave.counters import Counters
 from slave.light_report import LightReport
 from slave.markers.ambiguity import told_frames, told_places
 from slave.markers.calibrated import CalibratedDetector
@@ -31,7 +32,6 @@ from slave.raw import RawFrames, RawSettings
 from slave.report import Numbers, Reporter
 from slave.service import Service
 from slave.tags.live import LiveTags, finder_of
-from slave.tally import Tally
 from slave.tuning import CameraFiles, CameraTuning, Prepare
 from slave.uplink import Uplink
 from slave.wrist.detector import WristDetector
@@ -161,18 +161,18 @@ def _marker_line(
     rig, alive = files.rig, service.working
     tags = LiveTags(files.camera, files.objects)
     if colours == "none":
-        null_detector, tally = NullDetector(len(rig.markers)), Tally(rig.markers, tags.counts)
+        null_detector, counters = NullDetector(len(rig.markers)), Counters(rig.markers, tags.counts)
         plain = Previews(name, clock)
         return _Line(
-            lambda: run(source, null_detector, uplink, name, tally, stop, plain.offer, alive=alive),
-            tally,
+            lambda: run(source, null_detector, uplink, name, counters, stop, plain.offer, alive=alive),
+            counters,
             plain,
             None,
         )
     make = _maker(files, colours, engine, workers)
     choice = ScanChoice(scan, files.camera)
     detector = ReloadableDetector(make(files.camera, rig), choice)
-    tally = Tally(
+    counters = Counters(
         rig.markers,
         lambda: (
             tags.counts()
@@ -183,12 +183,12 @@ def _marker_line(
         lambda: told_places(detector.plain),
     )
     previews = Previews(name, clock, MarkerOverlay(detector, rig.markers))
-    numbers, seen = tally, previews.offer
+    numbers, seen = counters, previews.offer
     if colours == "follow":
-        numbers = LightReport(name, detector, tally, rig.markers, previews.offer)
+        numbers = LightReport(name, detector, counters, rig.markers, previews.offer)
         seen = numbers.offer
     return _Line(
-        lambda: run(source, detector, uplink, name, tally, stop, seen, tags, alive),
+        lambda: run(source, detector, uplink, name, counters, stop, seen, tags, alive),
         numbers,
         previews,
         _both(marker_changes(detector, make), _tag_changes(tags)),
@@ -238,20 +238,20 @@ def _wrist_line(
 ) -> _Line:
     alive = service.working
     if colours == "none":
-        tally, plain = Tally(()), Previews(name, clock)
+        counters, plain = Counters(()), Previews(name, clock)
         return _Line(
-            lambda: run_wrist(source, NullWristDetector(), uplink, name, tally, stop, plain.offer, alive),
-            tally,
+            lambda: run_wrist(source, NullWristDetector(), uplink, name, counters, stop, plain.offer, alive),
+            counters,
             plain,
             None,
         )
     detector = WristDetector(view_of(files), files.camera.frame_rate_hz, engine=engine)
     names = tuple(f"{what}.{finger}" for what in ("laser", "tip") for finger in FINGERS)
-    tally = Tally(names, lambda: {f"strobe.{event}": count for event, count in detector.counts.items()})
+    counters = Counters(names, lambda: {f"strobe.{event}": count for event, count in detector.counts.items()})
     previews = Previews(name, clock, WristOverlay(detector))
     return _Line(
-        lambda: run_wrist(source, detector, uplink, name, tally, stop, previews.offer, alive),
-        tally,
+        lambda: run_wrist(source, detector, uplink, name, counters, stop, previews.offer, alive),
+        counters,
         previews,
         wrist_changes(detector),
     )

@@ -85,14 +85,14 @@ class RawFrames:
         self._failure: RecordingError | None = None  # why the recording of that name ended
         self._closer: threading.Thread | None = None
         self._ended = 0
-        self._tap: RawTap | None = None
+        self._probe: RawProbe | None = None
 
     def reading(self, source: FrameSource) -> FrameSource:
         """The camera for the loop, all of whose frames are offered; without a folder the camera itself."""
         if self._settings is None:
             return source
-        self._tap = RawTap(source, self.offer)
-        return self._tap
+        self._probe = RawProbe(source, self.offer)
+        return self._probe
 
     def offer(self, frame: Frame) -> None:
         """Take a frame while something is recorded; by the loop. Never waits, never raises."""
@@ -127,8 +127,8 @@ class RawFrames:
 
     def close(self) -> None:
         """The slave ends: so does the recording, with the last frame that was read. Safe to call twice."""
-        if self._tap is not None:
-            self._tap.flush()
+        if self._probe is not None:
+            self._probe.flush()
         with self._command_lock:
             self._end("the slave ends")
             self._join()
@@ -252,7 +252,7 @@ class RawFrames:
             closer.join()
 
 
-class RawTap:
+class RawProbe:
     """A camera all of whose frames are offered to somebody, each when the loop comes back for the next one.
 
     Holds the frame that the loop is at.

@@ -14,7 +14,7 @@ from typing import Protocol
 
 from common.service_manager import WATCHDOG, ServiceManager, one_line
 
-FEEDS = 4  # in a period of the watchdog
+NOTIFIES = 4  # in a period of the watchdog
 STATUS_NS = 5_000_000_000  # between two lines of status where there is no watchdog
 LOST_PATIENCE_S = 90.0  # to open a camera again takes seconds, with all its settings checked; one that hangs is given up then
 COMPILE_S = 180.0  # numba compiles 15 s on a desktop processor, more than a minute on a Raspberry Pi
@@ -58,7 +58,7 @@ class Service:
         self._send, self._period_us = self._manager.send, self._manager.watchdog_us
         self._now_ns, self._noun = now_ns, noun
         self._linked: Callable[[], bool] = lambda: False
-        self._every_ns = self._period_us * 1000 // FEEDS or STATUS_NS
+        self._every_ns = self._period_us * 1000 // NOTIFIES or STATUS_NS
         self._ready = self._patient = False
         self._rounds, self._since_ns = 0, 0
         self._due_ns = NEVER_NS

@@ -32,8 +32,8 @@ from common.camera_settings import (
     same_exposed,
 )
 from common.errors import CalibrationError, PhalanxError
+from common.file_monitor import MonitoredFiles
 from common.object_profile import ObjectProfile
-from common.watching import WatchedFiles
 from slave.cameras.settings import Tunable
 from slave.colours_in_use import in_use
 
@@ -138,7 +138,7 @@ class CameraTuning:
         self._source = source if isinstance(source, Tunable) else None
         self._prepare, self._running, self._sampler = prepare, running, sampler
         self._lock = threading.Lock()
-        self._watched = WatchedFiles()
+        self._monitored = MonitoredFiles()
         self._applied = self._refused = 0
 
     @property
@@ -174,7 +174,7 @@ class CameraTuning:
     def look(self) -> None:
         """Apply the files if they were changed; where that fails, say so once and go on as before."""
         with self._lock:
-            if not self._running() or not self._watched.changed(self._used.paths):
+            if not self._running() or not self._monitored.changed(self._used.paths):
                 return
             try:
                 was, self._on_disk = self._on_disk, self._used.read_again()

@@ -26,10 +26,10 @@ from common.messages import Message, WristDetections, encode
 from master.link import MasterLink
 from slave.app import run
 from slave.cameras.source import Frame
+from slave.counters import Counters
 from slave.link import SlaveLink
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.engine import engine_named
-from slave.tally import Tally
 from slave.wrist import engine as wrist_engine
 from slave.wrist.detector import WristDetector
 from slave.wrist.view import WristView
@@ -162,7 +162,14 @@ def run_case(case: str, folder: Path, marks: Marks) -> str:
         each(lambda k: digest.add(seed_markers.detect(frames.image(k), ranges)))
     elif case == "step":
         wire = _Wire(frames.camera.name)
-        run(_Source(frames, mark), detector, wire, frames.camera.name, Tally(frames.names), threading.Event())
+        run(
+            _Source(frames, mark),
+            detector,
+            wire,
+            frames.camera.name,
+            Counters(frames.names),
+            threading.Event(),
+        )
         digest.add(np.frombuffer(b"".join(wire.datagrams), np.uint8))
     else:
         raise ValueError(f"no case {case!r}")

@@ -10,21 +10,21 @@ from msgspec import Struct
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.calibration_parts import Provenance
 from common.errors import CalibrationError
+from common.file_monitor import MonitoredFiles
 from common.messages import CheckItem
-from common.watching import WatchedFiles
 from master.checklist.facts import CameraPlan, Plan
 
 TOGETHER = timedelta(minutes=1)  # one calibration writes several parts, one after the other
 PartT = TypeVar("PartT", bound=Struct)
 
 
-class FileWatch:
+class FileMonitor:
     """Looks at the files of the rigs that run. Holds how they were, and what was wrong with them."""
 
     def __init__(self, calibration: Path, rigs: tuple[str, ...]) -> None:
         """Watch these rigs of a calib_json tree, and what they name."""
         self._calibration, self._rigs = calibration, rigs
-        self._watched = WatchedFiles()
+        self._monitored = MonitoredFiles()
         self._hands: dict[Path, None] = {}  # that ever were: one that is gone has changed, too
         self._plan: Plan | None = None
         self._found: tuple[CheckItem, ...] = ()
@@ -34,7 +34,7 @@ class FileWatch:
         cameras = [self._calibration / "cameras" / f"{one.name}.json" for one in plan.cameras]
         rigs = [self._calibration / "rigs" / f"{name}.json" for name in self._rigs]
         self._hands |= dict.fromkeys(sorted((self._calibration / "hands").glob("*.json")))
-        if self._watched.changed([*rigs, *cameras, *self._hands]) or plan != self._plan:
+        if self._monitored.changed([*rigs, *cameras, *self._hands]) or plan != self._plan:
             self._plan = plan
             self._found = judge(self._calibration, self._rigs, plan)
         return self._found

@@ -52,9 +52,9 @@ class SlaveReports:
         return 0 if self._now is None else self._now.t_ns
 
     @property
-    def gauges(self) -> Mapping[str, float]:
+    def metrics(self) -> Mapping[str, float]:
         """Quantity -> value, of the newest report."""
-        return {} if self._now is None else self._now.gauges
+        return {} if self._now is None else self._now.metrics
 
     @property
     def counts(self) -> Mapping[str, int]:

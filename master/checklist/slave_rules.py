@@ -70,18 +70,18 @@ class SlaveRules:
 
 def _settings(name: str, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether the camera has what it was told."""
-    gauges = reports.gauges
+    metrics = reports.metrics
     wrong: list[str] = []
     for setting, (share, least) in OFF.items():
-        want, got = gauges.get(WANTED + setting), gauges.get(setting)
+        want, got = metrics.get(WANTED + setting), metrics.get(setting)
         if want is not None and got is not None and abs(got - want) > max(share * want, least):
             wrong.append(f"{setting} is {got:.4g}, not {want:.4g}")
-    if (digital := gauges.get("digital_gain", 1.0)) > DIGITAL:
+    if (digital := metrics.get("digital_gain", 1.0)) > DIGITAL:
         wrong.append(f"digital_gain is {digital:.3g}")
     wrong += [
         f"{auto.removeprefix('auto.')} is on"
-        for auto in sorted(gauges)
-        if auto.startswith("auto.") and gauges[auto]
+        for auto in sorted(metrics)
+        if auto.startswith("auto.") and metrics[auto]
     ]
     yield Verdict(
         "auto_mode",
@@ -95,7 +95,7 @@ def _settings(name: str, reports: SlaveReports) -> Iterator[Verdict]:
 
 def _light(name: str, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether the picture is as bright as at calibration."""
-    exposure = reports.gauges.get("light_exposure")
+    exposure = reports.metrics.get("light_exposure")
     if exposure is None or exposure <= 0.0:
         return
     yield Verdict(
@@ -110,12 +110,12 @@ def _light(name: str, reports: SlaveReports) -> Iterator[Verdict]:
 def _collisions(camera: CameraPlan, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether two markers share colours, by their ranges or by their looks."""
     name = camera.name
-    for gauge, hues in reports.gauges.items():
-        if gauge.startswith(OVERLAP):
-            pair = tuple(gauge.removeprefix(OVERLAP).split(BETWEEN))
+    for metric, hues in reports.metrics.items():
+        if metric.startswith(OVERLAP):
+            pair = tuple(metric.removeprefix(OVERLAP).split(BETWEEN))
             what = f"the colour ranges of {' and '.join(pair)} overlap by {hues:.0f} hues"
-        elif gauge.startswith(DUPLICATE_SENDER):
-            pair = tuple(gauge.removeprefix(DUPLICATE_SENDER).split(BETWEEN))
+        elif metric.startswith(DUPLICATE_SENDER):
+            pair = tuple(metric.removeprefix(DUPLICATE_SENDER).split(BETWEEN))
             what = f"{' and '.join(pair)} look alike, {hues:.0f} hues apart"
         else:
             continue
@@ -145,7 +145,7 @@ def _file(camera: CameraPlan, reports: SlaveReports) -> Iterator[Verdict]:
         (name,),
         bare,
     )
-    width, height = reports.gauges.get("width_px"), reports.gauges.get("height_px")
+    width, height = reports.metrics.get("width_px"), reports.metrics.get("height_px")
     if width is None or height is None:
         return
     yield Verdict(
@@ -168,7 +168,7 @@ def _background(camera: CameraPlan, reports: SlaveReports) -> Iterator[Verdict]:
         if event not in reports.counts:
             continue
         share = (reports.increase(event) or 0) / frames
-        u, v = reports.gauges.get(f"{event}.u"), reports.gauges.get(f"{event}.v")
+        u, v = reports.metrics.get(f"{event}.u"), reports.metrics.get(f"{event}.v")
         where = "" if u is None or v is None else f", near pixel {u:.0f}, {v:.0f}"
         yield Verdict(
             "background_in_range",
@@ -203,16 +203,16 @@ def _strobe(name: str, reports: SlaveReports) -> Iterator[Verdict]:
 
 def _machine(name: str, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether the slave's computer is hot, throttled, or its disk full."""
-    gauges = reports.gauges
-    now, limit = gauges.get("temperature_c"), gauges.get("temperature_limit_c")
+    metrics = reports.metrics
+    now, limit = metrics.get("temperature_c"), metrics.get("temperature_limit_c")
     hot: bool | None = False
     why: list[str] = []
     if now is not None and limit is not None:
         hot = beyond(now, limit, limit - HOT_WELL_C)
         why = [f"{now:.0f} °C, {limit:.0f} are its limit"] if now >= limit else []
-    flags = int(gauges.get("throttled", 0.0))
+    flags = int(metrics.get("throttled", 0.0))
     held = [text for bit, text in FLAGS.items() if flags & bit]
-    if now is not None or "throttled" in gauges:
+    if now is not None or "throttled" in metrics:
         yield Verdict(
             "too_hot",
             name,
@@ -220,5 +220,5 @@ def _machine(name: str, reports: SlaveReports) -> Iterator[Verdict]:
             f"The computer of {name}: {'; '.join(why + held) or 'still warm'}.",
             "Give it air, a heat sink or a fan, and a supply of its own that is strong enough (Pi 5: 5 A).",
         )
-    if (free := gauges.get("disk_free_mb")) is not None:
+    if (free := metrics.get("disk_free_mb")) is not None:
         yield disk_verdict(name, free)

@@ -56,7 +56,7 @@ class UnseenMarkers:
         share = {name: (reports.increase(SEEN + name) or 0) / frames for name in self._markers}
         needed = min(OTHERS, len(share) - 1)
         for name, one in self._markers.items():
-            if self._recoloured(one, reports.gauges.get(COLOUR + name)):
+            if self._recoloured(one, reports.metrics.get(COLOUR + name)):
                 pass  # of the frames of this report some were looked at with the colours of before
             elif share[name]:
                 one.ever, one.without_s = True, 0.0

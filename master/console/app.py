@@ -13,11 +13,11 @@ from fastapi import FastAPI
 from nicegui import ui
 
 from common.errors import PhalanxError
-from master.console.guard import OwnPagesOnly, names_of
 from master.console.login import PasswordHash, kept_password, password_from
 from master.console.login_page import LoginRequired
 from master.console.neighbours import same_user
 from master.console.pages import checklist, gestures, live, outputs, plots, tune
+from master.console.request_filter import OwnPagesOnly, names_of
 from master.console.serving import console_server
 from master.console.setup import page as setup_page
 from master.console.shell import Entry, shell

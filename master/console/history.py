@@ -75,7 +75,7 @@ class History:
             if name == count:
                 continue
             out[f"lost_per_s.{name}"] = self._increase(report, f"{name}.lost")
-            if _CAMERA_HZ + name in report.gauges:
+            if _CAMERA_HZ + name in report.metrics:
                 out[f"rate_hz.{name}"] = self._increase(report, count)
         return {name: rate for name, rate in out.items() if not math.isnan(rate)}
 
@@ -95,7 +95,7 @@ class History:
 
 def _of_master(report: Health) -> dict[str, float]:
     out: dict[str, float] = {}
-    for name, value in report.gauges.items():
+    for name, value in report.metrics.items():
         for suffix, (quantity, factor) in _CLOCK.items():
             if name.endswith(suffix):
                 out[f"{quantity}.{name.removesuffix(suffix)}"] = factor * value
@@ -103,5 +103,5 @@ def _of_master(report: Health) -> dict[str, float]:
 
 
 def _of_sender(source: str, report: Health) -> dict[str, float]:
-    hot = [value for name, value in report.gauges.items() if "celsius" in name]
+    hot = [value for name, value in report.metrics.items() if "celsius" in name]
     return {f"celsius.{source}": max(hot)} if hot else {}

@@ -85,10 +85,10 @@ def output_panel(state: ConsoleState) -> None:
 
 def status_words(name: str, report: Health | None) -> str:
     """How an output does, by the report of the sending process."""
-    if report is None or not report.gauges.get(f"on.{name}"):
+    if report is None or not report.metrics.get(f"on.{name}"):
         return ""
     sent, failed, dropped = (report.counts.get(f"{what}.{name}", 0) for what in ("sent", "failed", "dropped"))
-    words = f"{'open' if report.gauges.get(f'open.{name}') else 'not open'}, {sent} sent"
+    words = f"{'open' if report.metrics.get(f'open.{name}') else 'not open'}, {sent} sent"
     return words + (f", {failed} failed" if failed else "") + (f", {dropped} dropped" if dropped else "")
 
 

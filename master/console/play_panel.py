@@ -79,7 +79,7 @@ class Controls:
     def update(self) -> None:
         """Show what the player said last."""
         now = self._newest()
-        position = None if now is None else now.gauges.get("play.position_s")
+        position = None if now is None else now.metrics.get("play.position_s")
         self._all.set_visibility(position is not None)
         if now is None or position is None or self._telling.busy:
             return
@@ -89,9 +89,9 @@ class Controls:
             if left_s > (_JUMP_S - _REST_S if there else 0.0):
                 return  # still being moved by hand, or on its way
             self._wanted_s = None
-        length = now.gauges.get("play.length_s", 0.0)
-        self._paused, self._at = bool(now.gauges.get("play.paused")), round(position, 1)
-        self._speed = now.gauges.get("play.speed", 1.0)
+        length = now.metrics.get("play.length_s", 0.0)
+        self._paused, self._at = bool(now.metrics.get("play.paused")), round(position, 1)
+        self._speed = now.metrics.get("play.speed", 1.0)
         self._slider.props(f"max={max(length, 0.1):.1f}")
         self._slider.set_value(self._at)
         self._words.set_text(f"{position:.1f} of {length:.1f} s")

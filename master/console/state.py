@@ -25,8 +25,8 @@ from common.streams import MASTER
 from master.console.history import STEP_S, History
 from master.console.link import Link
 from master.console.local import LocalProcesses
-from master.console.looking import Looking
 from master.console.picture_sizes import PictureSizes
+from master.console.preview_leases import PreviewLeases
 from master.console.received_gestures import ReceivedGestures
 from master.console.tuner import Tuner
 from master.master_bus import join_bus
@@ -114,7 +114,7 @@ class ConsoleState:
         self._closing = threading.Event()
         self._sizes = PictureSizes(self.camera)
         self.link = Link(open_bus or (lambda: join_bus(settings.bus)), _takers(self))
-        self._looking = Looking(self.link.ask)
+        self._preview_leases = PreviewLeases(self.link.ask)
         self._tuners: dict[str, Tuner] = {}
         self._sampler = threading.Thread(target=self._sample, name="console history", daemon=True)
         self._sampler.start()
@@ -160,11 +160,11 @@ class ConsoleState:
 
     def look(self, camera: str, mask: tuple[str, ...] = ()) -> None:
         """A page shows this camera for the next 3 s, with the pixels of these markers tinted. Never waits."""
-        self._looking.look(camera, mask)
+        self._preview_leases.look(camera, mask)
 
     def preview_error(self, camera: str) -> str:
         """Why there is no picture of a camera that somebody looks at; empty while it answers."""
-        return self._sizes.error(camera) or self._looking.error(camera)
+        return self._sizes.error(camera) or self._preview_leases.error(camera)
 
     def tuner(self, camera: str) -> Tuner:
         """What tunes a camera, the same for every page: all revert to what it was before the first change."""

@@ -12,22 +12,22 @@ finger has come to meet the thumb; and a finger that is stretched while a dial t
 from common.arrays import Float
 from common.gesture_settings import GestureSettings
 from common.messages import Gesture
-from master.gestures.dial import DialWatch
+from master.gestures.dial import DialMonitor
 from master.gestures.features import HandFeatures
-from master.gestures.pinch import PinchWatch
-from master.gestures.point import PointWatch
-from master.gestures.taps import TapWatch, is_pad
+from master.gestures.pinch import PinchMonitor
+from master.gestures.point import PointMonitor
+from master.gestures.taps import ThumbTapMonitor, is_pad
 from master.gestures.touch import thumb_touch
 
 
-class ActionWatch:
+class ActionMonitor:
     """Push machine. Holds the four watches, of which one at most is active."""
 
     def __init__(self, settings: GestureSettings, radius_m: Float) -> None:
         """Of a hand whose joints have the radii (26,) [m]."""
         self._radius_m, self._taps = radius_m, settings.tap
-        self.pinch, self.dial = PinchWatch(settings.pinch), DialWatch(settings.dial)
-        self.tap, self.point = TapWatch(settings.tap), PointWatch(settings.point)
+        self.pinch, self.dial = PinchMonitor(settings.pinch), DialMonitor(settings.dial)
+        self.tap, self.point = ThumbTapMonitor(settings.tap), PointMonitor(settings.point)
 
     def push(self, seen: HandFeatures, *, wrist_device_only: bool = False) -> list[Gesture]:
         """What is to be told at the instant of the features.

@@ -54,7 +54,7 @@ class _Grip:
     axis: Float
 
 
-class DialWatch:
+class DialMonitor:
     """Push machine. Holds the dial that has begun, its grip and its angle, and the grip that may become one."""
 
     def __init__(self, settings: DialSettings) -> None:

@@ -18,7 +18,7 @@ from master.gestures.lasting import Lasting, below
 from master.gestures.touch import ThumbTouch
 
 
-class PinchWatch:
+class PinchMonitor:
     """Push machine. Holds the pinch that has begun, and when its gap was known last, and how wide it was."""
 
     def __init__(self, settings: PinchSettings) -> None:

@@ -31,7 +31,7 @@ _LASTING = 1.5  # the doubt of a ray that is told already may be larger by this
 _KNUCKLE, _TIP = int(CHAINS[1, 0]), int(CHAINS[1, 3])
 
 
-class PointWatch:
+class PointMonitor:
     """Push machine. Holds the pointing that has begun, since when its shape is there or was lost, and if the ray was
     sure."""
 

@@ -61,7 +61,7 @@ class _Touch:
     epochs: list[_Epoch]
 
 
-class TapWatch:
+class ThumbTapMonitor:
     """Push machine. Holds the touch that goes on, when the thumb was clear of all keys last, and of the last tap."""
 
     def __init__(self, settings: TapSettings) -> None:

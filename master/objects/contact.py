@@ -63,7 +63,7 @@ class _PointEstimate:
     cov: Float
 
 
-class ContactWatch:
+class ContactMonitor:
     """Push machine of one hand. Holds the last poses of each object, and which finger touches which."""
 
     def __init__(self, model: HandModel, objects: Sequence[ObjectProfile]) -> None:

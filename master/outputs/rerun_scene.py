@@ -151,7 +151,7 @@ class RerunScene:
 
     def log_health(self, health: Health, t_ns: int) -> None:
         """Plot every count and gauge of a process at `t_ns` [ns] of the timeline."""
-        for name, value in [*health.counts.items(), *health.gauges.items()]:
+        for name, value in [*health.counts.items(), *health.metrics.items()]:
             path = rr.new_entity_path(["plots", "health", health.source, name])
             self._rows.scalars(path, np.array([t_ns], np.int64), np.array([float(value)]))
 

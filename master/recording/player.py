@@ -1,4 +1,4 @@
-"""Plays a recording: what the master took goes through the very same `World` again, at any speed, from any moment.
+"""Plays a recording: what the master took goes through the very same `Dispatcher` again, at any speed, from any moment.
 
 What comes out depends on nothing but the messages and their order, so that every pass over the same stretch tells the
 same, bit for bit, however fast; a `Backlog` among them says what the live master left out, and so does the player. To
@@ -16,16 +16,16 @@ from common.errors import PhalanxError
 from common.messages import Backlog, Contact, Gesture, HandPose, Message, Told
 from common.recording import MessageRecording, Recorded
 from master.app import Solved
+from master.dispatcher import Dispatcher
 from master.link_senders import SensorMessage
 from master.load_shedding import LoadShedding, Shedding
 from master.outputs.sink import Sink
 from master.recording.clock import ReplayClock
 from master.recording.digest import ToldDigest
-from master.recording.lines import EventWatch
+from master.recording.lines import EventMonitor
 from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from master.tuning import LivePipeline
-from master.world import World
 
 SETTLE_NS = 2_000_000_000
 GAP_NS = 600_000_000_000  # longer than that nobody waits for the next message
@@ -55,14 +55,16 @@ class Passed:
         return self.digest.counts["poses"] / max(self.seconds, 1e-9)
 
 
-def world_of(setups: Sequence[RigSetup], load_shedding: LoadShedding) -> World:
+def world_of(setups: Sequence[RigSetup], load_shedding: LoadShedding) -> Dispatcher:
     """The world as a live master builds it, which leaves out instants as `load_shedding` says.
 
     Raises:
         CalibrationError: The files do not fit together.
     """
     stages = StageTimes()
-    return World(setups, [LivePipeline(setup, stages, Shedding(load_shedding)) for setup in setups], stages)
+    return Dispatcher(
+        setups, [LivePipeline(setup, stages, Shedding(load_shedding)) for setup in setups], stages
+    )
 
 
 class Player:
@@ -190,8 +192,8 @@ class Player:
     def _pass(self, start_ns: int, digest: ToldDigest) -> bool:
         """Play from `start_ns`; False: not to the end."""
         load_shedding = LoadShedding()
-        world = None if self._solved else world_of(self._setups, load_shedding)
-        events = EventWatch(self._recording.begin_t_ns)
+        dispatcher = None if self._solved else world_of(self._setups, load_shedding)
+        events = EventMonitor(self._recording.begin_t_ns)
         with self._changed:
             self._clock.seek(start_ns, now_ns())  # to build a world took its time
         streams = (*AUXILIARY, *(SOLVED if self._solved else ("taken",)))
@@ -201,12 +203,12 @@ class Player:
                 return False
             if one.stream == "health":
                 self._tell_events(events.push(one.t_ns, one.message))
-                if events.restarted and world is not None:
+                if events.restarted and dispatcher is not None:
                     load_shedding = LoadShedding()
-                    world = world_of(self._setups, load_shedding)
+                    dispatcher = world_of(self._setups, load_shedding)
             if isinstance(one.message, Backlog):
                 load_shedding.reject = one.message.reject
-            told = self._told(world, one)
+            told = self._told(dispatcher, one)
             if not silent:
                 self._write(told, digest)
                 self._auxiliary(one)
@@ -231,21 +233,21 @@ class Player:
                 self._changed.wait(None if wait_s is None else min(wait_s, _STEP_S))
             return False
 
-    def _told(self, world: World | None, one: Recorded) -> Iterable[Told]:
+    def _told(self, dispatcher: Dispatcher | None, one: Recorded) -> Iterable[Told]:
         """What a message tells: the world makes it, or it was told live."""
         if one.stream in SOLVED:
             return (cast(Told, one.message),)
-        if one.stream != "taken" or world is None or isinstance(one.message, Backlog):
+        if one.stream != "taken" or dispatcher is None or isinstance(one.message, Backlog):
             return ()
-        return self._solve(world, cast(SensorMessage, one.message), one.name)
+        return self._solve(dispatcher, cast(SensorMessage, one.message), one.name)
 
-    def _solve(self, world: World, message: SensorMessage, name: str) -> Iterable[Told]:
+    def _solve(self, dispatcher: Dispatcher, message: SensorMessage, name: str) -> Iterable[Told]:
         """What the world makes of a message.
 
         Nothing of one that it cannot solve, which the recording may hold.
         """
         try:
-            return [_plain(solved) for solved in world.push(message)]
+            return [_plain(solved) for solved in dispatcher.push(message)]
         except PhalanxError:
             raise
         except Exception as error:  # noqa: BLE001 -- a file may hold whatever makes the solver raise

@@ -18,10 +18,10 @@ from common.machine import program
 from common.messages import Command, Health
 from common.recording import MessageWriter
 from master.outputs.previews import PictureAsker
-from master.recording.feed import Feed, MasterClock, TapLease
 from master.recording.files import carried_files, rigs_text
 from master.recording.raw import RawAsker, raw_text
 from master.recording.recorder import MessageRecorder, Progress
+from master.recording.subscriber import MasterClock, ProbeLease, StreamSubscriber
 from master.rig import RigFiles
 
 NAME = "recorder"
@@ -141,8 +141,8 @@ class _Run:
         self._session = secrets.randbits(63)
         self._clock = clock
         self._gone_lost = self._gone_dropped = 0
-        self._lease: TapLease | None = None
-        self._feed: Feed | None = None
+        self._lease: ProbeLease | None = None
+        self._subscriber: StreamSubscriber | None = None
         self._master: int | None = None
         self._reloads = 0
 
@@ -160,9 +160,9 @@ class _Run:
             BusError: The master refuses to be tapped.
         """
         with ExitStack() as stack:
-            self._feed = Feed(bus, self._settings.streams, self._recorder, self._clock)
-            stack.callback(self._close_feed, self._feed)
-            self._lease = TapLease(bus, self._feed, self._clock)
+            self._subscriber = StreamSubscriber(bus, self._settings.streams, self._recorder, self._clock)
+            stack.callback(self._close_subscriber, self._subscriber)
+            self._lease = ProbeLease(bus, self._subscriber, self._clock)
             bus.serve(NAME, self.answer)
             bus.announce(NAME)
             if self._settings.ready_as is not None:
@@ -185,13 +185,13 @@ class _Run:
         """
         now = self._recorder.progress()
         counts = now.counts | {"dropped": self._dropped(now), "lost": self._lost()}
-        gauges = {
+        metrics = {
             "recorder.seconds": round(now.seconds, 3),
             "recorder.megabytes": round(now.written_bytes * 1e-6, 3),
             "recorder.megabytes_per_s": round(now.bytes_per_s * 1e-6, 3),
             "recorder.free_gb": round(now.free_bytes * 1e-9, 3),
         }
-        return Health(NAME, self._session, self._clock.now_ns(), counts, gauges, *program())
+        return Health(NAME, self._session, self._clock.now_ns(), counts, metrics, *program())
 
     def answer(self, command: Command) -> Health:
         """Obey "report" or "stop".
@@ -205,7 +205,7 @@ class _Run:
             self._stop.set()
         return self.health()
 
-    def _keep(self, bus: Bus, lease: TapLease) -> None:
+    def _keep(self, bus: Bus, lease: ProbeLease) -> None:
         missed, due_ns = 0, now_ns()
         while not self.over and missed < _TRIES:
             if now_ns() < due_ns:
@@ -243,11 +243,14 @@ class _Run:
         return self._gone_lost + (0 if self._lease is None else self._lease.lost)
 
     def _dropped(self, now: Progress) -> int:
-        feed = {} if self._feed is None else self._feed.dropped
-        return self._gone_dropped + sum(now.dropped.values()) + sum(feed.values())
+        subscriber = {} if self._subscriber is None else self._subscriber.dropped
+        return self._gone_dropped + sum(now.dropped.values()) + sum(subscriber.values())
 
-    def _close_feed(self, feed: Feed) -> None:
+    def _close_subscriber(self, subscriber: StreamSubscriber) -> None:
         # One that owns us has stopped, and all that it said is to be kept; another one goes on without us.
-        feed.close(_DRAIN_S if self._settings.ready_as is None else _OWNED_DRAIN_S)
-        self._gone_lost, self._gone_dropped = self._lost(), self._gone_dropped + sum(feed.dropped.values())
-        self._lease = self._feed = None
+        subscriber.close(_DRAIN_S if self._settings.ready_as is None else _OWNED_DRAIN_S)
+        self._gone_lost, self._gone_dropped = (
+            self._lost(),
+            self._gone_dropped + sum(subscriber.dropped.values()),
+        )
+        self._lease = self._subscriber = None

@@ -149,7 +149,7 @@ class RawAsker:
         frames, dropped = told.counts.get("raw.frames", 0), told.counts.get("raw.dropped", 0)
         self._notify(
             f"camera {camera.name}: {frames} raw frames, {dropped} dropped, in {self._folder(camera)}"
-            f" ({told.gauges.get('raw.megabytes', 0.0):.1f} MB)"
+            f" ({told.metrics.get('raw.megabytes', 0.0):.1f} MB)"
         )
 
 

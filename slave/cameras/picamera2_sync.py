@@ -30,7 +30,7 @@ LOG_FRAMES = 120
 _LOG = logging.getLogger(__name__)
 
 
-class SyncWatch:
+class SyncMonitor:
     """Push machine for a camera's metadata. Holds whether it is in step, and how far off the last message found it."""
 
     def __init__(self, where: str, *, client: bool) -> None:

@@ -12,7 +12,7 @@ from common.errors import CameraError
 from slave.cameras.grey import Pixels
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
-from slave.cameras.reopening import ReopeningCamera
+from slave.cameras.reconnecting import ReconnectingCamera
 from slave.cameras.source import FrameSource
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
 from slave.service import LOST_PATIENCE_S, ConnectionLost, nobody
@@ -140,7 +140,9 @@ def lasting(
     Raises:
         CameraError: It cannot be opened the first time.
     """
-    return opener(camera) if stop is None else ReopeningCamera(opener, camera, clock, stop, connection_lost)
+    return (
+        opener(camera) if stop is None else ReconnectingCamera(opener, camera, clock, stop, connection_lost)
+    )
 
 
 def _index(place: str) -> int:

@@ -12,7 +12,7 @@ from common.errors import CameraError
 from slave.cameras import real
 from slave.cameras.source import FrameSource
 from slave.commands.options import add_place, add_simulated, epoch_of, number, world_of
-from slave.lights.opening import CHOICES, SYNTHETIC, choose, limits_for, open_guarded
+from slave.lights.factory import CHOICES, SYNTHETIC, choose, limits_for, open_guarded
 from slave.service import ConnectionLost, nobody
 
 if TYPE_CHECKING:
@@ -75,13 +75,13 @@ def open_lit(
         strobe = SimulatedStrobe(schedule, limits)
         source = _open(options, rig, camera, clock, true_clock, stop, nobody, strobe)
         return StrobedCamera(source, camera, rig, strobe)
-    guard = open_guarded(lights, rig)
+    interlock = open_guarded(lights, rig)
     try:
         source = _open(options, rig, camera, clock, true_clock, stop, connection_lost)
     except Exception:
-        guard.close()
+        interlock.close()
         raise
-    return StrobedCamera(source, camera, rig, StrobeController(schedule, guard, clock))
+    return StrobedCamera(source, camera, rig, StrobeController(schedule, interlock, clock))
 
 
 def _open(

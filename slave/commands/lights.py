@@ -6,7 +6,7 @@ from collections.abc import Callable
 from common.calibration import CameraCalibration, load
 from common.errors import LightsError
 from slave.commands.options import add_rig, camera_path, positive, rig_of
-from slave.lights.opening import SWITCHED, open_guarded
+from slave.lights.factory import SWITCHED, open_guarded
 from slave.stopping import stop_by_signal
 
 PURPOSE = "budget and test of laser and LEDs"
@@ -47,13 +47,13 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     if options.lights is None:
         raise LightsError(f"--blink and --off need the lights: --lights {SWITCHED}")
     with stop_by_signal() as stop:
-        guard = open_guarded(options.lights, rig)  # dark from here on
+        interlock = open_guarded(options.lights, rig)  # dark from here on
         try:
             if options.blink:
                 notify(budget(rig, camera))
-                blink(guard, rig, camera, stop, options.blink)
+                blink(interlock, rig, camera, stop, options.blink)
         finally:
-            guard.close()
-    events = ", ".join(f"{event} {count}" for event, count in guard.events().items())
+            interlock.close()
+    events = ", ".join(f"{event} {count}" for event, count in interlock.events().items())
     notify(events if options.blink else "dark")
     return 0

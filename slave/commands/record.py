@@ -25,7 +25,7 @@ from slave.commands.options import (
     skew_of,
     world_of,
 )
-from slave.imu import opening
+from slave.imu import factory
 from slave.stopping import stop_by_signal
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
         nargs="?",
         const="synthetic",
         metavar="DRIVER",
-        help=f"what the rig's IMU says, too, as imu.csv: {opening.REAL}; without a driver, that of a synthetic camera",
+        help=f"what the rig's IMU says, too, as imu.csv: {factory.REAL}; without a driver, that of a synthetic camera",
     )
     command.add_argument(
         "--every-frame",
@@ -192,9 +192,9 @@ def _imu_recorder(
     imu = scene.rig.imu
     if imu is None:
         raise CalibrationError(f"rig {scene.rig.name!r}: imu: missing; there is none to record")
-    orientation, stop = opening.orientation_of(imu), threading.Event()
+    orientation, stop = factory.orientation_of(imu), threading.Event()
     imu_recorder = ImuRecorder(
-        opening.open_real(imu.name, options.imu, imu.rate_hz, scene.clock, stop), orientation, stop
+        factory.open_real(imu.name, options.imu, imu.rate_hz, scene.clock, stop), orientation, stop
     )
     try:
         yield imu_recorder

@@ -19,7 +19,7 @@ from slave.commands.options import (
     secrets_of,
     world_of,
 )
-from slave.objects import opening
+from slave.objects import factory
 from slave.objects.source import TrackerSource
 from slave.service import ConnectionLost, Service
 from slave.stopping import stop_by_signal
@@ -41,7 +41,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
     """The options of `tracker`."""
     command.add_argument("name", metavar="NAME", help="the `tracker` of an object of the rig")
     add_rig(command)
-    opening.add_options(command)
+    factory.add_options(command)
     add_link(command)
     add_simulated(command.add_argument_group("synthetic tracker").add_argument)
 
@@ -56,7 +56,7 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     from slave.uplink import Uplink
 
     rig = rig_of(options)
-    profile = opening.object_with(options.calibration, rig, options.name)
+    profile = factory.object_with(options.calibration, rig, options.name)
     true_clock = SystemClock()
     clock = clock_of(options, true_clock)
     key, access = secrets_of(options)
@@ -88,7 +88,7 @@ def _open(
 ) -> TrackerSource:
     if options.device != "synthetic":
         named = options.device, options.serial, options.program
-        return opening.open_real(options.name, *named, clock, stop, connection_lost)
+        return factory.open_real(options.name, *named, clock, stop, connection_lost)
     from slave.objects.synthetic import SyntheticTracker
     from slave.simulated import tracker_of
 

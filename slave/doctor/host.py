@@ -32,7 +32,7 @@ def check_host(system: System) -> Iterator[Finding]:
     yield _release(system)
     yield _board(system)
     yield _python()
-    yield from _gauges(system)
+    yield from _metrics(system)
     yield _memory_limit(system)
     yield _throttled(system)
 
@@ -69,10 +69,10 @@ def _python() -> Finding:
     return ok("Python", f"{version} in {sys.prefix}")
 
 
-def _gauges(system: System) -> Iterator[Finding]:
+def _metrics(system: System) -> Iterator[Finding]:
     folder = system.path(STATE) if system.path(STATE).is_dir() else system.root
-    gauges = Machine(folder, system.environment).gauges()
-    free_mb = gauges.get("disk_free_mb")
+    metrics = Machine(folder, system.environment).metrics()
+    free_mb = metrics.get("disk_free_mb")
     if free_mb is None:
         yield unseen("disk", f"{folder}: not known")
     elif free_mb < FEW_MB:
@@ -82,7 +82,7 @@ def _gauges(system: System) -> Iterator[Finding]:
         )
     else:
         yield ok("disk", f"{free_mb / 1000.0:.1f} GB free")
-    now, limit = gauges.get("temperature_c"), gauges.get("temperature_limit_c")
+    now, limit = metrics.get("temperature_c"), metrics.get("temperature_limit_c")
     if now is None or limit is None:
         yield unseen("temperature", "no sensor with a limit")
     elif now >= limit:
@@ -126,5 +126,5 @@ def _flags(system: System) -> int | None:
     asked = system.run(("vcgencmd", "get_throttled"), 5.0)
     if asked.code == 0 and (found := re.search(r"throttled=(0x[0-9a-fA-F]+)", asked.out)):
         return int(found[1], 16)
-    told = Machine(system.root, system.environment).gauges().get("throttled")
+    told = Machine(system.root, system.environment).metrics().get("throttled")
     return None if told is None else int(told)

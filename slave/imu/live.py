@@ -10,8 +10,8 @@ from common.clock import Clock
 from common.keys import Access
 from common.zenoh_bus import ZenohBus
 from slave.app import Barrier, Sender, nothing
+from slave.imu.counters import Orientation, SampleCounters
 from slave.imu.source import ImuSource
-from slave.imu.tally import Orientation, SampleTally
 from slave.report import Reporter
 from slave.service import Service
 from slave.uplink import Uplink
@@ -54,7 +54,7 @@ def wait_for_start(
 def run(
     source: ImuSource,
     sender: Sender,
-    tally: SampleTally,
+    counters: SampleCounters,
     stop: threading.Event,
     orientation: Orientation | None = None,
     alive: Callable[[], None] = nothing,
@@ -71,10 +71,10 @@ def run(
         try:
             levelled = sample if orientation is None else orientation.push(sample)
             sender.send(replace(levelled, session=sender.session))
-            tally.sample(sample.seq)
+            counters.sample(sample.seq)
             alive()
         except Exception as error:  # noqa: BLE001 - one sample; it is counted and logged
-            tally.failed(sample.seq, error)
+            counters.failed(sample.seq, error)
 
 
 def run_live(
@@ -104,20 +104,20 @@ def run_live(
     Raises:
         ImuError: The IMU is gone.
     """
-    tally = SampleTally(source, orientation)
+    counters = SampleCounters(source, orientation)
     reporter = Reporter(
-        name, uplink, tally, clock, lambda endpoint: ZenohBus(None, endpoint, access), stop.set
+        name, uplink, counters, clock, lambda endpoint: ZenohBus(None, endpoint, access), stop.set
     )
     try:
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
         notify("ready, waiting for the master")
         service.ready(lambda: uplink.started)
-        if wait_for_start(source, uplink, stop, orientation, service.waiting, tally.failed):
-            run(source, uplink, tally, stop, orientation, service.working)
+        if wait_for_start(source, uplink, stop, orientation, service.waiting, counters.failed):
+            run(source, uplink, counters, stop, orientation, service.working)
     finally:
         service.stopping()
         reporter.close()
         uplink.close()
         source.close()
-    notify(f"{tally.counts()['samples']} samples, sent {uplink.counts['sent']}")
+    notify(f"{counters.counts()['samples']} samples, sent {uplink.counts['sent']}")

@@ -33,6 +33,6 @@ class Telling(Protocol):
         """Event -> how often since it was opened."""
         ...
 
-    def gauges(self) -> Mapping[str, float]:
+    def metrics(self) -> Mapping[str, float]:
         """Quantity with its unit -> value now."""
         ...

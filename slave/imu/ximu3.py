@@ -131,7 +131,7 @@ class Ximu3Imu:
         self._came: deque[Data] = deque()
         self._answers: deque[Answer] = deque()
         self._counts: Counter[str] = Counter()
-        self._gauges: dict[str, float] = {}
+        self._metrics: dict[str, float] = {}
         self._bytes = self._silent = 0
         self._seq = -1
         self._stamp_us: int | None = None
@@ -171,9 +171,9 @@ class Ximu3Imu:
         counts = dict(self._counts)
         return {"broken": sum(v for k, v in counts.items() if k.startswith("broken.")), **counts}
 
-    def gauges(self) -> Mapping[str, float]:
+    def metrics(self) -> Mapping[str, float]:
         """`temperature_c`, `battery_percent`, as they were last told."""
-        return dict(self._gauges)
+        return dict(self._metrics)
 
     def _begin(self) -> None:
         pong = self._ask("ping", None)
@@ -252,9 +252,9 @@ class Ximu3Imu:
                 mag = np.array(message.values) * TESLA_UNIT_UT
                 self._mag = np.where(np.isfinite(mag), mag, np.nan)
             case Kind.TEMPERATURE:
-                self._gauge("temperature_c", message.values[0])
+                self._metric("temperature_c", message.values[0])
             case Kind.BATTERY:
-                self._gauge("battery_percent", message.values[0])
+                self._metric("battery_percent", message.values[0])
             case Kind.NOTIFICATION | Kind.ERROR if self._counts[f"imu.{message.kind.name.lower()}"] <= LOGGED:
                 _LOG.warning(
                     "%s: the x-IMU3 says: %s", self._place.path, message.text.decode(errors="replace")
@@ -277,9 +277,9 @@ class Ximu3Imu:
         mag, self._mag = self._mag, _NONE[0]
         return ImuSample(self._name, 0, self._seq, t_ns, gyro, accel, mag, _NONE[1])
 
-    def _gauge(self, name: str, value: float) -> None:
+    def _metric(self, name: str, value: float) -> None:
         if math.isfinite(value):
-            self._gauges[name] = value
+            self._metrics[name] = value
 
     @contextmanager
     def _errors(self, what: str) -> Generator[None]:

@@ -19,7 +19,7 @@ from common.arrays import Float, Image
 from common.calibration import CameraCalibration
 from common.srgb import gain_tables
 from slave.markers.classify import ColourTable, table_of
-from slave.markers.colour_watch import ColourWarning, ColourWatch
+from slave.markers.colour_monitor import ColourMonitor, ColourWarning
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.engine import NUMPY, Engine
 from slave.markers.white_balance import WhiteBalance, apart
@@ -65,7 +65,7 @@ class LightAdaptiveDetector:
         reference = np.array([ranges[name].reference_bgr_linear or (np.nan,) * 3 for name in markers])
         self._detector = MarkerDetector(camera, markers, seeds, self._table, engine, free)
         self._light = WhiteBalance(self._table, reference, (camera.width_px, camera.height_px), workers)
-        self._watch = ColourWatch(markers, ranges)
+        self._watch = ColourMonitor(markers, ranges)
         self._workers, self._engine = workers, engine
         self._in_use = np.zeros(3)  # log gains of the table in use
         self._making: tuple[Float, Future[ColourTable]] | None = None

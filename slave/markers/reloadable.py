@@ -15,9 +15,9 @@ import numpy as np
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, RigCalibration
 from common.errors import CalibrationError, CameraError
-from slave.cameras.passing import Passing
+from slave.cameras.frame_observer import FrameObserver
 from slave.markers.calibrated import CalibratedDetector
-from slave.markers.colour_watch import ColourWarning
+from slave.markers.colour_monitor import ColourWarning
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.light_adaptive import LightAdaptiveDetector
 from slave.markers.scan_choice import ScanChoice
@@ -43,7 +43,7 @@ class ReloadableDetector:
         self._detector = detector
         self.choice, self._processor_ns = choice, processor_ns
         self._next: deque[AnyDetector] = deque(maxlen=1)  # one thread fills it, another empties it
-        self._frames = Passing[tuple[Image, int]]()
+        self._frames = FrameObserver[tuple[Image, int]]()
         self._found: deque[tuple[int, Float]] = deque(maxlen=RECENT)
 
     def push(self, image: Image, t_ns: int) -> Detections:

@@ -16,7 +16,7 @@ import numpy as np
 
 from common.arrays import Float, Image
 from slave.markers.classify import ColourTable
-from slave.markers.colour_watch import ColourWarning
+from slave.markers.colour_monitor import ColourWarning
 from slave.markers.drift import ColourDrift, GainFit, at_bound
 from slave.markers.initial_white_balance import (
     AHEAD,

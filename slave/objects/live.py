@@ -10,8 +10,8 @@ from common.clock import Clock
 from common.keys import Access
 from common.zenoh_bus import ZenohBus
 from slave.app import POLL_S, Barrier, Sender, nothing
+from slave.objects.counters import PoseCounters
 from slave.objects.source import TrackerSource
-from slave.objects.tally import PoseTally
 from slave.report import Reporter
 from slave.service import Service
 from slave.uplink import Uplink
@@ -45,7 +45,7 @@ def wait_for_start(
 def run(
     source: TrackerSource,
     sender: Sender,
-    tally: PoseTally,
+    counters: PoseCounters,
     stop: threading.Event,
     alive: Callable[[], None] = nothing,
 ) -> None:
@@ -56,7 +56,7 @@ def run(
     """
     while not stop.is_set() and (pose := source.read()) is not None:
         sender.send(replace(pose, session=sender.session))
-        tally.pose(pose)
+        counters.pose(pose)
         alive()
 
 
@@ -87,9 +87,9 @@ def run_live(
     Raises:
         TrackerError: The tracking system is gone.
     """
-    tally = PoseTally(source)
+    counters = PoseCounters(source)
     reporter = Reporter(
-        name, uplink, tally, clock, lambda endpoint: ZenohBus(None, endpoint, access), stop.set
+        name, uplink, counters, clock, lambda endpoint: ZenohBus(None, endpoint, access), stop.set
     )
     try:
         gc.collect()
@@ -97,11 +97,11 @@ def run_live(
         notify("ready, waiting for the master")
         service.ready(lambda: uplink.started)
         if wait_for_start(source, uplink, stop, recorded, service.waiting):
-            run(source, uplink, tally, stop, service.working)
+            run(source, uplink, counters, stop, service.working)
     finally:
         service.stopping()
         reporter.close()
         uplink.close()
         source.close()
-    counts = tally.counts()
+    counts = counters.counts()
     notify(f"{counts['poses']} poses, {counts['nowhere']} of them nowhere, sent {uplink.counts['sent']}")

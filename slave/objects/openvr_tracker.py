@@ -94,7 +94,7 @@ class OpenVrTracker:
         """`lost_itself`: asked while it saw no base station; `absent`: while it was switched off."""
         return dict(self._counts)
 
-    def gauges(self) -> Mapping[str, float]:
+    def metrics(self) -> Mapping[str, float]:
         """Nothing."""
         return {}
 

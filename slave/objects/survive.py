@@ -110,7 +110,7 @@ class SurviveTracker:
         """Lines that were broken by reason, clock_steps, gone, others."""
         return dict(self._device.counts)
 
-    def gauges(self) -> Mapping[str, float]:
+    def metrics(self) -> Mapping[str, float]:
         """Nothing."""
         return {}
 

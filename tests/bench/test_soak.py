@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from bench.processes import Footprint, footprint
+from bench.soak_monitor import Minute, SoakHistory, judged
 from bench.soak_steps import Mapping, grown, mapped, steps_of
 from bench.soak_verdict import judge, latency_slope, memory_slope, slope
-from bench.soak_watch import Minute, SoakHistory, judged
 from common.messages import Health
 
 _EVERY_S, _HOUR_S = 5.0, 3600.0

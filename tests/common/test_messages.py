@@ -238,7 +238,7 @@ healths = st.builds(
     session=counts,
     t_ns=times,
     counts=st.dictionaries(names, counts, max_size=64),
-    gauges=st.dictionaries(names, st.floats(-1e18, 1e18), max_size=64),
+    metrics=st.dictionaries(names, st.floats(-1e18, 1e18), max_size=64),
 )
 commands = st.builds(Command, target=names, verb=names, body=st.text(max_size=200))
 backlogs = st.builds(Backlog, source=names, t_ns=times, reject=st.integers(0, 64))
@@ -549,9 +549,9 @@ def test_a_message_knows_whether_a_marker_has_a_rival() -> None:
         (HandPose, {"markers_raw_m": b""}),
         (Health, {"counts": {"frames": -1}}),
         (Health, {"counts": {f"c{i}": 1 for i in range(513)}}),
-        (Health, {"gauges": {"rate_hz": float("nan")}}),
-        (Health, {"gauges": {"rate_hz": float("inf")}}),
-        (Health, {"gauges": {"a b": 1.0}}),
+        (Health, {"metrics": {"rate_hz": float("nan")}}),
+        (Health, {"metrics": {"rate_hz": float("inf")}}),
+        (Health, {"metrics": {"a b": 1.0}}),
         (Command, {"verb": ""}),
         (Backlog, {"reject": -1}),
         (Backlog, {"reject": 65}),
@@ -688,12 +688,12 @@ def test_texts_of_a_device_are_printable(text: str) -> None:
 
 def test_a_report_can_be_read_whatever_was_counted() -> None:
     counts = {"frames": 2**70, "gone": -5, "x" * 80: 1} | {f"c{i}": i for i in range(600)}
-    gauges = {"rate_hz": float("nan"), "high": float("inf"), "accel": 1e300, "low": -1e300}
-    report = decode(encode(Health("left", 1, 2, counts, gauges, "h" * 90)))
+    metrics = {"rate_hz": float("nan"), "high": float("inf"), "accel": 1e300, "low": -1e300}
+    report = decode(encode(Health("left", 1, 2, counts, metrics, "h" * 90)))
     assert isinstance(report, Health)
     assert (report.counts["frames"], report.counts["gone"], report.counts["x" * 64]) == (2**63 - 1, 0, 1)
     assert len(report.counts) == 512
-    assert report.gauges == {"accel": 1e18, "low": -1e18}
+    assert report.metrics == {"accel": 1e18, "low": -1e18}
 
 
 DEFAULTED = {

@@ -51,8 +51,8 @@ def test_what_a_device_says_of_itself_reaches_no_terminal(rig: HostileRig) -> No
         while any(one.poll() is None for one in running):
             for changes in (
                 {"host": OWNED, "version": OWNED},
-                {"gauges": {"temperature_c": 1e300}},
-                {"gauges": {OWNED: 1.0}},
+                {"metrics": {"temperature_c": 1e300}},
+                {"metrics": {OWNED: 1.0}},
                 {"counts": {"frames": 2**64 - 1}},
                 {"version": "9" * 64},
             ):

@@ -152,9 +152,9 @@ def test_an_ximu3_is_read_lost_and_back(tmp_path: Path) -> None:
         assert until(lambda: take(ingest, again) >= 30), log.read_text()
         counts = health(bus).counts
         assert (counts["lost"], counts["back"], counts["broken"]) == (1, 1, 0)
-        assert until(lambda: health(bus).gauges["away_s"] == 0.0), "it is there, however late it was read"
-        gauges = health(bus).gauges
-        assert {"rate_hz", "bias_x_rad_s", "heading_sigma_rad", "at_rest"} <= set(gauges)
+        assert until(lambda: health(bus).metrics["away_s"] == 0.0), "it is there, however late it was read"
+        metrics = health(bus).metrics
+        assert {"rate_hz", "bias_x_rad_s", "heading_sigma_rad", "at_rest"} <= set(metrics)
         slave.send_signal(signal.SIGINT)
         assert slave.wait(PATIENCE_S) == 0, log.read_text()
     for run in (got, again):

@@ -31,7 +31,7 @@ SITES = {"room-a": "star", "room-b": "hash"}  # and the key that is tapped there
 READY_S, BACK_S = 60.0, 60.0
 
 
-def tap(key: str) -> Gesture:
+def probe(key: str) -> Gesture:
     """What a master tells."""
     nowhere = np.full(3, np.nan)
     return Gesture("right", 1, "tap", key, "end", 1, 1.0, np.nan, np.nan, np.nan, nowhere, nowhere)
@@ -91,7 +91,7 @@ class Building:
     def tell(self) -> None:
         """Every master tells something."""
         for site, bus in self.masters.items():
-            bus.publish("gesture", "right", tap(SITES[site]))
+            bus.publish("gesture", "right", probe(SITES[site]))
 
     def what_comes(self, wait_s: float) -> dict[str, set[str]]:
         """Tell until every reader has heard something, and once more; what each heard."""

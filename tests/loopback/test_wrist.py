@@ -122,7 +122,7 @@ def test_a_slave_sends_cycles_reports_them_and_follows_its_files(tmp_path: Path)
         assert shown.shape == (240, 320)
         assert shown[60:180, 80:240].mean() > 30.0  # by the LEDs
 
-        assert wrist.ask("set", '{"exposure_us": 1500}').gauges["exposure_us"] == 1500.0
+        assert wrist.ask("set", '{"exposure_us": 1500}').metrics["exposure_us"] == 1500.0
         path = wrist.files / "rigs/wrist.json"
         rig = load(path, RigCalibration)
         assert rig.T_camera_palm is not None

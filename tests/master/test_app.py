@@ -13,11 +13,11 @@ from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_m
 from common.hand_model import WRIST
 from common.messages import HandPose, ImuSample, MarkerDetections, Told
 from master.app import AuxiliaryMessage, Observed, RunFigures, health, run
+from master.dispatcher import Dispatcher
 from master.live import cameras_line
 from master.rig_pipeline import pipeline_of
 from master.rig_setup import RigSetup
 from master.stages import StageTimes
-from master.world import World
 from tests.hand_helpers import detections
 from tests.synthetic_run import SyntheticRun, hand_at, setup_of, synthetic_run
 
@@ -63,8 +63,8 @@ class Collector:
         raise AssertionError("the loop does not own its sinks")
 
 
-def world_of(*setups: RigSetup) -> World:
-    return World(setups, [pipeline_of(setup, StageTimes()) for setup in setups], StageTimes())
+def world_of(*setups: RigSetup) -> Dispatcher:
+    return Dispatcher(setups, [pipeline_of(setup, StageTimes()) for setup in setups], StageTimes())
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +159,7 @@ def test_health_carries_counts_and_gauges() -> None:
     report = health(5, clock, figures, {"left received": 9})
     assert (report.source, report.session, report.t_ns) == ("master", 5, 77)
     assert report.counts == {"poses": 1, "left received": 9}
-    assert report.gauges == {"latency_p50_ms": 4.0, "latency_p99_ms": 4.0, "camera_hz.left": 50.0}
+    assert report.metrics == {"latency_p50_ms": 4.0, "latency_p99_ms": 4.0, "camera_hz.left": 50.0}
 
 
 def test_stages_are_means_and_survive_an_error() -> None:

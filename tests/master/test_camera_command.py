@@ -89,14 +89,14 @@ def served(name: str, verbs: Mapping[str, Callable[[str], Mapping[str, float]]])
 
 
 def test_wanted_and_read_back_stand_side_by_side() -> None:
-    gauges = {
+    metrics = {
         "wanted.exposure_us": 5000.0,
         "exposure_us": 4989.0,
         "wanted.red_gain": 0.83,
         "sync_locked": 1.0,
         "rate_hz": 60.0,
     }
-    health = tell(served("left", {"settings": lambda _body: gauges}), asked())
+    health = tell(served("left", {"settings": lambda _body: metrics}), asked())
     assert [line.split() for line in table(health)] == [
         ["setting", "wanted", "read", "back"],
         ["exposure_us", "5000", "4989"],

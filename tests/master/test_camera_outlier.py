@@ -40,7 +40,7 @@ TRUTH = RIGHT.marker_points(HAND, MARKERS)
 FRAMES = 4
 
 
-def looking(at: tuple[float, float, float]) -> Float:
+def preview_leases(at: tuple[float, float, float]) -> Float:
     """Pose of a camera there that looks at the hand."""
     z = np.array([0.04, 0.0, 0.5]) - at
     z /= np.linalg.norm(z)
@@ -51,7 +51,7 @@ def looking(at: tuple[float, float, float]) -> Float:
 
 def rig(names: tuple[str, ...], knocked: str = "", by: Float | None = None) -> RigCalibration:
     """Cameras around the hand; the file has one of them turned by a rotation vector [rad]."""
-    poses = {name: looking(AT[name]) for name in names}
+    poses = {name: preview_leases(AT[name]) for name in names}
     if by is not None:
         poses[knocked] = poses[knocked] @ rigid(Rotation.from_rotvec(by).as_matrix(), np.zeros(3))
     rows = {name: tuple(tuple(float(v) for v in row) for row in pose) for name, pose in poses.items()}

@@ -8,9 +8,9 @@ import pytest
 from common.messages import MarkerDetections
 from common.streams import sender_of
 from master.app import Solved
-from master.guard import SolverGuard, culprit
 from master.link_senders import SensorMessage
 from master.quarantine import FIRST_NS, LONGEST_NS, MAX_CAUSES, Quarantine
+from master.solver_supervisor import SolverSupervisor, culprit
 from tests.network_helpers import ManualClock, detections
 
 S = 1_000_000_000
@@ -61,7 +61,9 @@ class Scene:
     def __init__(self, at: str | None = None) -> None:
         self.at, self.clock, self.quarantine = at, ManualClock(0), Quarantine()
         self.solver, self.renewed = Fragile(at), list[str]()
-        self.guard = SolverGuard(self, self.quarantine, self.clock, self.renew, lambda _sender: Fragile(at))
+        self.guard = SolverSupervisor(
+            self, self.quarantine, self.clock, self.renew, lambda _sender: Fragile(at)
+        )
 
     def push_inner(self, message: SensorMessage) -> Iterator[Solved]:
         return self.solver.push(message)

@@ -12,13 +12,13 @@ from common.calibration import RigCalibration, load, save
 from common.errors import CalibrationError
 from common.gesture_settings import default_gestures
 from common.object_profile import Bead, ObjectProfile
+from master.dispatcher import Dispatcher
 from master.needs_restart import refuse_restart
 from master.rig import RigFiles, load_setup, load_setups, setups_with_hands
 from master.rig_merge import in_world, merged_rig
 from master.rig_objects import load_gestures, objects_of, refuse_shared_objects
 from master.stages import StageTimes
 from master.tuning import LivePipeline, RigTuning
-from master.world import World
 from tests.loopback.test_imu_link import sample
 from tests.master.test_rig_merge import ASIDE, rows
 
@@ -142,9 +142,9 @@ class Running:
         self.files = RigFiles(tree, ("desk-wand",))
         setups = self.files.load()
         self.lines = [LivePipeline(setup, StageTimes()) for setup in setups]
-        self.world = World(setups, self.lines, StageTimes())
+        self.dispatcher = Dispatcher(setups, self.lines, StageTimes())
         self.output: list[str] = []
-        self.tuning = RigTuning(self.files, setups, self.lines, self.output.append, self.world)
+        self.tuning = RigTuning(self.files, setups, self.lines, self.output.append, self.dispatcher)
         self.tuning.look()
 
 
@@ -158,12 +158,12 @@ def test_files_of_objects_and_gestures_are_followed_and_the_hand_is_left_alone(t
     running.tuning.look()
     assert running.output == ["changed files are in use"]
     assert not running.lines[0]._next, "no hand was built anew"
-    assert len(running.world._next) == 1
-    list(running.world.push(sample("nobody", 1, 1)))
+    assert len(running.dispatcher._next) == 1
+    list(running.dispatcher.push(sample("nobody", 1, 1)))
     assert running.tuning.setups[0].objects[0].markers == larger
     save(tree / "gestures/default.json", msgspec.structs.replace(default_gestures(), poses={}))
     running.tuning.look()
-    assert len(running.world._next) == 1
+    assert len(running.dispatcher._next) == 1
     (tree / "objects/wand.json").write_text("{")
     running.tuning.look()
     assert running.output[-1].startswith("changed files are not used")

@@ -111,8 +111,8 @@ def test_a_master_tracks_a_wrist_device_and_says_how_it_is(root: Path, tmp_path:
         assert report.counts["wrist.received"] == 40
         assert "wrist.lost" not in report.counts  # nothing was
         assert report.counts["poses"] > 30
-        assert report.gauges["wrist.clock_sigma_us"] >= 0.0
-        assert not [name for name in report.gauges if "phase" in name or "residual" in name]
+        assert report.metrics["wrist.clock_sigma_us"] >= 0.0
+        assert not [name for name in report.metrics if "phase" in name or "residual" in name]
     summary = json.loads((tmp_path / "live.json").read_text())
     poses = load_poses(tmp_path / "poses.npz")
     assert len(poses) == summary["poses"] > 30

@@ -57,12 +57,12 @@ def test_the_file_in_use_says_its_colours_by_number_and_has_no_overlap_as_it_com
         load(TREE / "cameras/left.json", CameraCalibration),
     )
     assert camera.markers is not None
-    gauges = in_use(camera, rig.markers)
-    assert not [name for name in gauges if name.startswith("overlap.")]
+    metrics = in_use(camera, rig.markers)
+    assert not [name for name in metrics if name.startswith("overlap.")]
     wide = msgspec.structs.replace(camera.markers["back"], hsv_high=(62, 255, 255))
     other = in_use(msgspec.structs.replace(camera, markers=camera.markers | {"back": wide}), rig.markers)
     assert other["overlap.index..back"] == 3.0
-    changed = {name for name, value in gauges.items() if other[name] != value}
+    changed = {name for name, value in metrics.items() if other[name] != value}
     assert changed == {"colour.back"}
 
 

@@ -186,10 +186,10 @@ def test_from_no_colour_at_all_to_a_slave_that_follows_the_light(tmp_path: Path)
         with pytest.raises(FitError):
             sample(name)  # the hand has moved on since the picture that was clicked on
         shown[7] = Frame(0, 7, 7, PICTURE)
-        gauges = sample(name, 7)
+        metrics = sample(name, 7)
         shown.clear()
-        assert gauges["pick.pixels"] > 100
-        assert gauges[f"marker.{name}.h_low"] < HUE[k] < gauges[f"marker.{name}.h_high"]
+        assert metrics["pick.pixels"] > 100
+        assert metrics[f"marker.{name}.h_low"] < HUE[k] < metrics[f"marker.{name}.h_high"]
         detector.push(moved, (2 * k + 1) * 16_666_667)
         found = detector.push(moved, (2 * k + 2) * 16_666_667).uv
         assert np.isfinite(found[:, 0]).sum() == k + 1

@@ -15,7 +15,7 @@ from common.sim.illuminant import Light
 from common.sim.light import MARKER_LINEAR_RGB
 from common.srgb import gain_tables
 from slave.markers.classify import ColourTable
-from slave.markers.colour_watch import ColourWatch, hsv
+from slave.markers.colour_monitor import ColourMonitor, hsv
 from slave.markers.drift import (
     LIMIT_BLUE,
     LIMIT_EXPOSURE,
@@ -227,7 +227,7 @@ def of_hsv(*colours: tuple[float, float, float]) -> Float:
     return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
 
 
-def watched(watch: ColourWatch, seconds: float, light: Float, begin_s: float = 0.0) -> list[str | None]:
+def watched(watch: ColourMonitor, seconds: float, light: Float, begin_s: float = 0.0) -> list[str | None]:
     marks: list[str | None] = []
     for k in range(round(seconds * 20)):
         t_ns = round((begin_s + k / 20) * 1e9)
@@ -236,7 +236,7 @@ def watched(watch: ColourWatch, seconds: float, light: Float, begin_s: float = 0
 
 
 def test_room_is_counted_to_the_nearest_border_also_through_zero() -> None:
-    watch = ColourWatch(("a", "b"), BAND)
+    watch = ColourMonitor(("a", "b"), BAND)
     assert watched(watch, 1.0, of_hsv((70, 200, 200), (177, 200, 200))) == []
     # a: 10 hues to either side, b: 7 to its low one; the smallest believed spread is 1.5 hues.
     np.testing.assert_allclose(watch.room(), [10.0 / 1.5, 7.0 / 1.5], atol=0.05)
@@ -255,13 +255,13 @@ def test_room_is_counted_to_the_nearest_border_also_through_zero() -> None:
 def test_a_colour_near_a_border_is_warned_of_while_it_is_inside(
     colour: tuple[float, float, float], *, warned: bool
 ) -> None:
-    watch = ColourWatch(("a", "b"), BAND)
+    watch = ColourMonitor(("a", "b"), BAND)
     assert watched(watch, 1.0, of_hsv(colour, (0, 200, 200))) == (["a"] if warned else [])
     assert watch.room()[0] > 0.0
 
 
 def test_a_warning_names_the_marker_and_the_fix_and_ends_only_when_there_is_room_again() -> None:
-    watch = ColourWatch(("a", "b"), BAND)
+    watch = ColourMonitor(("a", "b"), BAND)
     other = (0, 200, 200)
     watched(watch, 1.0, of_hsv((77.5, 200, 200), other))
     text = watch.push(of_hsv((77.5, 200, 200), other), np.ones(2), SECOND)[0].text
@@ -272,7 +272,7 @@ def test_a_warning_names_the_marker_and_the_fix_and_ends_only_when_there_is_room
 
 
 def test_a_warning_stays_while_the_marker_is_lost() -> None:
-    watch = ColourWatch(("a", "b"), BAND)
+    watch = ColourMonitor(("a", "b"), BAND)
     watched(watch, 1.0, of_hsv((78, 200, 200), (0, 200, 200)))
     lost = of_hsv((78, 200, 200), (0, 200, 200))
     lost[0] = np.nan
@@ -281,11 +281,11 @@ def test_a_warning_stays_while_the_marker_is_lost() -> None:
 
 def test_two_paints_that_come_to_look_alike_are_named() -> None:
     near = {"a": BAND["a"], "c": HsvRange(hsv_low=(81, 80, 60), hsv_high=(99, 255, 255))}
-    watch = ColourWatch(("a", "c"), near)
+    watch = ColourMonitor(("a", "c"), near)
     watched(watch, 1.0, of_hsv((75, 200, 200), (81, 200, 200)))
     texts = [
         warning.text for warning in watch.push(of_hsv((75, 200, 200), (81, 200, 200)), np.ones(2), SECOND)
     ]
     assert any("a and c look alike" in text for text in texts)
-    watch = ColourWatch(("a", "c"), near)
+    watch = ColourMonitor(("a", "c"), near)
     assert watched(watch, 1.0, of_hsv((70, 200, 200), (90, 200, 200))) == []

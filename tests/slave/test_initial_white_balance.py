@@ -139,7 +139,7 @@ def test_no_simulator_is_imported_to_know_the_light() -> None:
         "drift",
         "light_meter",
         "white_balance",
-        "colour_watch",
+        "colour_monitor",
         "light_adaptive",
     ):
         assert "common.sim" not in (folder / f"{name}.py").read_text(), name

@@ -12,10 +12,10 @@ import pytest
 from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
-from slave.cameras import passing, picamera2, reopening, v4l2_settings
+from slave.cameras import frame_observer, picamera2, reconnecting, v4l2_settings
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
-from slave.cameras.reopening import ReopeningCamera
+from slave.cameras.reconnecting import ReconnectingCamera
 from slave.cameras.source import FrameSource
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
 from tests.network_helpers import until
@@ -238,10 +238,12 @@ def test_without_a_loop_that_reads_frames_nothing_can_be_verified(monkeypatch: p
 
 
 def test_a_camera_that_comes_back_has_the_settings_it_was_given_last(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reopening, "FIRST_WAIT_S", 0.001)
+    monkeypatch.setattr(reconnecting, "FIRST_WAIT_S", 0.001)
     first, second = Camera(damaged=frozenset({20, 21})), Camera(damaged=frozenset({13}))
     plugged = [first, second]
-    source = ReopeningCamera(lambda file: usb(plugged.pop(0), file), FILE, SystemClock(), threading.Event())
+    source = ReconnectingCamera(
+        lambda file: usb(plugged.pop(0), file), FILE, SystemClock(), threading.Event()
+    )
     with reading(source):
         source.tune(changed(exposure_us=9000.0))
         assert until(lambda: source.counts()["camera.broken"] == 2)
@@ -258,7 +260,7 @@ def test_a_camera_that_comes_back_has_the_settings_it_was_given_last(monkeypatch
 
 
 def test_a_camera_that_is_away_cannot_be_changed() -> None:
-    source = ReopeningCamera(lambda file: usb(Camera(), file), FILE, SystemClock(), threading.Event())
+    source = ReconnectingCamera(lambda file: usb(Camera(), file), FILE, SystemClock(), threading.Event())
     source.close()
     with pytest.raises(CameraError, match="camera 'left' is away"):
         source.tune(changed(exposure_us=9000.0))
@@ -266,7 +268,7 @@ def test_a_camera_that_is_away_cannot_be_changed() -> None:
 
 
 def test_a_late_watcher_sees_only_the_newest() -> None:
-    frames = passing.Passing[int]()
+    frames = frame_observer.FrameObserver[int]()
     assert frames.newest is None
     frames.put(1)
     seen = frames.following(2, 5.0)

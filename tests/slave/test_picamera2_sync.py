@@ -10,7 +10,7 @@ import pytest
 from common.clock import SystemClock
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
-from slave.cameras.picamera2_sync import MOST_OFF_US, PERIOD_FRAMES, SILENT_FRAMES, SyncWatch
+from slave.cameras.picamera2_sync import MOST_OFF_US, PERIOD_FRAMES, SILENT_FRAMES, SyncMonitor
 from tests.slave.fake_picamera2 import Sensor, install
 from tests.slave.test_live_settings import FILE
 
@@ -47,8 +47,8 @@ def frames(
     return found
 
 
-def watched(metadata: list[dict[str, Any]]) -> tuple[SyncWatch, list[bool]]:
-    watch = SyncWatch("camera 'left'", client=True)
+def watched(metadata: list[dict[str, Any]]) -> tuple[SyncMonitor, list[bool]]:
+    watch = SyncMonitor("camera 'left'", client=True)
     locked: list[bool] = []
     for frame in metadata:
         watch.push(frame)
@@ -108,7 +108,7 @@ def test_a_camera_that_begins_anew_is_not_in_step(caplog: pytest.LogCaptureFixtu
 
 
 def test_a_server_is_in_step_when_it_is_ready() -> None:
-    watch = SyncWatch("camera 'left'", client=False)
+    watch = SyncMonitor("camera 'left'", client=False)
     watch.push({"SyncReady": False})
     assert watch.figures() == {"sync_locked": 0.0}
     for _ in range(1000):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from common.calibration import CameraCalibration, load
-from slave.markers.colour_watch import hsv
+from slave.markers.colour_monitor import hsv
 from slave.markers.detector import MarkerDetector
 from slave.markers.quality import WEIGHTS, Evidence, _hue, clarity_of, evidence_of, probability_of
 from tests.slave.painted import NAMES, RANGES, Disc, camera, paint, render

@@ -13,9 +13,9 @@ import pytest
 from common.messages import Message
 from slave.app import run, wait_for_start
 from slave.cameras.source import Frame
+from slave.counters import Counters
 from slave.markers.detector import Detections
 from slave.service import LOST_PATIENCE_S, WAITING, Service
-from slave.tally import Tally
 
 PERIOD_US = 4_000_000
 QUARTER_NS = 1_000_000_000
@@ -223,7 +223,7 @@ def test_a_detection_that_hangs_feeds_nothing(manager: Manager) -> None:
 
     loop = threading.Thread(
         target=run,
-        args=(Frames(10, lambda: None), detector, Nowhere(), "left", Tally(("index",)), stop),
+        args=(Frames(10, lambda: None), detector, Nowhere(), "left", Counters(("index",)), stop),
         kwargs={"alive": alive},
     )
     loop.start()

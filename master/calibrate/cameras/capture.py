@@ -104,11 +104,11 @@ class StillTaker:
         """
         self._bus, self._ingest, self._sizes = bus, ingest, dict(sizes)
         self._cameras = tuple(sizes)
-        self._feed: Subscription = bus.subscribe("still", depth=4 * len(sizes))
+        self._next_round: Subscription = bus.subscribe("still", depth=4 * len(sizes))
 
     def take(self) -> Round:
         """One round: ask all, then wait until all that answered have sent, at most a second."""
-        while self._feed.get(0.0) is not None:
+        while self._next_round.get(0.0) is not None:
             pass  # what came too late for its own round
         askers = [threading.Thread(target=self._ask, args=(name,), daemon=True) for name in self._cameras]
         for thread in askers:
@@ -116,7 +116,7 @@ class StillTaker:
         stills: dict[str, Still] = {}
         end_ns = now_ns() + ANSWER_NS
         while len(stills) < len(self._cameras) and (left_ns := end_ns - now_ns()) > 0:
-            message = self._feed.get(left_ns * 1e-9)
+            message = self._next_round.get(left_ns * 1e-9)
             if isinstance(message, Still) and message.camera in self._cameras:
                 stills[message.camera] = message
         for thread in askers:
@@ -127,7 +127,7 @@ class StillTaker:
 
     def close(self) -> None:
         """Listen no more. Safe to call twice."""
-        self._feed.close()
+        self._next_round.close()
 
     def _ask(self, camera: str) -> None:
         try:

@@ -28,11 +28,11 @@ def pick(camera: str, marker: str, uv: tuple[float, float]) -> Command:
 def ranges_of(health: Health) -> dict[str, HsvRange]:
     """The colours in use that an answer of a camera tells."""
     found: dict[str, HsvRange] = {}
-    for key in health.gauges:
+    for key in health.metrics:
         if key.startswith("marker.") and key.endswith(".h_low"):
             name = key.removeprefix("marker.").removesuffix(".h_low")
             low, high = (
-                tuple(round(health.gauges[f"marker.{name}.{letter}_{end}"]) for letter in "hsv")
+                tuple(round(health.metrics[f"marker.{name}.{letter}_{end}"]) for letter in "hsv")
                 for end in ("low", "high")
             )
             found[name] = HsvRange(hsv_low=(low[0], low[1], low[2]), hsv_high=(high[0], high[1], high[2]))

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from common.messages import CheckItem, Health
 from master.checklist.facts import CameraPlan, MasterNow, Plan, SenderNow
-from master.checklist.watch import ChecklistWatch
+from master.checklist.monitor import ChecklistMonitor
 from master.rejected_peers import MarkerCounts, RejectedPeer
 
 MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
@@ -23,7 +23,7 @@ NAMES = ("left", "right", "wrist", "imu")
 class Bench:
     """Holds a watch, the time, all counters, and what is wrong; `seconds` lets time go by."""
 
-    watch: ChecklistWatch = field(default_factory=lambda: ChecklistWatch(PLAN))
+    watch: ChecklistMonitor = field(default_factory=lambda: ChecklistMonitor(PLAN))
     t_ns: int = 10**12
     away: set[str] = field(default_factory=set[str])
     loss: dict[str, float] = field(default_factory=dict[str, float])
@@ -36,7 +36,7 @@ class Bench:
     disk_mb: float = 9000.0
     apart: float = 0.0
     files: tuple[CheckItem, ...] = ()
-    gauges: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
+    metrics: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
     counts: dict[str, dict[str, int]] = field(default_factory=dict[str, dict[str, int]])
     per_s: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
     session: dict[str, int] = field(default_factory=dict[str, int])
@@ -86,10 +86,10 @@ class Bench:
         counts = {
             event: int(n + 1e-6) for (who, event), n in self._sums.items() if who == name and who != "master"
         }
-        gauges = {"width_px": 640.0, "height_px": 480.0, "light_exposure": 1.0, "temperature_c": 50.0}
-        gauges |= {"temperature_limit_c": 80.0, "disk_free_mb": 8000.0, "exposure_us": 5000.0}
-        gauges |= {"wanted.exposure_us": 5000.0} | {f"colour.{marker}": 1.0 for marker in MARKERS}
-        told = gauges | self.gauges.get(name, {})
+        metrics = {"width_px": 640.0, "height_px": 480.0, "light_exposure": 1.0, "temperature_c": 50.0}
+        metrics |= {"temperature_limit_c": 80.0, "disk_free_mb": 8000.0, "exposure_us": 5000.0}
+        metrics |= {"wanted.exposure_us": 5000.0} | {f"colour.{marker}": 1.0 for marker in MARKERS}
+        told = metrics | self.metrics.get(name, {})
         counts |= self.counts.get(name, {})
         return Health(name, self.session.get(name, 1), self.t_ns + 10**9, counts, told)
 

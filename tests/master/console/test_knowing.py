@@ -13,14 +13,14 @@ from common.messages import Command, Gesture, Health
 from common.output_settings import OutputSettings
 from master.console.elements import full_frame_uv
 from master.console.filter_trial import save_filter, try_filter
-from master.console.guard import names_of, refusal
 from master.console.history import History
-from master.console.looking import Looking
 from master.console.output_files import change_output
 from master.console.own_copy import update_copy
 from master.console.play_panel import start_playing
+from master.console.preview_leases import PreviewLeases
 from master.console.received_gestures import KEPT, ReceivedGestures
 from master.console.recording_panel import recording_path
+from master.console.request_filter import names_of, refusal
 from master.console.state import ConsoleSettings, ConsoleState, Newest
 from master.console.tuner import Range, Tuner
 from master.console.words import hand_line
@@ -118,22 +118,22 @@ def test_looking_asks_for_all_that_anybody_wants_tinted_and_ends() -> None:
         asked.append(command)
         raise BusError("nobody there")
 
-    looking = Looking(ask)
-    looking.look("left")
-    looking.look("left", ("index",))
+    preview_leases = PreviewLeases(ask)
+    preview_leases.look("left")
+    preview_leases.look("left", ("index",))
     assert until(lambda: any("index" in one.body for one in asked))
-    assert looking.error("left") == "nobody there"
-    assert looking.looked_at == {"left"}
-    assert until(lambda: not looking.looked_at), "no thread is left when nobody looks"
-    assert not looking.error("left")
+    assert preview_leases.error("left") == "nobody there"
+    assert preview_leases.looked_at == {"left"}
+    assert until(lambda: not preview_leases.looked_at), "no thread is left when nobody looks"
+    assert not preview_leases.error("left")
 
 
 def test_history_keeps_a_minute_and_parts_what_masters_and_senders_say() -> None:
     history = History()
     for k in range(300):
-        gauges = {"camera_hz.left": 90.0, "left.clock_offset_us": 1500.0, "left.clock_sigma_us": 30.0}
+        metrics = {"camera_hz.left": 90.0, "left.clock_offset_us": 1500.0, "left.clock_sigma_us": 30.0}
         counts = {"left.received": 45 * k} | ({"left.lost": 2 * (k - 100)} if k > 100 else {})
-        master = Health("master", 1, k * 500_000_000, counts, gauges)
+        master = Health("master", 1, k * 500_000_000, counts, metrics)
         slave = Health("left", 1, k, {}, {"soc_celsius": 50.0})
         history.push(0.5 * k, [5.0, 7.0, 100.0], {"master": master, "left": slave})
     assert history.latest("latency_p50_ms") == 7.0

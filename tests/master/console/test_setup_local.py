@@ -11,7 +11,7 @@ import pytest
 
 from common.errors import PhalanxError
 from master.console.local import LocalProcesses
-from master.console.warden import watch
+from master.console.process_supervisor import watch
 
 WAIT_S = 60.0
 

@@ -8,7 +8,16 @@ from hypothesis import strategies as st
 from common.arrays import Float
 from common.errors import RecordingError
 from common.hand_model import TIPS, WRIST
-from master.export.motion import FRAMES_OF_POSE, FREE_FRAMES, Motion, complete, local, resample, slerp, world
+from master.export.motion import (
+    FRAMES_OF_POSE,
+    FREE_FRAMES,
+    Motion,
+    complete,
+    dispatcher,
+    local,
+    resample,
+    slerp,
+)
 from master.export.skeleton import ORDER, PARENT
 from tests.master.export.made import BEGIN_NS, REST, STEP_NS, poses_of, positions, stacked
 
@@ -33,7 +42,7 @@ def test_the_tree_has_every_joint_once_and_parents_before_children() -> None:
 @settings(max_examples=10)
 def test_local_and_world_undo_each_other(seed: int) -> None:
     motion = complete(stacked(poses_of(seed, 4, loose_m=0.003)), REST)
-    again = world(local(motion))
+    again = dispatcher(local(motion))
     np.testing.assert_allclose(again.position_m, motion.position_m, atol=1e-12)
     same = np.abs(np.vecdot(again.orientation_wxyz, motion.orientation_wxyz))
     np.testing.assert_allclose(same, 1.0, atol=1e-12)

@@ -138,10 +138,10 @@ def test_a_wrist_device_alone_turns_a_dial_by_its_imu(model: HandModel) -> None:
     told: list[Gesture] = []
     for k in range(60):
         rotation = np.radians(max(k - 20, 0))
-        world = axis_rotation(1, 0.7) @ _about(np.zeros(3), knob.axis, rotation)[:3, :3]
+        dispatcher = axis_rotation(1, 0.7) @ _about(np.zeros(3), knob.axis, rotation)[:3, :3]
         pose = _pose(model, k, np.eye(4), knob.posture_deg, markers=0)
         told += _actions(
-            recogniser, [msgspec.structs.replace(pose, palm_world_wxyz=matrix_to_quaternion(world))]
+            recogniser, [msgspec.structs.replace(pose, palm_world_wxyz=matrix_to_quaternion(dispatcher))]
         )
     assert told[0].phase == "begin"
     assert np.degrees(told[-1].angle_rad) == pytest.approx(39.0, abs=0.1)

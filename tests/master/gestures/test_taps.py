@@ -14,7 +14,7 @@ from common.hand_model import CHAINS
 from common.messages import Gesture, HandPose
 from common.sim.motion import angles_of
 from master.gestures.features import FeatureExtractor
-from master.gestures.taps import TapWatch
+from master.gestures.taps import ThumbTapMonitor
 from master.gestures.touch import thumb_touch
 from tests.hand_helpers import RIGHT, palm
 from tests.master.gestures.shown_hands import FRAME_NS, shown
@@ -53,7 +53,7 @@ def gap_at(k: int, down: int = 5, pace: int = 8) -> float:
 
 
 def told_of(pose: Callable[[int], HandPose], frames: int = 80, settings: TapSettings = TAPS) -> list[Gesture]:
-    watch, out = TapWatch(settings), list[Gesture]()
+    watch, out = ThumbTapMonitor(settings), list[Gesture]()
     for k in range(frames):
         seen = FeatureExtractor(RIGHT).of(pose(k))
         assert seen is not None

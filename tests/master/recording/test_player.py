@@ -129,7 +129,7 @@ def test_the_playing_master_obeys(run: RecordedRun) -> None:
     try:
         assert until(lambda: MASTER in asker.alive(), 30.0)
         asker.ask(Command(MASTER, "pause"), 1.0)
-        paused = asker.ask(Command(MASTER, "report"), 1.0).gauges
+        paused = asker.ask(Command(MASTER, "report"), 1.0).metrics
         assert paused["play.paused"] == 1.0
         assert paused["play.length_s"] == pytest.approx(0.392, abs=0.01)
         with pytest.raises(BusError, match=r"t_s 99: must be 0\.000 to 0\.3"):
@@ -148,7 +148,7 @@ def test_the_playing_master_obeys(run: RecordedRun) -> None:
             asker.ask(Command(MASTER, "dance"), 1.0)
         asker.ask(Command(MASTER, "seek", '{"t_s": 0.3}'), 1.0)
         asker.ask(Command(MASTER, "speed", '{"factor": 0}'), 1.0)
-        assert asker.ask(Command(MASTER, "resume"), 1.0).gauges["play.paused"] == 0.0
+        assert asker.ask(Command(MASTER, "resume"), 1.0).metrics["play.paused"] == 0.0
         thread.join(60.0)
     finally:
         stop.set()

@@ -65,7 +65,7 @@ def test_slaves_keep_raw_frames_for_as_long_as_messages_are_recorded(
     finally:
         stop.set()
         thread.join(60.0)
-        master.tap.close()
+        master.probe.close()
     assert isinstance(out[0], Progress), "a camera that refuses does not end it"
     assert not left.on
     assert left.kept == ["wave-left"]

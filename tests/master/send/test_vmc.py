@@ -154,9 +154,9 @@ def test_the_mirror_between_the_axes_is_no_rotation(ear: socket.socket) -> None:
     pose = hand_pose("right", rotation_vector=np.array([0.3, 1.0, -0.4]))
     _, bones = sent(ear, pose)
     rig = pose.position_m[[8, 13, 18]] - pose.position_m[WRIST]
-    world = np.stack([built(bones, "right")[row] for row in (8, 13, 18)])
-    assert np.linalg.det(rig) * np.linalg.det(world) < 0.0
-    np.testing.assert_allclose(np.linalg.norm(rig, axis=1), np.linalg.norm(world, axis=1), atol=1e-6)
+    dispatcher = np.stack([built(bones, "right")[row] for row in (8, 13, 18)])
+    assert np.linalg.det(rig) * np.linalg.det(dispatcher) < 0.0
+    np.testing.assert_allclose(np.linalg.norm(rig, axis=1), np.linalg.norm(dispatcher, axis=1), atol=1e-6)
 
 
 def built(bones: dict[str, Bone], side: Side) -> dict[int, Float]:

@@ -33,7 +33,7 @@ CLOSE = b"\x88"  # as no pose and no head of HTTP has it
 ENDED = (0, 1, 3, 4, 5)  # of these: the server says so, and closes
 
 
-class Feed:
+class StreamSubscriber:
     """Offers poses to a server, as the sender does. Holds how many it offered, and a thread."""
 
     def __init__(self, server: WebServer) -> None:
@@ -70,7 +70,7 @@ def spoken(port: int, frame: bytes, wait_s: float) -> bytes:
 
 def test_three_hundred_strangers_and_broken_frames_leave_the_reader_its_poses() -> None:
     server = WebServer("127.0.0.1", 0)
-    feed = Feed(server)
+    feed = StreamSubscriber(server)
     try:
         with connect(f"ws://127.0.0.1:{server.port}/hands", open_timeout=WAIT_S) as reader:
             unknown_peer = threading.Thread(target=assault, args=(("127.0.0.1", server.port), 300, 100, 3.0))

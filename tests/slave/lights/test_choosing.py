@@ -9,7 +9,7 @@ import pytest
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.errors import CalibrationError, LightsError
 from slave.__main__ import main
-from slave.lights.opening import choose, limits_for, open_guarded
+from slave.lights.factory import choose, limits_for, open_guarded
 from slave.lights.strobed import check_pulses, schedule_of
 from tests.slave.lights.stage import CAMERA, RIG, ROOT
 

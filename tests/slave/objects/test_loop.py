@@ -15,9 +15,9 @@ from common.messages import Message, TrackerPose
 from common.object_profile import ObjectProfile
 from common.sim.tracker import SET_UP_TRACKER, SET_UP_TRACKING, SimulatedTracker
 from slave.__main__ import main
+from slave.objects.counters import PoseCounters
 from slave.objects.live import run, wait_for_start
 from slave.objects.synthetic import SyntheticTracker
-from slave.objects.tally import PoseTally
 from slave.simulated import tracker_of
 
 CALIB = Path(__file__).resolve().parents[3] / "calib_json"
@@ -51,7 +51,7 @@ class Source:
     def counts(self) -> dict[str, int]:
         return {"lost": 2}
 
-    def gauges(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {"away_s": 0.5}
 
 
@@ -75,15 +75,15 @@ class Wire:
 
 def test_every_pose_is_sent_in_the_name_of_this_process_and_counted() -> None:
     source = Source([pose(0), pose(1, known=False), pose(4)])
-    wire, tally = Wire(), PoseTally(source)
-    run(source, wire, tally, threading.Event())
+    wire, counters = Wire(), PoseCounters(source)
+    run(source, wire, counters, threading.Event())
     assert [(one.session, one.seq) for one in wire.sent] == [(77, 0), (77, 1), (77, 4)]
-    assert tally.counts() == {"poses": 3, "skipped": 2, "nowhere": 1, "lost": 2}
-    gauges = tally.gauges()
-    assert gauges.pop("rate_hz") > 0.0
-    assert gauges == {"tracked": 1.0, "away_s": 0.5}
+    assert counters.counts() == {"poses": 3, "skipped": 2, "nowhere": 1, "lost": 2}
+    metrics = counters.metrics()
+    assert metrics.pop("rate_hz") > 0.0
+    assert metrics == {"tracked": 1.0, "away_s": 0.5}
     with pytest.raises(TrackerError, match="gone"):
-        run(Source([TrackerError("gone")]), wire, PoseTally(), threading.Event())
+        run(Source([TrackerError("gone")]), wire, PoseCounters(), threading.Event())
 
 
 def test_poses_before_the_start_are_forgotten() -> None:
@@ -185,7 +185,7 @@ def test_the_command_says_in_one_line_what_is_missing(
 
 
 def test_an_object_without_a_tracker_is_said_to_have_none() -> None:
-    from slave.objects.opening import object_with
+    from slave.objects.factory import object_with
 
     rig = load(CALIB / "rigs" / "desk-wand.json", RigCalibration)
     with pytest.raises(CalibrationError, match="no object has the tracker 'tracker'; there is none"):

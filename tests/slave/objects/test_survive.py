@@ -12,7 +12,7 @@ import pytest
 from common.clock import SystemClock
 from common.errors import TrackerChoiceError, TrackerError
 from common.messages import TrackerPose
-from slave.objects.reopening import ReopeningTracker
+from slave.objects.reconnecting import ReconnectingTracker
 from slave.objects.survive import OPTIONS, SurviveFile, SurviveTracker
 from tests.network_helpers import until
 from tests.slave.objects.recorded import HEAD, pose, program
@@ -22,7 +22,7 @@ def opened(command: str, wanted: str | None = None) -> SurviveTracker:
     return SurviveTracker("tracker", wanted, SystemClock(), threading.Event(), command)
 
 
-def read(source: SurviveTracker | SurviveFile | ReopeningTracker, count: int) -> list[TrackerPose]:
+def read(source: SurviveTracker | SurviveFile | ReconnectingTracker, count: int) -> list[TrackerPose]:
     poses = [source.read() for _ in range(count)]
     return [one for one in poses if one is not None]
 
@@ -71,7 +71,7 @@ def test_a_program_that_ends_is_an_error_and_is_started_again(tmp_path: Path) ->
         source.read()
     source.close()
     clock, stop = SystemClock(), threading.Event()
-    again = ReopeningTracker("tracker", lambda: opened(command), clock, stop)
+    again = ReconnectingTracker("tracker", lambda: opened(command), clock, stop)
     poses = read(again, 6)
     stop.set()
     again.close()
@@ -115,7 +115,7 @@ def alive(number: int) -> bool:
 
 def test_two_devices_and_no_choice_end_it_though_it_would_be_reopened(tmp_path: Path) -> None:
     command = program(tmp_path, f"{output(tmp_path, HEAD, pose(8.0), pose(8.0, 'T20'))}; sleep 60")
-    again = ReopeningTracker("tracker", lambda: opened(command), SystemClock(), threading.Event())
+    again = ReconnectingTracker("tracker", lambda: opened(command), SystemClock(), threading.Event())
     with pytest.raises(TrackerChoiceError, match="--serial"):
         read(again, 9)
     again.close()

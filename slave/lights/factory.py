@@ -3,7 +3,7 @@
 from common.calibration import RigCalibration
 from common.errors import LightsError
 from common.strobe_calibration import StrobeCalibration
-from slave.lights.guard import Guard
+from slave.lights.interlock import Interlock
 
 SWITCHED = "gpio:CHIP:LASER,LED | i2c:BUS[:ADDRESS]"
 ELSEWHERE = ("camera", "external")
@@ -64,7 +64,7 @@ def limits_for(lights: str, rig: RigCalibration) -> StrobeCalibration:
     return rig.strobe
 
 
-def open_guarded(lights: str, rig: RigCalibration) -> Guard:
+def open_guarded(lights: str, rig: RigCalibration) -> Interlock:
     """Open real lights, dark, within the limits of the rig file.
 
     Raises:
@@ -75,9 +75,9 @@ def open_guarded(lights: str, rig: RigCalibration) -> Guard:
     if kind == "gpio":
         from slave.lights.gpio import GpioLights
 
-        return Guard(GpioLights(place, strobe.max_pulse_us * 1e-6), strobe)
+        return Interlock(GpioLights(place, strobe.max_pulse_us * 1e-6), strobe)
     if kind == "i2c":
         from slave.lights.i2c_led import FlashDriverLights
 
-        return Guard(FlashDriverLights(place, strobe), strobe)
+        return Interlock(FlashDriverLights(place, strobe), strobe)
     raise LightsError(f"--lights {lights}: the slave does not switch these; it does {SWITCHED}")

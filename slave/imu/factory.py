@@ -11,7 +11,7 @@ from common.calibration import ImuCalibration
 from common.clock import Clock
 from common.errors import CalibrationError, ImuError
 from common.imu_fusion import OrientationFilter
-from slave.imu.reopening import ReopeningImu
+from slave.imu.reconnecting import ReconnectingImu
 from slave.imu.source import ImuSource
 from slave.service import ConnectionLost, nobody
 
@@ -67,7 +67,7 @@ def open_real(
     clock: Clock,
     stop: threading.Event,
     connection_lost: ConnectionLost = nobody,
-) -> ReopeningImu:
+) -> ReconnectingImu:
     """Open the IMU that `--imu DRIVER:PLACE` names; until `stop` is set, it is opened again when it was lost.
 
     Args:
@@ -95,7 +95,7 @@ def open_real(
         opener = lambda: lsm6dsox.Lsm6dsoxImu(name, wires, rate_hz, clock, stop)  # noqa: E731
     else:
         raise ImuError(f"--imu {driver}: no such driver; there are {IMUS}")
-    return ReopeningImu(opener, true_hz, clock, stop, connection_lost)
+    return ReconnectingImu(opener, true_hz, clock, stop, connection_lost)
 
 
 def places() -> str:

@@ -43,7 +43,7 @@ class Replayed(Solving, Protocol):
         ...
 
 
-class SolverGuard:
+class SolverSupervisor:
     """Push machine before a solver.
 
     Holds the last messages, and the thread that replaces what is broken.

@@ -27,7 +27,7 @@ LONGEST_WAIT_S = 10.0  # each try leaves 100 kB in openvr (ValveSoftware/openvr,
 LOG_LOST_S = 0.25
 
 
-class ReopeningTracker:
+class ReconnectingTracker:
     """A `TrackerSource` around one that can be lost.
 
     Holds the open one, if there is one, number and time of the last pose, and since when it is away.
@@ -112,13 +112,13 @@ class ReopeningTracker:
         counts.update(self._failures.ask(source.counts) if isinstance(source, Telling) else {})
         return {"lost": 0, "back": 0, "raised": self._failures.raised, **counts}
 
-    def gauges(self) -> Mapping[str, float]:
+    def metrics(self) -> Mapping[str, float]:
         """`away_s`, for how long the system has been lost, 0: it is there; and what the open one tells."""
         source, away_ns = self._source, self._away_ns
         away_s = 0.0 if away_ns is None else (self._clock.now_ns() - away_ns) * 1e-9
         return {
             "away_s": away_s,
-            **(self._failures.ask(source.gauges) if isinstance(source, Telling) else {}),
+            **(self._failures.ask(source.metrics) if isinstance(source, Telling) else {}),
         }
 
     def _lose(self, error: Exception) -> None:

@@ -116,7 +116,7 @@ class Watch:
         held = {one.name: mapped(one.pid) for one in self._rig.processes}
         took = now_s - self._since_s
         p50, p99 = np.percentile(latencies, [50, 99]) if len(latencies) else (np.nan, np.nan)
-        gauges = self._health["master"].gauges if "master" in self._health else {}
+        metrics = self._health["master"].metrics if "master" in self._health else {}
         minute = Minute(
             now_s,
             len(latencies) / took,
@@ -125,8 +125,8 @@ class Watch:
             os.getloadavg()[0],
             {name: (spent[name] - self._cpu_s[name]) / took for name in spent},
             judged(self._health),
-            _ending(gauges, ".clock_offset_us"),
-            _ending(gauges, ".clock_sigma_us"),
+            _ending(metrics, ".clock_offset_us"),
+            _ending(metrics, ".clock_sigma_us"),
             {name: more for name, now in held.items() if (more := grown(self._mapped[name], now))},
         )
         self.history.minutes.append(minute)
@@ -150,6 +150,6 @@ def judged(health: dict[str, Health]) -> dict[str, int]:
     return out
 
 
-def _ending(gauges: dict[str, float], end: str) -> dict[str, float]:
+def _ending(metrics: dict[str, float], end: str) -> dict[str, float]:
     """Sender -> value, of the gauges with this ending."""
-    return {name.removesuffix(end): value for name, value in gauges.items() if name.endswith(end)}
+    return {name.removesuffix(end): value for name, value in metrics.items() if name.endswith(end)}

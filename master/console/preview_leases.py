@@ -13,7 +13,7 @@ ASK_EVERY_S = 1.0  # a camera shows itself for 3 s after each request
 _ANSWER_S = 1.5
 
 
-class Looking:
+class PreviewLeases:
     """Holds for each camera who looks until when, and one thread per camera as long as somebody does."""
 
     def __init__(self, ask: Callable[[Command, float], Health]) -> None:

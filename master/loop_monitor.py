@@ -12,10 +12,10 @@ from typing import Generic
 from common.service_manager import ServiceManager
 from master.app import AuxiliaryMessage, SeenT, Source
 
-_FEEDS = 4  # in a period of the watchdog
+_NOTIFIES = 4  # in a period of the watchdog
 
 
-class WatchedLoop(Generic[SeenT]):
+class MonitoredLoop(Generic[SeenT]):
     """A source of messages that shows the manager each time it is asked.
 
     Holds when the next sign is due.
@@ -35,7 +35,7 @@ class WatchedLoop(Generic[SeenT]):
             now_ns: The time [ns].
         """
         self._source, self._manager, self._now_ns = source, manager, now_ns
-        self._every_ns = manager.watchdog_us * 1000 // _FEEDS
+        self._every_ns = manager.watchdog_us * 1000 // _NOTIFIES
         self._due_ns = now_ns() + self._every_ns
         manager.send("READY=1\nSTATUS=tracks", wait=True)
 

@@ -9,7 +9,7 @@ from common.calibration import RigCalibration, load
 from common.clock import Clock
 from common.errors import CalibrationError, TrackerError
 from common.object_profile import ObjectProfile
-from slave.objects.reopening import ReopeningTracker
+from slave.objects.reconnecting import ReconnectingTracker
 from slave.objects.source import TrackerSource
 from slave.service import ConnectionLost, nobody
 
@@ -87,4 +87,4 @@ def open_real(
         opener = lambda: OpenVrTracker(name, serial, clock, stop)  # noqa: E731
     else:
         raise TrackerError(f"--device {device}: no such system; there are {DEVICES}")
-    return ReopeningTracker(name, opener, clock, stop, connection_lost)
+    return ReconnectingTracker(name, opener, clock, stop, connection_lost)

@@ -71,7 +71,7 @@ class _Latch:
         self.shown |= t_ns - self.since_ns >= HOLD_NS.get(verdict.code, 0)
 
 
-class ChecklistWatch:
+class ChecklistMonitor:
     """Holds what each rule holds, what is wrong, and until when each cause silences what follows from it."""
 
     def __init__(self, plan: Plan) -> None:

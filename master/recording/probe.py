@@ -28,7 +28,7 @@ _TOGETHER_S = 0.2  # to wake a thread and a link for each message would cost sev
 ReceivedT = TypeVar("ReceivedT", bound=Message)
 
 
-class Tap:
+class Probe:
     """Whether somebody taps, and what is to be shown. The bus belongs to the caller.
 
     Holds the lease, the queue, and the thread while there is one. `show` belongs to the loop; the rest is called on any
@@ -51,7 +51,7 @@ class Tap:
 
     @property
     def counts(self) -> dict[str, int]:
-        """`tap.shown`, and of those `tap.dropped`, once there were any; a recorder tells from it what never came."""
+        """`probe.shown`, and of those `probe.dropped`, once there were any; a recorder tells from it what never came."""
         # What waits to be published can be nobody's loss yet.
         return (
             {"tap.shown": self._shown - len(self._queue), "tap.dropped": self._dropped} if self._shown else {}
@@ -141,9 +141,9 @@ class Tapped(Generic[ReceivedT]):
     With each message it sees how far behind the master is, which holds until the next. Holds the last message.
     """
 
-    def __init__(self, source: Taking[ReceivedT], tap: Tap, load_shedding: LoadShedding) -> None:
+    def __init__(self, source: Taking[ReceivedT], probe: Probe, load_shedding: LoadShedding) -> None:
         """Stand between a source and who reads it."""
-        self._source, self._tap, self._load_shedding = source, tap, load_shedding
+        self._source, self._probe, self._load_shedding = source, probe, load_shedding
         self._last: ReceivedT | None = None
 
     def get(self, timeout_s: float) -> ReceivedT | None:
@@ -158,4 +158,4 @@ class Tapped(Generic[ReceivedT]):
         """At the end: the last message, too."""
         last, self._last = self._last, None
         if last is not None:
-            self._tap.show(last, self._load_shedding.reject)
+            self._probe.show(last, self._load_shedding.reject)

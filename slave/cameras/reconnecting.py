@@ -28,7 +28,7 @@ LONGEST_WAIT_S = 1.0  # what is plugged in again tracks within two seconds
 FROZEN_NS = 1_000_000_000
 
 
-class ReopeningCamera:
+class ReconnectingCamera:
     """A `FrameSource` around one that can be lost.
 
     Holds the open camera, if there is one, its settings, the number and time of the last frame, its picture, in `lost`

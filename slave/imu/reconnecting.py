@@ -22,7 +22,7 @@ FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 1.0  # what is plugged in again tracks within two seconds
 
 
-class ReopeningImu:
+class ReconnectingImu:
     """An `ImuSource` around one that can be lost.
 
     Holds the open IMU, if there is one, number and time of the last sample, and since when it is away.
@@ -92,13 +92,13 @@ class ReopeningImu:
         counts.update(self._failures.ask(source.counts) if isinstance(source, Telling) else {})
         return {"lost": 0, "back": 0, "raised": self._failures.raised, **counts}
 
-    def gauges(self) -> Mapping[str, float]:
+    def metrics(self) -> Mapping[str, float]:
         """`away_s`, for how long it has been lost, 0: it is there; and what the open IMU tells."""
         source, away_ns = self._source, self._away_ns
         away_s = 0.0 if away_ns is None else (self._clock.now_ns() - away_ns) * 1e-9
         return {
             "away_s": away_s,
-            **(self._failures.ask(source.gauges) if isinstance(source, Telling) else {}),
+            **(self._failures.ask(source.metrics) if isinstance(source, Telling) else {}),
         }
 
     def _lose(self, error: Exception) -> None:

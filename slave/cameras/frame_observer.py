@@ -12,7 +12,7 @@ from common.errors import CameraError
 T = TypeVar("T")
 
 
-class Passing(Generic[T]):
+class FrameObserver(Generic[T]):
     """Holds the newest of what went by, and how many there were."""
 
     def __init__(self) -> None:

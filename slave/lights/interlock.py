@@ -26,7 +26,7 @@ _SHINING = (Illumination.LASER, Illumination.LED)
 _LOG = logging.getLogger(__name__)
 
 
-class Guard:
+class Interlock:
     """A driver within limits. Holds what is on, until when at most, the pulses of the last second, whether it failed.
 
     Attributes:

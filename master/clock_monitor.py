@@ -36,8 +36,8 @@ class _Machines:
         self.residual.push(message)
 
 
-class TimeWatch:
-    """Push machine in the loop; `follow`, `look` and `gauges` belong to the thread that reports, once a second.
+class ClockMonitor:
+    """Push machine in the loop; `follow`, `look` and `metrics` belong to the thread that reports, once a second.
 
     Holds the machines for phases and residual offsets, what the latter found last, and for how long a camera has
     been suspect. Cameras that watch two hands are measured once.
@@ -78,7 +78,7 @@ class TimeWatch:
                 lines.append(warning(name, offset))
         return lines
 
-    def gauges(self, clock_of: Callable[[str], ClockEstimate | None]) -> dict[str, float]:
+    def metrics(self, clock_of: Callable[[str], ClockEstimate | None]) -> dict[str, float]:
         """<sender>.<quantity>: clock_*, of a marker camera phase_*, residual_*; what is not known is not told."""
         out: dict[str, float] = {}
         for name in self._senders:

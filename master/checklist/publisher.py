@@ -14,8 +14,8 @@ from common.machine import Machine
 from common.messages import CheckItem, Checklist, Health
 from common.streams import MASTER
 from master.checklist.facts import MasterNow, SenderNow, plan_of
-from master.checklist.files import FileWatch
-from master.checklist.watch import ChecklistWatch
+from master.checklist.files import FileMonitor
+from master.checklist.monitor import ChecklistMonitor
 from master.quarantine import Quarantine
 from master.rejected_peers import MarkerCounts, RejectedPeer
 from master.rig_setup import RigSetup
@@ -76,7 +76,7 @@ class Counting(Protocol):
         ...
 
 
-class ChecklistFeed:
+class ChecklistPublisher:
     """Belongs to one thread. Holds the watch, its subscription, and what was published last."""
 
     def __init__(
@@ -86,7 +86,7 @@ class ChecklistFeed:
         received: Received,
         setups: Sequence[RigSetup],
         pipelines: Sequence[Counting],
-        files: FileWatch | None,
+        files: FileMonitor | None,
         session: int,
         writes_to: Path,
     ) -> None:
@@ -108,7 +108,7 @@ class ChecklistFeed:
         self._bus, self._clock, self._received, self._files = bus, clock, received, files
         self._setups, self._pipelines = tuple(setups), tuple(pipelines)
         self._plan = plan_of(setups)
-        self._watch = ChecklistWatch(self._plan)
+        self._monitor = ChecklistMonitor(self._plan)
         self._reports = bus.subscribe("health", depth=DEPTH)
         self._session, self._machine = session, Machine(writes_to)
         self._told: tuple[CheckItem, ...] | None = None
@@ -139,11 +139,11 @@ class ChecklistFeed:
             plan = plan_of(setups)
             if plan != self._plan:
                 self._plan = plan
-                self._watch.follow(plan)
+                self._monitor.follow(plan)
         while isinstance(health := self._reports.get(0.0), Health):
-            self._watch.push_health(health, t_ns)
-        self._watch.push(self._now(t_ns))
-        items = self._watch.look(t_ns)
+            self._monitor.push_health(health, t_ns)
+        self._monitor.push(self._now(t_ns))
+        items = self._monitor.look(t_ns)
         if _keys(items) != _keys(self._told) or t_ns - self._told_ns >= EVERY_NS:
             self._told, self._told_ns = items, t_ns
             self._bus.publish("checklist", MASTER, Checklist(MASTER, self._session, t_ns, items))

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from common.bus import Bus, Subscription
 from common.clock import now_ns
 from common.messages import Command, Health, Message
+from master.recording.probe import came_ns
 from master.recording.recorder import MessageRecorder
-from master.recording.tap import came_ns
 
 DEPTH = {"taken": 20_000, "preview": 32, "still": 32}  # messages that may wait for their thread
 _DEPTH = 5_000
@@ -38,7 +38,7 @@ class MasterClock:
         return now_ns() + self.ahead_ns
 
 
-class Feed:
+class StreamSubscriber:
     """Subscriptions of one connection, and their threads, which offer all that comes to a recorder."""
 
     def __init__(
@@ -95,21 +95,21 @@ class Feed:
         return self._last_ns
 
 
-class TapLease:
+class ProbeLease:
     """Asks the master to show what it takes, again and again, and tells from its answers what never came.
 
     Holds the clock, the session of the master, and by how much we were behind it at the last answers.
     """
 
-    def __init__(self, bus: Bus, feed: Feed, clock: MasterClock) -> None:
-        self._bus, self._feed, self._clock = bus, feed, clock
+    def __init__(self, bus: Bus, subscriber: StreamSubscriber, clock: MasterClock) -> None:
+        self._bus, self._subscriber, self._clock = bus, subscriber, clock
         self._session: int | None = None
         self._unseen = 0
         self._behind: deque[int] = deque(maxlen=_ANSWERS)
         self.lost = 0
 
     def ask(self) -> Health:
-        """Tap for three seconds more.
+        """Probe for three seconds more.
 
         Raises:
             BusError: The master is not there, or refuses.
@@ -117,7 +117,7 @@ class TapLease:
         asked_ns = now_ns()
         health = self._bus.ask(Command("master", "tap"), _ASK_S)
         self._clock.push(asked_ns, now_ns(), health.t_ns)
-        behind = health.counts.get("tap.shown", 0) - self._feed.received["taken"]
+        behind = health.counts.get("tap.shown", 0) - self._subscriber.received["taken"]
         if health.session != self._session:
             # What it showed before we listened was not for us.
             self._session, self._unseen = health.session, max(behind, 0) if self._session is None else 0

@@ -12,7 +12,7 @@ from slave.failures import Failures
 SMOOTHING = 0.05  # weight of the newest frame in the running means
 
 
-class Tally:
+class Counters:
     """Counters of the loop, written by the loop and read by the health thread.
 
     Holds the counts since the start, running means, what the last rate was reckoned from, and what frames failed of.
@@ -91,7 +91,7 @@ class Tally:
             counts |= {f"seen.{n}": int(k) for n, k in zip(self._names, self._seen, strict=True)}
         return {**counts, **self._others()}
 
-    def gauges(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """rate_hz since the last call, running mean and worst (since the last call) of detection [us].
 
         And those that are told beside them.

@@ -31,7 +31,7 @@ from master.app import Solved
 from master.estimator.pipeline import SolvedPose, Stage
 from master.gestures.recogniser import GestureRecogniser
 from master.link_senders import SensorMessage
-from master.objects.contact import ContactWatch
+from master.objects.contact import ContactMonitor
 from master.objects.line import SolvedObject
 from master.rig_pipeline import pipeline_of
 from master.rig_setup import RigSetup
@@ -55,7 +55,7 @@ class _Auxiliary:
     objects: tuple[TrackedObject, ...]
     shown: dict[str, list[TrackedObject]]
     trackers: dict[str, TrackedObject]
-    contacts: dict[str, ContactWatch]
+    contacts: dict[str, ContactMonitor]
     gestures: dict[str, GestureRecogniser]
 
     @classmethod
@@ -79,7 +79,7 @@ class _Auxiliary:
             shown,
             {one.tracker: one for one in objects if one.tracker is not None},
             {
-                name: ContactWatch(setup.hand, profiles)
+                name: ContactMonitor(setup.hand, profiles)
                 for name, setup in hands.items()
                 if profiles and setup.has_markers
             },
@@ -110,7 +110,7 @@ class Line(Protocol):
         ...
 
 
-class World:
+class Dispatcher:
     """Push machine over all that comes.
 
     Holds the line of each hand, what is beside them, and the gestures that have not ended.
@@ -258,11 +258,11 @@ class World:
             self._begun[key] = gesture
 
 
-def fresh_world(setups: Sequence[RigSetup]) -> World:
+def new_dispatcher(setups: Sequence[RigSetup]) -> Dispatcher:
     """A world of these hands in its first state, of which nothing is measured.
 
     Raises:
-        CalibrationError: As `World`.
+        CalibrationError: As `Dispatcher`.
     """
     stages = StageTimes()
-    return World(setups, [pipeline_of(setup, stages) for setup in setups], stages)
+    return Dispatcher(setups, [pipeline_of(setup, stages) for setup in setups], stages)

@@ -58,7 +58,7 @@ def hsv(light: Float) -> Float:
     return np.stack([hue, 255.0 * span / np.maximum(value, 1e-9), value], axis=-1)
 
 
-class ColourWatch:
+class ColourMonitor:
     """Watches the room of every marker's colour. Holds mean, spread and watched time of each, and who is warned of."""
 
     def __init__(self, names: Sequence[str], ranges: Mapping[str, HsvRange]) -> None:
@@ -74,7 +74,7 @@ class ColourWatch:
         count = len(self._names)
         self._mean = np.full((count, 3), np.nan)  # hue as the distance from the middle of the range
         self._variance = np.zeros((count, 3))
-        self._watched_s = np.zeros(count)
+        self._monitored_s = np.zeros(count)
         self._warned = np.zeros(count, np.bool_)
         self._t_ns: int | None = None
 
@@ -103,7 +103,7 @@ class ColourWatch:
         hue = (self._half - np.abs(self._mean[:, 0])) / spread[:, 0]
         rest = (self._mean[:, 1:] - self._low[:, 1:]) / spread[:, 1:]
         room = np.minimum(hue, rest.min(axis=1))
-        return np.where(self._watched_s >= LEAST_S, room, np.nan)
+        return np.where(self._monitored_s >= LEAST_S, room, np.nan)
 
     def _learn(self, good: Bool, seen: Float, dt_s: float) -> None:
         seen[:, 0] = (seen[:, 0] - self._middle[good] + HUES / 2.0) % HUES - HUES / 2.0
@@ -113,7 +113,7 @@ class ColourWatch:
         away = seen - mean
         self._mean[good] = mean + share * away
         self._variance[good] = (1.0 - share) * (self._variance[good] + share * away**2)
-        self._watched_s[good] += dt_s
+        self._monitored_s[good] += dt_s
 
     def _of(self, m: int, room: float) -> ColourWarning:
         name, colour = self._names[m], self._range[self._names[m]]
@@ -129,7 +129,7 @@ class ColourWatch:
         hue = (self._mean[:, 0] + self._middle) % HUES
         apart = np.abs(hue[:, None] - hue[None, :])
         apart = np.minimum(apart, HUES - apart)
-        long = self._watched_s >= LEAST_S
+        long = self._monitored_s >= LEAST_S
         with np.errstate(invalid="ignore"):
             near = (apart < APART) & long[:, None] & long[None, :]
         return [

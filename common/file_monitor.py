@@ -1,4 +1,4 @@
-"""Notice that files have another content than when they were last looked at. Looking costs one `stat` per file."""
+"""Notice that files have another content than when they were last looked at. PreviewLeases costs one `stat` per file."""
 
 import hashlib
 from collections.abc import Iterable
@@ -14,7 +14,7 @@ class _Look:
     digest: bytes
 
 
-class WatchedFiles:
+class MonitoredFiles:
     """Holds how each file was when it was last looked at; nothing before the first look."""
 
     def __init__(self) -> None:

@@ -6,7 +6,7 @@ _LOOKS = 5  # in a row, once a second: somebody who reaches before a camera is n
 _NAME = 64  # characters of a name in `Health`
 
 
-class OddWatch:
+class ExtrinsicsMonitor:
     """Belongs to the thread that reports. Holds the last counts, and for how many looks each camera was left out."""
 
     def __init__(self, cameras: tuple[str, ...]) -> None:
