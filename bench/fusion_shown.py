@@ -25,7 +25,7 @@ from common.sim.render import Renderer
 from common.sim.scene import Scene
 from common.sim.wrist.scene import WristTruth
 
-_LASTS_S = 0.2  # errors and misses are about the same for so long
+_HOLD_S = 0.2  # errors and misses are about the same for so long
 _SPOT_PX2, _SPOT_SPREAD_PX2 = 15.5, 4.0  # of paint that is found half of the time
 _WHOLE_PX2, _WHOLE_PX, _SPECK_PX = 100.0, 0.1, 1.1  # claimed of caps from so much paint on, and at most
 _OF_CLAIMED = 0.6  # how large errors are by what is claimed
@@ -43,7 +43,7 @@ class _Wander:
     """Errors of unit variance that are about the same for a while (an AR(1) process), N at once."""
 
     def __init__(self, rng: np.random.Generator, shape: tuple[int, ...], step_s: float) -> None:
-        self._rng, self._keep = rng, float(np.exp(-step_s / _LASTS_S))
+        self._rng, self._keep = rng, float(np.exp(-step_s / _HOLD_S))
         self._now = rng.normal(size=shape)
 
     def __call__(self) -> Float:

@@ -74,12 +74,12 @@ class LoginRequired:
             else:
                 await self._socket(session, scope, receive, send)
         elif scope["path"] in (LOGIN, LOGOUT) or session is None:
-            answer = await self._door(Request(scope, receive), token, session)
+            answer = await self._login(Request(scope, receive), token, session)
             await answer(scope, receive, send)
         else:
             await self._app(scope, receive, send)
 
-    async def _door(self, request: Request, token: str, session: Session | None) -> Response:
+    async def _login(self, request: Request, token: str, session: Session | None) -> Response:
         path, method = request.url.path, request.method
         if path == LOGIN and method == "POST":
             return await self._try(request)

@@ -13,9 +13,9 @@ from nicegui.events import GenericEventArguments
 from common.errors import PhalanxError
 from common.messages import Command, Health
 from common.streams import MASTER
+from master.console.command_queue import CommandQueue
 from master.console.recording_panel import recordings_folder
 from master.console.state import ConsoleState
-from master.console.telling import Telling
 
 PROCESS = "play"
 _UPDATE_S = 0.5
@@ -70,8 +70,8 @@ class Controls:
                 self._words = ui.label("").classes("mono play-at")
             self._speeds = ui.select(_SPEEDS, value=1.0, label="Speed").props("dense outlined")
             self._speeds.classes("known-poses")
-        self._telling = Telling(self._tell, self._told, notify)
-        self._pause.on_click(lambda: self._telling.change("resume" if self._paused else "pause", None))
+        self._command_queue = CommandQueue(self._tell, self._told, notify)
+        self._pause.on_click(lambda: self._command_queue.change("resume" if self._paused else "pause", None))
         self._slider.on_value_change(self._dragged)
         self._slider.on("change", self._sought)  # when it is let go, or its key
         self._speeds.on_value_change(self._sped)
@@ -81,7 +81,7 @@ class Controls:
         now = self._newest()
         position = None if now is None else now.metrics.get("play.position_s")
         self._all.set_visibility(position is not None)
-        if now is None or position is None or self._telling.busy:
+        if now is None or position is None or self._command_queue.busy:
             return
         if self._wanted_s is not None:
             there = abs(position - self._wanted_s) < _NEAR_S
@@ -126,13 +126,13 @@ class Controls:
     def _sought(self, event: GenericEventArguments) -> None:
         """The event has the value: `value` follows a moment later while a hand is quick."""
         self._wanted_s, self._until_s = float(cast(float, event.args)), time.monotonic() + _JUMP_S
-        self._telling.change("seek", {"t_s": round(self._wanted_s, 1)})
+        self._command_queue.change("seek", {"t_s": round(self._wanted_s, 1)})
 
     def _sped(self) -> None:
         factor = float(self._speeds.value or 0.0)
         if factor != self._speed:
             self._speed = factor
-            self._telling.change("speed", {"factor": factor})
+            self._command_queue.change("speed", {"factor": factor})
 
 
 def play_panel(state: ConsoleState) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from common.messages import Gesture
 
-LASTS_S = 0.5  # a gesture is repeated with every pose of its hand: not heard for so long, it is over
+HOLD_S = 0.5  # a gesture is repeated with every pose of its hand: not heard for so long, it is over
 KEPT = 30
 _MOST = 64
 
@@ -24,7 +24,7 @@ class ReceivedGestures:
 
     def __init__(self) -> None:
         """Nothing was said."""
-        self._lasting: dict[tuple[str, str], ReceivedGesture] = {}
+        self._held: dict[tuple[str, str], ReceivedGesture] = {}
         self._events: deque[ReceivedGesture] = deque(maxlen=KEPT)
 
     def push(self, gesture: Gesture, now_s: float) -> None:
@@ -34,17 +34,17 @@ class ReceivedGestures:
         if gesture.phase != "update":
             self._events.append(received)
         if gesture.phase == "end":
-            self._lasting.pop(key, None)
-        elif key in self._lasting or len(self._lasting) < _MOST:
-            self._lasting[key] = received
+            self._held.pop(key, None)
+        elif key in self._held or len(self._held) < _MOST:
+            self._held[key] = received
 
-    def lasting(self, now_s: float | None = None) -> dict[tuple[str, str], Gesture]:
+    def held(self, now_s: float | None = None) -> dict[tuple[str, str], Gesture]:
         """(hand, kind) -> what lasts at `now_s` [s], by default now."""
         now_s = time.monotonic() if now_s is None else now_s
         return {
             key: received.gesture
-            for key, received in list(self._lasting.items())
-            if now_s - received.received_s < LASTS_S
+            for key, received in list(self._held.items())
+            if now_s - received.received_s < HOLD_S
         }
 
     def events(self) -> list[ReceivedGesture]:

@@ -152,7 +152,7 @@ class ConsoleState:
     @property
     def gestures(self) -> dict[tuple[str, str], Gesture]:
         """(hand, kind) -> the gesture that lasts now."""
-        return self.received_gestures.lasting()
+        return self.received_gestures.held()
 
     def preview(self, camera: str) -> Preview | None:
         """The newest picture of a camera, unless it is older than 3 s."""

@@ -70,7 +70,7 @@ def stationary_of(settings: Settings, *, loose: bool, tilt_rad: float) -> Float:
 
 
 @inlined
-def _lasts(settings: Settings, i: int) -> float:
+def _correlation_time(settings: Settings, i: int) -> float:
     return settings.tilt_s if TILT <= i < TILT + 2 else _CONSTANT_S
 
 
@@ -100,7 +100,7 @@ def predict_extras(
     for i in range(K):
         for j in range(K):
             M[i, j] = 0.0
-        M[i, i] = 1.0 if i == HEADING else exp(-away / _lasts(settings, i))
+        M[i, i] = 1.0 if i == HEADING else exp(-away / _correlation_time(settings, i))
     paced = settings.pace_1_s * away
     decay = exp(-paced)
     for b in range(2):

@@ -26,7 +26,7 @@ from common.messages import Gesture, Phase
 from master.gestures.features import HandFeatures
 from master.gestures.grip import Tips, axis_of, is_grip, may_grip, rotation_between, spread_m, widened_m
 from master.gestures.grip_history import GripHistory
-from master.gestures.lasting import Lasting
+from master.gestures.held_gesture import HeldGesture
 
 _AXIS_RAD = radians(15.0)  # how well the circle of the tips tells the axis of the knob
 _SWAY_RAD = radians(4.0)  # about other axes, by which a hand sways while it turns a knob
@@ -59,7 +59,7 @@ class DialMonitor:
 
     def __init__(self, settings: DialSettings) -> None:
         self._settings = settings
-        self._dial: Lasting | None = None
+        self._dial: HeldGesture | None = None
         self._grip: _Grip | None = None
         self._maybe: deque[tuple[int, Tips, bool]] = deque()  # since when tips are as they are now; a grip's?
         self._angle = 0.0
@@ -95,7 +95,7 @@ class DialMonitor:
             axis = self._held(seen.t_ns, tips, self._settings.hold_s, grips=grips)
             if axis is None:
                 return []
-            self._dial = Lasting(seen.hand, "dial", "dial", seen.t_ns)
+            self._dial = HeldGesture(seen.hand, "dial", "dial", seen.t_ns)
             self._angle = 0.0
             self._take(tips, axis)
             self._closed_ns = self._known_ns = seen.t_ns
@@ -187,7 +187,7 @@ class DialMonitor:
         self._angle = twist + 2.0 * pi * round((self._angle - twist) / (2.0 * pi))
         grip.history.push(t_ns, wide_m, self._angle)
 
-    def _tell(self, dial: Lasting, phase: Phase, seen: HandFeatures, tips: Tips) -> Gesture:
+    def _tell(self, dial: HeldGesture, phase: Phase, seen: HandFeatures, tips: Tips) -> Gesture:
         grip = self._grip
         origin = 0.5 * seen.tips_m[0] + 0.5 * seen.tips_m[1:].mean(axis=0)
         way = seen.palmar if grip is None else tips.T_still_rig.T @ grip.axis

@@ -13,7 +13,7 @@ from statistics import median
 _LATE_S = 0.1  # what counts as of late
 _FIRM = 0.3  # of what is quick: from there on the last instants before it may be of it
 _FADE_S = 0.06  # in which a turn that nobody sees fades
-_LASTS_S = 0.15  # a grip that is wider for so long is just wider
+_HOLD_S = 0.15  # a grip that is wider for so long is just wider
 
 
 class GripHistory:
@@ -39,7 +39,7 @@ class GripHistory:
             good = abs(wide_m) <= most_m
         else:
             typical = median(wide for _, wide, _ in self._late)
-            lasts = self._since_ns is not None and (t_ns - self._since_ns) * 1e-9 > _LASTS_S
+            lasts = self._since_ns is not None and (t_ns - self._since_ns) * 1e-9 > _HOLD_S
             good = abs(wide_m) <= most_m and (lasts or abs(wide_m - typical) <= self._quick_m)
             if good and lasts:
                 self._late.clear()

@@ -23,7 +23,7 @@ from common.hand_model import CHAINS, TIPS
 from common.messages import Gesture
 from master.estimator.matrices import spread
 from master.gestures.features import HandFeatures
-from master.gestures.lasting import Lasting, below
+from master.gestures.held_gesture import HeldGesture, below
 from master.gestures.touch import ThumbTouch
 
 KEYS = (("3", "2", "1"), ("6", "5", "4"), ("9", "8", "7"), ("hash", "0", "star"))
@@ -144,7 +144,7 @@ class ThumbTapMonitor:
         sure = below(gone.least_m, self._settings.leave_gap_m, sigma) * below(0.0, nearer_m, sigma)
         sure *= below(0.0, float(np.abs(beyond).min()), sigma)
         self._tapped_ns = seen.t_ns
-        tap = Lasting(seen.hand, "tap", KEYS[finger][segment], gone.began_ns)
+        tap = HeldGesture(seen.hand, "tap", KEYS[finger][segment], gone.began_ns)
         ends = CHAINS[finger + 1, segment : segment + 2]
         middle = 0.5 * (nearest.joints_m[ends].mean(axis=0) + nearest.joints_m[TIPS[0]])
         return [tap.told("end", seen.t_ns, sure, distance_m=gone.least_m, origin_m=middle)]

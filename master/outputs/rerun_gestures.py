@@ -55,7 +55,7 @@ class GesturesLayer:
                 self._states.log(f"{one.hand}/tap", one.began_t_ns, one.name)
                 self._states.log(f"{one.hand}/tap", one.t_ns, None)
             else:
-                self._lasting(root, one, at)
+                self._held(root, one, at)
             if one.phase != "update":
                 self._states.at(one.t_ns)
                 self._rec.log(
@@ -63,7 +63,7 @@ class GesturesLayer:
                     rr.TextLog(f"{one.phase} {one.kind}: {label_of(one)}", level="INFO"),
                 )
 
-    def _lasting(self, root: str, one: Gesture, at: Float) -> None:
+    def _held(self, root: str, one: Gesture, at: Float) -> None:
         path, colour = f"{root}/{'ray' if one.kind == 'point' else one.kind}", GESTURE_RGB[one.kind]
         if one.phase == "end":
             self._states.log(f"{one.hand}/{one.kind}", one.t_ns, None)

@@ -105,12 +105,12 @@ def open_real(
         if options.sync != "off":  # the others may have to be started first
             connection_lost = partial(connection_lost, patience_s=LOST_PATIENCE_S + options.sync_timeout)
             connection_lost("opens the camera, in step with others")
-        return lasting(
+        return persistent(
             lambda file: Picamera2Camera(file, pi, clock, stop), camera, clock, stop, connection_lost
         )
     if kind == "v4l2":
         usb = V4l2Options(_path(place), _controls(options.control), tuple(options.allow_missing), pixels)
-        return lasting(lambda file: V4l2Camera(file, usb, clock), camera, clock, stop, connection_lost)
+        return persistent(lambda file: V4l2Camera(file, usb, clock), camera, clock, stop, connection_lost)
     return None
 
 
@@ -128,7 +128,7 @@ def _pixels(kind: str, as_luma: bool, wrist: bool) -> Pixels:
     return Pixels.COLOUR
 
 
-def lasting(
+def persistent(
     opener: Callable[[CameraCalibration], FrameSource],
     camera: CameraCalibration,
     clock: Clock,

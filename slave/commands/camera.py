@@ -145,7 +145,7 @@ def _open_synthetic(
 
     frozen = Frozen()
 
-    return real.lasting(
+    return real.persistent(
         lambda file: FaultyCamera(draw(file), file, options.faults, frozen),
         camera,
         clock,

@@ -7,7 +7,7 @@ from typing import Protocol
 from common.arrays import Float
 from common.messages import ImuSample
 from slave.counters import Counters
-from slave.imu.source import Telling
+from slave.imu.source import Reporting
 
 
 class Orientation(Protocol):
@@ -44,7 +44,7 @@ class SampleCounters:
     def __init__(self, source: object = None, orientation: Orientation | None = None) -> None:
         """Count from nothing, beside what the IMU and the filter of its orientation tell, if they tell anything."""
         self._counters = Counters(())
-        self._source = source if isinstance(source, Telling) else None
+        self._source = source if isinstance(source, Reporting) else None
         self._orientation = orientation
 
     def sample(self, seq: int) -> None:

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from common.clock import Clock
 from common.messages import ImuSample
 from slave.failures import Failures
-from slave.imu.source import ImuSource, Telling
+from slave.imu.source import ImuSource, Reporting
 from slave.service import ConnectionLost, nobody
 
 FIRST_WAIT_S = 0.2
@@ -89,7 +89,7 @@ class ReconnectingImu:
         """
         counts = Counter(self._counts)
         source = self._source
-        counts.update(self._failures.ask(source.counts) if isinstance(source, Telling) else {})
+        counts.update(self._failures.ask(source.counts) if isinstance(source, Reporting) else {})
         return {"lost": 0, "back": 0, "raised": self._failures.raised, **counts}
 
     def metrics(self) -> Mapping[str, float]:
@@ -98,7 +98,7 @@ class ReconnectingImu:
         away_s = 0.0 if away_ns is None else (self._clock.now_ns() - away_ns) * 1e-9
         return {
             "away_s": away_s,
-            **(self._failures.ask(source.metrics) if isinstance(source, Telling) else {}),
+            **(self._failures.ask(source.metrics) if isinstance(source, Reporting) else {}),
         }
 
     def _lose(self, error: Exception) -> None:
@@ -112,7 +112,7 @@ class ReconnectingImu:
         source, self._source = self._source, None
         if source is None:
             return
-        self._counts.update(self._failures.ask(source.counts) if isinstance(source, Telling) else {})
+        self._counts.update(self._failures.ask(source.counts) if isinstance(source, Reporting) else {})
         self._failures.close(source)
 
     def _return(self) -> ImuSource | None:

@@ -26,7 +26,7 @@ class ImuSource(Protocol):
 
 
 @runtime_checkable
-class Telling(Protocol):
+class Reporting(Protocol):
     """An IMU that has more to tell than its samples; asked by the thread of the reports."""
 
     def counts(self) -> Mapping[str, int]:

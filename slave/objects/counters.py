@@ -4,7 +4,7 @@ import numpy as np
 
 from common.messages import TrackerPose
 from slave.counters import Counters
-from slave.imu.source import Telling
+from slave.imu.source import Reporting
 
 
 class PoseCounters:
@@ -13,7 +13,7 @@ class PoseCounters:
     def __init__(self, source: object = None) -> None:
         """Count from nothing, beside what the source tells, if it tells anything."""
         self._counters = Counters(())
-        self._source = source if isinstance(source, Telling) else None
+        self._source = source if isinstance(source, Reporting) else None
         self._nowhere = 0
         self._tracked = False
 

@@ -18,7 +18,7 @@ from common.clock import Clock
 from common.errors import TrackerChoiceError
 from common.messages import TrackerPose
 from slave.failures import Failures
-from slave.imu.source import Telling
+from slave.imu.source import Reporting
 from slave.objects.source import TrackerSource
 from slave.service import ConnectionLost, nobody
 
@@ -109,7 +109,7 @@ class ReconnectingTracker:
         """
         counts = Counter(self._counts)
         source = self._source
-        counts.update(self._failures.ask(source.counts) if isinstance(source, Telling) else {})
+        counts.update(self._failures.ask(source.counts) if isinstance(source, Reporting) else {})
         return {"lost": 0, "back": 0, "raised": self._failures.raised, **counts}
 
     def metrics(self) -> Mapping[str, float]:
@@ -118,7 +118,7 @@ class ReconnectingTracker:
         away_s = 0.0 if away_ns is None else (self._clock.now_ns() - away_ns) * 1e-9
         return {
             "away_s": away_s,
-            **(self._failures.ask(source.metrics) if isinstance(source, Telling) else {}),
+            **(self._failures.ask(source.metrics) if isinstance(source, Reporting) else {}),
         }
 
     def _lose(self, error: Exception) -> None:
@@ -134,7 +134,7 @@ class ReconnectingTracker:
         source, self._source = self._source, None
         if source is None:
             return
-        self._counts.update(self._failures.ask(source.counts) if isinstance(source, Telling) else {})
+        self._counts.update(self._failures.ask(source.counts) if isinstance(source, Reporting) else {})
         self._failures.close(source)
 
     def _return(self) -> TrackerSource | None:

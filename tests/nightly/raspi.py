@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from bench.aarch64.sysroot import PYTHON, Sysroot
-from bench.made_once import made_once
+from bench.cached import made_once
 from tests.hosts.board_image import MIRROR, SUITE, run
 from tests.hosts.debian import cache
 from tests.hosts.rig import ROOT

@@ -13,12 +13,12 @@ from common.calibration import load
 from common.errors import CalibrationError, PhalanxError
 from common.gesture_settings import GestureSettings, default_gestures
 from common.messages import Gesture
+from master.console.labels import gesture_line, readable
 from master.console.state import ConsoleState
-from master.console.words import gesture_line, readable
 
 _UPDATE_S = 0.2
 _NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
-_TEACH = "teach a pose"
+_RECORD_TEMPLATE = "teach a pose"
 
 
 def build(state: ConsoleState) -> None:
@@ -135,11 +135,11 @@ def _poses(state: ConsoleState) -> None:
     def start(words: list[str]) -> None:
         async def work() -> None:
             try:
-                await asyncio.to_thread(state.local.start, _TEACH, words, {})
+                await asyncio.to_thread(state.local.start, _RECORD_TEMPLATE, words, {})
             except PhalanxError as error:
                 progress.set_text(str(error))
 
-        background_tasks.create(work(), name=_TEACH)
+        background_tasks.create(work(), name=_RECORD_TEMPLATE)
 
     def teach() -> None:
         wanted = (name.value or "").strip()
@@ -156,7 +156,7 @@ def _poses(state: ConsoleState) -> None:
         names = list(poses_of(state))
         if known.options != names:
             known.set_options(names, value=known.value if known.value in names else None)
-        process = state.local.get(_TEACH)
+        process = state.local.get(_RECORD_TEMPLATE)
         if process is not None:
             progress.set_text("\n".join(process.tail(8)))
 

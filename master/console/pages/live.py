@@ -6,8 +6,8 @@ from nicegui import ui
 
 from common.messages import HandPose
 from master.console.elements import CameraView, HandBox
+from master.console.labels import gesture_lines, hand_line, joint_states, object_line, readable
 from master.console.state import ConsoleState
-from master.console.words import gesture_lines, hand_line, joint_states, object_line, readable
 
 _UPDATE_S = 0.5
 _FIGURES = (

@@ -14,8 +14,9 @@ from common.output_settings import OutputSettings
 from master.console.elements import full_frame_uv
 from master.console.filter_trial import save_filter, try_filter
 from master.console.history import History
+from master.console.labels import hand_line
+from master.console.local_mirror import update_copy
 from master.console.output_files import change_output
-from master.console.own_copy import update_copy
 from master.console.play_panel import start_playing
 from master.console.preview_leases import PreviewLeases
 from master.console.received_gestures import KEPT, ReceivedGestures
@@ -23,7 +24,6 @@ from master.console.recording_panel import recording_path
 from master.console.request_filter import names_of, refusal
 from master.console.state import ConsoleSettings, ConsoleState, Newest
 from master.console.tuner import Range, Tuner
-from master.console.words import hand_line
 from tests.master.console.fakes import FakeSlave, pose, tree
 from tests.network_helpers import until
 
@@ -156,10 +156,10 @@ def test_gestures_last_until_they_end_or_are_not_heard_and_events_are_bounded() 
 
     publish("begin", 1.0)
     publish("update", 1.2)
-    assert set(received.lasting(1.4)) == {("me", "pinch")}
-    assert not received.lasting(1.8), "not repeated: over"
+    assert set(received.held(1.4)) == {("me", "pinch")}
+    assert not received.held(1.8), "not repeated: over"
     publish("end", 2.0)
-    assert not received.lasting(2.0)
+    assert not received.held(2.0)
     for k in range(100):
         publish("end", 3.0 + k, "tap")
     assert len(received.events()) == KEPT

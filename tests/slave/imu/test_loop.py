@@ -94,7 +94,7 @@ class Filter:
         return msgspec.structs.replace(sample, orientation_wxyz=np.array([1.0, 0.0, 0.0, 0.0]))
 
 
-class Telling(Source):
+class Reporting(Source):
     """An IMU that has more to tell."""
 
     def counts(self) -> dict[str, int]:
@@ -105,7 +105,7 @@ class Telling(Source):
 
 
 def test_the_filters_orientation_is_sent_and_what_it_and_the_imu_tell_is_told() -> None:
-    wire, source, orientation = Wire(), Telling([sample(0), sample(1)]), Filter()
+    wire, source, orientation = Wire(), Reporting([sample(0), sample(1)]), Filter()
     counters = SampleCounters(source, orientation)
     run(source, wire, counters, threading.Event(), orientation)
     assert [one.orientation_wxyz.tolist() for one in wire.sent] == [[1.0, 0.0, 0.0, 0.0]] * 2

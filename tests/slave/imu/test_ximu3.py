@@ -12,7 +12,7 @@ from common.clock import SystemClock
 from common.errors import ImuError
 from common.messages import ImuSample
 from slave.imu.reconnecting import ReconnectingImu
-from slave.imu.source import ImuSource, Telling
+from slave.imu.source import ImuSource, Reporting
 from slave.imu.ximu3 import SerialPlace, Ximu3Imu, divisor, open_port
 from slave.imu.ximu3_protocol import Kind
 from tests.slave.imu.fake_ximu3 import FakeXimu3
@@ -222,7 +222,7 @@ def test_unplugged_it_is_lost_and_plugged_in_again_it_is_back(link: Path) -> Non
     gap = after[0].seq - before[-1].seq
     assert gap == max(1, round((after[0].t_ns - before[-1].t_ns) * 1e-9 * 400.0 / 3.0)) > 1
     assert after[1].seq == after[0].seq + 1
-    assert isinstance(imu, Telling)
+    assert isinstance(imu, Reporting)
     counts = imu.counts()
     assert (counts["lost"], counts["back"], counts["imu.inertial"]) == (1, 1, 5)
     assert imu.metrics()["away_s"] == 0.0

@@ -79,7 +79,7 @@ class Example:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Taught:
+class PoseTemplate:
     """A pose that was learnt.
 
     Attributes:
@@ -95,7 +95,7 @@ class Taught:
 
 def learn(
     name: str, examples: Sequence[Example], settings: GestureSettings, within: str | None = None
-) -> Taught:
+) -> PoseTemplate:
     """The pose that the examples show.
 
     Args:
@@ -119,7 +119,9 @@ def learn(
     asked = [f"{span.low:.4g} to {span.high:.4g} {quantity}" for quantity, span in shape.ranges.items()]
     stated = [f"{name}: told by {', '.join(asked)}", f"each example fits the others by {agree:.2f} or better"]
     stated += [_difference(other, of, examples) for other, of in others.items()]
-    return Taught(shape, tuple(stated), {"examples": float(len(examples)), "agreement": round(agree, 3)})
+    return PoseTemplate(
+        shape, tuple(stated), {"examples": float(len(examples)), "agreement": round(agree, 3)}
+    )
 
 
 def _shape(name: str, examples: Sequence[Example], weight: float) -> PoseShape:

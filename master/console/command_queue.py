@@ -12,7 +12,7 @@ AnswerT = TypeVar("AnswerT")
 QUIET_S = 0.12  # so long nothing more changes until the change is sent
 
 
-class Telling(Generic[AnswerT]):
+class CommandQueue(Generic[AnswerT]):
     """Holds what is to be told, merged by key, while the last of it is on its way."""
 
     def __init__(

@@ -9,7 +9,7 @@ from common.messages import HandPose
 from master.gestures.features import FeatureExtractor, HandFeatures
 from master.gestures.poses import FingerSpeed
 from master.gestures.quantities import known_bends
-from master.gestures.teach import SHORTEST, Example
+from master.gestures.templates import SHORTEST, Example
 
 COUNT_DOWN_S = 3
 HOLD_S = 1.0
@@ -22,7 +22,7 @@ _STARTED_S = 0.2  # until a hand that obeys has stopped
 Receive = Callable[[float], HandPose | None]
 
 
-def lesson(
+def template_session(
     receive: Receive,
     model: HandModel,
     name: str,

@@ -13,7 +13,7 @@ _NOWHERE.flags.writeable = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lasting:
+class HeldGesture:
     """One that has begun.
 
     Attributes:
