@@ -51,7 +51,7 @@ SECTIONS = {
     "wrist_fingers": "Bends of fingers by a wrist device alone, by level and light; baseline: the printed cubic",
     "boards": "Lenses and places with a flat, a bent and the chosen board: exact truth; real pairs (PHALANX_DATASETS)",
     "wrist_calibration": "Laser plane by number of views, flat field, palm by board, who wears it; exact truth",
-    "wrist_mounting": "How a wrist device sits, its clocks, from 10 s with markers: noisy truth, rendered; exact truth",
+    "wrist_extrinsics": "How a wrist device sits, its clocks, from 10 s with markers: noisy, rendered; exact truth",
     "tracker": "A Vive tracker registered to the cameras from 12 s, and its clock; goal 3 mm, 2 deg; exact truth",
     "objects": "Objects of beads and of tags at half a metre, rendered, detected, partly hidden; goal 3 mm, 2 deg",
     "auxiliary_cost": "Processor time of objects, contact and gestures, pose by pose; baseline: the hand's fit",

@@ -32,7 +32,7 @@ from master.calibrate.wrist.flat_command import white_of
 from master.calibrate.wrist.flat_field import fit_flat_field
 from master.calibrate.wrist.laser_command import LinesSeen, lines_of
 from master.calibrate.wrist.lit_views import LitView
-from master.calibrate.wrist.palm_board import Mounting, palm_from_board
+from master.calibrate.wrist.palm_board import BoardOffset, palm_from_board
 from master.calibrate.wrist.plane import PlaneFit, ViewLine, fit_plane
 from master.calibrate.wrist.subject import Subject, calibrate_subject
 from master.estimator.wrist_pipeline import WristPipeline
@@ -45,7 +45,7 @@ VIEWS = (3, 4, 6, 10)
 FLAT_SEEDS, FLAT_VIEWS = range(200, 202), 40
 CURLED = 6  # people whose curl is solved, with three tables each
 BOARD = Checkerboard(9, 6, 0.015)
-PALM_BOARD, MOUNTING = Checkerboard(7, 4, 0.010), Mounting(0.085, 0.0, 0.022, 1.0)
+PALM_BOARD, OFFSET = Checkerboard(7, 4, 0.010), BoardOffset(0.085, 0.0, 0.022, 1.0)
 LENS_SIGMA_PX = (0.35, 0.5)  # focal length, centre: what a calibration from a dozen board views leaves
 KNUCKLES = np.array([0.0, 0.0, 0.08])
 
@@ -122,11 +122,11 @@ def _fields(camera: CameraCalibration, rig: RigCalibration) -> Iterator[Row]:
 
 def _palms(camera: CameraCalibration, rig: RigCalibration) -> Iterator[Row]:
     optics, true = CameraModel.of(camera, np.eye(4)), np.array(rig.T_camera_palm)
-    uv = optics.project(transform(true @ MOUNTING.T_palm_board(PALM_BOARD), board_corners(PALM_BOARD)))
+    uv = optics.project(transform(true @ OFFSET.T_palm_board(PALM_BOARD), board_corners(PALM_BOARD)))
     by_board: list[tuple[float, float]] = []
     for seed in SEEDS:
         noise = 0.1 * np.random.default_rng(seed).standard_normal(uv.shape)
-        fit = palm_from_board([place_corners(uv + noise, PALM_BOARD, optics)], PALM_BOARD, MOUNTING)
+        fit = palm_from_board([place_corners(uv + noise, PALM_BOARD, optics)], PALM_BOARD, OFFSET)
         by_board.append(_palm_error(fit.T_camera_palm, true))
     yield from _palm_rows(
         "palm by a board, corners 0.1 px", by_board, "one view; the ruler's error comes on top"

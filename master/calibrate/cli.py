@@ -9,8 +9,8 @@ from master.calibrate.cameras.capture_command import capture_views
 from master.calibrate.cameras.commands import intrinsics, stereo
 from master.calibrate.depth.commands import depth
 from master.calibrate.depth.verify_command import verify_command
+from master.calibrate.extrinsics.command import extrinsics
 from master.calibrate.hand.commands import hand_command
-from master.calibrate.mounting.command import mounting
 from master.calibrate.object.command import object_command
 from master.calibrate.object.cube_command import cube
 from master.calibrate.time.commands import time_command
@@ -35,7 +35,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "curl": curl,
     "palm": palm,
     "subject": subject,
-    "mounting": mounting,
+    "extrinsics": extrinsics,
     "tracker": tracker,
     "cube": cube,
     "object": object_command,

@@ -78,7 +78,7 @@ def _judge_rig(calibration: Path, name: str, used: Mapping[str, CameraPlan]) -> 
         yield _absent(
             rig.imu.name,
             f"IMU {rig.imu.name}: how it is mounted is not known; its orientation is not used.",
-            "`phalanx-master calibrate mounting`.",
+            "`phalanx-master calibrate extrinsics`.",
         )
     for camera in rig.cameras:
         yield from _judge_camera(calibration, rig, camera, used.get(camera))

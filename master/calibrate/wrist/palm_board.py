@@ -30,7 +30,7 @@ _ROTATION_LIMIT_RAD, _SHIFT_LIMIT_M = np.radians(1.0), 1e-3  # how sure the pose
 
 
 @dataclass(frozen=True, slots=True)
-class Mounting:
+class BoardOffset:
     """How the board lies, see above. `thumb_side`: +1 where the thumb is at +x of the palm (right hand), else -1."""
 
     wrist_m: float
@@ -65,7 +65,7 @@ class PalmFit:
     note: str
 
 
-def palm_from_board(placed: Sequence[BoardPose], board: Board, mounting: Mounting) -> PalmFit:
+def palm_from_board(placed: Sequence[BoardPose], board: Board, offset: BoardOffset) -> PalmFit:
     """The palm's pose, as mean over views in which the hand did not move.
 
     Raises:
@@ -101,7 +101,7 @@ def palm_from_board(placed: Sequence[BoardPose], board: Board, mounting: Mountin
             " sharp and well lit"
         )
     return PalmFit(
-        T_camera_board @ invert(mounting.T_palm_board(board)),
+        T_camera_board @ invert(offset.T_palm_board(board)),
         rotation_sigma,
         shift_sigma,
         {
@@ -109,8 +109,8 @@ def palm_from_board(placed: Sequence[BoardPose], board: Board, mounting: Mountin
             "between_views_mm": round(1e3 * shifted, 4),
             "between_views_deg": round(float(np.degrees(spread)), 4),
         },
-        f"{len(placed)} views of a board on the palm: {1e3 * mounting.wrist_m:g} mm from the wrist,"
-        f" {1e3 * mounting.aside_m:g} mm aside, {1e3 * mounting.depth_m:g} mm above the joint",
+        f"{len(placed)} views of a board on the palm: {1e3 * offset.wrist_m:g} mm from the wrist,"
+        f" {1e3 * offset.aside_m:g} mm aside, {1e3 * offset.depth_m:g} mm above the joint",
     )
 
 

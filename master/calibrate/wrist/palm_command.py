@@ -20,7 +20,7 @@ from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.board_pose import BoardPose, board_pose
 from master.calibrate.wrist.device import Device, device_of, print_line, write_device
 from master.calibrate.wrist.lit_views import lit_views, told_by_reason
-from master.calibrate.wrist.palm_board import Mounting, PalmFit, palm_from_board
+from master.calibrate.wrist.palm_board import BoardOffset, PalmFit, palm_from_board
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.summary import write_summary
 
@@ -71,9 +71,9 @@ def palm(
     """
     device = device_of(source, rig, calibration, out)
     model = HandModel.of(load(hand or calibration / "hands" / f"{device.rig.hand}.json", HandProfile))
-    mounting = Mounting(1e-3 * wrist_mm, 1e-3 * aside_mm, 1e-3 * depth_mm, model.side_sign)
+    offset = BoardOffset(1e-3 * wrist_mm, 1e-3 * aside_mm, 1e-3 * depth_mm, model.side_sign)
     try:
-        fit = _by_board(source, board_of(board, square_mm, marker_mm, dictionary), mounting, device)
+        fit = _by_board(source, board_of(board, square_mm, marker_mm, dictionary), offset, device)
     except FitError as error:
         raise FitError(f"{source}: {error}") from error
     print_line(report_lines(fit))
@@ -89,7 +89,7 @@ def palm(
         write_summary(json_file, told)
 
 
-def _by_board(source: Path, board: Board, mounting: Mounting, device: Device) -> PalmFit:
+def _by_board(source: Path, board: Board, offset: BoardOffset, device: Device) -> PalmFit:
     placed: list[BoardPose] = []
     refused: dict[str, str] = {}
     for view in lit_views(source, device.camera.name, Illumination.LED):
@@ -98,7 +98,7 @@ def _by_board(source: Path, board: Board, mounting: Mounting, device: Device) ->
         except FitError as error:
             refused[view.name] = str(error)
     print_line(f"left out: {reason}" for reason in told_by_reason(refused))
-    return palm_from_board(placed, board, mounting)
+    return palm_from_board(placed, board, offset)
 
 
 def report_lines(fit: PalmFit) -> list[str]:

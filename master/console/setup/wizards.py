@@ -220,7 +220,7 @@ _WRIST = (
         seconds=16.0,
     ),
     Wizard(
-        "mounting",
+        "extrinsics",
         "How the wrist device sits",
         "Palm, IMU and clocks of the device, by what marker cameras and device both see.",
         "Marker cameras and wrist device calibrated by themselves.",

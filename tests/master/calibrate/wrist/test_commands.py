@@ -20,7 +20,7 @@ from common.sim.wrist.scene import WristScene
 from common.sim.wrist_board import WristBoardScene, record_wrist_board
 from master.calibrate.cameras.boards import Checkerboard
 from master.calibrate.cli import calibrate_app
-from master.calibrate.wrist.palm_board import Mounting
+from master.calibrate.wrist.palm_board import BoardOffset
 from master.wrist_setup import WristSetup
 from tests.conftest import ROOT
 from tests.master.calibrate.wrist.devices import CAMERA, RIG, angle_deg, plane_of, scene_of
@@ -150,7 +150,7 @@ def test_the_flat_field_of_a_board_shown_everywhere(tree: Path, tmp_path: Path) 
 
 def test_the_palm_from_a_board_that_lies_on_it(tree: Path, tmp_path: Path) -> None:
     board = Checkerboard(7, 4, 0.010)
-    T = np.array(RIG.T_camera_palm) @ Mounting(0.085, 0.004, 0.022, 1.0).T_palm_board(board)
+    T = np.array(RIG.T_camera_palm) @ BoardOffset(0.085, 0.004, 0.022, 1.0).T_palm_board(board)
     scene = WristBoardScene(RIG, CAMERA, 7, 4, 0.010, np.stack([T, T]))
     record_wrist_board(tmp_path / "palm", scene, illuminations=(Illumination.AMBIENT, Illumination.LED))
     output = run(

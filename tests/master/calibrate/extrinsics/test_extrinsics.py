@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 from msgspec.structs import replace as replaced
 
-from bench.wrist_mounting import errors
+from bench.wrist_extrinsics import errors
 from common.calibration import RigCalibration, load, save
 from common.errors import CalibrationError, FitError
 from common.frame_recording import COLUMNS, FRAMES, MANIFEST, Manifest
 from common.geometry import quaternion_to_matrix
 from common.imu_recording import write_imu
 from common.messages import HandPose
-from master.calibrate.mounting import command, fit, mounting
-from master.calibrate.mounting.mounting import calibrate_mounting
-from master.calibrate.mounting.report import refuse
-from master.calibrate.mounting.seen import Fit
-from master.calibrate.mounting.unknown import UNKNOWN
+from master.calibrate.extrinsics import command, extrinsics, fit
+from master.calibrate.extrinsics.extrinsics import calibrate_extrinsics
+from master.calibrate.extrinsics.report import refuse
+from master.calibrate.extrinsics.seen import Fit
+from master.calibrate.extrinsics.unknown import UNKNOWN
 from master.rig_setup import RigSetup
-from tests.master.calibrate.mounting.moved import CAMERA_LATE_NS, IMU_LATE_NS, Moved, moved
+from tests.master.calibrate.extrinsics.moved import CAMERA_LATE_NS, IMU_LATE_NS, Moved, moved
 from tests.master.test_solve_both import write_detections
 
 CERTAIN = {
@@ -32,7 +32,7 @@ CERTAIN = {
 }
 
 
-def calibrated(seen: Moved, **other: object) -> mounting.Mounting:
+def calibrated(seen: Moved, **other: object) -> extrinsics.Extrinsics:
     """The mounting, with some of what was seen replaced."""
     markers = seen.both.markers
     given: dict[str, object] = {
@@ -44,7 +44,7 @@ def calibrated(seen: Moved, **other: object) -> mounting.Mounting:
         "rig": seen.rig,
         "camera": seen.both.wrist.cameras[seen.rig.cameras[0]],
     }
-    return calibrate_mounting(**(given | other))  # pyright: ignore[reportArgumentType]
+    return calibrate_extrinsics(**(given | other))  # pyright: ignore[reportArgumentType]
 
 
 def recorded(seen: Moved, folder: Path) -> Path:
@@ -61,25 +61,25 @@ def recorded(seen: Moved, folder: Path) -> Path:
     return folder
 
 
-def test_the_command_writes_the_true_mounting_into_a_tree(
+def test_the_command_writes_the_true_extrinsics_into_a_tree(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen, found = moved(), list[mounting.Mounting]()
+    seen, found = moved(), list[extrinsics.Extrinsics]()
 
     def as_seen(_setup: RigSetup, _folder: Path) -> list[HandPose]:
         return seen.poses
 
-    def noted(*given: object) -> mounting.Mounting:
-        found.append(calibrate_mounting(*given))  # pyright: ignore[reportArgumentType]
+    def noted(*given: object) -> extrinsics.Extrinsics:
+        found.append(calibrate_extrinsics(*given))  # pyright: ignore[reportArgumentType]
         return found[0]
 
     # The line of the markers has tests of its own; without noise fewer steps are enough.
     monkeypatch.setattr(command, "marker_poses", as_seen)
-    monkeypatch.setattr(mounting, "calibrate_mounting", noted)
+    monkeypatch.setattr(extrinsics, "calibrate_extrinsics", noted)
     monkeypatch.setattr(fit, "_COARSE_ROUNDS", (3,))
     monkeypatch.setattr(fit, "_ROUNDS", (4, 3))
     folder, tree, picture = recorded(seen, tmp_path), tmp_path / "tree", tmp_path / "mounting.png"
-    command.mounting(folder, folder, out=tree, picture=picture, json_file=tmp_path / "found.json")
+    command.extrinsics(folder, folder, out=tree, picture=picture, json_file=tmp_path / "found.json")
 
     rotation_deg, shift_mm, imu_deg, camera_ms, imu_ms = errors(found[0], seen.both).tolist()
     assert rotation_deg < 2.0  # of which most is that nobody knows when a wrist is straight
@@ -141,7 +141,7 @@ def fitted(off: float) -> Fit:
     )
 
 
-def test_what_no_mounting_explains_is_refused() -> None:
+def test_what_no_extrinsics_explain_is_refused() -> None:
     refuse(fitted(1.0), CERTAIN)
     with pytest.raises(FitError, match=r"no mounting explains what was seen: it is 3\.0 times"):
         refuse(fitted(3.0), CERTAIN)

@@ -1,4 +1,4 @@
-"""`phalanx-master calibrate mounting`: how a wrist device sits, by what marker rig and device both see."""
+"""`phalanx-master calibrate extrinsics`: how a wrist device sits, by what marker rig and device both see."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,7 +23,7 @@ from master.stages import StageTimes
 from master.summary import write_summary
 
 if TYPE_CHECKING:
-    from master.calibrate.mounting.mounting import Mounting
+    from master.calibrate.extrinsics.extrinsics import Extrinsics
 
 Recording = Annotated[
     Path, typer.Argument(help="Folder of a recording of kind `both`: the joint motion.", show_default=False)
@@ -41,7 +41,7 @@ Picture = Annotated[
 ]
 
 
-def mounting(
+def extrinsics(
     recording: Recording,
     detections: Detections,
     hand: Hand = None,
@@ -63,10 +63,10 @@ def mounting(
 
       phalanx-slave detect RECORDING --camera wrist --calibration calib_json -o found/detections_wrist.npz
 
-      phalanx-master calibrate mounting RECORDING --detections found --out calib_json
+      phalanx-master calibrate extrinsics RECORDING --detections found --out calib_json
     """
     # Imported here: scipy.optimize takes a second.
-    from master.calibrate.mounting.mounting import calibrate_mounting
+    from master.calibrate.extrinsics.extrinsics import calibrate_extrinsics
 
     device = device_of(recording, rig, calibration, out)
     if device.rig.T_camera_palm is None:
@@ -84,16 +84,16 @@ def mounting(
     samples = imu_samples(opened, device.rig.imu.name, device.rig.imu.rate_hz)
     cycles = list(recorded_cycles(detections, device.camera.name))
     try:
-        found = calibrate_mounting(
+        found = calibrate_extrinsics(
             poses, setup.markers, setup.hand, cycles, samples, device.rig, device.camera, device.source
         )
     except FitError as error:
         raise FitError(f"{recording}: {error}") from error
     print_line(found.report)
     if picture is not None:
-        from master.calibrate.mounting.picture import draw_mounting  # matplotlib takes a second to import
+        from master.calibrate.extrinsics.picture import draw_extrinsics  # matplotlib takes a second to import
 
-        draw_mounting(picture, found, device.optics)
+        draw_extrinsics(picture, found, device.optics)
         typer.echo(f"drew {picture}")
     written = write_device(out, device, found.rig, "T_camera_palm, imu, stamp_offset_us")
     if json_file is not None:
@@ -132,9 +132,9 @@ def imu_samples(recording: FrameRecording, name: str, rate_hz: float) -> Sequenc
     return [fusion.push(one) for one in samples]
 
 
-def summary(found: "Mounting") -> dict[str, object]:
+def summary(found: "Extrinsics") -> dict[str, object]:
     """What was measured, as numbers."""
-    from master.calibrate.mounting.report import left_of
+    from master.calibrate.extrinsics.report import left_of
 
     imu = found.rig.imu
     return {

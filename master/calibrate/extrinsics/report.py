@@ -4,8 +4,8 @@ import numpy as np
 
 from common.arrays import Float
 from common.errors import FitError
-from master.calibrate.mounting.seen import Fit
-from master.calibrate.mounting.unknown import CAMERA_IMU, CAMERA_LATE, FOREARM_IMU, IMU_LATE, SHIFT
+from master.calibrate.extrinsics.seen import Fit
+from master.calibrate.extrinsics.unknown import CAMERA_IMU, CAMERA_LATE, FOREARM_IMU, IMU_LATE, SHIFT
 
 _ROTATION_RAD, _SHIFT_M, _CLOCK_S = np.radians(4.0), 4e-3, 8e-3  # standard deviations, at most
 _MISFIT, _STRAYS = 1.8, 0.35

@@ -8,15 +8,15 @@ import pytest
 from common.arrays import Float
 from common.geometry import quaternion_to_matrix, rotation_vector_to_matrix
 from common.wrist_joint import forearm_palm
-from master.calibrate.mounting.hands import Hands
-from master.calibrate.mounting.lines_of_sight import LinesOfSight
-from master.calibrate.mounting.mounting import _cycles
-from master.calibrate.mounting.problem import Problem
-from master.calibrate.mounting.tracks import HandTrack, ImuTrack
-from master.calibrate.mounting.unknown import UNKNOWN, Unknown, believed
-from master.calibrate.mounting.wrists import bends_by_rotation, wrist_rotation_angles
+from master.calibrate.extrinsics.extrinsics import _cycles
+from master.calibrate.extrinsics.hands import Hands
+from master.calibrate.extrinsics.lines_of_sight import LinesOfSight
+from master.calibrate.extrinsics.problem import Problem
+from master.calibrate.extrinsics.tracks import HandTrack, ImuTrack
+from master.calibrate.extrinsics.unknown import UNKNOWN, Unknown, believed
+from master.calibrate.extrinsics.wrists import bends_by_rotation, wrist_rotation_angles
 from master.wrist_setup import WristSetup
-from tests.master.calibrate.mounting.moved import CAMERA_LATE_NS, IMU_LATE_NS, ZERO_NS, moved
+from tests.master.calibrate.extrinsics.moved import CAMERA_LATE_NS, IMU_LATE_NS, ZERO_NS, moved
 
 EYE = np.eye(3)
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from common.geometry import axis_rotation, matrix_to_quaternion, rotation_vector_to_matrix
 from common.messages import ImuSample
-from master.calibrate.mounting.tracks import HandTrack, ImuTrack
+from master.calibrate.extrinsics.tracks import HandTrack, ImuTrack
 
 RATE = np.array([0.3, -0.8, 0.5])
 

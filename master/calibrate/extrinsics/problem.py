@@ -27,12 +27,12 @@ import numpy as np
 from common.arrays import Float
 from common.geometry import rotation_vector_to_matrix
 from common.hand_model import HandModel
-from master.calibrate.mounting.hands import HandProblem, Hands
-from master.calibrate.mounting.lines_of_sight import FINGERS, SEEN, LinesOfSight
-from master.calibrate.mounting.normal import Normal
-from master.calibrate.mounting.seen import STRAYS, Fit, StrobeCycles
-from master.calibrate.mounting.tracks import HandTrack, ImuOrientations, ImuTrack, Markers
-from master.calibrate.mounting.unknown import (
+from master.calibrate.extrinsics.hands import HandProblem, Hands
+from master.calibrate.extrinsics.lines_of_sight import FINGERS, SEEN, LinesOfSight
+from master.calibrate.extrinsics.normal import Normal
+from master.calibrate.extrinsics.seen import STRAYS, Fit, StrobeCycles
+from master.calibrate.extrinsics.tracks import HandTrack, ImuOrientations, ImuTrack, Markers
+from master.calibrate.extrinsics.unknown import (
     CAMERA_IMU,
     CAMERA_LATE,
     FOREARM_IMU,
@@ -47,7 +47,7 @@ from master.calibrate.mounting.unknown import (
     Unknown,
     believed,
 )
-from master.calibrate.mounting.wrists import bends_by_rotation, wrist_rotation_angles
+from master.calibrate.extrinsics.wrists import bends_by_rotation, wrist_rotation_angles
 from master.estimator.body_points import BodyPoints
 from master.estimator.parameters import HandParameters
 from master.estimator.priors import Habits, habits_of

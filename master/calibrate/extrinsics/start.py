@@ -20,9 +20,9 @@ import numpy as np
 from common.arrays import Float
 from common.camera_model import CameraModel
 from common.geometry import cross, matrix_to_quaternion, quaternion_to_matrix
-from master.calibrate.mounting.seen import StrobeCycles
-from master.calibrate.mounting.tracks import HandTrack, ImuTrack
-from master.calibrate.mounting.unknown import Unknown
+from master.calibrate.extrinsics.seen import StrobeCycles
+from master.calibrate.extrinsics.tracks import HandTrack, ImuTrack
+from master.calibrate.extrinsics.unknown import Unknown
 
 _SEARCH_S = np.arange(-0.12, 0.1201, 0.01)
 _FEWEST = 20  # instants

@@ -5,17 +5,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from common.hand_model import HandModel
-from master.calibrate.mounting.lines_of_sight import LinesOfSight
-from master.calibrate.mounting.problem import Problem
-from master.calibrate.mounting.seen import Fit, StrobeCycles
-from master.calibrate.mounting.tracks import HandTrack, ImuTrack
-from master.calibrate.mounting.unknown import Unknown
+from master.calibrate.extrinsics.lines_of_sight import LinesOfSight
+from master.calibrate.extrinsics.problem import Problem
+from master.calibrate.extrinsics.seen import Fit, StrobeCycles
+from master.calibrate.extrinsics.tracks import HandTrack, ImuTrack
+from master.calibrate.extrinsics.unknown import Unknown
 
 _COARSE, _COARSE_ROUNDS = 40, (4, 4, 4)  # instants and steps of a first look
 _ROUNDS = (5, 5, 8)  # steps from one linearisation of the tracks to the next
 
 
-def fit_mounting(
+def fit_extrinsics(
     lines_of_sight: LinesOfSight,
     model: HandModel,
     names: tuple[str, ...],

@@ -7,11 +7,11 @@ import pytest
 
 from common.arrays import Float
 from common.geometry import rotation_vector_to_matrix
-from master.calibrate.mounting.hands import HandProblem, Hands
+from master.calibrate.extrinsics.hands import HandProblem, Hands
 from master.estimator.body_points import BodyPoints
 from master.estimator.parameters import HandParameters
 from master.estimator.priors import Habits, habits_of
-from tests.master.calibrate.mounting.moved import moved
+from tests.master.calibrate.extrinsics.moved import moved
 
 COUNT, LITTLE = 4, 1e-5
 

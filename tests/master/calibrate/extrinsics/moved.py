@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 from msgspec.structs import replace
 
-from bench.wrist_mounting import Both, both_of
+from bench.wrist_extrinsics import Both, both_of
 from common.calibration import RigCalibration
 from common.geometry import matrix_to_quaternion, rotation_vector_to_matrix
 from common.imu_fusion import OrientationFilter

@@ -17,18 +17,18 @@ from common.geometry import cross, matrix_to_quaternion, transform
 from common.hand_model import CHAINS, FINGERS, HandModel
 from common.messages import HandPose, ImuSample, WristDetections
 from master.calibrate.cameras.lens_files import matrix_of
-from master.calibrate.mounting.fit import fit_mounting
-from master.calibrate.mounting.lines_of_sight import FINGERS as LASER_FINGERS
-from master.calibrate.mounting.lines_of_sight import LinesOfSight
-from master.calibrate.mounting.report import left_of, refuse, report_lines, sigmas
-from master.calibrate.mounting.seen import Fit, StrobeCycles
-from master.calibrate.mounting.start import started
-from master.calibrate.mounting.tracks import GAP_S, HandTrack, ImuTrack
+from master.calibrate.extrinsics.fit import fit_extrinsics
+from master.calibrate.extrinsics.lines_of_sight import FINGERS as LASER_FINGERS
+from master.calibrate.extrinsics.lines_of_sight import LinesOfSight
+from master.calibrate.extrinsics.report import left_of, refuse, report_lines, sigmas
+from master.calibrate.extrinsics.seen import Fit, StrobeCycles
+from master.calibrate.extrinsics.start import started
+from master.calibrate.extrinsics.tracks import GAP_S, HandTrack, ImuTrack
 from master.calibrate.tree_files import provenance
 from master.estimator.laser_plane import in_image, laser_points
 from master.wrist_setup import WristSetup
 
-TOOL = "calibrate mounting"
+TOOL = "calibrate extrinsics"
 MOTION = (
     "for ten seconds bend fingers one by one and together, bend the wrist as far one way as the other, and turn the"
     " forearm about all its axes, before the marker cameras"
@@ -40,7 +40,7 @@ _MARKERS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mounting:
+class Extrinsics:
     """A mounting that explains what was seen.
 
     Attributes:
@@ -58,7 +58,7 @@ class Mounting:
     sigma: dict[str, float]
 
 
-def calibrate_mounting(
+def calibrate_extrinsics(
     poses: Sequence[HandPose],
     markers: tuple[str, ...],
     model: HandModel,
@@ -67,7 +67,7 @@ def calibrate_mounting(
     rig: RigCalibration,
     camera: CameraCalibration,
     source: str = "a joint motion",
-) -> Mounting:
+) -> Extrinsics:
     """Fit the mounting of a wrist device to one motion.
 
     Args:
@@ -103,11 +103,11 @@ def calibrate_mounting(
     )
     px_per_m = float(setup.optics.matrix[0, 0] / distance)
     firsts = [replaced(start, camera_late_s=late_s).unknown for late_s in (start.camera_late_s, 0.0)]
-    fit = fit_mounting(lines_of_sight, model, markers, hand, imu, seen.of(chosen), px_per_m, firsts)
+    fit = fit_extrinsics(lines_of_sight, model, markers, hand, imu, seen.of(chosen), px_per_m, firsts)
     sigma = sigmas(fit)
     refuse(fit, sigma)
     new = _documented(rig, camera, rig.imu, fit, imu, sigma, source)
-    return Mounting(new, report_lines(fit, sigma, len(cycles)), fit, seen.of(chosen), sigma)
+    return Extrinsics(new, report_lines(fit, sigma, len(cycles)), fit, seen.of(chosen), sigma)
 
 
 def _marker_of(model: HandModel, markers: tuple[str, ...], finger: str) -> int:

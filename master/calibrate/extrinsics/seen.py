@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from master.calibrate.mounting.unknown import Unknown
+from master.calibrate.extrinsics.unknown import Unknown
 
 STRAYS = 2.5  # standard deviations from which a sight is believed less
 

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from common.camera_model import CameraModel
-from master.calibrate.mounting.mounting import Mounting
+from master.calibrate.extrinsics.extrinsics import Extrinsics
 from master.calibrate.wrist.picture import BLUE, FINGER_COLOURS, GREY, ORANGE, figure_of, framed, saved
 
 
-def draw_mounting(path: Path, found: Mounting, optics: CameraModel) -> None:
+def draw_extrinsics(path: Path, found: Extrinsics, optics: CameraModel) -> None:
     """Laser points on their plane, fingertips in the image, seen (dots) and fitted (rings); the wrist over time. PNG.
 
     Raises:

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from common.arrays import Float
-from master.calibrate.mounting.hands import HandProblem, Hands, Linear
-from master.calibrate.mounting.unknown import CAMERA_LATE, UNKNOWN
+from master.calibrate.extrinsics.hands import HandProblem, Hands, Linear
+from master.calibrate.extrinsics.unknown import CAMERA_LATE, UNKNOWN
 from master.estimator.parameters import HandParameters
 
 _LITTLE = 1e-5

@@ -33,8 +33,8 @@ from common.sim.record_both import record_both
 from common.sim.scenes import scene_by_name
 from common.sim.wrist.scene import WristScene
 from master.calibrate.cameras.lens_files import matrix_of
-from master.calibrate.mounting.command import imu_samples, marker_poses
-from master.calibrate.mounting.mounting import Mounting, calibrate_mounting
+from master.calibrate.extrinsics.command import imu_samples, marker_poses
+from master.calibrate.extrinsics.extrinsics import Extrinsics, calibrate_extrinsics
 from master.recorded import recorded_cycles
 from master.rig import load_setup
 from master.rig_pipeline import build_pipeline
@@ -67,14 +67,14 @@ class Seen:
     cycles: Sequence[WristDetections]
     samples: Sequence[ImuSample]
 
-    def calibrated(self) -> Mounting:
+    def calibrated(self) -> Extrinsics:
         """The mounting.
 
         Raises:
             FitError: It is refused.
         """
         markers, camera = self.both.markers, self.both.wrist.cameras[self.rig.cameras[0]]
-        return calibrate_mounting(
+        return calibrate_extrinsics(
             self.poses, markers.markers, markers.hand, self.cycles, self.samples, self.rig, camera
         )
 
@@ -133,7 +133,7 @@ def _stamped(message: M, late_s: float) -> M:
     return msgspec.structs.replace(message, t_ns=message.t_ns - round(1e9 * late_s))
 
 
-def errors(found: Mounting, both: Both) -> Float:
+def errors(found: Extrinsics, both: Both) -> Float:
     """Turn of the palm [deg], place of the wrist [mm], turn of the IMU against camera [deg], clocks [ms]: (5,)."""
     true, T = np.array(both.wrist.rig.T_camera_palm), np.array(found.rig.T_camera_palm)
     if both.wrist.rig.imu is None:
