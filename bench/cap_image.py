@@ -83,7 +83,7 @@ class Cap:
         u, v: Centre of the whole ellipse [px], (0, 0) = centre of the top-left pixel.
         a, b: Semi-axes [px].
         angle: Direction of the axis a [rad].
-        paint: Linear RGB reflectance.
+        marker_colour: Linear RGB reflectance.
         bulge: Sine of the angle between the normals of rim and centre; 0 is flat.
         support, highlight, occluder: What is under, on and before it.
     """

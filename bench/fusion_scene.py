@@ -36,7 +36,7 @@ class Both:
         name: Of the scene.
         seed: Of motion and noise.
         scene: What the marker rig sees; its truth is that of the hand, in the rig frame.
-        worn: What the wrist device sees of the same hand.
+        wrist_scene: What the wrist device sees of the same hand.
         markers, wrist: The two rigs, each alone.
     """
 

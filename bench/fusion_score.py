@@ -26,7 +26,7 @@ class Sighted:
 
     Attributes:
         cameras: (N, M) marker cameras that have each marker in sight; none while that stream is away.
-        worn: (N, 5) whether the wrist device has laser line or tip of each finger in sight.
+        in_wrist_sight: (N, 5) whether the wrist device has laser line or tip of each finger in sight.
         hidden: (N, 5) whether fewer than two cameras have the finger's marker in sight, were no stream away.
         oriented: (N,) whether an IMU tells of the palm.
         strapped: Whether there are no markers: the palm is then where the device's strap has it, and nowhere else.

@@ -130,7 +130,7 @@ class Replayed:
 
     Attributes:
         t_s: (T,) times of the samples.
-        turn: Of the palm, rig frame, over time.
+        rotation: Of the palm, rig frame, over time.
         origin_m: (T, 3) of the palm, rig frame.
         fingers_m: (T, 20, 3) recorded joints, palm frame.
         angles_rad: (T, 20) of the hand model, nearest to these.

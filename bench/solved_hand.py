@@ -64,8 +64,8 @@ class PointHand:
         Args:
             t_ns: When.
             points_m, cov_m2: (M, 3) [m] and (M, 3, 3) [m^2] of the markers, rig frame; NaN: not seen.
-            facing: (3,) unit vector from the hand to the cameras.
-            turn: The palm's rotation (3, 3) by a sensor and its covariance (3, 3) [rad^2], rig axes; None: not known.
+            back_normal: (3,) unit vector from the hand to the cameras.
+            orientation: The measured rotation (3, 3) and its covariance (3, 3) [rad^2], rig axes; None: not known.
         """
         told = None
         if orientation is not None:

@@ -120,7 +120,7 @@ class HandModel:
         mounts: Marker name -> where it sits.
         side_sign: +1 right, -1 left.
         bone_m: (5, 3, 3) link k of each finger in the frame of its joint k.
-        turn: (5, 3, 3, 3) rest rotation of joint k + 1 in the frame of joint k.
+        link_rotation: (5, 3, 3, 3) rest rotation of joint k + 1 in the frame of joint k.
         swing: (3, 5, 4, 3, 3) for each angle a the rotation from the angle before it, its rest turn included, is
             swing[0] + cos a swing[1] + sin a swing[2].
     """

@@ -1,6 +1,6 @@
 """The wrist joint between forearm and palm: what stands between a device on the forearm and the hand.
 
-`wrist_angles_rad` (..., 2) is flexion and deviation, 0 where forearm and palm frame agree. A flexion is a rotation about
+`wrist_angles_rad` (..., 2) is flexion and deviation, 0 where forearm and palm agree. A flexion is a rotation about
 the palm's x, positive where the fingers go to the side of the palm of the hand, a deviation one about its y, positive
 towards the thumb of a right hand:
 

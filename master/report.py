@@ -39,7 +39,7 @@ class Played:
 
     Attributes:
         shown: What cameras of markers saw, or None.
-        worn: What a wrist device saw, or None.
+        wrist_scene: What a wrist device saw, or None.
         together: The scene is one for both kinds of rig, whether or not there are both.
     """
 

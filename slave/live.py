@@ -135,7 +135,7 @@ class _Line:
         numbers: What it counts.
         previews: Who shows them.
         prepare: How changed files reach it; None: it uses none of them.
-        picker: Who makes a colour of a click; None: it uses none.
+        sampler: Who makes a colour of a click; None: it uses none.
     """
 
     run: Callable[[], None]

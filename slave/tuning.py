@@ -132,7 +132,7 @@ class CameraTuning:
             source: The camera; a `Tunable`, or nothing can be changed but what senses.
             prepare: Makes what senses for other files; None: nobody senses.
             running: Whether frames are read: before, no change can be verified.
-            picker: Makes a colour of a click; None: no markers are sought.
+            sampler: Makes a colour of a click; None: no markers are sought.
         """
         self._used = self._on_disk = files
         self._source = source if isinstance(source, Tunable) else None

@@ -58,7 +58,7 @@ def shade(
 
     Args:
         samples: What the camera sees.
-        skin, posed: The hand.
+        hand_mesh, posed: The hand.
         ambient: The room's light on each vertex (V,) [grey].
         leds: (L, 3) [m].
         fan: The laser.

@@ -47,7 +47,7 @@ class Device:
         rig, camera: Their files.
         optics: The camera.
         fan: The laser.
-        skin: The hand.
+        hand_mesh: The hand.
         leds: (L, 3) [m].
     """
 

@@ -63,7 +63,7 @@ class Posed:
         posture_deg: (N, 5, 3).
         joints_m: (N, 26, 3) [m].
         rotation: (N, 26, 3, 3).
-        cones: (N, 5, 3) segments.
+        capsules: (N, 5, 3) segments.
     """
 
     posture_deg: Float

@@ -240,7 +240,7 @@ def record_wrist_board(
         folder: New or empty. Gets a recording of raw frames of kind "wrist", and truth.npz with T_camera_board.
         scene: What to render.
         rig: What the manifest says of the device; None: the truth.
-        kinds: Frames of a triple that are kept; the others were lost.
+        illuminations: Frames of a triple that are kept; the others were lost.
 
     Raises:
         RecordingError: The folder holds something already, or cannot be written.

@@ -188,7 +188,7 @@ def _at_edge(
 
     Args:
         first, last: (R - 1, N) seen part of each chord, which is changed.
-        cut: Indices of the chords of which one end is seen.
+        edges: Indices of the chords of which one end is seen.
         clear: (R, N) how clearly rays are seen.
         sights: (3, R, N) unit rays of the camera.
         before: (K - 1, R, N) where the cones begin on them.

@@ -19,8 +19,8 @@ class Epoch:
         uv: (C, A, 2) [px] centroids of all markers of the rig; NaN: not seen, or gated out.
         variance_px2: (C, A) of each camera's own errors; NaN: not to be used.
         own_m2: (A, 3, 3) covariance of what is wrong with each marker itself, beside bones.
-        facing: (3,) unit vector from the hand to the cameras that see its back.
-        turn: How other sensors have the palm turned; None: they do not say.
+        back_normal: (3,) unit vector from the hand to the cameras that see its back.
+        orientation: How other sensors have the palm turned; None: they do not say.
         wrist: What a wrist device sees of the fingers; None: nothing.
         place: (3,) [m] where the palm is, of a wrist device alone; None: not known.
         start: Another hand of this epoch; None: there is none.

@@ -102,7 +102,7 @@ class WristSide:
             t_ns: The epoch.
             hand: As it was solved.
             estimator: What solved it.
-            turned: Whether it had a TURN row to begin with.
+            oriented: Whether it had a TURN row to begin with.
         """
         if hand.solver_mode.any():
             self.solver_mode, self.ambiguous = hand.solver_mode, hand.ambiguous

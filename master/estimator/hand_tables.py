@@ -39,7 +39,7 @@ class HandTables:
         twist: (5,) [rad] by which the hinges of each finger are rolled about its first bone, in `swing` (`twist_hand`).
         twist_axis: (5, 3) that bone, in the frame of the abduction.
         untwisted: (3, 5, 3, 3) `swing` of the abductions with hinges as the profile has them.
-        turned: (3, 3) room.
+        product: (3, 3) room.
     """
 
     swing: Float

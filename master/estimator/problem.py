@@ -29,7 +29,7 @@ class Belief:
         palm: (4, 4) the palm by the state before.
         palm_w2: (6,) inverse variances of turn [rad] and shift [m] from there; 0: nothing is believed.
         sight: (3,) unit vector along which depth is held, and `depth_w2` (1,) how firmly [1/m^2].
-        facing: (3,) unit vector along which the back looks, and `back_normal_w2` (1,).
+        back_normal: (3,) unit vector along which the back looks, and `back_normal_w2` (1,).
         z, z_info: (K,), (K, K) mean and information of the extra unknowns (`master.estimator.wrist_device`).
         orientation_info: (3, 3) [1/rad^2] information of the measured orientation, rig axes; `oriented` (1,) whether
             there is any.

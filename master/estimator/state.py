@@ -56,7 +56,7 @@ class HandState:
         hidden_ns: (5,) when each finger that was hidden at the last epoch was seen last; NEVER_NS: it was seen there.
         then, then_rates: (5, 20) the angles and rates of the whole hand at that time.
         then_alike: (5,) how neighbours correlated then.
-        turn: (3, 3) how other sensors had the palm turned, and `measured_rotation_known` (1,) whether they said so.
+        measured_rotation: (3, 3) of the palm by other sensors, and `measured_rotation_known` (1,) whether they said so.
     """
 
     t_ns: Int

@@ -42,7 +42,7 @@ class Device:
         local: (5, 8, 3) their centres in the frames of their bones' joints.
         back: (5, 3, 3) unit vectors towards the back of each bone, in the frame of its joint.
         tip: (5, 3) fingertip in the frame of the last joint but the tip.
-        skin2: (5,) [m^2] variance of the skin's distance from the bone.
+        surface2: (5,) [m^2] variance of the skin's distance from the bone.
         tip2: (5,) [m^2] variance of where the skin ends.
     """
 

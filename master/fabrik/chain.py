@@ -31,7 +31,7 @@ class Link:
     """One joint and the bone behind it.
 
     Attributes:
-        turn: Rest orientation in the parent's frame (`world` joints: in the root frame).
+        rotation: Rest orientation in the parent's frame (`world` joints: in the root frame).
         joint: What it allows.
         bone: To the next joint, in the joint's own frame [m].
     """

@@ -58,7 +58,7 @@ class HandEstimate:
         t_ns: The instant.
         markers: Positions as triangulated.
         smooth_m: (M, 3) [m] after the 1 € filter.
-        facing: (3,) unit vector from the hand to the cameras that see its back.
+        back_normal: (3,) unit vector from the hand to the cameras that see its back.
         solution: The hand; None: none is known.
         valid, tracked, source: (26,) as of `HandPose`.
         seen: (5,) fingers whose marker was placed now.

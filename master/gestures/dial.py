@@ -41,7 +41,7 @@ class _Grip:
         tips: As they were when it closed.
         circle_axis: (3,) of the circle of the tips.
         base_rad: By how much the dial had been turned then.
-        course: How it has gone of late.
+        history: How it has gone of late.
         farthest_rad: Of its largest turn so far.
         axis: (3,) of the knob, by both.
     """

@@ -33,7 +33,7 @@ class Trial(Struct, frozen=True, kw_only=True):
         ambiguous: In at least half of the tracked triples another pose explained as much.
         laser_seen, tip_seen: In at least half of its triples at least 2 mm of laser line, the fingertip, are in sight
             by the truth.
-        triples: How many were held.
+        cycles: How many were held.
     """
 
     participant: str

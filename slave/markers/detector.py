@@ -91,7 +91,7 @@ class MarkerDetector:
     Attributes:
         windows_only: Only windows of tracked markers are scanned, and strips for lost ones; the first frame is scanned
             whole. May change between two frames.
-        beside: Things of a marker's colour that are none, as far as scans saw them.
+        ambiguity: Things of a marker's colour that are none, as far as scans saw them.
         evidence: Marker row -> what its quality was made of, of those that were judged in the last frame.
     """
 

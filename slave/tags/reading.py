@@ -30,7 +30,7 @@ class Read:
 
     Attributes:
         which: (N,) index of the tag that fits best.
-        turn: (N,) which of the quad's corners is the first of the print.
+        quarter_turns: (N,) which of the quad's corners is the first of the print.
         fit: (N,) correlation -1..1; NaN: the border is not black.
     """
 

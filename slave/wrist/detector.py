@@ -32,7 +32,7 @@ class WristFound:
     """What was found in one strobed triple.
 
     Attributes:
-        triple: The frames.
+        cycle: The frames.
         laser: Where the laser meets each finger.
         tips: Fingertips.
     """

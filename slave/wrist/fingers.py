@@ -36,11 +36,11 @@ class Fingers:
     """Five regions of the image: thumb, index ... little.
 
     Attributes:
-        corridors: Where the seams were searched.
+        search_bands: Where the seams were searched.
         seams: (4, S) index|middle, middle|ring, ring|little [px, along the row of each station], and the thumb's
             [rad, along the circle of each station].
         shown: Whether the LED image showed a hand; else the seams are those of geometry alone.
-        turn: How the palm lies.
+        palm_pose: How the palm lies.
     """
 
     search_bands: SearchBands

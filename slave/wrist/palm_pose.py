@@ -74,7 +74,7 @@ class _Marks:
     """Where B bends have the marks of the palm in the shrunken image, counted row by row.
 
     Attributes:
-        bends: (B, 2) [rad].
+        candidates: (B, 2) [rad].
         prior: (B,) what each costs.
         near_straight: (B,) whether it is hardly one.
         gap: (B, 3, G) pixels of a gap's two sides and its middle.

@@ -49,7 +49,7 @@ class LaserWorkspace:
         plane_m: (H, W, 3) what each pixel shows of the laser's plane, camera frame [m]; 0: nothing.
         focal_px: Of the camera.
         T_camera_palm: (4, 4) how the palm lies [m].
-        bent: Whether the wrist is.
+        flexed: Whether the wrist is.
         palm: What is known of the palm.
         first_row: Above it the laser meets no finger.
     """

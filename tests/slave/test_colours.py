@@ -11,7 +11,7 @@ from common.errors import FitError
 from slave.markers.classify import HUES
 from slave.markers.colours import calibrate, circular_median, grow, report
 from slave.offline import calibrate_colours
-from tests.slave.painted import CENTRES, HUE, NAMES, Disc, hand, linear, paint, render
+from tests.slave.painted import CENTRES, HUE, NAMES, Disc, hand, linear, marker_hsv, render
 
 IMAGE = render(hand(), noise=2.0)
 CLICKS = {n: (300.0 + x, 200.0 + y) for n, (x, y) in zip(NAMES, CENTRES.tolist(), strict=True)}
@@ -46,7 +46,7 @@ def test_a_hue_at_the_wrap_gives_a_range_that_wraps() -> None:
 
 
 def test_clutter_of_a_markers_colour_is_reported() -> None:
-    image = render([*hand(), Disc(paint(1), 560.0, 120.0, 60.0)])
+    image = render([*hand(), Disc(marker_hsv(1), 560.0, 120.0, 60.0)])
     rows = {r.name: r for r in calibrate(image, CLICKS)}
     assert rows["index"].background > 0.02
     text = report(list(rows.values()))
@@ -125,7 +125,7 @@ def test_the_reference_is_the_paints_colour_in_linear_light() -> None:
 
 
 def test_background_that_may_look_like_a_marker_is_warned_of() -> None:
-    pen = Disc(paint(2), 560.0, 120.0, 5.0)  # 80 px: too few for a collision in share
+    pen = Disc(marker_hsv(2), 560.0, 120.0, 5.0)  # 80 px: too few for a collision in share
     text = report(calibrate(render([*hand(), pen]), CLICKS))
     assert "no collisions" in text
     assert "warning: middle: 8" in text or "warning: middle: 7" in text

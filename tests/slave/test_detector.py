@@ -6,10 +6,10 @@ import pytest
 from common.arrays import Image
 from common.calibration import HsvRange
 from slave.markers.detector import Detections, MarkerDetector
-from tests.slave.painted import CENTRES, NAMES, RANGES, Disc, camera, finger, hand, paint, render
+from tests.slave.painted import CENTRES, NAMES, RANGES, Disc, camera, finger, hand, marker_hsv, render
 
 STEP_NS = 16_666_667
-MUG = [Disc(paint(1), 560.0, 120.0, 17.0)]
+MUG = [Disc(marker_hsv(1), 560.0, 120.0, 17.0)]
 DETECTOR = MarkerDetector(camera(), NAMES)
 
 
@@ -48,8 +48,8 @@ def test_a_missing_marker_is_nan_in_all_and_the_others_are_what_they_were() -> N
 
 
 def test_a_lost_marker_comes_back_anywhere_on_the_hand_in_the_first_frame_that_shows_it() -> None:
-    without = render([d for d in hand() if d.hsv != paint(2)])
-    moved = [d for d in hand(240.0, 260.0) if d.hsv != paint(2)] + finger(2, 300.0, 170.0)
+    without = render([d for d in hand() if d.hsv != marker_hsv(2)])
+    moved = [d for d in hand(240.0, 260.0) if d.hsv != marker_hsv(2)] + finger(2, 300.0, 170.0)
     frames = push_all([render(hand())] + [without] * 60 + [render(moved)])
     assert np.isnan(frames[60].uv[2]).all()
     assert np.hypot(*(frames[61].uv[2] - (300.0, 170.0))) < 0.3
@@ -67,14 +67,14 @@ def test_a_mug_of_the_same_colour_is_not_the_marker() -> None:
 
 
 def test_a_mug_is_not_taken_for_a_hidden_marker() -> None:
-    without = [d for d in hand() if d.hsv != paint(1)]
+    without = [d for d in hand() if d.hsv != marker_hsv(1)]
     for found in push_all([render(hand() + MUG), *[render(without + MUG)] * 60]):
         assert not np.hypot(*(found.uv[1] - (560.0, 120.0))) < 30.0
 
 
 def test_a_mug_near_a_fist_is_not_a_marker() -> None:
-    fist = [Disc((12, 100, 200), 300.0, 200.0, 40.0), Disc(paint(5), 300.0, 200.0, 16.0)]
-    (found,) = push_all([render([*fist, Disc(paint(1), 400.0, 180.0, 15.0)])])
+    fist = [Disc((12, 100, 200), 300.0, 200.0, 40.0), Disc(marker_hsv(5), 300.0, 200.0, 16.0)]
+    (found,) = push_all([render([*fist, Disc(marker_hsv(1), 400.0, 180.0, 15.0)])])
     assert np.isfinite(found.uv[5]).all()
     assert np.isnan(found.uv[1]).all()
 
@@ -91,7 +91,7 @@ def test_clicks_decide_where_two_hands_show_the_same_colours() -> None:
 
 def test_a_single_marker_without_a_hand_is_found_from_30_to_23000_px() -> None:
     for radius in (4.0, 12.0, 40.0, 85.0):
-        (found,) = push_all([render([Disc(paint(1), 300.0, 240.0, radius)])])
+        (found,) = push_all([render([Disc(marker_hsv(1), 300.0, 240.0, radius)])])
         assert found.uv[1] == pytest.approx((300.0, 240.0), abs=0.1)
         assert np.isnan(found.uv[[0, 2, 3, 4, 5]]).all()
 
@@ -116,7 +116,7 @@ def test_a_marker_first_seen_half_hidden_is_measured_as_it_is() -> None:
 
 
 def test_a_rival_of_the_same_colour_within_reach_is_named() -> None:
-    second = [Disc(paint(1), 245.0, 145.0, 7.0)]
+    second = [Disc(marker_hsv(1), 245.0, 145.0, 7.0)]
     frames = push_all([render(hand())] * 2 + [render(hand() + second)] * 2)
     assert np.isnan(frames[1].alternative_uv).all()
     for found in frames[2:]:
@@ -133,14 +133,14 @@ def test_a_thing_near_a_marker_never_seen_before_is_an_alternative_not_a_part_of
 ) -> None:
     connection_lost = 7.0 + gap + radius
     thing = 265.0 + connection_lost * math.cos(angle), 110.0 + connection_lost * math.sin(angle)
-    for found in push_all([render([*hand(), Disc(paint(1), *thing, radius)])] * 2):
+    for found in push_all([render([*hand(), Disc(marker_hsv(1), *thing, radius)])] * 2):
         place, alternative = (np.hypot(*(uv[1] - (265.0, 110.0))) for uv in (found.uv, found.alternative_uv))
         assert min(place, alternative) < 0.3
         assert np.hypot(*(found.alternative_uv[1] - thing)) < 0.3 or np.hypot(*(found.uv[1] - thing)) < 0.3
 
 
 def test_a_piece_split_off_is_joined_in_doubt_where_the_whole_is_not_known() -> None:
-    whole, empty = render([Disc(paint(1), 300.0, 240.0, 30.0)]), render([])
+    whole, empty = render([Disc(marker_hsv(1), 300.0, 240.0, 30.0)]), render([])
     split = whole.copy()
     split[242:258] = empty[242:258]  # something in front, across the cap
     new, known = push_all([split])[0], push_all([whole, whole, split])[2]

@@ -28,7 +28,7 @@ from slave.markers.roi import Window
 from slave.markers.scan import STRIPS, Scanner, merged
 from slave.markers.workers import Inline
 from slave.offline import calibrate_colours, camera_of
-from tests.slave.painted import CENTRES, NAMES, RANGES, Disc, camera, finger, hand, paint, render
+from tests.slave.painted import CENTRES, NAMES, RANGES, Disc, camera, finger, hand, marker_hsv, render
 
 STEP_NS = 16_666_667
 ENGINES = ("numpy", "numba") if importlib.util.find_spec("numba") is not None else ("numpy",)
@@ -154,7 +154,7 @@ def test_the_standard_scene_is_the_same_and_its_light_is_followed_alike() -> Non
 
 
 def test_a_rival_in_the_window_is_seen_and_one_beyond_it_is_not() -> None:
-    near, far = Disc(paint(1), 212.0, 125.0, 7.0), Disc(paint(1), 600.0, 420.0, 7.0)
+    near, far = Disc(marker_hsv(1), 212.0, 125.0, 7.0), Disc(marker_hsv(1), 600.0, 420.0, 7.0)
     for thing, there in ((near, True), (far, False)):
         detector = windowed()
         frames = push_all(detector, [render(hand())] * 2 + [render([*hand(), thing])] * 3)
@@ -168,7 +168,7 @@ def test_a_rival_in_the_window_is_seen_and_one_beyond_it_is_not() -> None:
 
 def still(u: float, v: float, marker: int = 1) -> Image:
     """The hand, whose index finger's cap lies elsewhere."""
-    return render([d for d in hand() if d.hsv != paint(marker)] + finger(marker, u, v))
+    return render([d for d in hand() if d.hsv != marker_hsv(marker)] + finger(marker, u, v))
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -179,7 +179,9 @@ def test_a_marker_that_jumps_out_of_its_window_is_found_within_as_many_frames_as
     waits: set[int] = set()
     for phase in range(STRIPS + 1):
         detector = windowed(engine)
-        without = [render([d for d in hand() if d.hsv != paint(1)])] * phase  # so the strips begin elsewhere
+        without = [
+            render([d for d in hand() if d.hsv != marker_hsv(1)])
+        ] * phase  # so the strips begin elsewhere
         frames = push_all(detector, [before, *without, before, before, *[jumped] * (STRIPS + 1)])
         after = frames[-STRIPS - 1 :]
         assert all(all(found) for found in (np.delete(seen(f), 1) for f in after)), "the others go on"
@@ -196,7 +198,7 @@ def test_a_marker_that_jumps_out_of_its_window_is_found_within_as_many_frames_as
 @pytest.mark.parametrize("v", [8.0, 120.0, 239.0, 240.0, 300.0, 472.0])
 def test_when_all_are_lost_a_marker_anywhere_is_found_within_all_strips(v: float, engine: str) -> None:
     detector = windowed(engine)
-    single = render([Disc(paint(1), 320.0, v, 6.0)])
+    single = render([Disc(marker_hsv(1), 320.0, v, 6.0)])
     frames = push_all(detector, [render(hand()), *[EMPTY] * 40, *[single] * STRIPS])
     assert not any(any(seen(f)) for f in frames[1:41])
     assert np.hypot(*(frames[-1].uv[1] - (320.0, v))) < 0.3
@@ -207,7 +209,7 @@ def test_when_all_are_lost_a_marker_anywhere_is_found_within_all_strips(v: float
 def test_a_hand_that_comes_back_is_whole_within_two_rounds_of_the_strips_and_a_mug_is_not_its_marker() -> (
     None
 ):
-    mug = Disc(paint(1), 560.0, 40.0, 17.0)  # in the first strip: it is seen before the hand
+    mug = Disc(marker_hsv(1), 560.0, 40.0, 17.0)  # in the first strip: it is seen before the hand
     gone, back = render([mug]), render([*hand(300.0, 300.0), mug])
     frames = push_all(windowed(), [render(hand()), *[gone] * 60, *[back] * (2 * STRIPS + 2)])
     assert all(seen(frames[-1]))
@@ -254,14 +256,14 @@ def test_motion_of_several_windows_a_frame_is_followed_by_prediction_or_found_ag
 
 def test_a_marker_of_a_few_pixels_is_found_in_strips_as_on_all_grids() -> None:
     for u in (300.0, 301.0, 302.0, 303.0):
-        speck = render([Disc(paint(1), u, 331.0, 2.6)])
+        speck = render([Disc(marker_hsv(1), u, 331.0, 2.6)])
         frames = push_all(windowed(), [EMPTY, *[speck] * STRIPS])
         assert np.hypot(*(frames[-1].uv[1] - (u, 331.0))) < 0.5
 
 
 def test_a_surface_in_a_markers_colour_is_seen_whole_and_is_not_the_marker() -> None:
     shirt = render(
-        [*hand(), Disc(paint(1), 320.0, 600.0, 330.0)]
+        [*hand(), Disc(marker_hsv(1), 320.0, 600.0, 330.0)]
     )  # it reaches into windows, and far out of them
     frames = push_all(windowed(), [render(hand())] * 2 + [shirt] * 4)
     whole = push_all(DETECTORS["numpy"].fresh(), [render(hand())] * 2 + [shirt] * 4)
@@ -300,7 +302,7 @@ def test_windows_are_a_part_of_the_frame_and_what_is_lost_costs_a_strip() -> Non
     push_all(detector, [render(hand())] * 2)
     assert points[0] == every
     assert sum(points[1:]) < 0.3 * every
-    lost = render([d for d in hand() if d.hsv != paint(1)])
+    lost = render([d for d in hand() if d.hsv != marker_hsv(1)])
     detector.push(lost, 2 * STEP_NS)
     del points[:]
     detector.push(lost, 3 * STEP_NS)
@@ -354,7 +356,7 @@ def test_the_strips_of_one_round_hold_the_whole_frame(scanner: Scanner) -> None:
     places = [(float(u), float(v)) for u in (4, 320, 634) for v in range(4, 480, 17)]
     found: set[tuple[float, float]] = set()
     for place in places:
-        image = render([Disc(paint(1), *place, 5.0)])
+        image = render([Disc(marker_hsv(1), *place, 5.0)])
         looks = [scanner.around(image, TABLE, NOWHERE, [1]).blobs[1] for _ in range(STRIPS)]
         if any(looks):
             found.add(place)

@@ -56,7 +56,7 @@ class LaserSheet:
         normal, offset_m: The plane, normal . X = offset_m.
         forward, across: Unit vectors (3,) of the plane: the middle of the fan, and towards its second edge.
         angle_rad: (RAYS,) of the rays to the middle, from one edge of the fan to the other.
-        flesh: The hand.
+        capsules: The hand.
         still: The palm of a straight wrist, which was met beforehand.
         still_m: How far along each ray that begins (RAYS,) [m]; inf: nowhere.
         still_body: Which body of it that is (RAYS,).

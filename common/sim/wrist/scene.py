@@ -77,7 +77,7 @@ class WristScene:
         seed: Of flesh, skin, room and noise.
         reflectance: How much light the skin gives back, of whatever light, against usual skin.
         optics: The camera.
-        flesh: The hand's surface.
+        capsules: The hand's surface.
         sheet: The laser.
         T_camera_palm: (4, 4) of a straight wrist [m].
     """

@@ -37,7 +37,7 @@ class Seen:
 
     Attributes:
         views: As found in the images.
-        turned: View -> camera -> order of the corner numbers, as of `links.Links`.
+        corner_order: View -> camera -> order of the corner numbers, as of `links.Links`.
     """
 
     views: BoardViews

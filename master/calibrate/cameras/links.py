@@ -20,7 +20,7 @@ class Links:
 
     Attributes:
         T_camera_rig: Camera -> (4, 4) [m]; the rig's frame is that of the first camera.
-        turned: View -> camera -> order (N,): what the camera calls corner i is corner order[i] of the view.
+        corner_order: View -> camera -> order (N,): what the camera calls corner i is corner order[i] of the view.
     """
 
     T_camera_rig: Mapping[str, Float]

@@ -47,7 +47,7 @@ class Extrinsics:
         rig: The wrist rig with its new keys: T_camera_palm, imu, stamp_offset_us.
         report: Lines for a person.
         fit: What was fitted.
-        triples: To what.
+        cycles: To what.
         sigma: Quantity with its unit -> standard deviation.
     """
 
@@ -74,7 +74,7 @@ def calibrate_extrinsics(
         poses: What the line of the marker rig made of it, by markers alone.
         markers: Their names, in the order of the poses'.
         model: The hand.
-        triples: What the slave of the device saw, in order.
+        cycles: What the slave of the device saw, in order.
         samples: What its IMU measured, in order, with the orientation of its filter.
         rig: The device: laser plane, a palm pose that is right to a centimetre and ten degrees, an IMU.
         camera: Its camera.

@@ -32,7 +32,7 @@ def fit_extrinsics(
         model: The hand.
         names: Of the markers, in the order of the track's.
         hand, imu: What was seen of the hand, and felt.
-        triples: What was seen from the wrist.
+        cycles: What was seen from the wrist.
         px_per_m: What a metre at the tips is in the image.
         firsts: First guesses, of which one is right to some 15 degrees, 15 mm and 20 ms.
     """

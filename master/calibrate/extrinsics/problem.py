@@ -347,7 +347,7 @@ class Problem:
         Args:
             shared: (T, R, UNKNOWN) which is changed.
             by_imu: (T, R, 3) derivatives by a turn of the IMU, rig axes.
-            unknown, turns: Where.
+            unknown, orientations: Where.
         """
         shared[..., RIG_WORLD] = by_imu
         by_gyro = -by_imu @ (unknown.R_rig_world @ orientations.drift)

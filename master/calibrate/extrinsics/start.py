@@ -75,7 +75,7 @@ def started(
         tips_m: (N, 4, 3) the markers on index ... little of the hand's instants, rig frame; NaN: not seen.
         optics: The wrist camera.
         T_camera_palm: (4, 4) first guess of the rig file.
-        triples: What was seen from the wrist.
+        cycles: What was seen from the wrist.
     """
     best: tuple[float, float, Float, Float] | None = None
     for late_s in _SEARCH_S.tolist():

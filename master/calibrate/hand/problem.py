@@ -42,7 +42,7 @@ class HandRoutineProblem:
         points_m: (T, 5 + B, 3) caps thumb ... little, then the markers on the back, rig frame; NaN: not seen.
         whiten: (T, 5 + B, 3, 3): whiten @ off has unit covariance.
         knots: Of the curves.
-        course: What the routine asks for at each of them.
+        targets: What the routine asks for at each of them.
         start: (4, 4) palm pose about which the curves are.
         palm_free: The palm may move, since it is measured.
         beliefs: Widths.

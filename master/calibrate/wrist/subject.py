@@ -81,7 +81,7 @@ def calibrate_subject(
     """Fit the subject of a wrist device to one guided motion: open hand, straight fingers bent at the knuckles, fist.
 
     Args:
-        triples: What the slave saw, in order.
+        cycles: What the slave saw, in order.
         rig: The device: laser plane, and a palm pose that is right to a centimetre and ten degrees.
         camera: Its camera.
         hand: The hand as far as it is known, such as a hand of the user's length.

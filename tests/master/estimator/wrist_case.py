@@ -34,7 +34,7 @@ class Seen:
     Attributes:
         laser: (5, 2) by the exact cut; NaN: the laser misses the finger, or it is not seen.
         length_px: (5,) of the line.
-        ridge: (5, 2) by the ridge.
+        predicted_laser: (5, 2) by the ridge.
         tip: (5, 2) fingertips, and `depth_m` (5,) how far they are along the camera's axis.
         by: (5, 5, 7) derivatives of ridge, tip and logarithm of its distance (`master.estimator.finger_surface.look`).
         stretch: (5,) of the ridge that is lit.
@@ -98,7 +98,7 @@ class WristCase:
             t_ns: When.
             tips: (5,) which fingertips are seen.
             unit: Of distances by light; None: there are none.
-            bend, twist: As of `looks`.
+            wrist_angles, twist: As of `looks`.
             lines: Whether lengths of the lines are reported.
         """
         seen, optics = self.looks(angles, wrist_angles, twist), self.setup.optics

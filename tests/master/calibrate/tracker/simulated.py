@@ -29,7 +29,7 @@ class Motion:
     Attributes:
         seed: Of all that is drawn.
         seconds: How long.
-        turns: How far it is turned about each of its axes, 1: some 60 degrees to both sides.
+        rotations: How far it is turned about each of its axes, 1: some 60 degrees to both sides.
         way_m: How far it is carried to each side.
         pace: How fast, 1: to and fro in some two seconds.
         late_s: How much later the tracker's poses hold than they say.
