@@ -114,7 +114,9 @@ def test_a_tracked_bit_is_false_where_the_joint_is_far_off() -> None:
     assert got.unseen == 0.0
 
 
-@pytest.mark.parametrize(("paint", "line", "false"), [(0.0, 0.02, 1.0), (100.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
+@pytest.mark.parametrize(
+    ("visible_area", "line", "false"), [(0.0, 0.02, 1.0), (100.0, 0.0, 0.0), (0.0, 0.0, 1.0)]
+)
 def test_a_tracked_bit_is_false_where_nothing_tells_of_the_joint(
     visible_area: float, line: float, false: float
 ) -> None:

@@ -210,7 +210,7 @@ def test_the_samples_of_this_file_are_valid(kind: type[msgspec.Struct]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "path", "value", "said"),
+    ("kind", "path", "value", "output"),
     [
         (RigCalibration, "imu", {"q_palm_imu": [1, 1, 0, 0]}, r"imu\.q_palm_imu: length 1\.414"),
         (RigCalibration, "imu", {"q_rig_world": [1, 0, 0]}, r"\$\.imu\.q_rig_world"),

@@ -47,7 +47,7 @@ def test_the_default_is_encrypted_where_there_are_keys() -> None:
 
 
 @pytest.mark.parametrize(
-    ("said", "received_from", "reached"),
+    ("output", "received_from", "reached"),
     [
         ("tls/0.0.0.0:47802", "192.168.1.2", "tls/192.168.1.2:47802"),
         ("tls/192.168.7.7:47802", "192.168.1.2", "tls/192.168.7.7:47802"),

@@ -65,7 +65,7 @@ def test_a_recording_without_frames_is_empty_not_broken(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("row", "said"),
+    ("row", "output"),
     [
         ("left,0,5,none", "columns"),
         ("left,0,5,none,", "columns"),
@@ -116,7 +116,7 @@ def test_a_missing_file_is_named(file: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("manifest", "said"),
+    ("manifest", "output"),
     [
         ({"versoin": 1}, "versoin"),
         ({"version": 2}, "version"),

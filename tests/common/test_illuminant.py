@@ -73,7 +73,7 @@ def test_a_course_goes_straight_jumps_and_stays() -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "says"),
+    ("make", "expected"),
     [
         (lambda: planckian_xy(1000.0), "1000 K"),
         (lambda: LightSchedule(()), "at least one"),

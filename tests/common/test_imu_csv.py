@@ -99,7 +99,7 @@ def test_what_was_not_measured_is_nan_and_counted_and_late_rows_are_left_out(tmp
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "expected"),
     [
         (
             "t,gx,gy,ax,ay,az\n0,0,0,0,0,1\n",

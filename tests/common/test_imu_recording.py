@@ -57,7 +57,7 @@ def test_field_and_orientation_may_be_left_out(header: tuple[str, ...], tmp_path
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "output"),
     [
         ("t_ns,gx,gy\n", r"imu\.csv: header t_ns,gx,gy: must be t_ns,gx"),
         ("", r"imu\.csv: header : must be"),

@@ -71,7 +71,7 @@ def test_the_size_of_every_jpeg_and_of_none_that_is_cut(flags: list[int]) -> Non
 
 
 @pytest.mark.parametrize(
-    ("data", "says"),
+    ("data", "expected"),
     [
         (b"", "no JPEG, PNG, BMP or TIFF"),
         (b"GIF89a" + b"\1" * 20, "no JPEG, PNG, BMP or TIFF"),

@@ -49,7 +49,7 @@ def test_the_laser_of_the_shipped_device_by_hand() -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "says"),
+    ("key", "value", "expected"),
     [
         (
             "laser.power_w",

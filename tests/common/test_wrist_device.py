@@ -32,7 +32,7 @@ PERSPECTIVE = ((1.0, 0, 0, 0), (0, 1.0, 0, 0), (0, 0, 1.0, 0), (0, 0, 0.1, 1.0))
 
 @pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "expected"),
     [
         ({"kind": "markers"}, "kind is 'markers'"),
         ({"cameras": ("other",)}, "cameras: other"),
@@ -89,7 +89,7 @@ def test_slave_and_master_place_the_same_plane_and_palm_also_where_the_file_is_r
 
 
 @pytest.mark.parametrize(
-    ("laser", "says"),
+    ("laser", "expected"),
     [
         (Laser(forward=(0.0, 0.0, 0.0)), "laser.forward: length 0, not 1"),
         (Laser(forward=(0.0, 0.0, 1000.0)), r"Expected `float` <= 1.01 - at `\$.laser.forward\[2\]`"),

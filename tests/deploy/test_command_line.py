@@ -47,7 +47,7 @@ def test_a_folder_that_is_no_recording_is_named(tmp_path: Path, capsys: pytest.C
 
 
 @pytest.mark.parametrize(
-    ("rigs", "says"),
+    ("rigs", "expected"),
     [
         ([{"name": "g", "kind": "glove", "cameras": []}], "no rig of kind 'markers' or 'wrist'"),
         ([], "no rig of kind"),
@@ -283,7 +283,7 @@ def test_of_both_kinds_each_sensor_has_its_rig_and_one_master_runs_all(tmp_path:
 
 
 @pytest.mark.parametrize(
-    ("rigs", "scene", "says"),
+    ("rigs", "scene", "expected"),
     [
         (("desk", "wrist"), "standard", "desk, wrist see one hand together only in grasp, both-poses"),
         (("desk", "desk"), "grasp", "a rig stands twice"),

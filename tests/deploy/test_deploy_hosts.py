@@ -48,7 +48,7 @@ def test_hosts_take_cameras_in_the_order_of_the_rig_or_by_name(
 
 
 @pytest.mark.parametrize(
-    ("hosts", "said"),
+    ("hosts", "output"),
     [
         (["a", "b", "c"], "c: rig 'desk' has no camera left for it; it has left, right"),
         (["up=a"], "rig 'desk' has no camera or IMU 'up'"),
@@ -168,7 +168,7 @@ def test_a_link_that_hangs_ends_by_the_deadline_with_all_that_it_started(
 
 
 @pytest.mark.parametrize(
-    ("said", "expected"),
+    ("output", "expected"),
     [
         (
             "ssh: Could not resolve hostname pi: Name or service not known",
@@ -373,7 +373,7 @@ def _file(path: Path, content: bytes) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "output"),
     [
         (["--options", "rihgt=--sync client"], "--options 'rihgt=--sync client': rig 'desk' has no 'rihgt'"),
         (["--camera", "up=v4l2"], "--camera 'up=v4l2': rig 'desk' has no 'up'; it has left, right"),
@@ -396,7 +396,7 @@ def test_a_fleet_with_a_keys_folder_that_is_not_there_is_told_so(capsys: pytest.
 
 
 @pytest.mark.parametrize(
-    ("said", "names", "driver"),
+    ("output", "names", "driver"),
     [
         ((), ("left",), "picamera2"),
         (("v4l2:0",), ("left",), "v4l2:0"),

@@ -195,7 +195,7 @@ def test_a_thief_between_both_reads_nothing_and_when_he_is_gone_they_find_each_o
 
 
 @pytest.mark.parametrize(
-    ("master", "slave", "said"),
+    ("master", "slave", "output"),
     [
         (LinkKey(KEY, ROOT), KEY, "has the rig key alone: phalanx deploy brings device-left.secret"),
         (KEY, own("left"), "start the master with --keys DIR, a folder that has devices.key"),

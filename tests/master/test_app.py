@@ -173,7 +173,7 @@ def test_stages_are_means_and_survive_an_error() -> None:
 
 
 @pytest.mark.parametrize(
-    ("connected", "said"),
+    ("connected", "output"),
     [
         ([], "cameras: none yet; waiting for left, right"),
         (["right"], "cameras: right; waiting for left"),

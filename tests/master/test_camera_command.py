@@ -51,7 +51,7 @@ def test_a_file_is_loaded_then_changed_then_saved() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
+    ("options", "expected"),
     [
         ({"exposure_us": 0.0}, "--exposure-us 0: must be positive"),
         ({"gain": float("nan")}, "--gain nan: must be positive"),

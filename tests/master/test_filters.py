@@ -219,7 +219,7 @@ def _by_noise(signals: Float, sigma_m: float, groups: tuple[int, ...]) -> Float:
 
 
 @pytest.mark.parametrize(
-    ("sigma_m", "said", "left_m"), [(1e-3, 1.0, 4e-4), (1e-3, 2.0, 2e-4), (3e-3, 2.0, 4e-4)]
+    ("sigma_m", "output", "left_m"), [(1e-3, 1.0, 4e-4), (1e-3, 2.0, 2e-4), (3e-3, 2.0, 4e-4)]
 )
 def test_at_rest_known_noise_leaves_about_the_jitter(sigma_m: float, output: float, left_m: float) -> None:
     noise = np.random.default_rng(1).normal(0.0, sigma_m, (2000, 6))

@@ -63,7 +63,7 @@ def test_systemd_has_nothing_to_say_about_the_unit(tmp_path: Path) -> None:
 
 @NEEDS_SYSTEMD
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "output"),
     [
         ("WatchdogSec", "WatchdogSek", "Unknown key 'WatchdogSek'"),
         ("MemoryMax=1G", "MemoryMax=1X", "Invalid memory limit"),

@@ -140,7 +140,7 @@ def test_a_folder_that_is_not_there_is_said_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "says"),
+    ("line", "expected"),
     [
         (b"{", "line 2: Input data was truncated"),
         (b"[1]", "line 2: Expected `object`"),
@@ -199,7 +199,7 @@ def test_searched_frames_come_back_with_their_tags_in_order(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "expected"),
     [
         ({"row": None}, "'row' is missing"),
         ({"row": np.array([0, 0, 3])}, "row or ids: out of range"),

@@ -106,7 +106,7 @@ def test_cameras_together_are_placed_as_well_as_the_worst(bench: RigSetup) -> No
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "expected"),
     [
         ({"markers": ("thumb", "index", "back")}, "'bench' and 'side': markers: differ"),
         ({"frame_sync": "predict"}, "'bench' and 'side': pairing: differ"),
@@ -203,7 +203,7 @@ def test_a_marker_is_of_one_hand() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "expected"),
     [
         ({"other_hands": ("made-right",)}, "other_hands: a hand stands twice"),
         ({"T_world_rig": rows(2.0 * np.eye(4))}, "T_world_rig: upper left 3x3 is not a rotation"),

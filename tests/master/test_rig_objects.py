@@ -52,7 +52,7 @@ def test_a_rig_has_its_objects_and_its_gestures(tree: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "changes", "says"),
+    ("path", "changes", "expected"),
     [
         ("rigs/desk-wand.json", {"objects": ["pen"]}, r"objects/pen\.json"),
         ("rigs/desk-wand.json", {"free_markers": ["wand1", "wand2"]}, "'wand3'"),

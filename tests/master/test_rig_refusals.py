@@ -69,7 +69,7 @@ def strange_solver(rig: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "expected"),
     [
         (
             without_numbers,

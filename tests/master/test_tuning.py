@@ -218,7 +218,7 @@ def test_another_rate_of_a_camera_is_followed(told: Told) -> None:
 
 
 @pytest.mark.parametrize(
-    ("part", "key", "value", "says"),
+    ("part", "key", "value", "expected"),
     [
         ("rigs/bench.json", "markers", ["thumb", "index", "back"], "markers: thumb, index, .* cannot become"),
         ("rigs/bench.json", "cameras", ["right", "left"], "cameras: left, right cannot become right, left"),

@@ -175,7 +175,7 @@ def test_a_bus_that_cannot_be_opened_is_tried_again_and_never_ends_the_slave() -
 
 
 @pytest.mark.parametrize(
-    ("counts", "said"),
+    ("counts", "output"),
     [
         ({"sent": 0}, "no master heard yet"),
         ({"refused.foreign": 5}, "of another rig key"),

@@ -46,7 +46,7 @@ def test_help_of_all_lists_every_command(capsys: pytest.CaptureFixture[str]) -> 
 
 
 @pytest.mark.parametrize(
-    ("option", "text", "says"),
+    ("option", "text", "expected"),
     [
         ("--queue-mb", "abc", "abc: must be a number"),
         ("--queue-mb", "-1", "must not be negative"),

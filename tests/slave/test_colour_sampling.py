@@ -92,7 +92,7 @@ def test_a_click_next_to_a_small_marker_is_meant_for_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("marker", "uv", "says"),
+    ("marker", "uv", "expected"),
     [
         ("index", (700.0, 3.0), r"pick index: \(700, 3\) is outside the 640x480 image"),
         (

@@ -84,7 +84,7 @@ def test_nothing_seen_changes_nothing_and_one_marker_stays_alone() -> None:
     np.testing.assert_array_equal(np.isfinite(fit.misfit), [False, False, True, False, False, False])
 
 
-@pytest.mark.parametrize("lone", range(6))
+@pytest.mark.parametrize("single", range(6))
 def test_a_lone_marker_of_another_shade_does_not_carry_the_light_away(single: int) -> None:
     drift, seen = ColourDrift(COLOURS), np.full((6, 3), np.nan)
     seen[single] = COLOURS[single] * 1.4 + 0.02  # a flat, bright patch with a sheen

@@ -229,7 +229,7 @@ def not_there(folder: Path) -> list[Path]:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "said"),
+    ("spoil", "output"),
     [
         (
             other_rig,

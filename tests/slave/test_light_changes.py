@@ -46,7 +46,7 @@ def still(seed: int, camera: str) -> Outcome:
 
 @pytest.mark.parametrize(("seed", "camera"), [(5, "left"), (9, "right")])
 @pytest.mark.parametrize(
-    "course", [RAMP, STEPS, EXPOSURES, SWITCHED], ids=["ramp", "steps", "exposure", "switched"]
+    "schedule", [RAMP, STEPS, EXPOSURES, SWITCHED], ids=["ramp", "steps", "exposure", "switched"]
 )
 def test_markers_stay_found_and_themselves(schedule: LightSchedule, seed: int, camera: str) -> None:
     got = outcome(schedule, seed, camera)

@@ -88,7 +88,7 @@ def pinned(name: str, value: object, after: int) -> Callable[[int, dict[str, Any
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "says"),
+    ("name", "value", "expected"),
     [
         ("ExposureTime", 7777, "ExposureTime: wanted 9000 us .exposure_us., got 7777 us"),
         ("AnalogueGain", 1.75, "AnalogueGain: wanted 2 .analogue_gain., got 1.75"),
@@ -118,7 +118,7 @@ def test_settings_that_do_not_come_back_are_said_to_be_lost(monkeypatch: pytest.
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "expected"),
     [
         ({"exposure_us": 40_000.0}, "does not fit into a frame of 33333 us"),
         ({"analogue_gain": 90.0}, "AnalogueGain 90 is not within 1 to 63.9375"),

@@ -133,7 +133,7 @@ def overwrite(name: str, value: object) -> Callable[[int, dict[str, Any]], None]
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "says"),
+    ("name", "value", "expected"),
     [
         ("ExposureTime", 4000, "ExposureTime: wanted 5000 us (exposure_us), got 4000 us"),
         ("AnalogueGain", 1.5, "AnalogueGain: wanted 1.25 (analogue_gain), got 1.5"),
@@ -176,7 +176,7 @@ def test_settings_that_come_late_are_waited_for_and_ones_that_waver_are_refused(
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "expected"),
     [
         ({"exposure_us": 25_000.0}, "exposure_us 25000 does not fit into a frame of 20000 us"),
         ({"analogue_gain": 90.0}, "AnalogueGain 90 is not within 1 to 63.9375"),

@@ -111,7 +111,7 @@ def test_other_drivers_are_not_its_business() -> None:
 
 
 @pytest.mark.parametrize(
-    ("driver", "arguments", "says"),
+    ("driver", "arguments", "expected"),
     [
         ("v4l2", ("--sync", "server"), "--sync is an option of --camera picamera2"),
         ("picamera2", ("--control", "gain=1"), "--control is an option of --camera v4l2"),

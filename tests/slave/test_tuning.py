@@ -119,7 +119,7 @@ def test_set_changes_what_it_names_and_nothing_else(tuning: CameraTuning, knobs:
 
 
 @pytest.mark.parametrize(
-    ("verb", "body", "says"),
+    ("verb", "body", "expected"),
     [
         ("set", '{"exposure": 9000}', "set: Object contains unknown field `exposure`"),
         ("set", '{"exposure_us": -1}', r"set: Expected `float` >= 0.01 - at `\$.exposure_us`"),

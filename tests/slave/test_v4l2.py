@@ -129,7 +129,7 @@ def test_automatics_are_off_before_values_are_written_and_all_are_as_asked() -> 
 
 
 @pytest.mark.parametrize(
-    ("name", "to", "says"),
+    ("name", "to", "expected"),
     [
         (
             "Exposure Time, Absolute",
@@ -202,7 +202,7 @@ def test_codes_of_the_maker_must_be_given() -> None:
 
 
 @pytest.mark.parametrize(
-    ("controls", "says"),
+    ("controls", "expected"),
     [
         (
             {"sharpness": 1},

@@ -86,7 +86,7 @@ def _put(path: Path, text: str) -> None:
     path.write_text(text)
 
 
-@pytest.mark.parametrize(("code", "subject", "says", "change"), CHANGES)
+@pytest.mark.parametrize(("code", "subject", "expected", "change"), CHANGES)
 def test_a_file_that_is_wrong_is_told_and_mended_it_is_not(
     code: str, subject: str, expected: str, change: Callable[[Path], None], tree: Path, tmp_path: Path
 ) -> None:

@@ -79,7 +79,7 @@ def sent_away(one: socket.socket) -> bool:
         return True
 
 
-@pytest.mark.parametrize("said", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: x\r\nX: y"])
+@pytest.mark.parametrize("output", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: x\r\nX: y"])
 def test_who_does_not_finish_a_question_is_sent_away(plain: Console, output: bytes) -> None:
     with plain.connect() as one:
         one.sendall(output)

@@ -40,7 +40,7 @@ def test_deviation_keeps_its_sign_and_size() -> None:
 
 
 @pytest.mark.parametrize(
-    ("points", "says"),
+    ("points", "expected"),
     [
         (np.full((30, 3), np.nan), "0 points"),
         (np.linspace([0, 0, 0.1], [0, 0, 0.2], 4), "4 points"),

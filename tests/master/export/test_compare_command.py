@@ -109,7 +109,7 @@ def test_markers_of_a_rig_are_compared(source: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "kind", "said"),
+    ("options", "kind", "output"),
     [
         ([], PhalanxError, "give --to FORMAT to export, or --compare FILE"),
         (["--compare", "EXACT", "--to", "csv"], PhalanxError, "--to is for exporting"),

@@ -107,7 +107,7 @@ def test_joints_of_a_program_are_ours(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "output"),
     [
         ("HIERARCHY", "HIERARCHIE", "it has HIERARCHY and MOTION"),
         ("Frames: 2", "Frames: 3", "42 numbers, 3 frames of 21 channels have 63"),

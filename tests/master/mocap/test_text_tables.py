@@ -112,7 +112,7 @@ HEAD = "time,wrist_x_m,wrist_y_m,wrist_z_m\n"
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "output"),
     [
         ("", "is empty"),
         ("a,b\n1,2\n", "no columns NAME_x"),

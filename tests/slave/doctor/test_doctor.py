@@ -138,7 +138,7 @@ TRACKING = "C0A80005,pc.local,9,1763800000.1,{},0.000002,0.000031,-3.1,0.0,0.05,
 
 
 @pytest.mark.parametrize(
-    ("said", "verdict", "text"),
+    ("output", "verdict", "text"),
     [
         (Ran(0, TRACKING.format("0.000012", "Normal"), ""), Verdict.OK, "+12 µs off pc.local (stratum 9)"),
         (Ran(0, TRACKING.format("-0.004", "Normal"), ""), Verdict.WARN, "-4000 µs off"),
@@ -298,7 +298,7 @@ UNIT = (
 
 
 @pytest.mark.parametrize(
-    ("said", "verdict", "runs", "text"),
+    ("output", "verdict", "runs", "text"),
     [
         (UNIT.format("active", "running", 0, 0, "90 frames/s"), Verdict.OK, True, "90 frames/s"),
         (UNIT.format("active", "running", 3, 0, "90 frames/s"), Verdict.WARN, True, "restarted 3 times"),

@@ -66,7 +66,7 @@ def test_colours_of_a_video_by_clicks_find_its_markers(
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
+    ("options", "expected"),
     [
         ([], "of a video or pictures give --calibration DIR, whose cameras/left.json they are of"),
         (["--calibration", "TREE", "--click", "nose=1,2"], "rig 'desk' has no marker 'nose'; it has thumb"),

@@ -208,7 +208,7 @@ def _text(tmp_path: Path) -> list[Path]:
 
 
 @pytest.mark.parametrize(
-    ("make", "says"),
+    ("make", "expected"),
     [
         (
             _small,
@@ -238,7 +238,7 @@ def test_what_cannot_be_used_is_refused_by_name_with_the_fix(
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "expected"),
     [
         ("frame;time\n0;1\n", "the header must have frame and time"),
         ("frame,time\n0,1.0\n0,2.0\n", "line 3: frame 0 of 'left' is there twice"),

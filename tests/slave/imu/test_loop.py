@@ -170,7 +170,7 @@ def test_it_reports_and_stops_on_the_bus() -> None:
 
 
 @pytest.mark.parametrize(
-    ("option", "says"),
+    ("option", "expected"),
     [
         (["--name", "imu", "--rig", "desk"], "rig 'desk' has no IMU 'imu'; it has none"),
         (["--name", "wrist"], "rig 'wrist' has no IMU 'wrist'; its IMU is 'imu'"),

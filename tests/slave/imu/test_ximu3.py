@@ -144,7 +144,7 @@ def test_behind_a_uart_the_wire_takes_its_time(link: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("behaviour", "says"),
+    ("behaviour", "expected"),
     [
         ({"mute": True}, "no x-IMU3 answers: is it switched on"),
         (

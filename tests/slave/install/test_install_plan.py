@@ -63,7 +63,7 @@ def test_drivers_and_options_are_of_one_camera_or_of_all() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "output"),
     [
         (("--rig", "attic"), "calib_json/rigs/attic.json: no such rig; there are desk"),
         ((), "rig 'desk' has left, right: say which of them this is, --name NAME"),
@@ -86,7 +86,7 @@ def test_what_does_not_fit_is_refused_with_its_fix(words: tuple[str, ...], outpu
 
 
 @pytest.mark.parametrize(
-    ("file", "content", "said"),
+    ("file", "content", "output"),
     [
         ("rig.key", b"0123", "rig.key is not 64 hexadecimal digits"),
         ("devices/left.secret", b"0123", "device-left.secret is not 64 hexadecimal digits"),
@@ -190,7 +190,7 @@ def test_what_config_txt_says_already_is_not_said_again() -> None:
 
 
 @pytest.mark.parametrize(
-    ("facts", "camera", "said"),
+    ("facts", "camera", "output"),
     [
         ({"bits": 32}, "", "needs a 64-bit system"),
         ({"machine": "armv7l"}, "", "needs a 64-bit system"),

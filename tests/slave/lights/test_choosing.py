@@ -34,7 +34,7 @@ def test_what_lights_a_camera(lights: str | None, camera: str, choice: str | Non
 
 
 @pytest.mark.parametrize(
-    ("lights", "camera", "says"),
+    ("lights", "camera", "expected"),
     [
         (None, "v4l2:0", "say who switches its laser and LEDs, --lights gpio:"),
         (None, "picamera2", "say who switches"),
@@ -68,7 +68,7 @@ def test_no_lights_without_limits() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "expected"),
     [
         (
             {"exposure_us": 5000.0},
@@ -102,7 +102,7 @@ def test_the_budget_is_printed_with_every_limit(capsys: pytest.CaptureFixture[st
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "expected"),
     [
         (["--blink", "1"], "--blink and --off need the lights: --lights gpio:"),
         (["--off", "--lights", "camera"], "does not switch these"),

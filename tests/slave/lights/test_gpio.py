@@ -236,7 +236,7 @@ def test_a_line_that_does_not_follow_is_said(kernel: FakeGpio) -> None:
 
 
 @pytest.mark.parametrize(
-    ("place", "fails", "says"),
+    ("place", "fails", "expected"),
     [
         ("7:17,27", None, "/dev/gpiochip7: no such GPIO chip; `gpiodetect`"),
         ("0:17,27", errno.EACCES, "not allowed; add the user to the group"),

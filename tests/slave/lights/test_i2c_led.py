@@ -227,7 +227,7 @@ def test_a_chip_that_does_not_go_dark_is_said(chip: Chip) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "says"), [(0x04, "LM3644TT, whose shortest time-out is 40 ms"), (0x1A, "id 0x1a")]
+    ("kind", "expected"), [(0x04, "LM3644TT, whose shortest time-out is 40 ms"), (0x1A, "id 0x1a")]
 )
 def test_another_chip_is_refused(chip: Chip, kind: int, expected: str) -> None:
     chip.kind = kind
@@ -242,7 +242,7 @@ def test_a_register_that_does_not_take_its_value_is_refused(chip: Chip) -> None:
 
 
 @pytest.mark.parametrize(
-    ("error", "says"),
+    ("error", "expected"),
     [
         (FileNotFoundError(errno.ENOENT, "x"), "no /dev/i2c-1; on a Pi: sudo raspi-config"),
         (PermissionError(errno.EACCES, "x"), "not allowed; add the user to the group i2c"),

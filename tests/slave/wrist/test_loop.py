@@ -137,7 +137,7 @@ def test_real_frames_go_through_the_loop_into_messages() -> None:
 
 
 @pytest.mark.parametrize(
-    ("option", "says"),
+    ("option", "expected"),
     [
         (
             ["--camera", "v4l2:/dev/there-is-none", "--lights", "camera"],

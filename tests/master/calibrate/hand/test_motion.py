@@ -109,7 +109,7 @@ def test_a_short_motion_tells_no_posture() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "kind", "said"),
+    ("change", "kind", "output"),
     [
         ("no tips", RecordingError, "a hand needs thumb-tip, index-finger-tip"),
         ("stiff ring", CalibrationError, "the ring never bends by 5 degrees"),
