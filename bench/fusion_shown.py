@@ -120,7 +120,7 @@ def _marker_message(
         area=np.where(found, view.area, np.nan),
         quality=np.where(found, np.clip(view.area / _WHOLE_PX2, 0.1, 1.0), np.nan),
         sigma_px=np.where(found, sigma, np.nan),
-        alternative_uv=np.full((len(found), 2), np.nan),
+        alt_uv=np.full((len(found), 2), np.nan),
     )
 
 

@@ -117,7 +117,7 @@ def _messages(
         area=np.where(seen, area, np.nan),
         quality=np.where(seen, 1.0, 0.0),
         sigma_px=np.where(seen, sigma_px, np.nan),
-        alternative_uv=np.full((m, 2), np.nan),
+        alt_uv=np.full((m, 2), np.nan),
     )
     if not features.tag_ids:
         return

@@ -65,7 +65,7 @@ def watch(scene: Scene, camera: str, times_s: Float) -> Watched:
 
 def message_of(camera: str, seq: int, t_ns: int, found: Detections) -> MarkerDetections:
     """What a slave would send of frame `seq`, taken at `t_ns` [ns] and handed over at once."""
-    seen = (found.uv, found.area, found.quality, found.sigma_px, found.alternative_uv)
+    seen = (found.uv, found.area, found.quality, found.sigma_px, found.alt_uv)
     return MarkerDetections(camera, 1, seq, t_ns, t_ns, *seen)
 
 

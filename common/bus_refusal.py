@@ -1,4 +1,4 @@
-"""Notify why an encrypted bus does not come about: zenoh keeps silent about a certificate that was refused."""
+"""Say why an encrypted bus does not come about: zenoh keeps silent about a certificate that was refused."""
 
 import logging
 import socket
@@ -69,7 +69,7 @@ def why_refused(endpoint: str, identity: Identity) -> str:
 
 
 def _why_invalid(endpoint: str, identity: Identity) -> str:
-    """Notify which certificate is not valid by the clock of this machine.
+    """Say which certificate is not valid by the clock of this machine.
 
     It is that of the rig, or that of who listens.
     """
@@ -86,7 +86,7 @@ def _why_invalid(endpoint: str, identity: Identity) -> str:
 
 
 def _why_expired_there(identity: Identity) -> str:
-    """Notify why who listens refused our certificate as not valid now.
+    """Say why who listens refused our certificate as not valid now.
 
     By our clock it is not valid either, or the clock there is wrong.
     """

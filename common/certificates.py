@@ -101,7 +101,7 @@ class Shown:
     fingerprint: str
 
     def invalid_at(self, now: datetime, whose: str) -> str:
-        """Notify why the certificate is not valid at `now`, with its validity.
+        """Say why the certificate is not valid at `now`, with its validity.
 
         Empty: it is valid.
 

@@ -1,4 +1,4 @@
-"""Notice that files have another content than when they were last looked at. PreviewLeases costs one `stat` per file."""
+"""Notice that files changed since they were last looked at. Looking costs one `stat` per file."""
 
 import hashlib
 from collections.abc import Iterable

@@ -140,7 +140,7 @@ def profile_from_joints(
 
 
 def _warn(model: HandModel, fingers_m: Float, angles: Float) -> None:
-    """Notify which fingers the profile does not follow, and whose rest heading is not that of the motion."""
+    """Say which fingers the profile does not follow, and whose rest heading is not that of the motion."""
     off = np.linalg.norm(model.chains(angles).position_m - fingers_m, axis=3).mean(axis=(0, 2))
     steps = np.diff(fingers_m[:, 1:, :2], axis=2)[:, :, 0]
     flat = np.hypot(steps[..., 0], steps[..., 2]) > _LEVEL * np.linalg.norm(steps, axis=2)

@@ -47,7 +47,7 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
         quality: Probability (M,) 0..1 that what was found is the marker.
         sigma_px: Standard deviation per axis (M,) [px] of `uv` as the centroid of all that the camera would see of
             the whole marker: noise, doubt of occlusion, size. Positive where `uv` is seen, NaN elsewhere.
-        alternative_uv: (M, 2) [px], as `uv`: a second place of the same colour, where the slave could not exclude that
+        alt_uv: (M, 2) [px], as `uv`: a second place of the same colour, where the slave could not exclude that
             this is the marker. NaN: none, the usual case. Only where `uv` is seen.
             A row that is NaN in all was not seen.
         t_sigma_ns: Standard deviation of `t_ns` [ns]: of the sender's stamp until `ingest`, with that of the clock
@@ -63,29 +63,27 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
     area: Annotated[Float, within(0.0, MAX_PICTURE**2)]
     quality: Annotated[Float, within(0.0, 1.0)]
     sigma_px: SigmaPx
-    alternative_uv: Pixels
+    alt_uv: Pixels
     t_sigma_ns: TimeSigmaNs = 0.0
 
     def __post_init__(self) -> None:
         m = len(self.area)
         if m > MAX_MARKERS:
             raise ValueError(f"{m} markers, at most {MAX_MARKERS}")
-        if self.alternative_uv.size == 0:
-            force_setattr(self, "alternative_uv", nowhere(m))
+        if self.alt_uv.size == 0:
+            force_setattr(self, "alt_uv", nowhere(m))
         _marker_arrays(m).freeze(self)
         refuse_sigma(self, "sigma_px", "uv")
-        if self.alternative_uv is nowhere(m):
+        if self.alt_uv is nowhere(m):
             return
-        refuse_parts(self, "alternative_uv")
-        if not np.isnan(self.alternative_uv[np.isnan(self.uv[:, 0])]).all():
-            raise ValueError("alternative_uv: a rival of a marker that is not seen")
+        refuse_parts(self, "alt_uv")
+        if not np.isnan(self.alt_uv[np.isnan(self.uv[:, 0])]).all():
+            raise ValueError("alt_uv: a rival of a marker that is not seen")
 
     @property
     def has_alternatives(self) -> bool:
         """Whether a marker has a rival."""
-        return self.alternative_uv is not nowhere(len(self.area)) and not bool(
-            np.isnan(self.alternative_uv).all()
-        )
+        return self.alt_uv is not nowhere(len(self.area)) and not bool(np.isnan(self.alt_uv).all())
 
 
 class WristDetections(Message, frozen=True, eq=False, tag=True):
@@ -237,7 +235,7 @@ def nowhere(markers: int) -> Float:
 
 @cache
 def _marker_arrays(m: int) -> Layout:
-    return Layout(MarkerDetections, uv=(m, 2), area=(m,), quality=(m,), sigma_px=(m,), alternative_uv=(m, 2))
+    return Layout(MarkerDetections, uv=(m, 2), area=(m,), quality=(m,), sigma_px=(m,), alt_uv=(m, 2))
 
 
 @cache

@@ -87,7 +87,6 @@ __all__ = [
     "HandPose",
     "Health",
     "ImuSample",
-    "SolverMode",
     "MarkerDetections",
     "Message",
     "MessageT",
@@ -96,6 +95,7 @@ __all__ = [
     "ObjectSource",
     "Phase",
     "Preview",
+    "SolverMode",
     "Source",
     "Still",
     "TagDetections",
@@ -108,7 +108,7 @@ __all__ = [
     "restamped",
 ]
 
-WIRE_VERSION = 12
+WIRE_VERSION = 13
 
 AnyMessage: TypeAlias = (
     MarkerDetections
@@ -160,7 +160,7 @@ def encode(message: Message) -> bytes:
     """Return the message as msgpack bytes."""
     if isinstance(message, MarkerDetections) and not message.has_alternatives:
         message = copy(message)
-        msgspec.structs.force_setattr(message, "alternative_uv", _NONE)
+        msgspec.structs.force_setattr(message, "alt_uv", _NONE)
     return _ENCODER.encode(message)
 
 

@@ -91,7 +91,7 @@ class Welcome(Handshake, frozen=True):
 class Unproven(Handshake, frozen=True):
     """The hello with this `slave_nonce` was not proven: the master has another secret for its name. No session.
 
-    `has_secrets`: whether the secrets of the master's devices are more than the rig key. It says no more than why: it is not
+    `has_secrets`: whether the secrets of the master's devices are more than the rig key. It says only why: it is not
     proven itself, and whoever has the rig key can say it.
     """
 

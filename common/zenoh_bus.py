@@ -288,7 +288,7 @@ class ZenohBus:
         return "; ".join(dict.fromkeys(reason for reason in reasons if reason))
 
     def _silence(self, command: Command, timeout_s: float) -> str:
-        """Notify why nobody may have answered."""
+        """Say why nobody may have answered."""
         text = (
             f"no answer from {command.target!r} to {command.verb!r} within {timeout_s:g} s ({self._where}): "
         )

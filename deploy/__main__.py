@@ -97,7 +97,7 @@ def _all(hosts: Sequence[str]) -> list[Target]:
 
 
 def _told(results: dict[str, str | None]) -> int:
-    """Notify which machines failed; the exit code."""
+    """Say which machines failed; the exit code."""
     failed = {host: why for host, why in results.items() if why is not None}
     for host, why in failed.items():
         print(f"{host}: FAILED: {why}", file=sys.stderr)

@@ -250,7 +250,7 @@ def _wait_until_tracking(
 
 
 def _look_at_viewer(state: _State, processes: list[Process], notify: Callable[[str], None]) -> None:
-    """Notify once where the viewer is, and once that it ended: nobody needs it, the run goes on without."""
+    """Say once where the viewer is, and once that it ended: nobody needs it, the run goes on without."""
     viewer = next((p for p in processes if p.name == "viewer"), None)
     if viewer is None:
         return

@@ -1,7 +1,7 @@
 """Whether the senders of a deployment are heard: before it, as a measure of how soon that shows, and after it.
 
 A new version that runs and sends nothing costs the stream for as long as it is listened for. So where a master runs and
-took all of them before, it is listened twice as long as that took, or as the slave's own start did; else `WAIT_SENDERS_S`.
+took all of them before, it waits twice as long as that took, or as the slave's own start did; else `WAIT_SENDERS_S`.
 """
 
 import json

@@ -97,7 +97,7 @@ def _points(message: Detections | TagDetections) -> tuple[Float, ...]:
     if isinstance(message, WristDetections):
         return message.laser_uv, message.tip_uv
     if isinstance(message, MarkerDetections) and message.has_alternatives:
-        return message.uv, message.alternative_uv
+        return message.uv, message.alt_uv
     return (message.uv,)
 
 

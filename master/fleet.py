@@ -132,7 +132,7 @@ def fleet(
     seconds: Annotated[float, typer.Option(min=0.5, max=3600.0, help="How long it listens.")] = 3.0,
     watch: Annotated[bool, typer.Option("--watch", help="A line of JSON each second, until Ctrl-C.")] = False,
 ) -> None:
-    """Notify how each process of the rig is, as JSON; `phalanx fleet` shows it as a table.
+    """Say how each process of the rig is, as JSON; `phalanx fleet` shows it as a table.
 
     Examples:
 

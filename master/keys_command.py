@@ -53,7 +53,7 @@ def make_command(folder: Folder, device: Devices = None) -> None:
 
 
 def show_command(folder: Folder) -> None:
-    """Notify who has a certificate, what for, until when, and which device has no secret for its datagrams.
+    """Say who has a certificate, what for, until when, and which device has no secret for its datagrams.
 
     Examples:
 

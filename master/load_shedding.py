@@ -7,7 +7,7 @@ queue, and every other camera has one there that is not older. So what is left o
 what is solved in its place: datagrams that come together, and jitter of less than half a period, leave nothing out
 while the solver takes less than a period (waiting is then never longer than the jitter: Lindley's recursion).
 
-How much waits is looked at once for each message that is taken, and nothing but `LoadShedding.reject` comes of it: with the
+How much waits is looked at once for each message, and nothing but `LoadShedding.reject` comes of it: with the
 messages and that number, what is solved can be solved again bit for bit (`master.recording`).
 """
 

@@ -27,7 +27,7 @@ class MonitoredLoop(Generic[SeenT]):
         manager: ServiceManager,
         now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Notify that the loop is ready: it begins now.
+        """Say that the loop is ready: it begins now.
 
         Args:
             source: Where messages come from.

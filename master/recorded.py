@@ -23,18 +23,12 @@ def recorded_detections(folder: Path, camera: str, count: int) -> Iterator[Marke
         RecordingError: The file is missing or broken, or has another number of markers.
     """
     path, fix = _file_of(folder, camera)
-    data = read_npz(
-        path, ("t_ns", "seq", "uv", "area_px2", "quality"), fix, also=("sigma_px", "alternative_uv")
-    )
+    data = read_npz(path, ("t_ns", "seq", "uv", "area_px2", "quality"), fix, also=("sigma_px", "alt_uv"))
     try:
         t_ns, seq = (data[name].astype(np.int64, casting="same_kind") for name in ("t_ns", "seq"))
         uv, area, quality = (data[name].astype(np.float64) for name in ("uv", "area_px2", "quality"))
         sigma = data["sigma_px"].astype(np.float64) if "sigma_px" in data else _sigma_of(uv, quality)
-        alternative = (
-            data["alternative_uv"].astype(np.float64)
-            if "alternative_uv" in data
-            else np.full_like(uv, np.nan)
-        )
+        alternative = data["alt_uv"].astype(np.float64) if "alt_uv" in data else np.full_like(uv, np.nan)
     except (TypeError, ValueError) as error:
         raise RecordingError(f"{path}: {error}: {fix}") from error
     _check_times(path, t_ns, seq, fix)
@@ -42,7 +36,7 @@ def recorded_detections(folder: Path, camera: str, count: int) -> Iterator[Marke
         raise RecordingError(f"{path}: uv has shape {uv.shape}, the rig needs ({len(t_ns)}, {count}, 2)")
     if sigma.shape != uv.shape[:2] or alternative.shape != uv.shape:
         raise RecordingError(
-            f"{path}: sigma_px and alternative_uv have shapes {sigma.shape} and {alternative.shape}, expected {uv.shape[:2]}"
+            f"{path}: sigma_px and alt_uv have shapes {sigma.shape} and {alternative.shape}, expected {uv.shape[:2]}"
             f" and {uv.shape}: {fix}"
         )
     for row in range(len(t_ns)):
@@ -57,7 +51,7 @@ def recorded_detections(folder: Path, camera: str, count: int) -> Iterator[Marke
                 area=area[row],
                 quality=quality[row],
                 sigma_px=sigma[row],
-                alternative_uv=alternative[row],
+                alt_uv=alternative[row],
             )
         except ValueError as error:
             raise RecordingError(f"{path}: row {row}: {error}: {fix}") from error

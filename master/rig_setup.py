@@ -100,7 +100,7 @@ class RigSetup:
             area=message.area[chosen],
             quality=message.quality[chosen],
             sigma_px=message.sigma_px[chosen],
-            alternative_uv=message.alternative_uv[chosen],
+            alt_uv=message.alt_uv[chosen],
         )
 
     @classmethod

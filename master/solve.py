@@ -1,4 +1,4 @@
-"""The same line offline: detections of every camera and a recording's calibration -> all that a `Dispatcher` tells, scored.
+"""Solve offline: detections of every camera and a recording's calibration -> what a `Dispatcher` returns, scored.
 
 No clock is read for the poses: messages are pushed in the order of their capture times, so two runs write the
 same bytes. Only the stage times of the summary are measured.

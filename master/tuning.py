@@ -1,7 +1,7 @@
 """Other geometry, depth model, filter, hand, object or gestures while the master tracks: a new pipeline takes the old
 one's place.
 
-Each hand has a pipeline, and only those change whose files did; objects and gestures change together (`master.dispatcher`).
+Each hand has a pipeline; only those change whose files did; objects and gestures change together (`master.dispatcher`).
 
 The new pipeline is built on another thread and shown the last messages, so that its tracks, filter and hand stand when
 it takes over, between two messages. An instant is never solved twice: poses go on with rising times.
@@ -70,8 +70,8 @@ class LivePipeline:
     def __init__(
         self, setup: RigSetup, stage: Stage, dropped_epochs: Callable[[], bool] | None = None
     ) -> None:
-        """Begin with the pipeline of `setup`; `stage` measures the stages of whichever is in use, `dropped_epochs` is asked for
-        each of its instants whether it is left out.
+        """Begin with the pipeline of `setup`; `stage` measures the stages of whichever is in use, `dropped_epochs` is
+        asked for each of its epochs whether it is rejected.
 
         Raises:
             CalibrationError: The depth model does not fit the rig.

@@ -116,7 +116,7 @@ def run(
             found.area,
             found.quality,
             found.sigma_px,
-            found.alternative_uv,
+            found.alt_uv,
             frame.t_sigma_ns,
         )
         sender.send(message)

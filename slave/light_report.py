@@ -1,4 +1,4 @@
-"""Notify what the light does to the colours: counts, gauges, and a log line before it costs a marker."""
+"""Say what the light does to the colours: counts, gauges, and a log line before it costs a marker."""
 
 import logging
 from collections.abc import Callable, Mapping

@@ -267,7 +267,7 @@ class SlaveLink:
         return Refusal.DUPLICATE_SENDER
 
     def _answer_other_version(self, datagram: bytes, address: Address, t_ns: int) -> None:
-        """Notify who we are to a master of this rig that cannot understand us; its word is not proven, so seldom."""
+        """Say who we are to a master of this rig that cannot understand us; its word is not proven, so seldom."""
         if len(datagram) < OVERHEAD:
             return
         _, version, kind, _, rig, _, _ = HEADER.unpack_from(datagram)

@@ -38,7 +38,7 @@ class RecordedDetections:
         area_px2: (T, M) visible areas [px^2].
         quality: (T, M) 0..1, the probability that it is the marker.
         sigma_px: (T, M) standard deviation of the centroids per axis [px].
-        alternative_uv: (T, M, 2) second places of the same colour [px]; NaN: none.
+        alt_uv: (T, M, 2) second places of the same colour [px]; NaN: none.
     """
 
     t_ns: Int
@@ -47,7 +47,7 @@ class RecordedDetections:
     area_px2: Float
     quality: Float
     sigma_px: Float
-    alternative_uv: Float
+    alt_uv: Float
 
 
 def camera_of(recording: FrameRecording, camera: str, calibration: Path | None) -> CameraCalibration:
@@ -116,7 +116,7 @@ def detect_recording(
     if (plain := plain_of(detector)) is not None:
         plain.windows_only = windows_only
     shape = (len(rows), len(names))
-    uv, alternative_uv = np.full((*shape, 2), np.nan), np.full((*shape, 2), np.nan)
+    uv, alt_uv = np.full((*shape, 2), np.nan), np.full((*shape, 2), np.nan)
     area, quality, sigma_px = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan)
     pictures = FramePictures(folder, (model.width_px, model.height_px))
     for i, row in enumerate(rows):
@@ -127,11 +127,11 @@ def detect_recording(
         if tags is not None:
             tags.push(image, row)
         uv[i], area[i], quality[i] = found.uv, found.area, found.quality
-        sigma_px[i], alternative_uv[i] = found.sigma_px, found.alternative_uv
+        sigma_px[i], alt_uv[i] = found.sigma_px, found.alt_uv
         progress(i + 1, len(rows))
     t_ns = np.array([row.t_ns for row in rows], np.int64)
     seq = np.array([row.seq for row in rows], np.int64)
-    return RecordedDetections(t_ns, seq, uv, area, quality, sigma_px, alternative_uv)
+    return RecordedDetections(t_ns, seq, uv, area, quality, sigma_px, alt_uv)
 
 
 def calibrate_colours(

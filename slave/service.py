@@ -16,7 +16,9 @@ from common.service_manager import WATCHDOG, ServiceManager, one_line
 
 NOTIFIES = 4  # in a period of the watchdog
 STATUS_NS = 5_000_000_000  # between two lines of status where there is no watchdog
-LOST_PATIENCE_S = 90.0  # to open a camera again takes seconds, with all its settings checked; one that hangs is given up then
+LOST_PATIENCE_S = (
+    90.0  # opening a camera again, all settings checked, takes seconds; one that hangs is given up
+)
 COMPILE_S = 180.0  # numba compiles 15 s on a desktop processor, more than a minute on a Raspberry Pi
 NEVER_NS = 2**63
 WAITING = "waits for the master"

@@ -67,7 +67,9 @@ class Uplink:
         self._unsent = 0
         self._closing = threading.Event()
         self._threads = [
-            threading.Thread(target=self._receive, args=(self._beacons, self._link.receive_beacon), name=f"{name} beacons"),
+            threading.Thread(
+                target=self._receive, args=(self._beacons, self._link.receive_beacon), name=f"{name} beacons"
+            ),
             threading.Thread(target=self._receive, args=(self._data, self._link.receive), name=f"{name} data"),
         ]  # fmt: skip
         for thread in self._threads:

@@ -168,7 +168,7 @@ def detections(
         area=np.where(seen, area_px2, np.nan),
         quality=np.where(seen, 1.0, np.nan),
         sigma_px=np.where(seen, 0.1, np.nan),
-        alternative_uv=np.full_like(uv, np.nan),
+        alt_uv=np.full_like(uv, np.nan),
     )
 
 

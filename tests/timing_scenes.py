@@ -159,5 +159,5 @@ def message_of(camera: str, seq: int, t_s: float, uv: Float) -> MarkerDetections
         area=400.0 * mask,
         quality=mask,
         sigma_px=0.15 * mask,
-        alternative_uv=np.full_like(uv, np.nan),
+        alt_uv=np.full_like(uv, np.nan),
     )

@@ -153,7 +153,7 @@ class CameraPanel:
         self._colours.show(now.markers)
 
     def _fail(self, text: str) -> None:
-        """Notify what the slave said, as it said it, and show what holds instead."""
+        """Say what the slave said, as it said it, and show what holds instead."""
         self._error.set_text(text)
         self._error.set_visibility(True)
         with self._client:

@@ -1,6 +1,6 @@
 """Processes of this machine that the console starts by command line: cameras, a master, calibrations. They end with it.
 
-Each runs in a process group of its own; its lines are read on a thread. A `supervisor` process holds the list of groups and
+Each runs in a process group of its own; a thread reads its lines. A `supervisor` process holds the groups and
 ends them when the console is gone, so that a console that was killed leaves no camera busy.
 """
 

@@ -1,4 +1,4 @@
-"""Ends what the console started when the console itself is gone, however it ended: `python -m master.console.process_supervisor`.
+"""End what the console started once the console is gone: `python -m master.console.process_supervisor`.
 
 It reads "+PID" and "-PID" lines from a pipe whose other end only the console holds. The end of the pipe is the end of
 the console: each process group that is still listed is told to end, and killed if it does not.

@@ -75,7 +75,7 @@ class EpochSteps:
         space = Workspace.empty(n, extras, _capacity(count))
         self.now, self.at = fields(state), fields(space)
         self._state, self._space, self._work = boxed(state), boxed(space), boxed(Scratch.empty())
-        self._ground, self._lines_of_sight = self._space["ground"], self._space["belief"]["sights"]
+        self._ground, self._lines_of_sight = self._space["ground"], self._space["belief"]["lines_of_sight"]
         hand, device = boxed(self._rig.hand), boxed(device)
         self._model = Model(hand, boxed(settings.record()), mounts, self._rig.cameras, device)
         self.at.scratch.search.wrist_share[0] = settings.wrist_share

@@ -51,7 +51,7 @@ class Prior:
         abduction, flexion: (5,) standard deviations of abduction and flexion about them [rad].
         coupled_share, coupled_spread: (1,) by how much of the PIP more this hand bends in its MCP, and within how much
             of it (`master.estimator.finger_coupling`).
-        last: (5,) PIPs where the fingers are expected, `process_noise` (5,) how far from there they may be, and `had_previous` (5,)
+        last: (5,) PIPs expected, `process_noise` (5,) how far from there they may be, `had_previous` (5,)
             whether they are expected anywhere.
         near_rad: (5,) how far from there a finger that is well known is searched; 0: everywhere.
         only_natural: (1,) 1 where fingers are taken to bend naturally, whatever is seen (level "fk").

@@ -107,7 +107,7 @@ class MarkerPipeline:
             side: Wrist device and IMU on the forearm of this hand; None: there are none.
             counts: Counted into; None: counts of its own.
             stage: Opens a timer by stage name.
-            shed: Asked for each epoch whether it is left out, for newer ones wait (`master.load_shedding`); None: none is.
+            shed: Asked for each epoch whether to drop it for newer ones (`master.load_shedding`); None: none is.
         """
         self.model, self.markers = model, markers
         self.counts: Counter[str] = Counter() if counts is None else counts
@@ -178,7 +178,7 @@ class MarkerPipeline:
         with self._stage("triangulate"):
             if self._lens_shift.any:
                 frames = replace(frames, uv=self._lens_shift.centres(frames.uv, frames.area))
-            if frames.alternative_uv is not None:
+            if frames.alt_uv is not None:
                 frames = self._associated(frames)
         line = self._line.solve(frames, last, age_s)
         hand: HandEstimate | Fitted = line
@@ -259,18 +259,18 @@ class MarkerPipeline:
 
     def _associated(self, frames: FrameSet) -> FrameSet:
         """The epoch with one place for each marker."""
-        assert frames.alternative_uv is not None
-        assert frames.alternative_sigma_px is not None
-        in_doubt = np.isfinite(frames.alternative_uv[..., 0]).any(axis=0)
+        assert frames.alt_uv is not None
+        assert frames.alt_sigma_px is not None
+        in_doubt = np.isfinite(frames.alt_uv[..., 0]).any(axis=0)
         if not in_doubt.any():  # an alternative was named in a frame nearby, and is not carried to this epoch
-            return replace(frames, alternative_uv=None)
+            return replace(frames, alt_uv=None)
         first = triangulate(self._cameras, frames.uv, frames.sigma_px, self._rays_px)
         clear = np.where((in_doubt | first.outliers)[:, None], np.nan, first.points_m)
         others = self._line.solve_once(clear, first.cov_m2, frames.area)
         associated = associate(
             self._cameras,
             (frames.uv, frames.sigma_px, frames.area),
-            (frames.alternative_uv, frames.alternative_sigma_px),
+            (frames.alt_uv, frames.alt_sigma_px),
             among(clear, self._on_hand) if others is None else self._expected(others),
             (self._was_m, np.asarray((frames.t_ns - self._was_ns) * 1e-9, np.float64)),
             self._rays_px,
@@ -282,7 +282,7 @@ class MarkerPipeline:
             uv=associated.uv,
             sigma_px=associated.sigma_px,
             area=associated.area_px2,
-            alternative_uv=None,
+            alt_uv=None,
         )
 
     def _expected(self, hand: SolvedHand) -> Prior:

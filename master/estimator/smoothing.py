@@ -101,7 +101,7 @@ class Smoothing:
             ),
             **dict.fromkeys(("dt_s", "across", "dip_per_pip", "blend_s", "tracked_m"), 1),
             **dict.fromkeys(("t_ns", "until_ns"), ("i8", 1)),
-            **dict.fromkeys(("rests", "since_ns"), ("i8", 6)),
+            **dict.fromkeys(("sources", "since_ns"), ("i8", 6)),
             **dict.fromkeys(("part", "seen_ns"), ("i8", 26)),
             count=("i8", 2),
             marker_of=("i8", 5),

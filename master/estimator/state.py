@@ -45,7 +45,7 @@ class HandState:
         rates: (20,) [rad/s].
         cov: (N, N) of turn [rad], shift [m], rig axes, free angles [rad] and extras.
         z, z_cov: (K,), (K, K) mean and covariance of the extras, which are filtered (`master.estimator.extras`).
-        z_ns: (1,) when they were stepped last, `stationary` (K,) variances that their doubt grows to, and `habit` (2,) [rad]
+        z_ns: (1,) when they were stepped last, `stationary` (K,) variances that they grow to, and `habit` (2,) [rad]
             the bend of the wrist that is kept.
         solver_mode: (5,) `SolverMode` codes of what a wrist device told each finger from last; 0: markers since.
         searched: (5,) triples since the whole valley of a finger was searched.

@@ -1,4 +1,4 @@
-"""Notify that kernels are compiled, two minutes on a version's first start."""
+"""Say that kernels are compiled, two minutes on a version's first start."""
 
 import logging
 import threading

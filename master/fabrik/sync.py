@@ -41,7 +41,7 @@ class FrameSet:
         area: (C, M) [px^2] of the nearest frame.
         ready_t_ns: When the last contributing frame was handed to its slave.
         missing: (C,) cameras that had no frame in time.
-        alternative_uv, alternative_sigma_px: As `uv` and `sigma_px` of the second places that slaves named; None: none at all.
+        alt_uv, alt_sigma_px: As `uv` and `sigma_px` of the second places that slaves named; None: none at all.
     """
 
     t_ns: int
@@ -50,8 +50,8 @@ class FrameSet:
     area: Float
     ready_t_ns: int
     missing: Bool
-    alternative_uv: Float | None = None
-    alternative_sigma_px: Float | None = None
+    alt_uv: Float | None = None
+    alt_sigma_px: Float | None = None
 
 
 class FrameSync:
@@ -161,7 +161,7 @@ class FrameSync:
         times_ns[c, slot, 0], times_ns[c, slot, 1] = centre_ns, message.t_ns
         times_ns[c, slot, 2], t_sigma_ns[c, slot] = message.ready_t_ns, message.t_sigma_ns
         marks = all_marks[c, slot]
-        marks[:2], marks[2:4] = message.uv.T, message.alternative_uv.T
+        marks[:2], marks[2:4] = message.uv.T, message.alt_uv.T
         marks[4], marks[5] = message.sigma_px, message.area
 
     def _leader(self) -> int:

@@ -2,7 +2,7 @@
 
 Kalbfleisch measures x = u_left - u_right on the images as they are, not rectified, and fits D = k x^z with a target on
 the axis, before the middle between the lenses (section VI). There the law contains how the cameras are misaligned.
-RejectedPeer from the axis lens, roll and yaw change the disparity of the same depth: of the shipped desk rig, whose right
+Away from the axis lens, roll and yaw change the disparity of the same depth: of the shipped desk rig, whose right
 camera is rolled by 0.3 degrees, by 0.8 px at the edge of the volume, or 8 mm. By the rig's own geometry that change is
 
     x(u, v, D) - x(axis, D) = a(u, v) + b(u, v) / D

@@ -113,7 +113,7 @@ def read(
     calibration: Calibration = CALIB_JSON,
     every: Annotated[bool, typer.Option(help="Every message as a line of JSON, too.")] = False,
 ) -> None:
-    """Notify what a recorded hand says: its gestures, from when to when.
+    """Say what a recorded hand says: its gestures, from when to when.
 
     Examples:
 

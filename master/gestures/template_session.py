@@ -30,7 +30,7 @@ def template_session(
     clock: Clock,
     notify: Callable[[str], None],
 ) -> list[Example]:
-    """Blend a person through `count` examples of the pose `name`.
+    """Lead a person through `count` examples of the pose `name`.
 
     Args:
         receive: The next pose of the hand, waiting at most so long [s].

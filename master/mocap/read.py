@@ -50,7 +50,7 @@ def read_motion(path: Path, reading: Reading | None = None) -> JointMotion:
     matched = choose_names(table.names, table.ends, str(path), given, reading.side)
     if not matched.names:
         raise RecordingError(
-            f"{path}: no name in it is that of a joint of a hand; it has {shown(table.names)}. Notify which is which with"
+            f"{path}: no name in it is that of a joint of a hand; it has {shown(table.names)}. Say which is which with"
             f' --joints, a JSON file of pairs such as {{"index-finger-tip": "NAME"}}; ours are {", ".join(POINTS)}'
         )
     t_ns = checked_times(table.t_s, str(path))

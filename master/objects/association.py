@@ -85,7 +85,7 @@ def _nearer(
 ) -> tuple[Float, Float]:
     """Places (K, 2) of the points (K,) of sightings, rivals taken where a pose has the point nearer to them; sigmas."""
     uv, sigma = np.concatenate([one.uv for one in line]), np.concatenate([one.sigma_px for one in line])
-    alternative = np.concatenate([one.alternative_uv for one in line])
+    alternative = np.concatenate([one.alt_uv for one in line])
     if T is None or np.isnan(alternative).all():
         return uv, sigma
     there = camera.project(features.points[point] @ T[:3, :3].T + T[:3, 3])
@@ -107,7 +107,7 @@ def sighted_now(window: Window, features: Features) -> list[Sighted]:
                 if np.isnan(first.uv[rows]).any():
                     continue
                 uv = _brought(first.point[rows], line, at_ns)
-                alternative = first.alternative_uv[rows]
+                alternative = first.alt_uv[rows]
                 places = [uv] if np.isnan(alternative).any() else [uv, alternative]
                 out.append(Sighted(c, int(feature), np.stack(places)))
     return out

@@ -35,7 +35,7 @@ class ImageObservation:
         ready_t_ns: When the frame was handed to its slave.
         point: (K,) rows of `Features.points`.
         uv: (K, 2) [px] as from a lens that keeps blobs in their place; NaN: not seen.
-        alternative_uv: (K, 2) [px] second places; NaN: none.
+        alt_uv: (K, 2) [px] second places; NaN: none.
         t_ns: (K,) when the rows were exposed [ns], from the first frame of all.
         sigma_px: (K,), t_sigma_s: the same for all.
         area_px2: (K,) of blobs; NaN: a corner.
@@ -45,7 +45,7 @@ class ImageObservation:
     ready_t_ns: int
     point: Int
     uv: Float
-    alternative_uv: Float
+    alt_uv: Float
     t_ns: Float
     sigma_px: Float
     t_sigma_s: float
@@ -170,7 +170,7 @@ class Windows:
         else:
             rows = self._features.rows
             point, sigma, area = np.arange(len(rows)), message.sigma_px[rows], message.area[rows]
-            both = np.stack([message.uv[rows], message.alternative_uv[rows]])
+            both = np.stack([message.uv[rows], message.alt_uv[rows]])
             if self._shift[c].any and len(rows):
                 # Of a rival the area is not told: about that of the marker.
                 both = (
@@ -184,7 +184,7 @@ class Windows:
             ready_t_ns=message.ready_t_ns,
             point=point,
             uv=uv,
-            alternative_uv=alternative,
+            alt_uv=alternative,
             t_ns=(t_ns - self._origin_ns) + self._cameras[c].row_time_ns * uv[:, 1],
             sigma_px=sigma,
             t_sigma_s=message.t_sigma_ns * 1e-9,

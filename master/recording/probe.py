@@ -51,7 +51,7 @@ class Probe:
 
     @property
     def counts(self) -> dict[str, int]:
-        """`probe.shown`, and of those `probe.dropped`, once there were any; a recorder tells from it what never came."""
+        """`probe.shown`, and of those `probe.dropped`, once there were any: what a recorder never received."""
         # What waits to be published can be nobody's loss yet.
         return (
             {"tap.shown": self._shown - len(self._queue), "tap.dropped": self._dropped} if self._shown else {}

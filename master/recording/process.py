@@ -227,7 +227,7 @@ class _Run:
             self._notify("the master is gone; waiting for it")
 
     def _look(self, told: Health) -> None:
-        """Notify what the player of this file has to know, and keep in the file where a master was started anew."""
+        """Say what the player of this file has to know, and keep in the file where a master was started anew."""
         if told.session != self._master:
             self._recorder.offer("health", told, self._clock.now_ns())
             if self._master is None:

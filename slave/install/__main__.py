@@ -15,7 +15,7 @@ def print_line(line: str) -> None:
 
 
 def refuse(action: str) -> int:
-    """Notify what an old Python needs to be told, in its own words: the installer itself it cannot read."""
+    """Say what an old Python needs to be told, in its own words: the installer itself it cannot read."""
     facts = probe()
     why = judge(facts)
     print_line(

@@ -6,8 +6,8 @@ seen, and read back.
 
 A slave that is killed or stopped during a pulse darkens nothing, and what a pin does whose process is gone is the
 matter of the chip's driver: it may become an input, or keep its level. So a second process inherits the request, is
-told of every pulse, and sets the lines dark when one lasts too long or the first process is gone (`gpio_watchdog`). Nothing
-is lit without it. Against a kernel that is dead, or a kill of both, only wires help: a pull-down resistor, and a
+told of every pulse, and sets the lines dark when one lasts too long or the first process is gone (`gpio_watchdog`).
+None is lit without it. Against a kernel that is dead, or a kill of both, only wires help: a pull-down resistor, and a
 monostable in series (docs/safety.md).
 """
 

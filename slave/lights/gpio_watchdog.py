@@ -1,6 +1,6 @@
 """Darkens two GPIO lines when the slave that lit them cannot: a process of its own, started beside it.
 
-    python gpio_watchdog.py FD LONGEST_S        standard input: a pipe on which the slave says `1` before a light goes on
+    python gpio_watchdog.py FD LONGEST_S        standard input: a pipe; the slave writes `1` before a light goes on
                                             and `0` after it went off
 
 It inherits the slave's request of the lines: while it lives the kernel does not give them back. It sets both lines

@@ -1,4 +1,4 @@
-"""Notify that a marker is about to be lost while it is still seen: how far its colour is from the border of its range.
+"""Say that a marker is about to be lost while it is still seen: how far its colour is from the border of its range.
 
 Colours are undone to the light of calibration first, so what is left is what following the light does not mend: light
 beyond the bounds, a lamp whose colour von Kries' law does not describe, paint that has become dirty or worn. Each

@@ -66,7 +66,7 @@ class Detections:
         quality: (M,) 0..1, the probability that it is a marker.
         sigma_px: (M,) standard deviation per axis of `uv` as an estimate of the centroid of all that the camera
             would see of the whole cap: noise, doubt of occlusion, size, motion.
-        alternative_uv: (M, 2) centroid of a second blob of the colour that may be the marker instead [px]; in a frame with
+        alt_uv: (M, 2) centroid of a second blob of the colour that may be the marker instead [px]; in a frame with
             many only as the scan saw it, to a pixel or so; NaN: none.
         clarity: (M,) 0..1, how far `colour` is that of the paint alone: 1 is a whole, clear marker.
         colour: (M, 3) mean of the core in linear light 0..1: blue, green, red.
@@ -76,7 +76,7 @@ class Detections:
     area: Float
     quality: Float
     sigma_px: Float
-    alternative_uv: Float
+    alt_uv: Float
     clarity: Float
     colour: Float
 

@@ -1,4 +1,4 @@
-"""Notify how probable it is that what was found is a marker, from how it looks.
+"""Say how probable it is that what was found is a marker, from how it looks.
 
 A field, a window frame or a face holds pixels of every colour, and what a colour table finds there has an area and a
 centroid like a marker. But paint is of one colour against its surroundings, near the middle of its range, and a cap

@@ -1,4 +1,4 @@
-"""Notify how far a measured centroid may be off, in pixels, from what was measured.
+"""Say how far a measured centroid may be off, in pixels, from what was measured.
 
 Five independent causes, added in squares; the numbers are those of generated caps (bench/marker_accuracy):
 

@@ -63,7 +63,7 @@ def markers(folder: Path) -> list[MarkerDetections]:
     for k in range(MARKER_FRAMES):
         t_ns = k * FRAME_NS
         found = detector.push(frames.image(k), t_ns)
-        measured = (found.uv, found.area, found.quality, found.sigma_px, found.alternative_uv)
+        measured = (found.uv, found.area, found.quality, found.sigma_px, found.alt_uv)
         messages.append(MarkerDetections(frames.camera.name, 7, k, t_ns, t_ns + 1, *measured))
     return messages
 

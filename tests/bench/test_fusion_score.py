@@ -5,7 +5,7 @@ import pytest
 
 from bench.fusion_scene import Both, Shown, Sight
 from bench.fusion_score import Figures, Sighted, ratios
-from bench.fusion_solved import Away, Solved
+from bench.fusion_solved import RejectedPeer, Solved
 from bench.played import START_NS
 from common.arrays import Float
 from common.geometry import matrix_to_quaternion
@@ -67,7 +67,7 @@ def shown(visible_area: float = 100.0, line: float = 0.02) -> Shown:
     return Shown(BOTH, 6.0, [], line_of_sight)
 
 
-def figures(one: Solved, of: Shown, away: Away | None = None) -> Figures:
+def figures(one: Solved, of: Shown, away: RejectedPeer | None = None) -> Figures:
     return Figures.of(one, Sighted.of(of, one, away))
 
 
@@ -156,7 +156,7 @@ def _moved(pose: HandPose, R_extra: Float, shift: Float) -> HandPose:
 
 
 def test_streams_are_cut_off_in_turn_and_never_both() -> None:
-    away = Away()
+    away = RejectedPeer()
     t = np.arange(0.0, 60.0, 0.01)
     markers, wrist = away.at(t)
     assert not (markers & wrist).any()
@@ -177,7 +177,7 @@ def test_what_is_cut_off_does_not_come() -> None:
     wrist = [
         WristDetections("wrist", 1, k, t, t, five, none, none, five, none, none) for k, t in enumerate(ns)
     ]
-    left = Away().left([*markers, *wrist])
+    left = RejectedPeer().left([*markers, *wrist])
     assert [one.seq for one in left if isinstance(one, MarkerDetections)] == [0, 2, 3, 4]
     assert [one.seq for one in left if isinstance(one, WristDetections)] == [0, 1, 2, 4]
 

@@ -10,7 +10,7 @@ import pytest
 from msgspec import Meta, Struct
 
 from bench.hostile_examples import Speaker, examples
-from bench.hostile_messages import CALIBRATED, Attack, Now, all_attacks, attacks, flood, plausible
+from bench.hostile_messages import SAID, Attack, Now, all_attacks, attacks, flood, plausible
 from common.arrays import Float
 from common.datagram import Kind
 from common.errors import MessageError
@@ -18,7 +18,7 @@ from common.message_parts import Count, within
 from common.messages import Message, TrackerPose, decode, encode
 from common.session import EchoAnswer, Hello, Started, read
 
-MESSAGES = [kind for kind in CALIBRATED if issubclass(kind, Message)]
+MESSAGES = [kind for kind in SAID if issubclass(kind, Message)]
 SHAKES: dict[type[Struct], Kind] = {Hello: Kind.HELLO, Started: Kind.STARTED, EchoAnswer: Kind.ECHO_ANSWER}
 
 
@@ -46,14 +46,14 @@ def of_type(kind: type[Struct]) -> list[Attack]:
 
 def test_there_is_a_plausible_message_of_each_type() -> None:
     known = examples("left")
-    assert set(known) == set(CALIBRATED)
+    assert set(known) == set(SAID)
     for kind, base in known.items():
         body = msgspec.msgpack.encode(base)
         made = decode(body) if kind in MESSAGES else read(SHAKES[kind], body)
         assert type(made) is kind
 
 
-@pytest.mark.parametrize("kind", CALIBRATED, ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("kind", SAID, ids=lambda kind: kind.__name__)
 def test_every_field_is_attacked_with_many_values_and_left_out(kind: type[Struct]) -> None:
     single = [attack for attack in of_type(kind) if attack.whole is None]
     changed = Counter(name for attack in single for name in attack.changes)
@@ -117,14 +117,14 @@ def test_what_is_nested_ten_thousand_deep_is_refused() -> None:
 
 
 def test_a_flood_repeats_with_its_seed_and_half_of_it_is_whole_but_for_one_field() -> None:
-    known, shares = examples("left"), dict.fromkeys(CALIBRATED, 1.0)
+    known, shares = examples("left"), dict.fromkeys(SAID, 1.0)
     first, again, other = (list(flood(shares, known, 2000, seed)) for seed in (1, 1, 2))
     assert len(first) == 2000
     assert [one.what for one in first] == [one.what for one in again]
     assert [one.what for one in first] != [one.what for one in other]
     single = [one for one in first if one.whole is None and len(one.changes) == 1 and not one.without]
     assert len(single) > 1000
-    assert {one.kind for one in first} == set(CALIBRATED)
+    assert {one.kind for one in first} == set(SAID)
 
 
 def test_times_are_those_of_the_moment_of_sending() -> None:

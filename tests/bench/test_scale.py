@@ -9,7 +9,7 @@ import pytest
 
 from bench.scale import cost_per_camera, summary
 from bench.scale_page import into_page
-from bench.scale_rig import CAPACITY, dome, room, told
+from bench.scale_rig import ROOM, dome, room, told
 from bench.scale_run import ScaleRun
 from master.rig import load_setup
 
@@ -19,14 +19,14 @@ PAGE = Path(__file__).parents[2] / "docs" / "scale.html"
 def run(cameras: int, pose_ms: float = 6.0, message_ms: float = 0.2) -> ScaleRun:
     cores = 90.0 * (pose_ms + cameras * message_ms) * 1e-3
     return ScaleRun(
-        CAPACITY, cameras, 1, 90.0, 10.0, 900 * cameras, 900 * cameras, 0, 0, 0, 0, 0, 0, 90.0, 5.0, 9.0, cores,
+        ROOM, cameras, 1, 90.0, 10.0, 900 * cameras, 900 * cameras, 0, 0, 0, 0, 0, 0, 90.0, 5.0, 9.0, cores,
         {"ingest": 0.1}, 5000.0, 1.0, 2.0,
     )  # fmt: skip
 
 
 @pytest.mark.parametrize("cameras", [2, 5, 16])
 def test_the_cameras_of_a_room_all_see_the_hand(tmp_path: Path, cameras: int) -> None:
-    setup = load_setup(room(tmp_path, cameras, 90.0), CAPACITY)
+    setup = load_setup(room(tmp_path, cameras, 90.0), ROOM)
     np.testing.assert_allclose(dome(cameras)[0], np.eye(4), atol=1e-12)
     for pose in dome(cameras):
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)

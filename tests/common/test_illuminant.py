@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.errors import PhalanxError
-from common.sim.illuminant import CALIBRATED_KELVIN, CAPACITY, Light, LightSchedule, planckian_xy, white
+from common.sim.illuminant import CALIBRATED_KELVIN, ROOM, Light, LightSchedule, planckian_xy, white
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from common.sim.scenes import scene_by_name
@@ -118,11 +118,11 @@ def test_calibrated_light_changes_no_pixel() -> None:
 
 def test_the_scene_of_changing_light_by_its_name() -> None:
     scene = scene_by_name("lights", RIG, CAMERAS, HAND, 7)
-    assert scene.light == CAPACITY
-    kelvin = [CAPACITY.at(t).kelvin for t in np.linspace(0.0, 60.0, 601)]
-    exposure = [CAPACITY.at(t).exposure for t in np.linspace(0.0, 60.0, 601)]
+    assert scene.light == ROOM
+    kelvin = [ROOM.at(t).kelvin for t in np.linspace(0.0, 60.0, 601)]
+    exposure = [ROOM.at(t).exposure for t in np.linspace(0.0, 60.0, 601)]
     assert (min(kelvin), max(kelvin), min(exposure), max(exposure)) == pytest.approx(
         (3000.0, 6500.0, 0.7, 1.3)
     )
-    assert CAPACITY.at(0.0) == CAPACITY.at(60.0)
+    assert ROOM.at(0.0) == ROOM.at(60.0)
     assert scene_by_name("standard", RIG, CAMERAS, HAND, 7).light is None

@@ -94,7 +94,7 @@ def detections(draw: st.DrawFn) -> MarkerDetections:
         area=draw(floats(kind, "area", m)),
         quality=draw(floats(kind, "quality", m)),
         sigma_px=positive(draw, seen),
-        alternative_uv=np.where(seen[:, None], draw(rows(kind, "alternative_uv", m, 2)), np.nan),
+        alt_uv=np.where(seen[:, None], draw(rows(kind, "alt_uv", m, 2)), np.nan),
         t_sigma_ns=draw(st.floats(0.0, 1e10)),
     )
 
@@ -466,16 +466,16 @@ def test_the_detections_of_24_markers_are_one_ethernet_packet_while_none_has_a_r
 
 
 def test_no_rival_travels_as_no_bytes_and_one_rival_with_its_row() -> None:
-    assert as_map(sample_detections())["alternative_uv"] == b""
+    assert as_map(sample_detections())["alt_uv"] == b""
     decoded = decode(encode(sample_detections()))
     assert isinstance(decoded, MarkerDetections)
-    assert decoded.alternative_uv.shape == (6, 2)
-    assert np.isnan(decoded.alternative_uv).all()
+    assert decoded.alt_uv.shape == (6, 2)
+    assert np.isnan(decoded.alt_uv).all()
     alternatives = np.full((6, 2), np.nan)
     alternatives[3] = 7.0, 8.0
     decoded = decode(encode(sample_detections(6, alternatives)))
     assert isinstance(decoded, MarkerDetections)
-    np.testing.assert_array_equal(decoded.alternative_uv, alternatives)
+    np.testing.assert_array_equal(decoded.alt_uv, alternatives)
 
 
 @pytest.mark.parametrize("value", [np.inf, -np.inf])
@@ -534,10 +534,10 @@ def test_a_message_knows_whether_a_marker_has_a_rival() -> None:
         (MarkerDetections, {"sigma_px": np.array([0.1, np.nan, 0.1, np.inf, 0.1, 0.1]).tobytes()}),
         (MarkerDetections, {"sigma_px": np.array([0.1, np.nan, 0.1, np.nan, 0.1, 0.1]).tobytes()}),  # seen
         (MarkerDetections, {"sigma_px": np.full(6, 0.1).tobytes()}),  # the second is not seen
-        (MarkerDetections, {"alternative_uv": b"\0" * 8}),
-        (MarkerDetections, {"alternative_uv": np.zeros((5, 2)).tobytes()}),
-        (MarkerDetections, {"alternative_uv": np.zeros((6, 2)).tobytes()}),  # the second is not seen
-        (MarkerDetections, {"alternative_uv": np.full((6, 2), -np.inf).tobytes()}),
+        (MarkerDetections, {"alt_uv": b"\0" * 8}),
+        (MarkerDetections, {"alt_uv": np.zeros((5, 2)).tobytes()}),
+        (MarkerDetections, {"alt_uv": np.zeros((6, 2)).tobytes()}),  # the second is not seen
+        (MarkerDetections, {"alt_uv": np.full((6, 2), -np.inf).tobytes()}),
         (MarkerDetections, {"surplus": 1}),
         (MarkerDetections, {"type": "HandPose"}),
         (MarkerDetections, {"type": "Pickle"}),
@@ -809,8 +809,8 @@ def test_constructors_refuse_what_does_not_fit() -> None:
         msgspec.structs.replace(sample_detections(), uv=np.zeros((6, 3)))
     with pytest.raises(ValueError, match="sigma_px: 0 is not within"):
         msgspec.structs.replace(sample_detections(), sigma_px=np.zeros(6))
-    with pytest.raises(ValueError, match="alternative_uv: a rival of a marker that is not seen"):
-        msgspec.structs.replace(sample_detections(), alternative_uv=np.ones((6, 2)))
+    with pytest.raises(ValueError, match="alt_uv: a rival of a marker that is not seen"):
+        msgspec.structs.replace(sample_detections(), alt_uv=np.ones((6, 2)))
     with pytest.raises(ValueError, match="at most 48"):
         sample_detections(MAX_MARKERS + 1)
     with pytest.raises(ValueError, match="at most 48"):

@@ -18,7 +18,7 @@ from msgspec import Struct
 
 from bench.hostile import Limits, all_attacked, row
 from bench.hostile_rig import ROOT, STOLEN, HostileRig
-from bench.scale_rig import CAPACITY
+from bench.scale_rig import ROOM
 from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerPose, WristDetections
 from common.session import EchoAnswer
 from tests.hostile_rigs import (
@@ -86,10 +86,10 @@ def test_a_slave_whose_rig_has_other_markers_is_refused_by_name_with_the_fix(
 ) -> None:
     own = tmp_path / "calib"
     copytree(rig.tree, own)
-    path, other = own / f"rigs/{CAPACITY}.json", json.loads((own / "rigs/desk-back3.json").read_text())
+    path, other = own / f"rigs/{ROOM}.json", json.loads((own / "rigs/desk-back3.json").read_text())
     edited = {name: other[name] for name in ("hand", "markers")}
     path.write_text(json.dumps(json.loads(path.read_text()) | edited))
-    place = ["--name", "cam02", "--camera", "synthetic", "--rig", CAPACITY, "--calibration", str(own)]
+    place = ["--name", "cam02", "--camera", "synthetic", "--rig", ROOM, "--calibration", str(own)]
     link = ["--bind", "127.0.0.1", "--beacon-port", str(rig.port)]
     with unharmed(rig) as rise, (tmp_path / "slave.log").open("w") as log:
         slave = subprocess.Popen(

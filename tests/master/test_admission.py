@@ -34,7 +34,7 @@ def at(*uv: float) -> MarkerDetections:
         (msgspec.structs.replace(at(1.0, 1.0), ready_t_ns=READY_NS), None),
         (msgspec.structs.replace(at(1.0, 1.0), ready_t_ns=READY_NS + 1), Refusal.READY_TIME),
         (msgspec.structs.replace(at(1.0, 1.0), ready_t_ns=-READY_NS - 1), Refusal.READY_TIME),
-        (msgspec.structs.replace(at(1.0, 1.0), alternative_uv=np.full((6, 2), 2000.0)), Refusal.OUTSIDE_PICTURE),
+        (msgspec.structs.replace(at(1.0, 1.0), alt_uv=np.full((6, 2), 2000.0)), Refusal.OUTSIDE_PICTURE),
         (cycle("left", 1, 0), None),
         (msgspec.structs.replace(cycle("left", 1, 0), tip_sigma_px=np.ones(5), tip_uv=np.full((5, 2), -999.0)),
          Refusal.OUTSIDE_PICTURE),

@@ -51,7 +51,7 @@ def frame(camera: str, seq: int, area: float = 50.0) -> MarkerDetections:
         np.full(6, area),
         message.quality,
         message.sigma_px,
-        message.alternative_uv,
+        message.alt_uv,
     )
 
 

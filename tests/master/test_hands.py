@@ -63,7 +63,7 @@ def with_left_markers(message: MarkerDetections) -> MarkerDetections:
     """The message of a rig whose second six markers are those of a left hand, seen where the right ones are."""
     twice = {
         name: np.concatenate([getattr(message, name)] * 2)
-        for name in ("uv", "area", "quality", "sigma_px", "alternative_uv")
+        for name in ("uv", "area", "quality", "sigma_px", "alt_uv")
     }
     return msgspec.structs.replace(message, **twice)
 

@@ -57,7 +57,7 @@ def among(run: SyntheticRun, message: MarkerDetections) -> MarkerDetections:
         area=400 * ones,
         quality=ones,
         sigma_px=0.1 * ones,
-        alternative_uv=np.full((24, 2), np.nan),
+        alt_uv=np.full((24, 2), np.nan),
     )
 
 
@@ -93,9 +93,9 @@ def test_a_free_marker_has_its_rival_told_by_the_other_camera_and_by_its_own_pas
         if m.seq < 6 or m.camera == "left":
             messages.append(m)
             continue
-        uv, alternative = m.uv.copy(), m.alternative_uv.copy()
+        uv, alternative = m.uv.copy(), m.alt_uv.copy()
         uv[row], alternative[row] = many.setup.models[m.camera].project(thing), m.uv[row]
-        messages.append(msgspec.structs.replace(m, uv=uv, alternative_uv=alternative))
+        messages.append(msgspec.structs.replace(m, uv=uv, alt_uv=alternative))
     poses, counts = solve(many, messages)
     for pose in poses:
         np.testing.assert_allclose(pose.markers_raw_m[row], PLACES[FREE.index("cube-3")], atol=2e-3)
@@ -111,10 +111,7 @@ def test_fewer_markers_are_placed_and_a_hand_is_solved_where_they_determine_one(
     some = [
         msgspec.structs.replace(
             m,
-            **{
-                field: getattr(m, field)[rows]
-                for field in ("uv", "area", "quality", "sigma_px", "alternative_uv")
-            },
+            **{field: getattr(m, field)[rows] for field in ("uv", "area", "quality", "sigma_px", "alt_uv")},
         )
         for m in six.messages
     ]

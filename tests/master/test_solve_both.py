@@ -27,7 +27,7 @@ from master.solve import rigs_to_solve, solve_hands
 from tests.hand_helpers import LEFT
 
 SECONDS = 0.4
-MARKERS = ("t_ns", "seq", "uv", "quality", "sigma_px", "alternative_uv")
+MARKERS = ("t_ns", "seq", "uv", "quality", "sigma_px", "alt_uv")
 CYCLES = ("t_ns", "seq", "laser_uv", "laser_sigma_px", "laser_px", "tip_uv", "tip_sigma_px", "tip_depth")
 
 

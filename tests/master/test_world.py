@@ -273,7 +273,7 @@ def test_markers_of_objects_are_found_in_a_rig_of_two_hands(wand: ObjectRun, roo
 
 def with_more(message: MarkerDetections, count: int) -> MarkerDetections:
     """The frame with so many markers of another hand before its own."""
-    names = ("uv", "area", "quality", "sigma_px", "alternative_uv")
+    names = ("uv", "area", "quality", "sigma_px", "alt_uv")
     more = {name: np.full((count, *getattr(message, name).shape[1:]), nan) for name in names}
     return msgspec.structs.replace(
         message, **{name: np.concatenate([more[name], getattr(message, name)]) for name in names}

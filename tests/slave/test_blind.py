@@ -21,7 +21,7 @@ def test_every_answer_is_a_message_in_which_nothing_is_seen() -> None:
             found.area,
             found.quality,
             found.sigma_px,
-            found.alternative_uv,
+            found.alt_uv,
         )
         assert np.isnan(message.uv).all()
         assert found.colour.shape == (6, 3)

@@ -32,7 +32,7 @@ def test_those_that_are_known_are_seen_as_ever_and_the_others_never() -> None:
     for k in range(3):
         of_all, found = every.push(PICTURE, k * FRAME_NS), some.push(PICTURE, k * FRAME_NS)
         np.testing.assert_allclose(found.uv[[1, 2, 3, 5]], of_all.uv[[1, 2, 3, 5]], atol=0.01)
-        for rows in (found.uv, found.area, found.quality, found.sigma_px, found.alternative_uv, found.colour):
+        for rows in (found.uv, found.area, found.quality, found.sigma_px, found.alt_uv, found.colour):
             assert np.isnan(rows[[0, 4]]).all()
 
 

@@ -118,11 +118,11 @@ def test_a_marker_first_seen_half_hidden_is_measured_as_it_is() -> None:
 def test_a_rival_of_the_same_colour_within_reach_is_named() -> None:
     second = [Disc(marker_hsv(1), 245.0, 145.0, 7.0)]
     frames = push_all([render(hand())] * 2 + [render(hand() + second)] * 2)
-    assert np.isnan(frames[1].alternative_uv).all()
+    assert np.isnan(frames[1].alt_uv).all()
     for found in frames[2:]:
         assert (off(found, 300.0, 200.0)[[0, 1, 3, 4, 5]] < 0.3).all()
-        assert np.hypot(*(found.alternative_uv[1] - (245.0, 145.0))) < 0.5
-        assert np.isnan(found.alternative_uv[[0, 3, 4, 5]]).all()
+        assert np.hypot(*(found.alt_uv[1] - (245.0, 145.0))) < 0.5
+        assert np.isnan(found.alt_uv[[0, 3, 4, 5]]).all()
 
 
 @pytest.mark.parametrize("radius", [5.0, 7.0])
@@ -134,9 +134,9 @@ def test_a_thing_near_a_marker_never_seen_before_is_an_alternative_not_a_part_of
     connection_lost = 7.0 + gap + radius
     thing = 265.0 + connection_lost * math.cos(angle), 110.0 + connection_lost * math.sin(angle)
     for found in push_all([render([*hand(), Disc(marker_hsv(1), *thing, radius)])] * 2):
-        place, alternative = (np.hypot(*(uv[1] - (265.0, 110.0))) for uv in (found.uv, found.alternative_uv))
+        place, alternative = (np.hypot(*(uv[1] - (265.0, 110.0))) for uv in (found.uv, found.alt_uv))
         assert min(place, alternative) < 0.3
-        assert np.hypot(*(found.alternative_uv[1] - thing)) < 0.3 or np.hypot(*(found.uv[1] - thing)) < 0.3
+        assert np.hypot(*(found.alt_uv[1] - thing)) < 0.3 or np.hypot(*(found.uv[1] - thing)) < 0.3
 
 
 def test_a_piece_split_off_is_joined_in_doubt_where_the_whole_is_not_known() -> None:
@@ -146,7 +146,7 @@ def test_a_piece_split_off_is_joined_in_doubt_where_the_whole_is_not_known() -> 
     new, known = push_all([split])[0], push_all([whole, whole, split])[2]
     for found in (new, known):
         assert np.hypot(*(found.uv[1] - (300.0, 240.0))) < 6.0  # 12 px without the piece
-        assert np.isnan(found.alternative_uv[1]).all()
+        assert np.isnan(found.alt_uv[1]).all()
     assert new.sigma_px[1] > 3.0
     assert known.sigma_px[1] < 0.8 * new.sigma_px[1]
 

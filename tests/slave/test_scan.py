@@ -128,7 +128,7 @@ def test_generated_markers_are_the_same(name: str, engine: str) -> None:
             assert seen(one) == seen(other)
             same += assert_same(one, other)
             # A marker that was not tracked may be anywhere, and so may its rival, which its quality remembers.
-            np.testing.assert_array_equal(one.alternative_uv[tracked], other.alternative_uv[tracked])
+            np.testing.assert_array_equal(one.alt_uv[tracked], other.alt_uv[tracked])
             always &= seen(one)
             np.testing.assert_array_equal(one.quality[always], other.quality[always])
             tracked = seen(one)
@@ -159,7 +159,7 @@ def test_a_rival_in_the_window_is_seen_and_one_beyond_it_is_not() -> None:
         detector = windowed()
         frames = push_all(detector, [render(hand())] * 2 + [render([*hand(), thing])] * 3)
         assert all(seen(frames[-1]))
-        assert math.isfinite(frames[-1].alternative_uv[1, 0]) is there
+        assert math.isfinite(frames[-1].alt_uv[1, 0]) is there
         assert detector.ambiguity.frames["index"] == (3 if there else 0)
 
 

@@ -28,7 +28,7 @@ def sweep_live(
     table: Path | None,
     outline: Float,
 ) -> Measured:
-    """Blend the user through a sweep with the slaves that run."""
+    """Lead the user through a sweep with the slaves that run."""
     assert pair.rig is not None
     names = pair.rig.markers
     if marker is None or marker not in names:

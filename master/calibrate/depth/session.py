@@ -142,7 +142,7 @@ def run_session(
     progress: Callable[[float], None],
     keep: Callable[[Sweep], None],
 ) -> Sweep:
-    """Blend a person through a sweep.
+    """Lead a person through a sweep.
 
     Args:
         source: Detections, times on `clock`.

@@ -14,7 +14,7 @@ _DEPTH = 256  # poses that may wait while a line is printed
 
 
 def observe_live(bus: str, names: tuple[str, ...], model: HandModel) -> Observed:
-    """Blend the user through the routine.
+    """Lead the user through the routine.
 
     Args:
         bus: Endpoint of the running master's bus.

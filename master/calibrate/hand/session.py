@@ -56,7 +56,7 @@ class Track:
 def guide(
     receive: Receive, tips: Sequence[int], names: Sequence[str], clock: Clock, notify: Callable[[str], None]
 ) -> Track:
-    """Blend a person through the routine.
+    """Lead a person through the routine.
 
     Args:
         receive: The next pose of the running master, waiting at most so long [s].

@@ -15,7 +15,7 @@ _DEPTH = 512  # poses that may wait while a line is printed
 def observe_live(
     bus: str, rig: RigCalibration, names: Sequence[str], longest_s: float, notify: Callable[[str], None]
 ) -> Seen:
-    """Blend the user through the motion.
+    """Lead the user through the motion.
 
     Args:
         bus: Endpoint of the running master's bus.

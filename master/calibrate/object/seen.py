@@ -120,9 +120,9 @@ def seen_in(poses: Sequence[HandPose], rig: RigCalibration, names: Sequence[str]
 
 def _clear(frames: FrameSet, uv: Float) -> Float:
     """Pixels (C, M, 2) without those that have a rival."""
-    if frames.alternative_uv is None:
+    if frames.alt_uv is None:
         return uv
-    return np.where(np.isfinite(frames.alternative_uv[..., :1]), np.nan, uv)
+    return np.where(np.isfinite(frames.alt_uv[..., :1]), np.nan, uv)
 
 
 def _seen(names: tuple[str, ...], times: list[int], points: list[Float], covs: list[Float]) -> Seen:

@@ -27,7 +27,7 @@ def guide(
     notify: Callable[[str], None],
     longest_s: float,
 ) -> Seen:
-    """Blend a person through the motion until it is enough, or the time is over.
+    """Lead a person through the motion until it is enough, or the time is over.
 
     Args:
         receive: The next pose of the running master, waiting at most so long [s].

@@ -14,7 +14,7 @@ _DEPTH = 1024  # poses that may wait while a line is printed
 def observe_live(
     bus: str, profile: ObjectProfile, longest_s: float, notify: Callable[[str], None]
 ) -> Session:
-    """Blend the user through the motion.
+    """Lead the user through the motion.
 
     Args:
         bus: Endpoint of the running master's bus.

@@ -65,7 +65,7 @@ class Session:
 
 
 def guide(receive: Receive, clock: Clock, notify: Callable[[str], None], longest_s: float) -> Session:
-    """Blend a person through the motion until it is enough, or the time is over.
+    """Lead a person through the motion until it is enough, or the time is over.
 
     Args:
         receive: The next pose of object or device, waiting at most so long [s].

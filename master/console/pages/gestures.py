@@ -94,8 +94,8 @@ def _show_events(state: ConsoleState) -> None:
     def update() -> None:
         now_s = time.monotonic()
         lines = [
-            f"<li><span class='soft'>{now_s - received.received_s:.0f} s ago</span> {escape(readable(received.gesture.hand))}:"
-            f" {escape(_phase(received.gesture))}</li>"
+            f"<li><span class='soft'>{now_s - received.received_s:.0f} s ago</span>"
+            f" {escape(readable(received.gesture.hand))}: {escape(_phase(received.gesture))}</li>"
             for received in state.received_gestures.events()[:14]
         ]
         content.set_content(

@@ -112,7 +112,7 @@ def mistaken(
         new = changed(m, 1, run.setup.models[m.camera].project(thing_m))
         alternatives = np.full((6, 2), np.nan)
         alternatives[1] = m.uv[1]
-        out.append(msgspec.structs.replace(new, alternative_uv=alternatives) if doubt else new)
+        out.append(msgspec.structs.replace(new, alt_uv=alternatives) if doubt else new)
     return out
 
 
@@ -173,7 +173,7 @@ def test_what_fits_no_camera_is_dropped_with_its_rays_and_counted_by_name(exact_
     false = [
         msgspec.structs.replace(
             changed(m, 1, exact_run.setup.models["right"].project(other)),
-            alternative_uv=np.full((6, 2), np.nan),
+            alt_uv=np.full((6, 2), np.nan),
         )
         if m.camera == "right" and m.seq >= 20
         else m

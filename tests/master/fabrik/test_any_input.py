@@ -54,7 +54,7 @@ def anything(message: MarkerDetections, rng: np.random.Generator) -> MarkerDetec
     area = rng.choice([0.0, 1e-9, 400.0, float(MAX_PICTURE) ** 2, np.nan], m)
     sigma = np.where(seen, rng.choice([1e-6, 0.1, 30.0, float(MAX_PICTURE)], m), np.nan)
     return msgspec.structs.replace(
-        message, uv=uv, area=area, quality=np.ones(m), sigma_px=sigma, alternative_uv=np.full((m, 2), np.nan)
+        message, uv=uv, area=area, quality=np.ones(m), sigma_px=sigma, alt_uv=np.full((m, 2), np.nan)
     )
 
 
@@ -156,6 +156,6 @@ def test_no_kernel_is_compiled_while_a_hand_is_tracked(
     for k, message in enumerate(run.messages):
         sent = anything(message, rng) if k % 5 == 0 else message
         alternative = np.where(rng.random((6, 1)) < 0.1, np.minimum(sent.uv + 30.0, [639.5, 479.5]), np.nan)
-        pipeline.push(msgspec.structs.replace(sent, alternative_uv=alternative))
+        pipeline.push(msgspec.structs.replace(sent, alt_uv=alternative))
     pipeline.flush()
     assert compiled() == before

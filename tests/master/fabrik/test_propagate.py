@@ -75,7 +75,7 @@ def carried(held: TrackHistory, t_ns: int = 0, reach_ns: Reach = REACH_NS) -> Fr
 def propagate_one(frames: list[Frame]) -> FrameSet:
     """To time 0, of one camera, whose axis is then taken off."""
     found = carried(history([frames], np.array([PX_M])))
-    named = [None if x is None else x[0] for x in (found.alternative_uv, found.alternative_sigma_px)]
+    named = [None if x is None else x[0] for x in (found.alt_uv, found.alt_sigma_px)]
     return FrameSet(0, found.uv[0], found.sigma_px[0], found.area[0], found.ready_t_ns, found.missing, *named)
 
 
@@ -99,8 +99,8 @@ def test_without_a_rival_there_are_none() -> None:
     found = propagate_one(
         [observation(5, marker(5)), observation(-11, marker(-11)), observation(-27, marker(-27))]
     )
-    assert found.alternative_uv is None
-    assert found.alternative_sigma_px is None
+    assert found.alt_uv is None
+    assert found.alt_sigma_px is None
     np.testing.assert_allclose(found.uv, np.array([marker(0), (10.0, 20.0)]), atol=0.02)
 
 
@@ -111,12 +111,12 @@ def test_two_things_that_change_their_roles_keep_their_own_paths(swapped: tuple[
         first, second = (mug, marker) if i in swapped else (marker, mug)
         warm_start.append(observation(t, first(t), second(t)))
     found = propagate_one(warm_start)
-    assert found.alternative_uv is not None
+    assert found.alt_uv is not None
     # Which of the two is called the marker is what the nearest sighting says.
     first, second = (mug, marker) if 0 in swapped else (marker, mug)
     np.testing.assert_allclose(found.uv[0], first(0.0), atol=0.02)
-    np.testing.assert_allclose(found.alternative_uv[0], second(0.0), atol=0.02)
-    assert np.isnan(found.alternative_uv[1]).all()
+    np.testing.assert_allclose(found.alt_uv[0], second(0.0), atol=0.02)
+    assert np.isnan(found.alt_uv[1]).all()
     np.testing.assert_allclose(found.uv[1], [10.0, 20.0])
 
 
@@ -127,11 +127,11 @@ def test_a_rival_seen_in_the_nearest_frame_alone_is_held_there_with_a_larger_sig
         observation(-27, marker(-27)),
     ]
     found = propagate_one(warm_start)
-    assert found.alternative_uv is not None
-    assert found.alternative_sigma_px is not None
+    assert found.alt_uv is not None
+    assert found.alt_sigma_px is not None
     np.testing.assert_allclose(found.uv[0], marker(0.0), atol=0.02)
-    np.testing.assert_allclose(found.alternative_uv[0], mug(5.0))
-    assert found.alternative_sigma_px[0] == pytest.approx(np.hypot(0.1, HELD_PX_S * 0.005), rel=2e-3)
+    np.testing.assert_allclose(found.alt_uv[0], mug(5.0))
+    assert found.alt_sigma_px[0] == pytest.approx(np.hypot(0.1, HELD_PX_S * 0.005), rel=2e-3)
     assert found.sigma_px[0] < 0.3
 
 
@@ -155,8 +155,8 @@ def test_a_rival_of_an_older_frame_is_no_rival_now_but_does_not_lead_the_marker_
         observation(-27, mug(-27)),
     ]
     found = propagate_one(warm_start)
-    assert found.alternative_uv is not None
-    assert np.isnan(found.alternative_uv[0]).all()
+    assert found.alt_uv is not None
+    assert np.isnan(found.alt_uv[0]).all()
     # A line through two sightings; the third is the mug.
     np.testing.assert_allclose(found.uv[0], marker(0.0), atol=0.05)
 
@@ -346,7 +346,7 @@ def examples() -> list[list[float]]:
             steps = zip(times.tolist(), places, alternatives, strict=True)
             views.append([Frame(t, uv, r, float(rng.uniform(0.05, 0.6)), 0.2) for t, uv, r in steps])
         one = carried(history(views, np.array([1000.0, 800.0, 1200.0]), 20_600.0))
-        for array in (one.uv, one.sigma_px, one.alternative_uv, one.alternative_sigma_px):
+        for array in (one.uv, one.sigma_px, one.alt_uv, one.alt_sigma_px):
             found.append([] if array is None else array.ravel().tolist())
     return found
 

@@ -206,7 +206,7 @@ def test_a_rival_is_carried_at_the_time_of_its_own_row() -> None:
                 msgspec.structs.replace(
                     m,
                     uv=np.where(alone[:, ::-1] == 0, alternative, alone) if cross else m.uv + alone,
-                    alternative_uv=m.uv + alone if cross else alternative,
+                    alt_uv=m.uv + alone if cross else alternative,
                     sigma_px=np.array([0.1, np.nan]),
                 )
                 for m, alternative, cross in zip(frames, alternatives, crossed, strict=True)
@@ -214,19 +214,19 @@ def test_a_rival_is_carried_at_the_time_of_its_own_row() -> None:
         )
     epochs = push_all(sync(20.6), interleaved(*streams))
     for epoch in epochs[3:]:
-        assert epoch.alternative_uv is not None
+        assert epoch.alt_uv is not None
         truth = path(np.array(epoch.t_ns * 1e-9))
         for c in range(2):
-            places = np.stack([epoch.uv[c, 0], epoch.alternative_uv[c, 0]])
+            places = np.stack([epoch.uv[c, 0], epoch.alt_uv[c, 0]])
             if np.linalg.norm(places[0] - truth[0]) > 1.0:
                 places = places[::-1]
             np.testing.assert_allclose(places, truth, atol=0.1)
-        assert np.isnan(epoch.alternative_uv[:, 1]).all()
+        assert np.isnan(epoch.alt_uv[:, 1]).all()
 
 
 def test_no_rival_costs_nothing_and_makes_none() -> None:
     epochs = push_all(sync(), interleaved(stream("left", 4), stream("right", 4, 5 * MS)))
-    assert all(epoch.alternative_uv is None and epoch.alternative_sigma_px is None for epoch in epochs)
+    assert all(epoch.alt_uv is None and epoch.alt_sigma_px is None for epoch in epochs)
 
 
 # -- cameras that come and go -------------------------------------------------------------------------------------

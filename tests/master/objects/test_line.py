@@ -209,11 +209,11 @@ def test_beads_do_not_begin_with_one_camera_alone() -> None:
 def with_uv(
     message: MarkerDetections, row: int, uv: Float, alternative: Float | None = None
 ) -> MarkerDetections:
-    places, alternatives = message.uv.copy(), message.alternative_uv.copy()
+    places, alternatives = message.uv.copy(), message.alt_uv.copy()
     places[row] = uv
     if alternative is not None:
         alternatives[row] = alternative
-    return msgspec.structs.replace(message, uv=places, alternative_uv=alternatives)
+    return msgspec.structs.replace(message, uv=places, alt_uv=alternatives)
 
 
 def test_another_thing_in_the_colour_of_a_bead_does_no_harm() -> None:

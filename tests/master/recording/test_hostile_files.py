@@ -260,7 +260,7 @@ def wider(one: MarkerDetections) -> MarkerDetections:
     """The same frame with two markers more."""
     arrays = {
         name: np.concatenate([getattr(one, name), getattr(one, name)[:2]])
-        for name in ("uv", "area", "sigma_px", "quality", "alternative_uv")
+        for name in ("uv", "area", "sigma_px", "quality", "alt_uv")
     }
     return msgspec.structs.replace(one, **arrays)
 

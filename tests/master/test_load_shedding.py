@@ -11,7 +11,7 @@ import pytest
 
 from common.messages import HandPose, MarkerDetections
 from master.load_shedding import MOST, LoadShedding, Shedding
-from master.message_queue import CAPACITY, QUEUE, QUEUE_PER_CAMERA, MessageQueue, Span, room
+from master.message_queue import CAPACITY, QUEUE, QUEUE_PER_CAMERA, MessageQueue, Span, capacity
 from master.rig_pipeline import build_pipeline
 from master.rig_setup import RigSetup
 from master.stages import StageTimes
@@ -231,4 +231,4 @@ def test_what_is_solved_next_to_rejected_frames_is_as_right_as_ever() -> None:
 
 @pytest.mark.parametrize(("cameras", "frames"), [(1, QUEUE), (2, QUEUE), (16, 16 * QUEUE_PER_CAMERA)])
 def test_many_cameras_have_more_room_and_samples_as_much(cameras: int, frames: int) -> None:
-    assert room(cameras) == CAPACITY | {"frame": frames, "tags": frames}
+    assert capacity(cameras) == CAPACITY | {"frame": frames, "tags": frames}
