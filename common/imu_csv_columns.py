@@ -111,9 +111,9 @@ def _meaning(name: str) -> tuple[str, str, str] | None:
         if axis
         else words
     )
-    for what, words in _WORDS.items():
+    for what, keywords in _WORDS.items():
         if axis in AXES[what] and any(
-            word in words and (k == 0 or len(word) > 1) for k, word in enumerate(rest)
+            word in keywords and (k == 0 or len(word) > 1) for k, word in enumerate(rest)
         ):
             return what, axis, _unit(what, rest, bracket)
     return None

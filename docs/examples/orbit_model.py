@@ -99,7 +99,7 @@ def show_model(show: rr.RecordingStream, model: rr.Boxes3D | rr.Asset3D, radius:
 
 def run(bus: Bus, orbit: Orbit, show: rr.RecordingStream, go_on: Callable[[], bool]) -> None:
     """Follow the gestures while `go_on`; the screen says what is waited for."""
-    feed, text, drawn = bus.subscribe("gesture", depth=256), "", np.full(3, np.nan)
+    feed, shown, drawn = bus.subscribe("gesture", depth=256), "", np.full(3, np.nan)
     there, last_s, asked_s = False, time.monotonic(), -ASK_S
     while go_on():
         message = feed.get(FRAME_S)
@@ -114,10 +114,10 @@ def run(bus: Bus, orbit: Orbit, show: rr.RecordingStream, go_on: Callable[[], bo
             rotation = axis_rotation(0, drawn[1]) @ axis_rotation(1, drawn[0])
             show.log("model", rr.Transform3D(mat3x3=rotation * math.exp(drawn[2])))
         text = HELP.get(orbit.mode, orbit.mode) if there else "waiting for a master ..."
-        if text != text:
+        if text != shown:
             show.log("said", rr.TextDocument(text))
             sys.stderr.write(f"{text}\n")
-        text, last_s = text, now_s
+        shown, last_s = text, now_s
 
 
 def main() -> None:

@@ -45,9 +45,9 @@ def covariances(hand: FittedHand, cov: Float, seen: Bool, model: HandModel = RIG
         boxed(Device.none()),
     )
     straight, whole = np.empty((26, 3, 3)), np.empty((26, 3, 3))
-    scratch, information = Certainty.empty(len(cov), 16), np.asarray(np.linalg.inv(small_cov()), np.float64)
-    T, scratch = hand.T_rig_palm, boxed(Scratch.empty())
-    joint_covariances(rig, T, hand.x, cov, seen, information, scratch, boxed(scratch), straight, whole)
+    storage, information = Certainty.empty(len(cov), 16), np.asarray(np.linalg.inv(small_cov()), np.float64)
+    T, work = hand.T_rig_palm, boxed(Scratch.empty())
+    joint_covariances(rig, T, hand.x, cov, seen, information, work, boxed(storage), straight, whole)
     return straight, whole
 
 
