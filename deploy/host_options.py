@@ -117,7 +117,7 @@ def _add_deploy(add_parser: AddParser, calibration: Path) -> None:
     )
     deploy.add_argument("--no-apt", action="store_true", help="install no packages of the system there")
     deploy.add_argument(
-        "--no-hear", action="store_true", help="do not wait for datagrams, only until slaves are ready"
+        "--no-wait", action="store_true", help="do not wait for datagrams, only until slaves are ready"
     )
     deploy.add_argument("--ready-s", type=float, default=_READY_S, metavar="S", help=argparse.SUPPRESS)
     deploy.add_argument("--hear-s", type=float, default=WAIT_SENDERS_S, metavar="S", help=argparse.SUPPRESS)

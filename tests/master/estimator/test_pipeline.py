@@ -129,7 +129,7 @@ def test_a_thing_that_one_slave_takes_for_a_marker_is_told_by_the_other_camera(
     for pose, true in zip(poses, clear, strict=True):
         np.testing.assert_allclose(pose.markers_raw_m, true.markers_raw_m, atol=2e-3)
     assert all(pose.tracked[SURE].all() for pose in poses[3:])
-    assert pipeline.counts["rival.index"] >= 18
+    assert pipeline.counts["alternative.index"] >= 18
     assert pipeline.counts["epipolar_misfits"] == pipeline.counts["unclear.index"] == 0
     sure = build_pipeline(exact_run.setup, StageTimes())  # without the slave's doubt nothing can be chosen
     lost = solve_all(sure, mistaken(exact_run, THING, ("right",), doubt=False))
@@ -154,7 +154,7 @@ def test_a_thing_that_both_slaves_take_for_a_marker_is_told_by_where_the_hand_is
     pipeline = build_pipeline(exact_run.setup, StageTimes())
     poses = solve_all(pipeline, mistaken(exact_run, OUT_OF_REACH, ("left", "right"), doubt=True))
     assert all(marker_mm(p)[1] < 3.0 for p in poses[3:])
-    assert pipeline.counts["rival.index"] >= 18
+    assert pipeline.counts["alternative.index"] >= 18
 
 
 def test_what_was_mistaken_long_ago_is_not_the_past_of_a_marker(exact_run: SyntheticRun) -> None:
