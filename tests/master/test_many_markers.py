@@ -99,7 +99,7 @@ def test_a_free_marker_has_its_rival_told_by_the_other_camera_and_by_its_own_pas
     poses, counts = solve(many, messages)
     for pose in poses:
         np.testing.assert_allclose(pose.markers_raw_m[row], PLACES[FREE.index("cube-3")], atol=2e-3)
-    assert counts["rival.cube-3"] >= 5
+    assert counts["alternative.cube-3"] >= 5
 
 
 @pytest.mark.parametrize("names", [("back",), ("index",), ("thumb", "index"), ("index", "middle", "back")])
