@@ -217,7 +217,7 @@ def _scaled(
             ("", ""),
         )
         if not unit and what != QUATERNION:
-            unit, who = _likely(what, raw), "not said"
+            unit, who = _likely(what, raw), "not stated"
         scaled[what] = raw * UNITS[what].get(unit, 1.0)
         if unit:
             units[what] = f"{unit} ({who})"
@@ -263,4 +263,4 @@ def _time_unit(times: Sequence[Decimal], named: str, given: str | None) -> tuple
         raise RecordingError(
             f"time: a step of {step:g} fits no unit: say --time-unit {'|'.join(UNITS[TIME])}"
         )
-    return Decimal(UNITS[TIME][unit]), f"{unit} ({'header' if named else 'given' if given else 'not units'})"
+    return Decimal(UNITS[TIME][unit]), f"{unit} ({'header' if named else 'given' if given else 'not stated'})"

@@ -99,7 +99,7 @@ CASES = [
         "left",
         lambda b: b.away.add("left"),
         lambda b: b.away.clear(),
-        "not heard any more",
+        "not received any more",
         "slave",
     ),
     Case(
@@ -240,14 +240,14 @@ CASES = [
         "imu",
         lambda b: b.away.add("imu"),
         lambda b: b.away.clear(),
-        "not heard any more",
+        "not received any more",
         "phalanx-slave imu",
     ),
     Case(
         "twin_sender",
         "left",
-        _set("twin", "left", RejectedPeer("10.0.0.7", 10)),
-        _set("twin", "left", None),
+        _set("duplicate", "left", RejectedPeer("10.0.0.7", 10)),
+        _set("duplicate", "left", None),
         "the one at 10.0.0.7 is not taken",
         "--name",
     ),
@@ -308,7 +308,7 @@ def test_who_never_came_is_told_after_a_grace() -> None:
     told = bench.seconds(8.0)
     assert not any(items for s, items in told if s < 5.0)
     assert [(i.code, i.subject) for i in told[-1][1]] == [("camera_absent", "right"), ("imu_silent", "imu")]
-    assert "never heard" in told[-1][1][0].sentence
+    assert "never received" in told[-1][1][0].sentence
 
 
 def test_a_camera_that_gives_no_frames_is_absent_though_its_slave_is_there() -> None:
