@@ -99,7 +99,7 @@ def object_columns(poses: ObjectPoses, begin_t_ns: int) -> list[Column]:
                 np.sqrt(poses.cov[:, k, k]),
                 unit,
                 RIG,
-                f"standard deviation {'along' if unit == 'm' else 'of a rotate about'} {axis}",
+                f"standard deviation {'along' if unit == 'm' else 'of a rotation about'} {axis}",
             )
             for k, (axis, unit) in enumerate([(axis, unit) for unit in ("m", "rad") for axis in _AXES])
         ),

@@ -138,7 +138,7 @@ def show(settings: Settings = None, calibration: Calibration = CALIB_JSON) -> No
     known = _settings(_settings_path(calibration, settings))
     for name, shape in known.poses.items():
         templates = known.provenance.get(name)
-        typer.echo(f"{name}{'' if templates is None else f' (templates {templates.date})'}")
+        typer.echo(f"{name}{'' if templates is None else f' (template of {templates.date})'}")
         for quantity, span in shape.ranges.items():
             typer.echo(f"  {quantity:24s} {span.low:8.4g} to {span.high:8.4g}, border {span.soft:.3g}")
 

@@ -67,7 +67,7 @@ class RecorderProcess:
             if self._process.poll() is not None:
                 self._thread.join(1.0)
                 raise RecordingError(
-                    f"{self._path}: the recorder ended at once: {self._last or 'it text nothing'}"
+                    f"{self._path}: the recorder ended at once: {self._last or 'it printed nothing'}"
                 )
             if time.monotonic() > deadline:
                 self.close()

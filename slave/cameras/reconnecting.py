@@ -171,7 +171,7 @@ class ReconnectingCamera:
             try:
                 self._source, self._fresh = self._open(self._camera), True
             except Exception as error:  # noqa: BLE001 - as above
-                self._connection_lost(f"camera away: {self._failures.log('still connection_lost', error)}")
+                self._connection_lost(f"camera away: {self._failures.log('still lost', error)}")
                 continue
             if self._closed.is_set():  # while it was being opened
                 self._drop()

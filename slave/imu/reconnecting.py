@@ -122,7 +122,7 @@ class ReconnectingImu:
             try:
                 self._source = self._open()
             except Exception as error:  # noqa: BLE001 - as above
-                self._connection_lost(f"IMU away: {self._failures.log('still connection_lost', error)}")
+                self._connection_lost(f"IMU away: {self._failures.log('still lost', error)}")
                 continue
             if self._closed.is_set():  # while it was being opened
                 self._drop()

@@ -70,7 +70,7 @@ def test_time_without_a_unit_is_in_the_one_that_fits(unit: str, step: float, tmp
     rows = [f"{k * step},0,0,0,0,0,1" for k in range(4)]
     table = read(tmp_path, "\n".join(["t,gx,gy,gz,ax,ay,az", *rows]))
     assert np.diff(table.t_ns) == pytest.approx(step * UNITS["time"][unit])
-    assert table.units == {"time": f"{unit} (not stated)", "gyro": "rad/s (not said)", "accel": "g (not said)"}
+    assert table.units == {"time": f"{unit} (not stated)", "gyro": "rad/s (not stated)", "accel": "g (not stated)"}
 
 
 def test_units_can_be_given_and_a_table_may_lack_time(tmp_path: Path) -> None:

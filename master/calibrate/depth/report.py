@@ -105,7 +105,7 @@ def report_lines(report: DepthReport) -> list[str]:
         f"{100 * np.abs(report.rejected[n]).mean():.2f} %" if n in report.rejected else "" for n in names
     )
     lines.append(
-        f"  {'mean, left out in rotation':21s} "
+        f"  {'mean, left out in turn':21s} "
         + "  ".join(f"{c:>{w}s}" for c, w in zip(cells, widths, strict=True))
     )
     power, affine = report.power_law, report.affine_disparity
