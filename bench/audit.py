@@ -16,7 +16,7 @@ from uuid import uuid4
 
 import msgspec
 
-from bench.locked import locked, scopes
+from bench.pinned import locked, scopes
 from common.errors import PhalanxError
 
 ROOT = Path(__file__).resolve().parents[1]

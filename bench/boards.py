@@ -94,7 +94,7 @@ def _audits(fit: CamerasFit, views: BoardViews) -> Iterator[tuple[float, float, 
         )
         for i, name in enumerate(names)
     }
-    corners = {view.name: {c: s.corners_px for c, s in view.sightings.items()} for view in views.views}
+    corners = {view.name: {c: s.corners_px for c, s in view.observations.items()} for view in views.views}
     for pair, seen in pairs_with_views(corners).items():
         audit = audit_pair(views.board, pair, (models[pair[0]], models[pair[1]]), seen)
         if audit.edges:

@@ -83,7 +83,7 @@ class Cap:
         u, v: Centre of the whole ellipse [px], (0, 0) = centre of the top-left pixel.
         a, b: Semi-axes [px].
         angle: Direction of the axis a [rad].
-        paint: Linear RGB reflectance.
+        marker_colour: Linear RGB reflectance.
         bulge: Sine of the angle between the normals of rim and centre; 0 is flat.
         support, highlight, occluder: What is under, on and before it.
     """
@@ -93,7 +93,7 @@ class Cap:
     a: float
     b: float
     angle: float
-    paint: Rgb
+    marker_colour: Rgb
     bulge: float
     support: Support | None = None
     highlight: Highlight | None = None
@@ -196,12 +196,12 @@ def _exposed(
     pad = math.ceil(0.5 * max(abs(motion[0]), abs(motion[1]))) + 1 if steps > 1 else 0
     x = (np.arange(-pad * fine, (width + pad) * fine) + 0.5) / fine - 0.5 + left - cap.u
     y = (np.arange(-pad * fine, (height + pad) * fine) + 0.5) / fine - 0.5 + top - cap.v
-    canvas = _paint(cap, x.astype(np.float32)[None, :], y.astype(np.float32)[:, None], to_light, fine)
+    canvas = _shade(cap, x.astype(np.float32)[None, :], y.astype(np.float32)[:, None], to_light, fine)
     if steps > 1:
         # Instants symmetric about the middle, rounded symmetrically: their mean place is exactly the cap's.
-        instants = (np.arange(steps) + 0.5) / steps - 0.5
+        epochs = (np.arange(steps) + 0.5) / steps - 0.5
         mean = np.zeros((height * fine, width * fine, 4), np.float32)
-        for dx, dy in np.rint(fine * instants[:, None] * np.array(motion)).astype(int).tolist():
+        for dx, dy in np.rint(fine * epochs[:, None] * np.array(motion)).astype(int).tolist():
             mean += canvas[
                 pad * fine - dy : (pad + height) * fine - dy, pad * fine - dx : (pad + width) * fine - dx
             ]
@@ -209,7 +209,7 @@ def _exposed(
     return cast(Light, cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA))
 
 
-def _paint(cap: Cap, x: Light, y: Light, to_light: Float, fine: int) -> Light:
+def _shade(cap: Cap, x: Light, y: Light, to_light: Float, fine: int) -> Light:
     """Light and coverage (H, W, 4) of sub-pixels at (x, y) [px] from the cap's centre, `fine` per pixel.
 
     The paint's own edges are soft over one sub-pixel, or its centroid would be off by up to 0.006 px.
@@ -231,7 +231,7 @@ def _paint(cap: Cap, x: Light, y: Light, to_light: Float, fine: int) -> Light:
     cosine = cap.bulge * (p_in * lx + q_in * ly) + np.sqrt(1.0 - tilt) * to_light[2]
     shade = AMBIENT + (1.0 - AMBIENT) * np.maximum(cosine, 0.0)
     colour = np.ones((p_in.size, 4), np.float32)
-    colour[:, :3] = shade[:, None] * np.array(cap.paint, np.float32)
+    colour[:, :3] = shade[:, None] * np.array(cap.marker_colour, np.float32)
     if cap.highlight is not None and cap.highlight.radius > 0.0:
         spot = cap.highlight
         away = np.hypot(p_in - spot.x, q_in - spot.y) / spot.radius

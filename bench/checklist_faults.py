@@ -88,13 +88,13 @@ def _as_bright(rig: Rig) -> None:
 def _collide(rig: Rig) -> None:
     """The slave applies it within a second, and says so: then it is a fault."""
     _range(rig, "back", [36, 95, 81], [62, 255, 255])
-    until(lambda: "overlap.index..back" in rig.ask("left", "report").gauges, 20.0)
+    until(lambda: "overlap.index..back" in rig.ask("left", "report").metrics, 20.0)
 
 
 def _no_colour(rig: Rig) -> None:
-    before = rig.ask("left", "settings").gauges["colour.index"]
+    before = rig.ask("left", "settings").metrics["colour.index"]
     _range(rig, "index", [174, 225, 225], [177, 255, 255])
-    until(lambda: rig.ask("left", "settings").gauges["colour.index"] != before, 20.0)
+    until(lambda: rig.ask("left", "settings").metrics["colour.index"] != before, 20.0)
 
 
 def _range(rig: Rig, marker: str, low: list[int], high: list[int]) -> None:
@@ -108,11 +108,11 @@ def _colours(rig: Rig) -> None:
     """The colours of before, in use again."""
     path = rig.slaves / "cameras/left.json"
     markers = rig.read(rig.master / "cameras/left.json")["markers"]
-    before = dict(rig.ask("left", "settings").gauges)
+    before = dict(rig.ask("left", "settings").metrics)
     rig.write(path, {**rig.read(path), "markers": markers})
     names = ("colour.index", "colour.back")
     until(
-        lambda: any(rig.ask("left", "settings").gauges[name] != before[name] for name in names),
+        lambda: any(rig.ask("left", "settings").metrics[name] != before[name] for name in names),
         20.0,
     )
 

@@ -82,7 +82,7 @@ def errors(told: Shown, poses: list[HandPose]) -> tuple[float, float]:
     joints, angles = list[Float](), list[Float]()
     for pose in poses:
         truth = told.both.truth(pose.t_ns)
-        both = told.sight.cameras_of(np.array([truth.t_s]), _NEAR_S)[0] >= 2
+        both = told.line_of_sight.cameras_of(np.array([truth.t_s]), _NEAR_S)[0] >= 2
         clear = np.ones(26, np.bool_)
         for finger, name in enumerate(names):
             clear[list(FINGER_JOINTS[finger])] = both[markers.index(name)]
@@ -95,11 +95,11 @@ def errors(told: Shown, poses: list[HandPose]) -> tuple[float, float]:
 def _cost_rows(scene: str, setup: RigSetup, told: Shown) -> Iterator[Row]:
     line = line_of(setup, StageTimes())
     messages = [message for message in told.messages if isinstance(message, MarkerDetections)]
-    instants = [instant for message in messages for instant in line.sync.push(message)]
+    epochs = [epoch for message in messages for epoch in line.sync.push(message)]
     spent, iterations, fingers = list[float](), 0, 0
-    for instant in instants:
+    for epoch in epochs:
         begun_ns = time.thread_time_ns()
-        hand = line.solve(instant)
+        hand = line.solve(epoch)
         spent.append(1e-6 * (time.thread_time_ns() - begun_ns))
         iterations, fingers = iterations + int(hand.iterations.sum()), fingers + int(hand.seen.sum())
     low, middle, high = np.percentile(spent[_WARM:], [25, 50, 75])

@@ -126,14 +126,14 @@ def flood(pool: list[bytes], targets: list[Address], count: int, per_s: float | 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
         out.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         began = time.monotonic()
-        for k, datagram in enumerate(_turns(pool, count)):
+        for k, datagram in enumerate(_round_robin(pool, count)):
             out.sendto(datagram, targets[k % len(targets)])
             if per_s is not None and k % 64 == 0:
                 time.sleep(max(0.0, k / per_s - (time.monotonic() - began)))
         return time.monotonic() - began
 
 
-def _turns(pool: list[bytes], count: int) -> Iterator[bytes]:
+def _round_robin(pool: list[bytes], count: int) -> Iterator[bytes]:
     for k in range(count):
         yield pool[k % len(pool)]
 

@@ -69,7 +69,7 @@ def of_links(long: bool) -> list[Fault]:
         Fault("version", "a slave of another wire version, then ours", "not taken; named on both sides", _version,
               ("refused.version",), ("version_mismatch",)),
         Fault("twin", "a second process with the name of a camera", "the first keeps its session; both sides say it",
-              _twin, ("refused.twin",), ("twin_sender",), tracks=0.7),
+              _duplicate, ("refused.twin",), ("twin_sender",), tracks=0.7),
     ]  # fmt: skip
 
 
@@ -138,7 +138,7 @@ def _version(rig: FaultRig) -> float:
     return time.monotonic()
 
 
-def _twin(rig: FaultRig) -> float:
+def _duplicate(rig: FaultRig) -> float:
     rig.start_camera("left", "second left")
     time.sleep(3.0)
     rig.kill("second left")

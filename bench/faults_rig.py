@@ -125,7 +125,7 @@ class FaultRig:
         self.processes[name].wait()
 
     def tell(self, name: str, line: str) -> None:
-        """Say a line to a camera's process."""
+        """Notify a line to a camera's process."""
         pipe = self.processes[name].stdin
         assert pipe is not None
         pipe.write(line + "\n")

@@ -26,12 +26,12 @@ from common.imu_fusion import OrientationFilter
 from common.messages import ImuSample
 from common.sim.imu import SimulatedImu
 from common.sim.motion import HandState, smooth_step
-from common.wrist_bend import STRAIGHT, forearm_palm
+from common.wrist_joint import STRAIGHT, forearm_palm
+from master.estimator.cycle_reader import CycleReader
 from master.estimator.epoch import Epoch, Fitted
 from master.estimator.estimator import Estimator
 from master.estimator.fused import WristSide
-from master.estimator.triple_reader import TripleReader
-from master.estimator.wrist_device import BEND, HEADING
+from master.estimator.wrist_device import HEADING, WRIST_ANGLES
 from master.estimator.wrist_model import WristModel, loosened
 from master.rig import load_setup
 from master.rig_setup import RigSetup
@@ -50,7 +50,7 @@ Kind = Literal["plain", "staying"]
 KINDS: tuple[Kind, ...] = ("plain", "staying")
 
 
-class BentWrist:
+class FlexedWrist:
     """A wrist that goes from one posture to the next, and wavers. Pure in time: holds its script."""
 
     def __init__(self, seed: int) -> None:
@@ -103,22 +103,22 @@ class Line:
             [NO_RAY], loosened(markers.hand), self._names, self._names, continuous=True, wrist=model
         )
         counts = Counter[str]()
-        self.side = WristSide(wrist, TripleReader(wrist, None, counts), counts, continuous=True)
+        self.side = WristSide(wrist, CycleReader(wrist, None, counts), counts, continuous=True)
 
     def push(self, t_ns: int, points_m: Float) -> Fitted:
         """Fit one epoch with markers (M, 3) [m], which may be NaN."""
-        turn = self.side.turn_at(t_ns, self.estimator)
+        orientation = self.side.orientation_at(t_ns, self.estimator)
         cov = np.tile(_SIGMA_M**2 * np.eye(3), (len(points_m), 1, 1))
-        hand = self.estimator.push(Epoch(t_ns, points_m, TOWARDS, cov_m2=cov, turn=turn))
-        self.side.solved(t_ns, hand, self.estimator, turned=turn is not None)
+        hand = self.estimator.push(Epoch(t_ns, points_m, TOWARDS, cov_m2=cov, orientation=orientation))
+        self.side.solved(t_ns, hand, self.estimator, oriented=orientation is not None)
         return hand
 
 
-class TurnedArm(Gestures):
+class RotatedArm(Gestures):
     """Those gestures of a forearm that lies any way. Pure in time: holds how."""
 
     def __init__(self, seed: int) -> None:
-        """Rest first, as a wearer is asked to."""
+        """Rest first, as a subject is asked to."""
         super().__init__(seed, _REST_S)
         self._lies = rotation_vector_to_matrix(np.random.default_rng([seed, 8]).normal(size=3))
 
@@ -132,16 +132,16 @@ class Arm:
     """One recording: who moves how, and the samples of its IMU with the filter's orientation."""
 
     seed: int
-    forearm: TurnedArm
-    wrist: BentWrist
+    forearm: RotatedArm
+    wrist: FlexedWrist
     samples: list[ImuSample]
 
     @classmethod
     def of(cls, seed: int, imu: ImuCalibration, seconds: float) -> "Arm":
         """Simulate."""
-        forearm, fusion = TurnedArm(seed), OrientationFilter(imu.rate_hz)
+        forearm, fusion = RotatedArm(seed), OrientationFilter(imu.rate_hz)
         samples = [fusion.push(one) for one in SimulatedImu(forearm, imu, seed).around(0.0, seconds)]
-        return cls(seed, forearm, BentWrist(seed), samples)
+        return cls(seed, forearm, FlexedWrist(seed), samples)
 
     def lies(self, t_s: float) -> Float:
         """The forearm (3, 3) in the rig."""
@@ -153,10 +153,10 @@ class Arm:
 
     def heading(self, sample: ImuSample) -> float:
         """The heading [rad] of the filter's world against the rig, at a sample."""
-        world = (
+        dispatcher = (
             quaternion_to_matrix(sample.orientation_wxyz) @ quaternion_to_matrix(np.array(IMU.q_palm_imu)).T
         )
-        off = quaternion_to_matrix(np.array(_WORLD)).T @ self.lies(sample.seq / IMU.rate_hz) @ world.T
+        off = quaternion_to_matrix(np.array(_WORLD)).T @ self.lies(sample.seq / IMU.rate_hz) @ dispatcher.T
         return atan2(off[1, 0] - off[0, 1], off[0, 0] + off[1, 1])
 
 
@@ -191,7 +191,7 @@ def moments(arm: Arm, kind: Kind, rigs: tuple[RigSetup, WristSetup]) -> Iterator
         shown = since_s <= _TOLD_S
         hand = line.push(sample.t_ns, told.of(arm.palm(t_s)) if shown else unseen)
         if shown:
-            last = line.estimator.extras[BEND : BEND + 2].copy()
+            last = line.estimator.extras[WRIST_ANGLES : WRIST_ANGLES + 2].copy()
         looked = [s for s in _AFTER_S[1:] if abs(since_s - _TOLD_S - s) < 0.5 * _FRAME_S]
         if _SETTLED_S < since_s <= _TOLD_S and frame % 15 == 0:
             looked = [0.0]
@@ -207,11 +207,11 @@ def _moment(
         return Moment(after_s, np.full(5, 180.0), np.full(3, np.inf))
     z, cov, truth = estimator.extras, estimator.extras_cov, arm.wrist.at(t_s)
     heading = remainder(z[HEADING] - arm.heading(sample), 2.0 * pi)
-    bent = z[BEND : BEND + 2] - truth
+    bent = z[WRIST_ANGLES : WRIST_ANGLES + 2] - truth
     palm = matrix_to_rotation_vector(arm.palm(t_s) @ hand.solution.T_rig_palm[:3, :3].T)
     surprise = (
         heading**2 / cov[HEADING, HEADING],
-        bent @ np.linalg.solve(cov[BEND : BEND + 2, BEND : BEND + 2], bent),
+        bent @ np.linalg.solve(cov[WRIST_ANGLES : WRIST_ANGLES + 2, WRIST_ANGLES : WRIST_ANGLES + 2], bent),
         palm @ np.linalg.solve(hand.solution.alone[:3, :3], palm),
     )
     off = [float(np.linalg.norm(one)) for one in (heading, bent, palm, last - truth, truth)]
@@ -239,9 +239,9 @@ def rows() -> Iterator[Row]:
 
 def _rigs() -> tuple[RigSetup, WristSetup]:
     """Three markers on the back, and the device with this IMU."""
-    markers, worn = load_setup(CALIBRATION, "desk-back3"), load_setup(CALIBRATION, "wrist-back3")
-    assert worn.wrist is not None
-    return markers, replace(worn.wrist, imu=IMU)
+    markers, wrist_setup = load_setup(CALIBRATION, "desk-back3"), load_setup(CALIBRATION, "wrist-back3")
+    assert wrist_setup.wrist is not None
+    return markers, replace(wrist_setup.wrist, imu=IMU)
 
 
 def _cost(arm: Arm, rigs: tuple[RigSetup, WristSetup]) -> Row:

@@ -27,7 +27,7 @@ def rows() -> Iterator[Row]:
     )
     yield Row("an instant of two cameras, markers alone", 1e3 * markers["instant"], "ms", "")
     yield _row("  fused with the wrist device", fused["instant"], markers["instant"], "markers alone")
-    yield Row("a triple, wrist device alone", 1e3 * wrist["triple"], "ms", "")
+    yield Row("a triple, wrist device alone", 1e3 * wrist["cycle"], "ms", "")
     both_s = markers["second"] + wrist["second"]
     yield _row("a second, fused", fused["second"], both_s, "both apart")
     yield Row("a sample of the IMU, fused", 1e3 * fused["sample"], "ms", "")
@@ -51,8 +51,8 @@ def costs(setup: RigSetup, messages: Iterable[Observed]) -> dict[str, float]:
             kind, news = "sample", 1
         elif message.camera in setup.cameras:
             poses = pipeline.push(message)
-            kind = "triple" if isinstance(message, WristDetections) else "instant"
-            news = 1 if kind == "triple" else len(poses)
+            kind = "cycle" if isinstance(message, WristDetections) else "instant"
+            news = 1 if kind == "cycle" else len(poses)
         else:
             continue
         spent[kind] += process_time() - start_s

@@ -68,17 +68,17 @@ def _digest() -> str:
 
 def _write(path: Path, made: Shown) -> None:
     coded = [encode(message) for message in made.messages]
-    sight = made.sight
-    cameras = {f"paint_t_s.{name}": times for name, times in sight.paint_t_s.items()}
-    cameras |= {f"paint_px2.{name}": area for name, area in sight.paint_px2.items()}
+    line_of_sight = made.line_of_sight
+    cameras = {f"visible_t_s.{name}": times for name, times in line_of_sight.visible_t_s.items()}
+    cameras |= {f"visible_px2.{name}": area for name, area in line_of_sight.visible_px2.items()}
     write_npz(
         path,
         {
             "messages": np.frombuffer(b"".join(coded), np.uint8),
             "ends": np.cumsum([len(one) for one in coded]),
-            "line_t_s": sight.line_t_s,
-            "line_m": sight.line_m,
-            "tip": sight.tip,
+            "line_t_s": line_of_sight.line_t_s,
+            "line_m": line_of_sight.line_m,
+            "tip": line_of_sight.tip,
             **cameras,
         },
     )
@@ -89,11 +89,11 @@ def _read(path: Path, both: Both, seconds: float) -> Shown:
     coded, ends = np.asarray(data["messages"]).tobytes(), np.asarray(data["ends"]).astype(np.int64).tolist()
     messages = [cast(Observed, decode(coded[a:b])) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
     names = both.markers.rig.cameras
-    sight = Sight(
-        {name: data[f"paint_t_s.{name}"] for name in names},
-        {name: data[f"paint_px2.{name}"] for name in names},
+    line_of_sight = Sight(
+        {name: data[f"visible_t_s.{name}"] for name in names},
+        {name: data[f"visible_px2.{name}"] for name in names},
         data["line_t_s"],
         data["line_m"],
         np.asarray(data["tip"], np.bool_),
     )
-    return Shown(both, seconds, messages, sight)
+    return Shown(both, seconds, messages, line_of_sight)

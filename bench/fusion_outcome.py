@@ -7,7 +7,7 @@ from typing import Literal
 from bench.fusion_kept import Mode, observed
 from bench.fusion_scene import Shown
 from bench.fusion_score import Figures, Ratios, Sighted, ratios
-from bench.fusion_solved import Away, Solved, solve
+from bench.fusion_solved import RejectedPeer, Solved, solve
 from master.rig_setup import RigSetup
 
 Kind = Literal["fused", "markers", "wrist"]
@@ -29,7 +29,7 @@ class Outcome:
     figures: dict[Kind, Figures]
 
     @classmethod
-    def of(cls, shown: Shown, kinds: Sequence[Kind] = KINDS, away: Away | None = None) -> "Outcome":
+    def of(cls, shown: Shown, kinds: Sequence[Kind] = KINDS, away: RejectedPeer | None = None) -> "Outcome":
         """Solve and judge the scene with these pipelines, with streams cut off if asked."""
         both = shown.both
         setups: dict[Kind, RigSetup] = {"fused": both.fused, "markers": both.markers, "wrist": both.wrist}
@@ -56,6 +56,6 @@ def solved(scenes: Sequence[str], seconds: float, seed: int, mode: Mode) -> dict
 def cut_off(scenes: Sequence[str], seconds: float, seed: int, mode: Mode) -> dict[str, Figures]:
     """How good the fused hand is in scenes while either stream goes and returns."""
     return {
-        name: Outcome.of(observed(name, seconds, seed, mode), KINDS[:1], Away()).figures["fused"]
+        name: Outcome.of(observed(name, seconds, seed, mode), KINDS[:1], RejectedPeer()).figures["fused"]
         for name in scenes
     }

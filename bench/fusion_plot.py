@@ -34,7 +34,7 @@ def draw(found: Mapping[str, Outcome], file: Path) -> None:
         "mean joint error [mm]; wrist device: placed by the truth",
     )
     below = figure.add_subplot(grid[1, :])
-    _course(below, found[_GRASP])
+    _timeline(below, found[_GRASP])
     figure.legend(*below.get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=4)
     figure.savefig(file)
 
@@ -53,7 +53,7 @@ def _bars(axes: Axes, scenes: dict[str, dict[Kind, float]], title: str) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _course(axes: Axes, found: Outcome) -> None:
+def _timeline(axes: Axes, found: Outcome) -> None:
     """Mean PIP error of the four fingers through the first round, and when no two cameras see them."""
     until_s = min(_ROUND_S, found.shown.seconds)
     for kind in reversed(KINDS):
@@ -65,7 +65,7 @@ def _course(axes: Axes, found: Outcome) -> None:
         mean = np.where(known.any(axis=1), mean, np.nan)
         axes.plot(one.t_s[early], mean, color=_COLOURS[kind], linewidth=1.4, label=_NAMES[kind])
     t_s: Float = np.arange(0.0, until_s, 0.02)
-    hidden = (found.shown.sight.cameras_of(t_s, ABOUT_S)[:, 1:5] < 2).mean(axis=1)
+    hidden = (found.shown.line_of_sight.cameras_of(t_s, ABOUT_S)[:, 1:5] < 2).mean(axis=1)
     shade = axes.twinx()
     shade.fill_between(t_s, hidden, step="mid", color="#bbbbbb", alpha=0.4, linewidth=0.0)
     shade.set_ylim(0.0, 1.0)

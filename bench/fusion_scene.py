@@ -36,14 +36,14 @@ class Both:
         name: Of the scene.
         seed: Of motion and noise.
         scene: What the marker rig sees; its truth is that of the hand, in the rig frame.
-        worn: What the wrist device sees of the same hand.
+        wrist_scene: What the wrist device sees of the same hand.
         markers, wrist: The two rigs, each alone.
     """
 
     name: str
     seed: int
     scene: Scene
-    worn: WristScene
+    wrist_scene: WristScene
     markers: RigSetup
     wrist: RigSetup
 
@@ -62,8 +62,8 @@ class Both:
         """
         markers, wrist = (load_setup(calibration, rig) for rig in rigs)
         scene = scene_by_name(name, markers.rig, markers.cameras, markers.hand.profile, seed)
-        worn = WristScene(wrist.rig, wrist.cameras, wrist.hand, scene.motion, seed=seed)
-        return cls(name, seed, scene, worn, markers, wrist)
+        wrist_scene = WristScene(wrist.rig, wrist.cameras, wrist.hand, scene.motion, seed=seed)
+        return cls(name, seed, scene, wrist_scene, markers, wrist)
 
     @property
     def fused(self) -> RigSetup:
@@ -80,15 +80,15 @@ class Sight:
     """What is truly in sight, frame by frame.
 
     Attributes:
-        paint_t_s: Camera -> (T,) scene times [s] of its frames.
-        paint_px2: Camera -> (T, M) visible area of every marker [px^2].
+        visible_t_s: Camera -> (T,) scene times [s] of its frames.
+        visible_px2: Camera -> (T, M) visible area of every marker [px^2].
         line_t_s: (K,) scene times [s] of the wrist device's triples.
         line_m: (K, 5) length of the laser line on each finger that is lit and seen [m].
         tip: (K, 5) whether each fingertip is in sight of the wrist camera.
     """
 
-    paint_t_s: Mapping[str, Float]
-    paint_px2: Mapping[str, Float]
+    visible_t_s: Mapping[str, Float]
+    visible_px2: Mapping[str, Float]
     line_t_s: Float
     line_m: Float
     tip: Bool
@@ -98,12 +98,12 @@ class Sight:
 
         `without` (N,) says when the markers' stream is cut off.
         """
-        count = np.zeros((len(t_s), next(iter(self.paint_px2.values())).shape[1]), np.int64)
-        for name, times in self.paint_t_s.items():
-            count += _about(t_s, times, self.paint_px2[name] >= SPOT_PX2, within_s)
+        count = np.zeros((len(t_s), next(iter(self.visible_px2.values())).shape[1]), np.int64)
+        for name, times in self.visible_t_s.items():
+            count += _about(t_s, times, self.visible_px2[name] >= SPOT_PX2, within_s)
         return count if without is None else np.where(without[:, None], 0, count)
 
-    def worn(self, t_s: Float, within_s: float, without: Bool | None = None) -> Bool:
+    def in_wrist_sight(self, t_s: Float, within_s: float, without: Bool | None = None) -> Bool:
         """(N, 5) whether the wrist device has laser line or tip of each finger in sight, as in `cameras_of`."""
         seen = _about(t_s, self.line_t_s, (self.line_m >= LINE_M) | self.tip, within_s)
         return seen if without is None else seen & ~without[:, None]
@@ -130,7 +130,7 @@ class Shown:
     both: Both
     seconds: float
     messages: list[Observed]
-    sight: Sight
+    line_of_sight: Sight
 
 
 def in_order(messages: list[Observed]) -> list[Observed]:
@@ -144,4 +144,4 @@ def orientations(both: Both, seconds: float) -> list[Observed]:
     if imu is None:
         return []
     fusion = OrientationFilter(imu.rate_hz)
-    return [fusion.push(one) for one in SimulatedImu.of(both.worn).around(0.0, seconds, START_NS)]
+    return [fusion.push(one) for one in SimulatedImu.of(both.wrist_scene).around(0.0, seconds, START_NS)]

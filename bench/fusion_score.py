@@ -6,7 +6,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from bench.fusion_scene import Shown
-from bench.fusion_solved import Away, Solved
+from bench.fusion_solved import RejectedPeer, Solved
 from common.arrays import Bool, Float, Int
 from common.hand_model import CHAINS
 
@@ -26,7 +26,7 @@ class Sighted:
 
     Attributes:
         cameras: (N, M) marker cameras that have each marker in sight; none while that stream is away.
-        worn: (N, 5) whether the wrist device has laser line or tip of each finger in sight.
+        in_wrist_sight: (N, 5) whether the wrist device has laser line or tip of each finger in sight.
         hidden: (N, 5) whether fewer than two cameras have the finger's marker in sight, were no stream away.
         oriented: (N,) whether an IMU tells of the palm.
         strapped: Whether there are no markers: the palm is then where the device's strap has it, and nowhere else.
@@ -34,14 +34,14 @@ class Sighted:
     """
 
     cameras: Int
-    worn: Bool
+    in_wrist_sight: Bool
     hidden: Bool
     oriented: Bool
     strapped: bool
     hand_over: Bool
 
     @classmethod
-    def of(cls, shown: Shown, solved: Solved, away: Away | None) -> Self:
+    def of(cls, shown: Shown, solved: Solved, away: RejectedPeer | None) -> Self:
         """Of a pipeline's poses: what its own sensors have in sight."""
         t_s = solved.t_s
         gone = (np.zeros(len(t_s), np.bool_),) * 2 if away is None else away.at(t_s)
@@ -49,18 +49,23 @@ class Sighted:
         if away is not None:
             before = away.at(t_s - ABOUT_S)
             gone = (gone[0] & before[0], gone[1] & before[1])
-        cameras = shown.sight.cameras_of(t_s, ABOUT_S, gone[0] | (not solved.markers))
-        worn = shown.sight.worn(t_s, ABOUT_S, gone[1] | (not solved.wrist))
+        cameras = shown.line_of_sight.cameras_of(t_s, ABOUT_S, gone[0] | (not solved.markers))
+        in_wrist_sight = shown.line_of_sight.in_wrist_sight(t_s, ABOUT_S, gone[1] | (not solved.wrist))
         oriented = ~gone[1] & solved.wrist
-        by = np.concatenate([cameras[:, :_FINGERS] >= 2, worn], axis=1)
+        by = np.concatenate([cameras[:, :_FINGERS] >= 2, in_wrist_sight], axis=1)
         changed = np.zeros(by.shape, np.int64)
         changed[1:] = by[1:] != by[:-1]
         total = np.concatenate([np.zeros((1, by.shape[1]), np.int64), np.cumsum(changed, axis=0)])
         first, last = (np.searchsorted(t_s, t_s + way * HAND_OVER_S) for way in (-1.0, 1.0))
         near = total[last] > total[first]
-        hidden = shown.sight.cameras_of(t_s, ABOUT_S)[:, :_FINGERS] < 2
+        hidden = shown.line_of_sight.cameras_of(t_s, ABOUT_S)[:, :_FINGERS] < 2
         return cls(
-            cameras, worn, hidden, oriented, not solved.markers, near[:, :_FINGERS] | near[:, _FINGERS:]
+            cameras,
+            in_wrist_sight,
+            hidden,
+            oriented,
+            not solved.markers,
+            near[:, :_FINGERS] | near[:, _FINGERS:],
         )
 
     @property
@@ -75,7 +80,7 @@ class Sighted:
         out = np.zeros((len(seen), 26), np.bool_)
         palm = (count >= 3) | (seen[:, _BACK] & (count >= 2)) | ((count >= 1) & self.oriented)
         out[:, _PALM_JOINTS] = palm[:, None] | self.strapped
-        out[:, CHAINS] = (seen[:, :_FINGERS] | self.worn)[:, :, None]
+        out[:, CHAINS] = (seen[:, :_FINGERS] | self.in_wrist_sight)[:, :, None]
         return out
 
 

@@ -20,12 +20,12 @@ from bench.fusion_scene import Both, Observed, Shown, Sight, in_order, orientati
 from bench.played import START_NS, times_of
 from common.arrays import Bool, Float
 from common.messages import MarkerDetections, WristDetections
-from common.sim.paint import MarkerView
+from common.sim.painter import MarkerView
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from common.sim.wrist.scene import WristTruth
 
-_LASTS_S = 0.2  # errors and misses are about the same for so long
+_HOLD_S = 0.2  # errors and misses are about the same for so long
 _SPOT_PX2, _SPOT_SPREAD_PX2 = 15.5, 4.0  # of paint that is found half of the time
 _WHOLE_PX2, _WHOLE_PX, _SPECK_PX = 100.0, 0.1, 1.1  # claimed of caps from so much paint on, and at most
 _OF_CLAIMED = 0.6  # how large errors are by what is claimed
@@ -43,7 +43,7 @@ class _Wander:
     """Errors of unit variance that are about the same for a while (an AR(1) process), N at once."""
 
     def __init__(self, rng: np.random.Generator, shape: tuple[int, ...], step_s: float) -> None:
-        self._rng, self._keep = rng, float(np.exp(-step_s / _LASTS_S))
+        self._rng, self._keep = rng, float(np.exp(-step_s / _HOLD_S))
         self._now = rng.normal(size=shape)
 
     def __call__(self) -> Float:
@@ -71,16 +71,16 @@ def shown(name: str, seconds: float, seed: int, every: int = 1) -> Shown:
 def shown_of(both: Both, seconds: float, every: int = 1) -> Shown:
     """The same of a scene before other rigs."""
     messages = orientations(both, seconds)
-    times, paint = dict[str, Float](), dict[str, Float]()
+    times, visible_area = dict[str, Float](), dict[str, Float]()
     for camera in both.markers.rig.cameras:
         rate = both.markers.cameras[camera].frame_rate_hz / every
         times[camera] = times_of(both.scene, camera, seconds, rate)
-        found, paint[camera] = markers_shown(both.scene, camera, times[camera], 1.0 / rate, both.seed)
+        found, visible_area[camera] = markers_shown(both.scene, camera, times[camera], 1.0 / rate, both.seed)
         messages += found
     frame_s = 1.0 / both.wrist.cameras[both.wrist.rig.cameras[0]].frame_rate_hz
     line_t = np.arange(1.0, seconds / frame_s - 1.0, 3.0) * frame_s
-    triples, line, tip = _triples(both, line_t, frame_s)
-    return Shown(both, seconds, in_order(messages + triples), Sight(times, paint, line_t, line, tip))
+    cycles, line, tip = _cycles(both, line_t, frame_s)
+    return Shown(both, seconds, in_order(messages + cycles), Sight(times, visible_area, line_t, line, tip))
 
 
 def markers_shown(
@@ -93,14 +93,14 @@ def markers_shown(
     least, lasting = _Wander(rng, (count,), step_s), _Wander(rng, (count, 2), step_s)
     renderer = Renderer(scene, camera)
     out: list[MarkerDetections] = []
-    paint: list[Float] = []
+    visible_area: list[Float] = []
     for seq, t in enumerate(times_s.tolist()):
         view = renderer.markers(t)
-        paint.append(np.where(np.isfinite(view.uv[:, 0]), view.area, 0.0))
+        visible_area.append(np.where(np.isfinite(view.uv[:, 0]), view.area, 0.0))
         off = 0.8 * lasting() + 0.6 * rng.normal(size=(count, 2))
         found = view.area > _SPOT_PX2 + _SPOT_SPREAD_PX2 * least()
         out.append(_marker_message(camera, seq, START_NS + round(t * 1e9), view, found, off))
-    return out, np.array(paint)
+    return out, np.array(visible_area)
 
 
 def _marker_message(
@@ -120,18 +120,18 @@ def _marker_message(
         area=np.where(found, view.area, np.nan),
         quality=np.where(found, np.clip(view.area / _WHOLE_PX2, 0.1, 1.0), np.nan),
         sigma_px=np.where(found, sigma, np.nan),
-        rival_uv=np.full((len(found), 2), np.nan),
+        alt_uv=np.full((len(found), 2), np.nan),
     )
 
 
-def _triples(both: Both, times_s: Float, frame_s: float) -> tuple[list[Observed], Float, Bool]:
+def _cycles(both: Both, times_s: Float, frame_s: float) -> tuple[list[Observed], Float, Bool]:
     """The triples with laser frames at these times, and of line [m] and tips (K, 5) what is in sight."""
     report = _WristErrors(both, 3.0 * frame_s)
     out: list[Observed] = []
     lines: list[Float] = []
     tips: list[Bool] = []
     for k, t in enumerate(times_s.tolist()):
-        laser, led = both.worn.truth(t), both.worn.truth(t + frame_s)
+        laser, led = both.wrist_scene.truth(t), both.wrist_scene.truth(t + frame_s)
         lines.append(laser.laser_len_vis[1:6])
         tips.append(led.tip_visible)
         t_ns = START_NS + round(t * 1e9)
@@ -144,7 +144,7 @@ class _WristErrors:
 
     def __init__(self, both: Both, step_s: float) -> None:
         rng = np.random.default_rng([both.seed, 22])
-        self._camera, self._fx = both.wrist.rig.cameras[0], float(both.worn.optics.matrix[0, 0])
+        self._camera, self._fx = both.wrist.rig.cameras[0], float(both.wrist_scene.optics.matrix[0, 0])
         self._rng = rng
         self._other, self._missed, self._false = (_Wander(rng, (5,), step_s) for _ in range(3))
         self._laser, self._tip, self._aside = (_Wander(rng, (5, 2), step_s) for _ in range(3))
@@ -190,8 +190,8 @@ class _WristErrors:
     def _tips(self, truth: WristTruth) -> tuple[Float, Float]:
         missed, false = self._missed(), self._false() < _TIP_FALSE
         off, aside = 0.8 * self._tip() + 0.6 * self._rng.normal(size=(5, 2)), self._aside()
-        usual = np.array([_THUMB_TIP_FOUND, *4 * [_TIP_FOUND]])
-        found = truth.tip_visible & (missed < usual) & np.isfinite(truth.tip_uv[:, 0])
+        typical = np.array([_THUMB_TIP_FOUND, *4 * [_TIP_FOUND]])
+        found = truth.tip_visible & (missed < typical) & np.isfinite(truth.tip_uv[:, 0])
         away = _TIP_FALSE_PX * aside / np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 0.5)
         at = truth.tip_uv + np.where(false[:, None], away, 0.0) + _TIP_PX * off
         claimed = np.where(false, _TIP_FALSE_CLAIMED_PX, _TIP_CLAIMED_PX)

@@ -106,10 +106,10 @@ class Solved:
 def _placed(found: Poses, wrist_m: Float, wrist_rotation: Float) -> Poses:
     """A hand with the wrist joint there (N, 3) and turned so (N, 3, 3)."""
     own = quaternion_to_matrix(found.orientation_wxyz[:, WRIST])
-    turn = wrist_rotation @ np.swapaxes(own, 1, 2)
+    rotation = wrist_rotation @ np.swapaxes(own, 1, 2)
     beyond = found.position_m - found.position_m[:, WRIST, None]
-    place = wrist_m[:, None] + np.einsum("nab,njb->nja", turn, beyond)
-    cov = turn[:, None] @ found.cov_m2 @ np.swapaxes(turn, 1, 2)[:, None]
+    place = wrist_m[:, None] + np.einsum("nab,njb->nja", rotation, beyond)
+    cov = rotation[:, None] @ found.cov_m2 @ np.swapaxes(rotation, 1, 2)[:, None]
     return replace(found, position_m=place, cov_m2=cov)
 
 
@@ -127,7 +127,7 @@ def solve(setup: RigSetup, messages: Iterable[Observed]) -> list[HandPose]:
 
 
 @dataclass(frozen=True, slots=True)
-class Away:
+class RejectedPeer:
     """Which streams are cut off when: every so many seconds one of the two, for a while, in turn.
 
     Attributes:

@@ -45,14 +45,14 @@ from master.study.trials import read_trials
 CALIBRATION = Path(__file__).parent.parent / "calib_json"
 SIGMA_M = 1e-3
 _PERIOD_NS = 16_666_667
-_SEED, _PEOPLE, _WORN = 31, 12, 3
+_SEED, _PEOPLE, _WRIST_PEOPLE = 31, 12, 3
 
 
 def rows() -> Iterator[Row]:
     """All parts; a row that says so where the data are absent."""
     yield from people(range(1, _PEOPLE + 1)).rows("12 people, all markers seen")
     yield from rigs()
-    yield from worn(range(1, _WORN + 1)).rows(f"wrist device, {_WORN} people")
+    yield from wrist_device(range(1, _WRIST_PEOPLE + 1)).rows(f"wrist device, {_WRIST_PEOPLE} people")
     yield from static_rows()
     yield from leap_rows()
     yield _cost()
@@ -61,9 +61,9 @@ def rows() -> Iterator[Row]:
 def people(numbers: Sequence[int] | range, seconds: float = 15.0) -> Told:
     """People of the study before cameras that see all markers: own bones, a measured model, 1 mm of noise."""
     out = Told()
-    wrist, usual = load(CALIBRATION / "rigs/wrist.json", RigCalibration), _hand("right")
+    wrist, typical = load(CALIBRATION / "rigs/wrist.json", RigCalibration), _hand("right")
     for number in numbers:
-        who = participant(_SEED, number, wrist, usual)
+        who = participant(_SEED, number, wrist, typical)
         true, known = HandModel.of(who.hand), HandModel.of(who.measured)
         motion = StudyPoses(true, np.array([0.0, 0.0, 0.5]), _SEED + number)
         solver = PointHand(known, MARKERS)
@@ -75,16 +75,16 @@ def people(numbers: Sequence[int] | range, seconds: float = 15.0) -> Told:
             caps = true.marker_points(true.forward(state.T_rig_palm, state.angles_rad), MARKERS)
             caps = caps + rng.normal(0.0, SIGMA_M, caps.shape)
             cov = np.tile(SIGMA_M**2 * np.eye(3), (len(MARKERS), 1, 1))
-            facing = -state.T_rig_palm[:3, 3] / np.linalg.norm(state.T_rig_palm[:3, 3])
-            solved = smooth.push(t_ns, solver.push(t_ns, caps, cov, facing), cov).solution
+            back_normal = -state.T_rig_palm[:3, 3] / np.linalg.norm(state.T_rig_palm[:3, 3])
+            solved = smooth.push(t_ns, solver.push(t_ns, caps, cov, back_normal), cov).solution
             assert solved is not None
-            place, turned = solved.joints.position_m, matrix_to_quaternion(solved.joints.rotation)
-            poses.append(pose_of(known, t_ns, place, turned, solved.angles_rad))
+            place, orientation = solved.joints.position_m, matrix_to_quaternion(solved.joints.rotation)
+            poses.append(pose_of(known, t_ns, place, orientation, solved.angles_rad))
         out.add([motion.held(1e-9 * pose.t_ns) for pose in poses], told_of(poses, known))
     return out
 
 
-def worn(numbers: Sequence[int] | range) -> Told:
+def wrist_device(numbers: Sequence[int] | range) -> Told:
     """Trials of the study: rendered, detected by the slave, calibrated and solved as everybody's."""
     rig = load(CALIBRATION / "rigs/wrist.json", RigCalibration)
     camera = load(CALIBRATION / "cameras/wrist.json", CameraCalibration)
@@ -97,7 +97,7 @@ def worn(numbers: Sequence[int] | range) -> Told:
             seed=_SEED,
             blocks=1,
             conditions=(("calibrated", "detected"),),
-            level=None,
+            solver_mode=None,
             step=2,
             guided=96,
             out=Path(folder),

@@ -53,14 +53,14 @@ def static_rows() -> Iterator[Row]:
         model = HandModel.of(profile)
         for name in names:
             joints = np.asarray(data[name][row], np.float64)
-            said = [_static(model, joints, seed) for seed in range(_SEEDS)]
+            annotations = [_static(model, joints, seed) for seed in range(_SEEDS)]
             if name in MEANT:
-                good = sum(one == MEANT[name] for one in said)
+                good = sum(one == MEANT[name] for one in annotations)
                 right, count = right + good, count + _SEEDS
                 if good < _SEEDS:
-                    lines.append(Row(f"  {side} {name}", 100.0 * good / _SEEDS, "%", f"told {said}"))
+                    lines.append(Row(f"  {side} {name}", 100.0 * good / _SEEDS, "%", f"told {annotations}"))
             else:
-                lines.append(Row(f"  {side} {name}: not judged", 0.0, "", f"told {said[0]}"))
+                lines.append(Row(f"  {side} {name}: not judged", 0.0, "", f"told {annotations[0]}"))
     yield Row("handy_poses: holds right", 100.0 * right / count, "%", f"goal 98; of {count}")
     yield from lines
 
@@ -140,8 +140,8 @@ def _solved(model: HandModel, t_ns: list[int], points: Float, towards: Float, se
         cov = np.where(np.isfinite(seen[:, :1, None]), SIGMA_M**2 * np.eye(3), np.nan)
         hand = smooth.push(t, solver.push(t, seen, cov, towards), cov).solution
         assert hand is not None
-        turned = matrix_to_quaternion(hand.joints.rotation)
-        out.append(pose_of(model, t, hand.joints.position_m, turned, hand.angles_rad))
+        orientation = matrix_to_quaternion(hand.joints.rotation)
+        out.append(pose_of(model, t, hand.joints.position_m, orientation, hand.angles_rad))
     return out
 
 

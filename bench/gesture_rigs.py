@@ -1,7 +1,7 @@
 """The six study poses of simulated people before each rig that a user may have, through rendered frames.
 
 Everybody has bones of his own and is solved with bones as a calibration measures them; a wrist device sits a little
-otherwise than its file says, by what `calibrate mounting` leaves (docs/calibrate.md). Hands turn by up to 35 degrees
+otherwise than its file says, by what `calibrate extrinsics` leaves (docs/calibrate.md). Hands turn by up to 35 degrees
 and hide their fingers. One rendering serves two rigs: two cameras are half of four, and markers are half of what is
 fused. Frames come at 30 Hz, so that two of them are 67 ms.
 
@@ -18,7 +18,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from bench.fusion_scene import Both, Observed, in_order, orientations
-from bench.fusion_watched import triples_of
+from bench.fusion_watched import cycles_of
 from bench.gesture_told import Told, told_of
 from bench.played import START_NS, message_of, times_of
 from bench.row import Row
@@ -28,21 +28,21 @@ from common.messages import HandPose, ImuSample
 from common.sim.poses import StudyPoses
 from common.sim.render import Renderer
 from common.sim.scene import Scene, view_centre
-from common.sim.together import Bent
+from common.sim.together import FlexedWrist
 from common.sim.wrist.scene import WristScene
 from master.rig import load_setup
 from master.rig_pipeline import pipeline_of
 from master.rig_setup import RigSetup
 from master.stages import StageTimes
-from master.study.participant import Participant, participant, turned
-from slave.markers.following import detector_for
+from master.study.participant import Participant, participant, rotated
+from slave.markers.light_adaptive import detector_for
 from slave.markers.workers import Inline
 
 CALIBRATION = Path(__file__).parent.parent / "calib_json"
 RATE_HZ, SECONDS = 30.0, 15.0  # one round of the six poses
 PEOPLE = (20,)  # a minute or two each; more by the command line
 _SEED, _MOTION = 1, 100
-_TURN_RAD, _SHIFT_M = np.radians(0.75), 0.65e-3  # per axis, what a calibrated mounting is off by
+_ROTATION_RAD, _SHIFT_M = np.radians(0.75), 0.65e-3  # per axis, what a calibrated mounting is off by
 
 
 def rows(people: Sequence[int] = PEOPLE) -> Iterator[Row]:
@@ -63,33 +63,33 @@ def by_markers(number: int, seconds: float = SECONDS) -> dict[str, Told]:
     model = HandModel.of(who.hand)
     motion = StudyPoses(model, view_centre(four.rig), _MOTION + number)
     scene = Scene.of_motion(four.rig, four.cameras, who.hand, motion, _MOTION + number)
-    messages = _watched(scene, seconds)
+    messages = _monitored(scene, seconds)
     return {name: _told(_known(_setup(name), who), messages, motion) for name in ("desk", "desk4")}
 
 
 def by_both(number: int, seconds: float = SECONDS) -> dict[str, Told]:
     """One person before two cameras with three markers on the back, and what a wrist device adds."""
-    marked, worn = _setup("desk-back3"), load_setup(CALIBRATION, "wrist-back3")
+    marked, wrist_setup = _setup("desk-back3"), load_setup(CALIBRATION, "wrist-back3")
     who = _person(number, marked)
     model, seed = HandModel.of(who.hand), _MOTION + number
-    motion = Bent(posed := StudyPoses(model, view_centre(marked.rig), seed), seed)
+    motion = FlexedWrist(posed := StudyPoses(model, view_centre(marked.rig), seed), seed)
     scene = Scene.of_motion(marked.rig, marked.cameras, who.hand, motion, seed)
     rng = np.random.default_rng([number, 77])
-    true = replace(worn.rig, T_camera_palm=who.rig.T_camera_palm)
-    file = turned(true, rng.normal(0.0, _TURN_RAD, 3), rng.normal(0.0, _SHIFT_M, 3))
-    device = WristScene(true, worn.cameras, model, motion, seed=seed, reflectance=who.reflectance)
+    true = replace(wrist_setup.rig, T_camera_palm=who.rig.T_camera_palm)
+    file = rotated(true, rng.normal(0.0, _ROTATION_RAD, 3), rng.normal(0.0, _SHIFT_M, 3))
+    device = WristScene(true, wrist_setup.cameras, model, motion, seed=seed, reflectance=who.reflectance)
     alone = _known(marked, who)
-    wrist = RigSetup.of(file, worn.cameras, alone.hand)
+    wrist = RigSetup.of(file, wrist_setup.cameras, alone.hand)
     both = Both("both-poses", seed, scene, device, alone, wrist)
-    markers = _watched(scene, seconds)
-    everything = in_order([*markers, *orientations(both, seconds), *triples_of(both, seconds)[0]])
+    markers = _monitored(scene, seconds)
+    everything = in_order([*markers, *orientations(both, seconds), *cycles_of(both, seconds)[0]])
     return {
         "desk-back3": _told(alone, markers, posed),
         "desk-back3 + wrist-back3": _told(both.fused, everything, posed),
     }
 
 
-def _watched(scene: Scene, seconds: float) -> list[Observed]:
+def _monitored(scene: Scene, seconds: float) -> list[Observed]:
     """What the cameras' slaves send of the scene."""
     out: list[Observed] = []
     for camera in scene.rig.cameras:

@@ -80,14 +80,16 @@ class Told:
                 yield Row(f"  {name}", 100.0 * of.get(name, 0) / sum(of.values()), "%", str(of))
 
 
-def pose_of(model: HandModel, t_ns: int, place_m: Float, turned_wxyz: Float, angles_rad: Float) -> HandPose:
+def pose_of(
+    model: HandModel, t_ns: int, place_m: Float, orientation_wxyz: Float, angles_rad: Float
+) -> HandPose:
     """The pose of joints (26, 3) [m] and (26, 4) that are all seen."""
     whole = np.ones(JOINT_COUNT, np.bool_)
     return HandPose(
         hand=model.profile.name,
         t_ns=t_ns,
         position_m=place_m,
-        orientation_wxyz=turned_wxyz,
+        orientation_wxyz=orientation_wxyz,
         radius_m=model.radius_m,
         valid=whole,
         tracked=whole,

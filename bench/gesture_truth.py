@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float
+from common.capsule_gaps import TaperedCapsules, gaps_between
 from common.gesture_settings import GestureSettings
 from common.hand_model import CHAINS, FINGERS, TIPS, HandModel
-from common.sim.gestures import Gestures, Said
-from common.skin_gaps import RoundCones, gaps_between
+from common.sim.gestures import Annotation, Gestures
 
 RATE_HZ = 240.0
 
@@ -58,11 +58,15 @@ class GestureTruth:
         joints = model.forward(
             np.stack([state.T_rig_palm for state in states]), np.stack([state.angles_rad for state in states])
         ).position_m
-        cones = RoundCones.of_segments(joints, model.radius_m)
-        gap = gaps_between(cones.part(slice(0, 1), slice(2, 3)), cones.part(slice(1, 5), slice(0, 3))).gap_m
+        capsules = TaperedCapsules.of_segments(joints, model.radius_m)
+        gap = gaps_between(
+            capsules.part(slice(0, 1), slice(2, 3)), capsules.part(slice(1, 5), slice(0, 3))
+        ).gap_m
         seen = cls(motion, t, joints, gap[..., 2], gap.min(axis=-1), ())
-        said = (seen._event(one, settings) for one in motion.said if one.stop_s < seconds - 1.0)
-        return cls(motion, t, joints, seen.pinch_m, seen.key_m, tuple(one for one in said if one is not None))
+        annotations = (seen._event(one, settings) for one in motion.annotations if one.stop_s < seconds - 1.0)
+        return cls(
+            motion, t, joints, seen.pinch_m, seen.key_m, tuple(one for one in annotations if one is not None)
+        )
 
     def pinch_at(self, t_s: float, finger: str) -> float:
         """The true gap [m] of a pinch of a finger."""
@@ -74,16 +78,16 @@ class GestureTruth:
         way = joints[CHAINS[1, 3]] - joints[CHAINS[1, 0]]
         return way / np.linalg.norm(way)
 
-    def _event(self, said: Said, settings: GestureSettings) -> TrueEvent | None:
-        inside = (self.t_s >= said.start_s) & (self.t_s <= said.stop_s)
+    def _event(self, annotations: Annotation, settings: GestureSettings) -> TrueEvent | None:
+        inside = (self.t_s >= annotations.start_s) & (self.t_s <= annotations.stop_s)
         before = after = 0.0
-        if said.kind == "pinch":
-            gap = self.pinch_m[:, FINGERS.index(said.name) - 1]
+        if annotations.kind == "pinch":
+            gap = self.pinch_m[:, FINGERS.index(annotations.name) - 1]
             begun, going = gap <= settings.pinch.begin_gap_m, gap <= settings.pinch.end_gap_m
-        elif said.kind == "tap":
+        elif annotations.kind == "tap":
             begun = going = self.key_m.min(axis=1) <= settings.tap.touch_gap_m
-        elif said.kind == "dial":
-            begun, going = self._gripped(said, settings)
+        elif annotations.kind == "dial":
+            begun, going = self._gripped(annotations, settings)
             before, after = settings.dial.hold_s, settings.dial.regrip_s
         else:
             begun, going = self._points(settings)
@@ -92,13 +96,13 @@ class GestureTruth:
         if not len(first) or not len(last):
             return None
         begin_s, end_s = float(self.t_s[first[0]]) + before, float(self.t_s[last[-1]]) + after
-        return TrueEvent(said.kind, said.name, begin_s, end_s)
+        return TrueEvent(annotations.kind, annotations.name, begin_s, end_s)
 
-    def _gripped(self, said: Said, settings: GestureSettings) -> tuple[Bool, Bool]:
+    def _gripped(self, annotations: Annotation, settings: GestureSettings) -> tuple[Bool, Bool]:
         """Whether the tips are about the knob (T,), and whether they have not let it go (T,)."""
-        turned = np.array([self.motion.dial_rad(float(t)) for t in self.t_s])
-        start = int(np.searchsorted(self.t_s, said.start_s))
-        turns = start + int(np.argmax(np.abs(turned[start:] - turned[start]) > 1e-6))
+        rotated = np.array([self.motion.dial_rad(float(t)) for t in self.t_s])
+        start = int(np.searchsorted(self.t_s, annotations.start_s))
+        turns = start + int(np.argmax(np.abs(rotated[start:] - rotated[start]) > 1e-6))
         tips = self.joints_m[:, TIPS]
         away = np.linalg.norm(tips - tips.mean(axis=1, keepdims=True), axis=-1)
         off = away - away[turns]

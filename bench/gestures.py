@@ -45,7 +45,7 @@ from master.rig_setup import RigSetup
 
 RATE_HZ = 60.0
 FUSED = "desk-back3+wrist-back3"
-WORN = "wrist"
+WRIST = "wrist"
 SILENT = ("wave", "HandSplay-110fps", "rollAndPitchWithEntry", "three-claps", "confidence-demo")
 _CALIBRATION = Path(__file__).parent.parent / "calib_json"
 _DATA = Path(os.environ.get("PHALANX_DATASETS", Path(__file__).parent.parent.parent / "shared/datasets"))
@@ -61,7 +61,7 @@ class Score:
     """
 
     late: dict[str, list[float]] = field(default_factory=lambda: dict[str, list[float]]())
-    said: dict[str, int] = field(default_factory=lambda: dict.fromkeys(_KINDS, 0))
+    annotations: dict[str, int] = field(default_factory=lambda: dict.fromkeys(_KINDS, 0))
     missed: dict[str, int] = field(default_factory=lambda: dict.fromkeys(_KINDS, 0))
     false: dict[str, int] = field(default_factory=lambda: dict.fromkeys(_KINDS, 0))
     pinch_mm: list[float] = field(default_factory=lambda: list[float]())
@@ -73,7 +73,7 @@ class Score:
         """Hold what was told against the truth."""
         free = [one for one in told if one.phase == "begin" or one.kind == "tap"]
         for event in truth.events:
-            self.said[event.kind] += 1
+            self.annotations[event.kind] += 1
             at_s = event.end_s if event.kind == "tap" else event.begin_s
             same = [one for one in free if (one.kind, one.name) == (event.kind, event.name)]
             found = min(same, key=lambda one: abs(_s(one.t_ns) - at_s), default=None)
@@ -84,13 +84,13 @@ class Score:
             self._late(f"{event.kind} begin" if event.kind != "tap" else "tap", _s(found.t_ns) - at_s)
             if event.kind == "tap":
                 continue
-            course = [one for one in told if (one.kind, one.began_t_ns) == (found.kind, found.began_t_ns)]
-            if course[-1].phase == "end":
-                self._late(f"{event.kind} end", _s(course[-1].t_ns) - event.end_s)
-            self._values(course, truth, event.end_s)
+            updates = [one for one in told if (one.kind, one.began_t_ns) == (found.kind, found.began_t_ns)]
+            if updates[-1].phase == "end":
+                self._late(f"{event.kind} end", _s(updates[-1].t_ns) - event.end_s)
+            self._values(updates, truth, event.end_s)
         # What is said at the very end is in no event, and is not false either.
         last_s = float(truth.t_s[-1]) - 1.0
-        cut_s = min((one.start_s for one in truth.motion.said if one.stop_s >= last_s), default=last_s)
+        cut_s = min((one.start_s for one in truth.motion.annotations if one.stop_s >= last_s), default=last_s)
         for one in free:
             self.false[one.kind] += _s(one.t_ns) < min(cut_s, last_s)
 
@@ -102,17 +102,17 @@ class Score:
     def _late(self, what: str, seconds: float) -> None:
         self.late.setdefault(what, []).append(seconds * RATE_HZ)
 
-    def _values(self, course: Sequence[Gesture], truth: GestureTruth, end_s: float) -> None:
-        first_s, before = _s(course[0].t_ns), None
-        for one in course:
+    def _values(self, updates: Sequence[Gesture], truth: GestureTruth, end_s: float) -> None:
+        first_s, before = _s(updates[0].t_ns), None
+        for one in updates:
             t_s = _s(one.t_ns)
             if t_s > end_s:
                 break
             if one.kind == "pinch":
                 self.pinch_mm.append(1e3 * (one.distance_m - truth.pinch_at(t_s, one.name)))
             elif one.kind == "dial":
-                turned = truth.motion.dial_rad(t_s) - truth.motion.dial_rad(first_s)
-                self.dial_deg.append(float(np.degrees(one.angle_rad - turned)))
+                rotated = truth.motion.dial_rad(t_s) - truth.motion.dial_rad(first_s)
+                self.dial_deg.append(float(np.degrees(one.angle_rad - rotated)))
             elif one.kind == "point":
                 off = one.direction - truth.ray_at(t_s)
                 self.ray_deg.append(float(np.degrees(np.linalg.norm(off))))
@@ -128,14 +128,14 @@ def rows() -> Iterator[Row]:
         yield from table(rig, scored(rig, (1,), 75.0, exact=False))
     yield from table(FUSED, scored(FUSED, (7,), 29.0, exact=False))
     yield from table("silent, true hands", silent(SILENT, None, 60.0))
-    yield from table("silent, wrist device alone", silent(SILENT, WORN, 25.0))
+    yield from table("silent, wrist device alone", silent(SILENT, WRIST, 25.0))
 
 
 def scored(rig: str, seeds: Sequence[int], seconds: float, *, exact: bool) -> Score:
     """The scene of several seeds before a marker rig, or MARKER_RIG+WRIST_RIG."""
     settings, score = default_gestures(), Score()
     for seed in seeds:
-        marked, _, worn = rig.partition("+")
+        marked, _, wrist_rig = rig.partition("+")
         setup = load_setup(_CALIBRATION, marked)
         scene = scene_by_name("gestures", setup.rig, setup.cameras, setup.hand.profile, seed)
         if not isinstance(scene.motion, Gestures):
@@ -143,8 +143,8 @@ def scored(rig: str, seeds: Sequence[int], seconds: float, *, exact: bool) -> Sc
         truth = GestureTruth.of(scene.motion, scene.model, settings, min(seconds, scene.period_s))
         if exact:
             poses: Iterable[HandPose] = true_poses(scene.motion, scene.model, seconds)
-        elif worn:
-            poses = fused_poses((marked, worn), seed, seconds)
+        elif wrist_rig:
+            poses = fused_poses((marked, wrist_rig), seed, seconds)
         else:
             poses = seen_poses(setup, "gestures", seed, seconds)
         score.add(told_of(poses, scene.model, settings), truth)
@@ -155,13 +155,13 @@ def silent(names: Sequence[str], rig: str | None, seconds: float) -> Score:
     """Recorded hands that say nothing, each for so long: as they truly are, or rendered before a rig."""
     settings, score = default_gestures(), Score()
     for name in names:
-        setup = load_setup(_CALIBRATION, "desk-back3" if rig in (None, WORN) else rig)
+        setup = load_setup(_CALIBRATION, "desk-back3" if rig in (None, WRIST) else rig)
         scene = f"leap:{_DATA / 'leapjs' / name}.npz"
         made = scene_by_name(scene, setup.rig, setup.cameras, setup.hand.profile, 1)
         if rig is None:
             poses: Iterable[HandPose] = true_poses(made.motion, made.model, seconds)
-        elif rig == WORN:
-            poses = worn_poses(scene, 1, seconds)
+        elif rig == WRIST:
+            poses = wrist_poses(scene, 1, seconds)
         else:
             poses = seen_poses(setup, scene, 1, seconds)
         score.add_silent(told_of(poses, made.model, settings))
@@ -189,7 +189,7 @@ def fused_poses(rigs: tuple[str, str], seed: int, seconds: float) -> list[HandPo
     return solve_both(shown.both.fused, shown.messages)
 
 
-def worn_poses(name: str, seed: int, seconds: float) -> list[HandPose]:
+def wrist_poses(name: str, seed: int, seconds: float) -> list[HandPose]:
     """The poses of a scene by the wrist device alone, of messages made of the truth."""
     shown = shown_of(Both.of(name, seed), seconds)
     return solve_both(shown.both.wrist, shown.messages)
@@ -223,7 +223,7 @@ def true_poses(motion: HandMotion, model: HandModel, seconds: float) -> Iterator
 def table(name: str, score: Score) -> Iterator[Row]:
     """The rows of one score."""
     for kind in _KINDS:
-        note = f"said {score.said[kind]}, missed {score.missed[kind]}"
+        note = f"said {score.annotations[kind]}, missed {score.missed[kind]}"
         yield Row(f"{name}: {kind}, told and not said", float(score.false[kind]), "", note)
     for what, late in sorted(score.late.items()):
         yield Row(f"{name}: {what}, late", *_most(np.array(late), "frame"))

@@ -29,7 +29,7 @@ FRAMES = 240
 _PERIOD_S = 1 / 60
 NOISE = Noise((0.15e-3, 0.15e-3, 1.0e-3))
 _SEED = 7
-_TURN_RAD = np.radians(20.0)
+_ROTATION_RAD = np.radians(20.0)
 _SLOW = {"scipy": 20, "mink": 4, "papers' way": 2}  # one frame in so many
 WARM = "whole hand, warm"
 
@@ -58,9 +58,11 @@ def motion(model: HandModel, frames: int) -> Draw:
     """A hand that bends its fingers, each in its own phase, while the palm turns about all axes."""
     rng = np.random.default_rng(_SEED)
     t = _PERIOD_S * np.arange(frames)
-    turn = _TURN_RAD * np.stack([np.sin(1.1 * t), np.sin(0.8 * t + 1.0), np.sin(0.9 * t + 2.0)], axis=1)
+    rotation = _ROTATION_RAD * np.stack(
+        [np.sin(1.1 * t), np.sin(0.8 * t + 1.0), np.sin(0.9 * t + 2.0)], axis=1
+    )
     place = np.array([0.03, 0.08, 0.5])
-    poses = np.stack([rigid(rotation_vector_to_matrix(v) @ FACING_ROTATION, place) for v in turn])
+    poses = np.stack([rigid(rotation_vector_to_matrix(v) @ FACING_ROTATION, place) for v in rotation])
     angles = np.zeros((frames, 5, 4))
     bend = 0.5 + 0.4 * np.sin(2.0 * t[:, None] + rng.uniform(0, 2 * np.pi, 5))
     angles[:, :, 2] = bend

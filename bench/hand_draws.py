@@ -23,7 +23,7 @@ MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
 BACK = 5
 FACING_ROTATION = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
 _PLACE_M = np.array([0.03, 0.08, 0.6])
-_TURN_RAD = np.radians(45.0)
+_ROTATION_RAD = np.radians(45.0)
 _DIP_PER_PIP = 2.0 / 3.0
 _DIP_OFF_RAD = np.radians(8.0)
 
@@ -94,7 +94,7 @@ def draw(model: HandModel, seed: int, count: int, *, coupling_off_rad: float = _
     off = rng.uniform(-coupling_off_rad, coupling_off_rad, (count, 4))
     angles[:, 1:, 3] = np.clip(_DIP_PER_PIP * angles[:, 1:, 2] + off, low[1:, 3], high[1:, 3])
     T = np.tile(np.eye(4), (count, 1, 1))
-    T[:, :3, :3] = _turn(rng.uniform(-_TURN_RAD, _TURN_RAD, (count, 3))) @ FACING_ROTATION
+    T[:, :3, :3] = _rotation(rng.uniform(-_ROTATION_RAD, _ROTATION_RAD, (count, 3))) @ FACING_ROTATION
     T[:, :3, 3] = _PLACE_M
     return posed(model, T, angles)
 
@@ -105,7 +105,7 @@ def posed(model: HandModel, T_rig_palm: Float, angles_rad: Float) -> Draw:
     return Draw(T_rig_palm, angles_rad, joints.position_m, model.marker_points(joints, MARKERS))
 
 
-def _turn(angles_rad: Float) -> Float:
+def _rotation(angles_rad: Float) -> Float:
     """Turns (N, 3, 3) about x, then y, then z by angles (N, 3) [rad]."""
     x, y, z = (rotation_vector_to_matrix(angles_rad[:, [k]] * np.eye(3)[k]) for k in range(3))
     return z @ y @ x

@@ -99,10 +99,10 @@ def whole_hands(
     solver = PointHand(model, MARKERS, continuous=False, faces=False)
     palms, angles = np.full((len(points_m), 4, 4), np.nan), np.full((len(points_m), 5, 4), np.nan)
     for k, p in enumerate(points_m):
-        turn = None
+        orientation = None
         if rotation is not None and noise.orientation_rad is not None:
-            turn = rotation[k], noise.orientation_rad**2 * np.eye(3)
-        found = solver.push(k, p, noise.cov_m2, turn=turn).solution
+            orientation = rotation[k], noise.orientation_rad**2 * np.eye(3)
+        found = solver.push(k, p, noise.cov_m2, orientation=orientation).solution
         if found is not None:
             palms[k], angles[k] = found.T_rig_palm, found.angles_rad
     return palms, angles

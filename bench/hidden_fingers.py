@@ -47,7 +47,7 @@ def rows() -> Iterator[Row]:
     for name, group in played.items():
         angles = [(model, angles_of(motion)) for model, motion in group]
         together, alone = (
-            np.concatenate([strayed_deg(model, a, alike=alike) for model, a in angles], axis=1)
+            np.concatenate([growth_deg(model, a, alike=alike) for model, a in angles], axis=1)
             for alike in (True, False)
         )
         for k, after_s in enumerate(HIDDEN_S[1:], 1):
@@ -62,7 +62,7 @@ def angles_of(motion: HandMotion) -> Float:
     return np.array([motion.at(t).angles_rad for t in times.tolist()])
 
 
-def strayed_deg(model: HandModel, angles_rad: Float, *, alike: bool) -> Float:
+def growth_deg(model: HandModel, angles_rad: Float, *, alike: bool) -> Float:
     """Errors (K, N, 2) [deg] of flexion and PIP, at each of the times `HIDDEN_S` after the last marker of a finger.
 
     Args:
@@ -76,7 +76,7 @@ def strayed_deg(model: HandModel, angles_rad: Float, *, alike: bool) -> Float:
     palm = rigid(FACING_ROTATION, np.array([0.0, 0.08, 0.5]))
     places = model.marker_points(model.forward(np.tile(palm, (len(angles_rad), 1, 1)), angles_rad), MARKERS)
     cov = np.tile(_SIGMA_M**2 * np.eye(3), (len(MARKERS), 1, 1))
-    turn = palm[:3, :3], _SIGMA_RAD**2 * np.eye(3)
+    orientation = palm[:3, :3], _SIGMA_RAD**2 * np.eye(3)
     off: list[list[Float]] = [[] for _ in HIDDEN_S]
     for finger in range(1, 5):
         solver = PointHand(model, MARKERS, settings=settings)
@@ -84,7 +84,7 @@ def strayed_deg(model: HandModel, angles_rad: Float, *, alike: bool) -> Float:
             points, hidden = places[k].copy(), k % _CYCLE - _SEEN + 1
             if hidden > 0:
                 points[finger] = np.nan
-            hand = solver.push(round(k * 1e9 / _RATE_HZ), points, cov, turn=turn).solution
+            hand = solver.push(round(k * 1e9 / _RATE_HZ), points, cov, orientation=orientation).solution
             if hidden in _STEPS:
                 assert hand is not None
                 error = (hand.angles_rad - angles_rad[k])[finger, 1:3]

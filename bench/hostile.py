@@ -169,7 +169,7 @@ def all_attacked(
     per_s: float,
     seed: int,
     calm_s: float = CALM_S,
-    say: Callable[[str], None] = lambda _line: None,
+    notify: Callable[[str], None] = lambda _line: None,
     limits: Limits = LIMITS,
 ) -> list[Outcome]:
     """Let each device in turn send its share of the attack.
@@ -191,10 +191,10 @@ def all_attacked(
                 if not rig.alive():
                     break
                 outcomes.append(attacked(rig, device, process, calm, limits))
-                say(row(outcomes[-1]))
+                notify(row(outcomes[-1]))
         if failed:
             outcomes[-1] = replace(outcomes[-1], broken=(*outcomes[-1].broken, *dict.fromkeys(failed)))
-            say("; ".join(outcomes[-1].broken))
+            notify("; ".join(outcomes[-1].broken))
     finally:
         for process in stolen.values():
             process.kill()
@@ -219,7 +219,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             print(HEAD, flush=True)
             place = (options.devices, options.messages, options.per_s, options.seed)
-            outcomes = all_attacked(rig, *place, say=lambda line: print(line, flush=True))
+            outcomes = all_attacked(rig, *place, notify=lambda line: print(line, flush=True))
             if not rig.alive():
                 print(rig.log.read_text(errors="replace")[-3000:])
         finally:

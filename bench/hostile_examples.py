@@ -79,7 +79,7 @@ def frames_of(name: str, setup: RigSetup | None) -> dict[type[Struct], list[Fiel
     if setup is None or name not in setup.models:
         return {}
     if setup.wrist_cameras:
-        return {WristDetections: [wire(one) for one in triples(setup, _LOOP, _RATE_HZ)]}
+        return {WristDetections: [wire(one) for one in cycles(setup, _LOOP, _RATE_HZ)]}
     return {MarkerDetections: [wire(one) for one in told(setup, _RATE_HZ)[name][:_LOOP]]}
 
 
@@ -92,7 +92,7 @@ def own_kinds(name: str, setup: RigSetup) -> tuple[type[Message], ...]:
     return (WristDetections,) if name in setup.wrist_cameras else (MarkerDetections, TagDetections)
 
 
-def triples(setup: RigSetup, count: int, rate_hz: float) -> list[WristDetections]:
+def cycles(setup: RigSetup, count: int, rate_hz: float) -> list[WristDetections]:
     """What the camera of a wrist device measures, without errors."""
     scene = WristScene.by_name("standard", setup.rig, setup.cameras, setup.hand.profile, 7)
     out: list[WristDetections] = []

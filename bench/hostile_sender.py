@@ -51,7 +51,7 @@ class HostileUplink(Uplink):
     It answers echoes rightly besides, so the session lives.
     """
 
-    def say(self, kind: Kind, body: bytes) -> bool:
+    def seal_and_send(self, kind: Kind, body: bytes) -> bool:
         """Send a body in the session; False: there is none, or it does not fit."""
         with self._lock:
             session = self._link._session  # pyright: ignore[reportPrivateUsage]
@@ -143,8 +143,8 @@ class HostileSender:
             self._bus.put(key, body, congestion_control=waits)
             return True
         if kind is Started:
-            return self.uplink.say(Kind.STARTED, body)
-        return self.uplink.say(Kind.ECHO_ANSWER if kind is EchoAnswer else Kind.DATA, body)
+            return self.uplink.seal_and_send(Kind.STARTED, body)
+        return self.uplink.seal_and_send(Kind.ECHO_ANSWER if kind is EchoAnswer else Kind.DATA, body)
 
 
 def main() -> None:

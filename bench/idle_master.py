@@ -20,8 +20,8 @@ def pass_on(self: MarkerPipeline, message: MarkerDetections) -> list[SolvedPose]
     """An empty pose for every message, in place of `MarkerPipeline.push`."""
     count = len(message.area)
     nowhere, unknown = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
-    apart, left_out = np.zeros(count, np.bool_), np.zeros((1, count), np.bool_)
-    markers = MarkerPositions(nowhere, unknown, unknown, apart, left_out)
+    apart, rejected = np.zeros(count, np.bool_), np.zeros((1, count), np.bool_)
+    markers = MarkerPositions(nowhere, unknown, unknown, apart, rejected)
     pose = pose_of(_NOTHING, self.model, message.t_ns, nowhere, markers)
     return [SolvedPose(pose, message.ready_t_ns)]
 

@@ -31,7 +31,7 @@ from common.sim.imu import ICM20948, LSM6DSO, InertialPart, SimulatedImu
 from common.sim.motion import HandState
 
 _DATASETS = Path(os.environ.get("PHALANX_DATASETS", Path(__file__).parents[2] / "shared/datasets")).resolve()
-_NOTHING, _NO_TURN = np.full(3, np.nan), np.full(4, np.nan)
+_NOTHING, _NO_QUATERNION = np.full(3, np.nan), np.full(4, np.nan)
 _PARTS: dict[str, InertialPart] = {"LSM6DSO": LSM6DSO, "ICM-20948": ICM20948}
 _SEEDS = range(8)
 _STATED_DEG = (0.0, 0.4, 0.6, 0.8, 1.0, 1.5, 2.0, 3.0, 6.0)
@@ -61,7 +61,7 @@ class Recording:
                 data["movement"][::every].astype(np.bool_),
             )
         samples = [
-            ImuSample("broad", 0, k, round(k * 1e9 / rate_hz), gyro[k], accel[k], _NOTHING, _NO_TURN)
+            ImuSample("broad", 0, k, round(k * 1e9 / rate_hz), gyro[k], accel[k], _NOTHING, _NO_QUATERNION)
             for k in range(len(gyro))
         ]
         return cls(samples, rate_hz, truth, moving & np.isfinite(truth).all(axis=1))
@@ -160,8 +160,8 @@ def _recorded(what: str, recording: Recording, pooled: list[TiltErrors]) -> Iter
     against = "VQF is not installed" if theirs is None else (
         f"{tilt.rms_deg / theirs.inclination_rms_deg:.2f} of VQF's {theirs.inclination_rms_deg:.2f}"
     )  # fmt: skip
-    says = f"stated {tilt.stated_deg:.2f}, {100 * tilt.within:.0f} % within 95 %"
-    yield Row(f"{what}: inclination", tilt.rms_deg, "deg rms", f"{against}; {says}")
+    stated_text = f"stated {tilt.stated_deg:.2f}, {100 * tilt.within:.0f} % within 95 %"
+    yield Row(f"{what}: inclination", tilt.rms_deg, "deg rms", f"{against}; {stated_text}")
     errors = Errors.of(found, recording)
     note = f"{_rms(errors.heading_deg):.2f} deg rms against its begin"
     if theirs is not None:
@@ -220,8 +220,8 @@ class Gestures:
         """Its pose; the fingers do not matter."""
         t = max(t_s - self.rest_s, 0.0)
         swing = self._grown(t) * self._amplitude * np.sin(self._rate * t + self._phase)
-        turn = axis_rotation(2, 2.0 * swing[0]) @ axis_rotation(1, swing[1]) @ axis_rotation(0, swing[2])
-        return HandState(rigid(turn, 0.15 * swing[3:]), np.zeros((5, 4)))
+        rotation = axis_rotation(2, 2.0 * swing[0]) @ axis_rotation(1, swing[1]) @ axis_rotation(0, swing[2])
+        return HandState(rigid(rotation, 0.15 * swing[3:]), np.zeros((5, 4)))
 
     @staticmethod
     def _grown(t: float) -> float:
@@ -261,8 +261,12 @@ def _simulated(part: str, rest_s: float, pooled: list[TiltErrors]) -> Iterator[R
     name = f"simulated {part}, {'rested' if rest_s else 'never at rest'}"
     rms, within = _rms(np.array([one.rms_deg for one in tilt])), np.mean([one.within for one in tilt])
     against = f"VQF {_rms(np.array(theirs)):.2f}" if theirs else "VQF is not installed"
-    says = f"stated {_rms(np.array([one.stated_deg for one in tilt])):.2f}, {100 * within:.0f} % within 95 %"
-    yield Row(f"{name}: inclination", rms, "deg rms", f"{len(_SEEDS)} arms, a minute each; {against}; {says}")
+    stated_text = (
+        f"stated {_rms(np.array([one.stated_deg for one in tilt])):.2f}, {100 * within:.0f} % within 95 %"
+    )
+    yield Row(
+        f"{name}: inclination", rms, "deg rms", f"{len(_SEEDS)} arms, a minute each; {against}; {stated_text}"
+    )
     note = f"{_rms(np.array(surprise)):.1f} of what heading_sigma_rad says (rms)"
     yield Row(f"{name}: heading", _rms(np.array(drift)), "deg/min", note)
 

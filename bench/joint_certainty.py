@@ -44,7 +44,7 @@ _PALM_JOINTS = np.setdiff1d(
     np.arange(1, 26), CHAINS[:, 1:]
 )  # knuckles and the thumb's root move with the palm
 _DIP_OFF = np.radians(8.0)
-_TURN = np.radians(45.0)
+_ROTATION = np.radians(45.0)
 
 
 class RandomPoses:
@@ -62,15 +62,15 @@ class RandomPoses:
             if model.dip_per_pip is not None:
                 angles[1:, 3] = model.dip_per_pip * angles[1:, 2] + rng.uniform(-_DIP_OFF, _DIP_OFF, 4)
             at = centre_m + rng.uniform(-0.05, 0.05, 3)
-            self._held.append((at, rng.uniform(-_TURN, _TURN, 3), np.clip(angles, low, high)))
+            self._held.append((at, rng.uniform(-_ROTATION, _ROTATION, 3), np.clip(angles, low, high)))
 
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
         step, phase = divmod(max(t_s, 0.0), self._HOLD_S + self._MOVE_S)
         here, there = (self._held[(int(step) + k) % len(self._held)] for k in range(2))
         share = smooth_step((phase - self._HOLD_S) / self._MOVE_S)
-        at, turn, angles = ((1.0 - share) * a + share * b for a, b in zip(here, there, strict=True))
-        return HandState(base_pose(self._model, at, np.zeros(3), turn), angles)
+        at, rotation, angles = ((1.0 - share) * a + share * b for a, b in zip(here, there, strict=True))
+        return HandState(base_pose(self._model, at, np.zeros(3), rotation), angles)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,12 +17,12 @@ import numpy as np
 from bench.row import Row
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.sim.illuminant import CALIBRATED_KELVIN, LightCourse
+from common.sim.illuminant import CALIBRATED_KELVIN, LightSchedule
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from slave.markers.detector import Detections, MarkerDetector
-from slave.markers.following import FollowingDetector
-from slave.markers.light import apart
+from slave.markers.light_adaptive import LightAdaptiveDetector
+from slave.markers.white_balance import apart
 from slave.markers.workers import Inline
 
 CALIBRATION = Path(__file__).resolve().parents[1] / "calib_json"
@@ -34,13 +34,13 @@ FREE_PX = 3.0
 BEGIN_S = (0.0, 4.0, 15.0, 41.0)  # an open hand, fists, a hand that shows few markers
 OPEN_S = 20.0  # an open hand: all six markers in view
 
-STILL = LightCourse(((0.0, CALIBRATED_KELVIN, 1.0),))
-RAMP = LightCourse(((2.0, 3000.0, 1.0), (12.0, 6500.0, 1.0)))
-STEPS = LightCourse(
+STILL = LightSchedule(((0.0, CALIBRATED_KELVIN, 1.0),))
+RAMP = LightSchedule(((2.0, 3000.0, 1.0), (12.0, 6500.0, 1.0)))
+STEPS = LightSchedule(
     tuple((2.0 * i + j * 1.99, k, 1.0) for i, k in enumerate(range(3000, 6501, 500)) for j in (0, 1))
 )
-EXPOSURES = LightCourse(((1.0, 4300.0, 1.0), (4.0, 4300.0, 0.7), (10.0, 4300.0, 1.3), (13.0, 4300.0, 1.0)))
-SWITCHED = LightCourse(
+EXPOSURES = LightSchedule(((1.0, 4300.0, 1.0), (4.0, 4300.0, 0.7), (10.0, 4300.0, 1.3), (13.0, 4300.0, 1.0)))
+SWITCHED = LightSchedule(
     (
         (4.0, 3000.0, 1.3),
         (4.0, 6500.0, 0.7),
@@ -50,7 +50,7 @@ SWITCHED = LightCourse(
         (11.0, 5000.0, 1.3),
     )
 )
-CANDLE = LightCourse(((1.0, 4300.0, 1.0), (9.0, 2000.0, 1.0)))
+CANDLE = LightSchedule(((1.0, 4300.0, 1.0), (9.0, 2000.0, 1.0)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,12 +58,12 @@ class Outcome:
     """What became of the markers under one course of the light.
 
     Attributes:
-        visible: Sightings to be had: markers at least half visible, over all frames.
+        visible: ImageObservations to be had: markers at least half visible, over all frames.
         found: How many were found.
         swaps: Reports of a marker on the place of another one.
         wrong: All reports that are on no visible part of their marker, swaps included.
         swaps_unwarned: Swaps before the first warning.
-        missed_unwarned: Sightings missed before the first warning.
+        missed_unwarned: ImageObservations missed before the first warning.
         apart: Largest error of the estimated light in log gains of red or blue against green, after the first second.
         refused: Frames in which nothing was reported.
     """
@@ -117,14 +117,14 @@ def rows() -> list[Row]:
             "of those half visible; the others are a few px^2",
         ),
     ]
-    courses = {
+    schedules = {
         "3000 -> 6500 K in 10 s": RAMP,
         "3000 -> 6500 K, steps of 500 K": STEPS,
         "exposure 0.7 -> 1.3": EXPOSURES,
         "lamps switched": SWITCHED,
     }
-    for name, course in courses.items():
-        got, plain = total(course), total(course, follow=False, seeds=SEEDS[:1])
+    for name, schedule in schedules.items():
+        got, plain = total(schedule), total(schedule, follow=False, seeds=SEEDS[:1])
         swapped = f"of {got.visible}, goal 0; colours fixed: {plain.swaps} of {plain.visible}"
         share = f"goal 99; colours fixed: {100.0 * plain.share:.0f}"
         out += [
@@ -140,7 +140,7 @@ def rows() -> list[Row]:
 def _starts() -> Row:
     """Programs that start under a light other than that of calibration."""
     lights = [
-        LightCourse(((0.0, kelvin, exposure),)) for kelvin in (3000.0, 6500.0) for exposure in (0.7, 1.3)
+        LightSchedule(((0.0, kelvin, exposure),)) for kelvin in (3000.0, 6500.0) for exposure in (0.7, 1.3)
     ]
     runs = [
         outcome(light, seed, camera, seconds=1.5, begin_s=begin_s)
@@ -157,15 +157,15 @@ def _starts() -> Row:
 def _candle() -> Row:
     """A light that leaves the bounds: what is lost, and whether it was foreseen."""
     still, got = total(STILL), total(CANDLE)
-    lost, usual = got.visible - got.found, still.visible - still.found
-    note = f"goal 0; lost in all {lost}, in calibrated light {usual}"
+    lost, typical = got.visible - got.found, still.visible - still.found
+    note = f"goal 0; lost in all {lost}, in calibrated light {typical}"
     return Row("4300 -> 2000 K: swapped before a warning", got.swaps_unwarned, "count", note)
 
 
-def total(course: LightCourse, *, follow: bool = True, seeds: Sequence[int] = SEEDS) -> Outcome:
+def total(schedule: LightSchedule, *, follow: bool = True, seeds: Sequence[int] = SEEDS) -> Outcome:
     """Outcome over seeds and both cameras."""
     return sum_of(
-        [outcome(course, seed, camera, follow=follow) for seed in seeds for camera in load_rig().cameras]
+        [outcome(schedule, seed, camera, follow=follow) for seed in seeds for camera in load_rig().cameras]
     )
 
 
@@ -178,7 +178,7 @@ def sum_of(outcomes: Sequence[Outcome]) -> Outcome:
 
 
 def outcome(
-    course: LightCourse,
+    schedule: LightSchedule,
     seed: int,
     camera: str,
     *,
@@ -187,10 +187,10 @@ def outcome(
     begin_s: float = 0.0,
 ) -> Outcome:
     """Judge one camera on one course; deterministic."""
-    scene = replace(standard_scene(seed), light=course)
+    scene = replace(standard_scene(seed), light=schedule)
     renderer, model = Renderer(scene, camera), scene.cameras[camera]
-    following = FollowingDetector(model, scene.rig.markers, Inline()) if follow else None
-    detector: Detector = MarkerDetector(model, scene.rig.markers) if following is None else following
+    adaptive = LightAdaptiveDetector(model, scene.rig.markers, Inline()) if follow else None
+    detector: Detector = MarkerDetector(model, scene.rig.markers) if adaptive is None else adaptive
     got, warned = Outcome(0, 0, 0, 0, 0, 0, 0.0, 0), False
     for k in range(round(seconds * RATE_HZ)):
         t_s = begin_s + k / RATE_HZ
@@ -200,14 +200,14 @@ def outcome(
         allowed = np.maximum(FREE_PX, np.sqrt(truth.area / np.pi))
         swaps, wrong = _misplaced(found.uv, truth.uv, allowed)
         light = 0.0
-        if following is not None:
-            warned = warned or bool(following.warnings)
+        if adaptive is not None:
+            warned = warned or bool(adaptive.warnings)
             if k >= RATE_HZ:
-                light = apart(following.log_gains, np.log(course.gains_bgr(t_s)), dim=0.0)
+                light = apart(adaptive.log_gains, np.log(schedule.gains_bgr(t_s)), dim=0.0)
         missed = int((visible & ~seen).sum())
         unwarned = (0, 0) if warned else (swaps, missed)
         got += Outcome(int(visible.sum()), int((visible & seen).sum()), swaps, wrong, *unwarned, light, 0)
-    return replace(got, refused=0 if following is None else following.refused)
+    return replace(got, refused=0 if adaptive is None else adaptive.refused)
 
 
 def _misplaced(uv: Float, truth: Float, allowed: Float) -> tuple[int, int]:
@@ -229,10 +229,10 @@ def _times() -> list[Row]:
     camera = scene.cameras[scene.rig.cameras[0]]
     image = Renderer(scene, camera.name).render(OPEN_S)
     plain = MarkerDetector(camera, scene.rig.markers)
-    following = FollowingDetector(camera, scene.rig.markers, Inline())
+    adaptive = LightAdaptiveDetector(camera, scene.rig.markers, Inline())
     samples = np.empty((300, 2))
     for k in range(len(samples)):
-        for i, detector in enumerate((plain, following)):
+        for i, detector in enumerate((plain, adaptive)):
             start_ns = perf_counter_ns()
             detector.push(image, k * 16_666_667)
             samples[k, i] = (perf_counter_ns() - start_ns) * 1e-3

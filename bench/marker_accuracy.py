@@ -19,7 +19,7 @@ GOALS: Final = {"base": 0.07, "finger_end": 0.10, "blur6": 0.12}
 HIDDEN_GOAL: Final = 0.20
 SEQUENCES: Final = {"base": 30, "finger_end": 30, "blur3": 20, "blur6": 20, "occluded15": 20, "320x240": 20}
 LARGE: Final = 2  # sequences of the large sizes
-USUAL_SEQUENCES: Final = 8
+TYPICAL_SEQUENCES: Final = 8
 FLOOR_SEQUENCES: Final = 6
 
 
@@ -74,7 +74,7 @@ def rows_of(name: str, m: Measurements) -> list[tuple[str, float, str, str]]:
 
 
 def _count(name: str) -> int:
-    return SEQUENCES.get(name, LARGE if KINDS[name].scale > 1.0 else USUAL_SEQUENCES)
+    return SEQUENCES.get(name, LARGE if KINDS[name].scale > 1.0 else TYPICAL_SEQUENCES)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

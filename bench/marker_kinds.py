@@ -5,7 +5,7 @@ from typing import Final
 
 import msgspec
 
-from bench.marker_paints import camera_file, paints
+from bench.marker_colours import camera_file, marker_rgb
 from common.calibration import CameraCalibration
 
 
@@ -52,7 +52,7 @@ class Kind:
     @property
     def names(self) -> tuple[str, ...]:
         """The markers, in the order of every array."""
-        return tuple(paints(self.count))
+        return tuple(marker_rgb(self.count))
 
     @property
     def scale(self) -> float:

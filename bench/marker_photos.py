@@ -18,7 +18,7 @@ from bench.marker_kinds import KINDS, Kind
 from bench.marker_scene import make_scene
 from common.arrays import Float, Image
 from common.sim.light import to_linear
-from common.srgb import relit_bytes
+from common.srgb import gain_tables
 
 WIDTH: Final = 640  # px, to which a photograph is scaled
 DATASETS: Final = Path(os.environ.get("PHALANX_DATASETS", "../shared/datasets"))
@@ -103,7 +103,7 @@ def painted(photo: Photo, rng: np.random.Generator) -> Painted:
 def as_by_another_camera(image: Image, rng: np.random.Generator) -> Image:
     """The picture under another exposure and white balance, with some haze, now and then as JPEG."""
     gains = np.exp(rng.normal(0.0, (0.08, 0.02, 0.08)) + rng.normal(0.0, 0.15))
-    image = np.asarray(cv2.LUT(image, relit_bytes(gains).T[None]), np.uint8)
+    image = np.asarray(cv2.LUT(image, gain_tables(gains).T[None]), np.uint8)
     haze = rng.uniform(0.0, 0.15)
     image = np.asarray(cv2.addWeighted(image, 1.0 - haze, np.full_like(image, 160), haze, 0.0), np.uint8)
     if rng.random() < 0.5:

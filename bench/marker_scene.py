@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 
 from bench.cap_image import Cap, Highlight, Light, Occluder, Rgb, Support, draw
+from bench.marker_colours import marker_rgb
 from bench.marker_kinds import Kind
-from bench.marker_paints import paints
 from common.arrays import Float
 from common.sim.light import CARD_LINEAR_RGB, DESK_LINEAR_RGB, SKIN_LINEAR_RGB
 
@@ -81,7 +81,7 @@ def make_scene(kind: Kind, rng: np.random.Generator) -> Scene:
     for hand in range(hands):
         box = (kind.size[0] * hand / hands, kind.size[0] * (hand + 1) / hands, kind.size[1])
         spots += _hand(rng, kind.count // hands, scale, LARGEST[kind.count], box, travel)
-    colours = list(paints(kind.count).values())
+    colours = list(marker_rgb(kind.count).values())
     make = _finger_cap if kind.finger else _patch_cap
     caps = tuple(make(rng, *spot, colour) for spot, colour in zip(spots, colours, strict=True))
     occluders = tuple(
@@ -121,7 +121,7 @@ def _hand(
     Neighbours are 6 to 8 radii apart, so that no cap lies on another's finger.
     """
     size = scale * rng.uniform(RADIUS[0], largest)
-    turn = rng.uniform(0.0, 2.0 * math.pi)
+    angle = rng.uniform(0.0, 2.0 * math.pi)
     spread = [(k - 2) * math.radians(30.0) for k in range(5)]
     polar = [(16.0, t) for t in spread] + [(4.5 if count == 6 else 2.5, 0.0)]
     if count == 12:
@@ -129,7 +129,7 @@ def _hand(
     places: list[tuple[float, float, float]] = []
     for away, t in polar:
         away *= size * rng.uniform(0.95, 1.05)
-        t += turn + math.radians(rng.uniform(-3.0, 3.0))
+        t += angle + math.radians(rng.uniform(-3.0, 3.0))
         places.append((away * math.cos(t), away * math.sin(t), t + math.pi))
     points = np.array(places)[:, :2]
     margin = 2.5 * size
@@ -143,7 +143,9 @@ def _hand(
     return [(u + du, v + dv, r, back) for (u, v, back), r in zip(places, radii.tolist(), strict=True)]
 
 
-def _finger_cap(rng: np.random.Generator, u: float, v: float, radius: float, back: float, paint: Rgb) -> Cap:
+def _finger_cap(
+    rng: np.random.Generator, u: float, v: float, radius: float, back: float, marker_colour: Rgb
+) -> Cap:
     """A glossy cap at the end of a finger that goes on in the direction `back`."""
     back += math.radians(rng.uniform(-8.0, 8.0))
     stretch = math.sqrt(rng.uniform(0.85, 1.3))
@@ -158,7 +160,7 @@ def _finger_cap(rng: np.random.Generator, u: float, v: float, radius: float, bac
         a=a,
         b=b,
         angle=back,
-        paint=paint,
+        marker_colour=marker_colour,
         bulge=rng.uniform(0.5, 0.98),
         support=Support(
             (behind * math.cos(back), behind * math.sin(back)), back, 3.5 * radius, half_width, skin, True
@@ -169,7 +171,9 @@ def _finger_cap(rng: np.random.Generator, u: float, v: float, radius: float, bac
     )
 
 
-def _patch_cap(rng: np.random.Generator, u: float, v: float, radius: float, back: float, paint: Rgb) -> Cap:
+def _patch_cap(
+    rng: np.random.Generator, u: float, v: float, radius: float, back: float, marker_colour: Rgb
+) -> Cap:
     """A matt cap on a patch of skin, on its edge, or (one in five) on the table."""
     stretch = math.sqrt(rng.uniform(0.7, 1.0))
     place = rng.choice(3, p=(0.4, 0.4, 0.2))
@@ -183,7 +187,7 @@ def _patch_cap(rng: np.random.Generator, u: float, v: float, radius: float, back
         a=radius / stretch,
         b=radius * stretch,
         angle=rng.uniform(0.0, math.pi),
-        paint=paint,
+        marker_colour=marker_colour,
         bulge=rng.uniform(0.3, 0.9),
         support=None
         if place == 2
@@ -218,7 +222,7 @@ def _table(rng: np.random.Generator, size: tuple[int, int]) -> Light:
 def _lay_object(table: Light, rng: np.random.Generator, caps: tuple[Cap, ...], scale: float) -> None:
     """A mug or a pen in the colour of one of the markers, where it touches neither cap nor finger."""
     height, width = int(table.shape[0]), int(table.shape[1])
-    colour = caps[rng.integers(len(caps))].paint
+    colour = caps[rng.integers(len(caps))].marker_colour
     pen = rng.random() < 0.5
     radius = scale * (rng.uniform(2.5, 5.0) if pen else rng.uniform(18.0, 45.0))
     half = scale * rng.uniform(40.0, 75.0) if pen else 0.0

@@ -58,7 +58,7 @@ def _generated() -> list[Row]:
             "ours": six.ours(6),
             "windows": six.ours(6, windows_only=True),
             "large windows": large.ours(6, windows_only=True),
-            "anew": six.anew(),
+            "anew": six.reinitialised(),
             "6 of 12": twelve.ours(6),
             "12": twelve.ours(12),
             "6 of 24": many.ours(6),
@@ -111,7 +111,7 @@ class Timed:
         detectors = [first.fresh(clicks(self.kind, scene[0])) for scene in self.scenes]
         return self._each(lambda scene, image, t_ns: detectors[scene].push(image, t_ns))
 
-    def anew(self) -> Step:
+    def reinitialised(self) -> Step:
         """Our detector when it knows nothing."""
         detector = MarkerDetector(self._camera, self.kind.names)
         return self._each(lambda scene, image, t_ns: detector.fresh().push(image, t_ns))

@@ -41,7 +41,7 @@ _ROOT = Path(__file__).resolve().parents[1]
 SECONDS = 10.0
 CASES = (("standard", 7), ("standard", 23), ("grasp", 7), ("grasp", 22), ("both-travel", 21))
 """Scene and seed. Seeds above 20 were not looked at while it was decided which joints frame and clock are fitted by."""
-_TURN = rotation_vector_to_matrix(np.array([0.9, -1.7, 0.4]))
+_ROTATION = rotation_vector_to_matrix(np.array([0.9, -1.7, 0.4]))
 _SHIFT_M = np.array([1.0, -2.0, 0.3])
 _LATE_S, _NOISE_M, _RATE_HZ = 11.5, 3e-4, 120.0
 _PEOPLE = 8
@@ -76,7 +76,7 @@ def _compared_rows(scene: str, seed: int) -> Iterator[Row]:
         t_s = np.asarray(1e-9 * t_ns, np.float64)
         plain = _table(Path(folder) / "plain.csv", t_s, exact)
         noise = np.random.default_rng(seed).normal(0.0, _NOISE_M, exact.shape)
-        far = _table(Path(folder) / "far.csv", t_s + _LATE_S, (exact + noise) @ _TURN.T + _SHIFT_M)
+        far = _table(Path(folder) / "far.csv", t_s + _LATE_S, (exact + noise) @ _ROTATION.T + _SHIFT_M)
         known, fitted = (
             cast(
                 dict[str, Any],
@@ -85,8 +85,8 @@ def _compared_rows(scene: str, seed: int) -> Iterator[Row]:
             for one, aligned in ((plain, True), (far, False))
         )
     how = fitted["alignment"]
-    left = np.array(how["T_rig_file"]) @ rigid(_TURN, _SHIFT_M)
-    turn_deg = float(np.degrees(np.linalg.norm(matrix_to_rotation_vector(left[:3, :3]))))
+    left = np.array(how["T_rig_file"]) @ rigid(_ROTATION, _SHIFT_M)
+    rotation_deg = float(np.degrees(np.linalg.norm(matrix_to_rotation_vector(left[:3, :3]))))
     at = f"{scene}, seed {seed}: "
     for key, name, unit in (
         ("joint_mm", "joints, frame and clock fitted", "mm"),
@@ -102,7 +102,7 @@ def _compared_rows(scene: str, seed: int) -> Iterator[Row]:
         f"stated ± {how['offset_sigma_ms']:.1f}; the poses' own delay",
     )
     yield Row(
-        at + "frame that is found, turned", turn_deg, "deg", f"stated ± {how['rotation_sigma_deg']:.2f}"
+        at + "frame that is found, turned", rotation_deg, "deg", f"stated ± {how['rotation_sigma_deg']:.2f}"
     )
 
 
@@ -119,11 +119,11 @@ def _flat_rows(path: Path) -> Iterator[Row]:
     to_palm = np.array([-1.0, 1.0, -1.0])
     data = read_npz(path, ("hands", "flat"), "static poses of WebXR hands")
     for joints, name in ((PALM_JOINTS, "with metacarpals"), (PALM_JOINTS[:6], "without")):
-        turns = [
+        rotations = [
             palm_axes(np.vstack([np.zeros(3), flat[:, :3, 3] * to_palm])[list(joints)], list(joints), side)
             for side, flat in zip(("left", "right"), np.asarray(data["flat"], np.float64), strict=True)
         ]
-        off = [float(np.degrees(np.linalg.norm(matrix_to_rotation_vector(R)))) for R in turns]
+        off = [float(np.degrees(np.linalg.norm(matrix_to_rotation_vector(R)))) for R in rotations]
         yield Row(
             f"WebXR hands: palm frame, {name}",
             max(off),

@@ -23,22 +23,22 @@ PERIOD_S = 1.0 / 60.0
 class Noise:
     """Standard deviations per axis [px]: what stays of a feature in a camera, and what is new in each frame."""
 
-    stays_px: float = 0.1
-    fresh_px: float = 0.08
+    correlated_px: float = 0.1
+    independent_px: float = 0.08
 
     @property
     def sigma_px(self) -> float:
         """Both."""
-        return float(np.hypot(self.stays_px, self.fresh_px))
+        return float(np.hypot(self.correlated_px, self.independent_px))
 
 
-def wander(seed: int, centre_m: Float, speed_m_s: float, turn_rad_s: float) -> Where:
+def wander(seed: int, centre_m: Float, speed_m_s: float, rotation_rad_s: float) -> Where:
     """A smooth way about a place (3,) [m], whose greatest speeds are about these; any turn to begin with."""
     rng = np.random.default_rng([seed, 5])
     first = rotation_vector_to_matrix(rng.normal(0.0, 0.5, 3))
     pace = 2.0 * np.pi * rng.uniform(0.35, 0.8, (2, 3))
     phase = rng.uniform(0.0, 2.0 * np.pi, (2, 3))
-    size = np.array([[speed_m_s], [turn_rad_s]]) / np.sqrt(2.0) / pace
+    size = np.array([[speed_m_s], [rotation_rad_s]]) / np.sqrt(2.0) / pace
     size = size * np.array([[1.0, 1.0, 0.6], [1.0, 1.0, 1.0]])
 
     def where(t_s: float) -> Float:
@@ -63,12 +63,12 @@ def detections(
     """Messages of all cameras in the order of their frames, each camera `offset_s` after the one before it."""
     rng = np.random.default_rng([seed, 7])
     features = Features.of(profile, markers)
-    stays = {name: rng.normal(0.0, noise.stays_px, (len(features.points), 2)) for name in models}
+    stays = {name: rng.normal(0.0, noise.correlated_px, (len(features.points), 2)) for name in models}
     for seq in range(int(seconds / PERIOD_S)):
         for c, (name, model) in enumerate(models.items()):
             t_s = seq * PERIOD_S + c * offset_s
             uv, shown = _seen(features, model, where, t_s)
-            uv = uv + stays[name] + rng.normal(0.0, noise.fresh_px, uv.shape)
+            uv = uv + stays[name] + rng.normal(0.0, noise.independent_px, uv.shape)
             hidden = [k for k in range(features.count) if hides(name, k, t_s)]
             shown[hidden] = False
             yield from _messages(features, markers, name, seq, t_s, uv, shown, noise.sigma_px, model, where)
@@ -117,7 +117,7 @@ def _messages(
         area=np.where(seen, area, np.nan),
         quality=np.where(seen, 1.0, 0.0),
         sigma_px=np.where(seen, sigma_px, np.nan),
-        rival_uv=np.full((m, 2), np.nan),
+        alt_uv=np.full((m, 2), np.nan),
     )
     if not features.tag_ids:
         return

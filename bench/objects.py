@@ -24,7 +24,7 @@ from common.sim.scene import Scene
 from common.sim.scenes import scene_by_name
 from master.objects.features import Features
 from master.objects.line import ObjectLine
-from slave.markers.following import detector_for
+from slave.markers.light_adaptive import detector_for
 from slave.markers.workers import Inline
 from slave.tags.finder import TagFinder
 
@@ -62,7 +62,7 @@ def _rows_of(title: str, found: list[Outcome]) -> Iterable[Row]:
         np.concatenate([getattr(one, key) for one in found]) for key in ("mm", "deg", "sigmas_2")
     )
     frames = sum(one.frames for one in found)
-    for what, values, unit, goal in (("place", mm, "mm", 3), ("turn", deg, "deg", 2)):
+    for what, values, unit, goal in (("place", mm, "mm", 3), ("rotation", deg, "deg", 2)):
         if len(values):  # a stretch in which it is never tracked has no error
             most, middle = np.percentile(values, [95, 50])
             note = f"median {middle:.2f}; goal {goal}"
@@ -92,14 +92,14 @@ def stretch(name: str, seed: int, start_s: float, seconds: float) -> Outcome:
     models = {c: CameraModel.of(file, rig.camera_pose(c)) for c, file in cameras.items()}
     hand = load(CALIBRATION / f"hands/{rig.hand}.json", HandProfile)
     scene = scene_by_name("object", rig, cameras, hand, seed, {name: profile})
-    messages, seen = _watched(scene, profile, start_s, seconds)
+    messages, seen = _monitored(scene, profile, start_s, seconds)
     line = ObjectLine(profile, rig, models)
     poses = [solved.pose for message in messages for solved in line.push(message)]
     poses += [solved.pose for solved in line.flush()]
     return _judged(poses, scene, Features.of(profile, rig.markers), models, seen, name)
 
 
-def _watched(
+def _monitored(
     scene: Scene, profile: ObjectProfile, start_s: float, seconds: float
 ) -> tuple[list[MarkerDetections | TagDetections], Seen]:
     """What the slaves of all cameras would send, in order, and what there was to be seen."""
@@ -143,10 +143,10 @@ def _judged(
             flags[least < _HIDDEN][1] += 1
         if not pose.tracked:
             continue
-        turn = matrix_to_rotation_vector(T[:3, :3] @ quaternion_to_matrix(pose.orientation_wxyz).T)
-        off = np.concatenate([T[:3, 3] - pose.position_m, turn])
+        rotation = matrix_to_rotation_vector(T[:3, :3] @ quaternion_to_matrix(pose.orientation_wxyz).T)
+        off = np.concatenate([T[:3, 3] - pose.position_m, rotation])
         mm.append(1e3 * float(np.linalg.norm(off[:3])))
-        deg.append(float(np.degrees(np.linalg.norm(turn))))
+        deg.append(float(np.degrees(np.linalg.norm(rotation))))
         sigmas.append(float(off @ np.linalg.solve(pose.cov, off)) / 6.0)
     hidden, clear = flags[True], flags[False]
     return Outcome(

@@ -130,14 +130,14 @@ class Replayed:
 
     Attributes:
         t_s: (T,) times of the samples.
-        turn: Of the palm, rig frame, over time.
+        rotation: Of the palm, rig frame, over time.
         origin_m: (T, 3) of the palm, rig frame.
         fingers_m: (T, 20, 3) recorded joints, palm frame.
         angles_rad: (T, 20) of the hand model, nearest to these.
     """
 
     t_s: Float
-    turn: Slerp
+    rotation: Slerp
     origin_m: Float
     fingers_m: Float
     angles_rad: Float
@@ -155,7 +155,7 @@ class Replayed:
 
     def palm(self, t_s: float) -> Float:
         """The pose (4, 4) of the palm, rig frame."""
-        return rigid(np.asarray(self.turn(t_s).as_matrix()), _between(self.t_s, self.origin_m, t_s))
+        return rigid(np.asarray(self.rotation(t_s).as_matrix()), _between(self.t_s, self.origin_m, t_s))
 
     def joints(self, t_s: float) -> Float:
         """The recorded joints (20, 3) [m], rig frame."""
@@ -168,11 +168,11 @@ class Replayed:
         """Turned and moved so that in the mean its back is before the cameras, fingers up."""
         palms = recorded.T_rig_palm
         mean = np.asarray(Rotation.from_matrix(palms[:, :3, :3]).mean().as_matrix())
-        turn = FACING @ mean.T
+        rotation = FACING @ mean.T
         middle = palms[:, :3, 3].mean(axis=0)
-        origin_m = (palms[:, :3, 3] - middle) @ turn.T + centre_m + _UP
+        origin_m = (palms[:, :3, 3] - middle) @ rotation.T + centre_m + _UP
         t_s = np.asarray(1e-9 * recorded.t_ns, np.float64)
-        slerp = Slerp(t_s, Rotation.from_matrix(turn @ palms[:, :3, :3]))
+        slerp = Slerp(t_s, Rotation.from_matrix(rotation @ palms[:, :3, :3]))
         angles = _nearest_angles(model, recorded.fingers_m)
         return cls(t_s, slerp, origin_m, recorded.fingers_m.reshape(-1, 20, 3), angles)
 

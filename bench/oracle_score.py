@@ -105,7 +105,7 @@ class Samples:
     spent_us: Float = field(default_factory=_nothing)
     misfit: Float = field(default_factory=lambda: np.zeros(len(LAGS_NS)))
     wanted: int = 0
-    instants: int = 0
+    epochs: int = 0
     without: int = 0
     ghosts: int = 0
 
@@ -128,7 +128,7 @@ class Samples:
             ),
             misfit=self.misfit + other.misfit,
             wanted=self.wanted + other.wanted,
-            instants=self.instants + other.instants,
+            epochs=self.epochs + other.epochs,
             without=self.without + other.without,
             ghosts=self.ghosts + other.ghosts,
         )
@@ -170,7 +170,7 @@ def _piece(run: Solved, truth: Truth, other_ns: Int) -> Samples:
         spent_us=run.spent_us,
         misfit=_misfit(run, truth, scored & run.tracked),  # others are off by more than they lag
         wanted=int(known.sum()) + missed * int(known.any(axis=0).sum()),
-        instants=int(exists.sum()) + missed,
+        epochs=int(exists.sum()) + missed,
         without=int((exists & ~scored.any(axis=1)).sum()) + missed,
         ghosts=int((~exists & run.valid.any(axis=1)).sum()),
     )

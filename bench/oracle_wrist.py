@@ -27,7 +27,7 @@ from common.frame_recording import open_recording
 from common.hand_model import FINGERS
 from common.messages import WristDetections
 from common.npz import read_npz
-from master.recorded import recorded_triples
+from master.recorded import recorded_cycles
 from master.wrist_score import load_wrist_truth
 
 RECORDED = ("curl", "mcp", "spread", "left_small")
@@ -58,9 +58,9 @@ def recorded(data: Path) -> Iterator[Piece]:
 def meshes(data: Path) -> Iterator[Piece]:
     """Mesh hands, rendered now, with a seed that nothing is tuned by."""
     with tempfile.TemporaryDirectory() as name:
-        for kind, triples in MESHES.items():
+        for kind, cycles in MESHES.items():
             folder = Path(name) / kind
-            write_set(set_named(kind, data, triples, _MESH_SEED), data, folder, _MESH_SEED)
+            write_set(set_named(kind, data, cycles, _MESH_SEED), data, folder, _MESH_SEED)
             yield _detected(folder, data / "hands")
 
 
@@ -76,7 +76,7 @@ def _detected(folder: Path, hands: Path) -> Piece:
     with tempfile.TemporaryDirectory() as name:
         target = Path(name) / f"detections_{camera}.npz"
         slave("detect", folder, "--camera", camera, "--hand", hand, "-o", target)
-        messages = list(recorded_triples(Path(name), camera))
+        messages = list(recorded_cycles(Path(name), camera))
     found = load_wrist_truth(recording, camera)
     if found is None:
         raise RecordingError(f"{folder}: nothing says what is true of it")
@@ -107,6 +107,6 @@ def _thinned(messages: list[Observed]) -> list[Observed]:
 def _truth_of(shown: Shown) -> Truth:
     scene = shown.both.scene
     truth = truth_of(scene, shown.seconds)
-    cameras = shown.sight.cameras_of(1e-9 * (truth.t_ns - truth.t_ns[0]), _ABOUT_S)
+    cameras = shown.line_of_sight.cameras_of(1e-9 * (truth.t_ns - truth.t_ns[0]), _ABOUT_S)
     markers = [scene.rig.markers.index(name) for name in FINGERS]
     return replace(truth, hidden=np.asarray(cameras[:, markers] < 2, np.bool_))

@@ -124,10 +124,10 @@ def _oriented(scene: Scene, imu: ImuCalibration, seed: int, first_s: float, last
     off = world_rig.T @ palm @ palm_imu @ quaternion_to_matrix(settled.orientation_wxyz).T
     heading = np.arctan2(off[1, 0] - off[0, 1], off[0, 0] + off[1, 1])
     wrong = imu.heading_sigma_rad * np.random.default_rng([seed, 3]).normal()
-    turn = axis_rotation(2, float(heading + wrong))
+    rotation = axis_rotation(2, float(heading + wrong))
     return [
         msgspec.structs.replace(
-            one, orientation_wxyz=matrix_to_quaternion(turn @ quaternion_to_matrix(one.orientation_wxyz))
+            one, orientation_wxyz=matrix_to_quaternion(rotation @ quaternion_to_matrix(one.orientation_wxyz))
         )
         for one in samples
         if np.isfinite(one.orientation_wxyz).all()
@@ -155,8 +155,8 @@ def errors_of(run: _Run, imu: ImuCalibration | None, seed: int) -> _Errors:
             if not pose.valid.any():
                 continue
             found = quaternion_to_matrix(pose.orientation_wxyz[WRIST])
-            turn = matrix_to_quaternion(found.T @ truth.joints.rotation[WRIST])
-            palm.append(float(np.degrees(2.0 * np.arccos(min(turn[0], 1.0)))))
+            rotation = matrix_to_quaternion(found.T @ truth.joints.rotation[WRIST])
+            palm.append(float(np.degrees(2.0 * np.arccos(min(rotation[0], 1.0)))))
             off = (pose.position_m - truth.joints.position_m)[WRIST:]
             joint.append(1e3 * float(np.linalg.norm(off, axis=1).mean()))
             surprise = np.vecdot(off, np.linalg.solve(pose.cov_m2[WRIST:], off[..., None])[..., 0])

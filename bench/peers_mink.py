@@ -56,10 +56,10 @@ def _finger(model: HandModel, f: int) -> str:
     rest, still = model.rest_rotation[root], np.eye(3)
     before, after = (rest, still) if f == 0 else (still, rest)  # the thumb abducts about its own axis
     places = (model.rest_position_m[root], np.zeros(3), *model.bone_m[f, :2])
-    turns = (before, after, *model.turn[f, :2])
+    rotations = (before, after, *model.link_rotation[f, :2])
     axes = ((0.0, model.side_sign, 0.0), *[(-1.0, 0.0, 0.0)] * 3)
     mount = model.mount(MARKERS[f])
-    inner = _site(MARKERS[f], model.bone_m[f, 2] + model.turn[f, 2] @ mount.offset_m)
+    inner = _site(MARKERS[f], model.bone_m[f, 2] + model.link_rotation[f, 2] @ mount.offset_m)
     for k in (3, 2, 1, 0):
         low, high = model.limits_rad[f, k].tolist()
         joint = ""
@@ -68,7 +68,7 @@ def _finger(model: HandModel, f: int) -> str:
                 f'<joint name="{name}_{_ANGLES[k]}" axis="{_numbers(np.array(axes[k]))}" limited="true"'
                 f' range="{low!r} {high!r}"/>'
             )
-        quaternion = _numbers(matrix_to_quaternion(turns[k]))
+        quaternion = _numbers(matrix_to_quaternion(rotations[k]))
         inner = f'<body pos="{_numbers(places[k])}" quat="{quaternion}">{joint}{_MASS}{inner}</body>'
     return inner
 
@@ -148,8 +148,8 @@ class MinkHand:
         for _ in range(_STEPS):
             for task, name, point in zip(self._points, self._names, points_m, strict=False):
                 # The target turns with the site: only its place is asked for.
-                turn = self._hand.get_transform_frame_to_world(name, "site").rotation()
-                task.set_target(self._mink.SE3.from_rotation_and_translation(turn, point))
+                R_target = self._hand.get_transform_frame_to_world(name, "site").rotation()
+                task.set_target(self._mink.SE3.from_rotation_and_translation(R_target, point))
             step = self._mink.solve_ik(
                 self._hand,
                 self._tasks,

@@ -16,7 +16,7 @@ from master.rig_pipeline import build_pipeline
 from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from slave.markers.detector import Detections
-from slave.markers.following import detector_for
+from slave.markers.light_adaptive import detector_for
 from slave.markers.workers import Inline
 
 START_NS = 1_000_000_000  # scene time 0 on the clock of the messages
@@ -65,7 +65,7 @@ def watch(scene: Scene, camera: str, times_s: Float) -> Watched:
 
 def message_of(camera: str, seq: int, t_ns: int, found: Detections) -> MarkerDetections:
     """What a slave would send of frame `seq`, taken at `t_ns` [ns] and handed over at once."""
-    seen = (found.uv, found.area, found.quality, found.sigma_px, found.rival_uv)
+    seen = (found.uv, found.area, found.quality, found.sigma_px, found.alt_uv)
     return MarkerDetections(camera, 1, seq, t_ns, t_ns, *seen)
 
 

@@ -32,12 +32,12 @@ from bench.row import Row
 from bench.scale_rig import ROOM, in_order, room, told
 from common.messages import ImuSample, encode
 from master.app import told_at
+from master.dispatcher import Dispatcher
 from master.link import MasterLink
 from master.rig import load_setups
 from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from master.tuning import LivePipeline
-from master.world import World
 from slave.link import SlaveLink
 
 RIGS = {
@@ -71,9 +71,9 @@ import numba
 spent_s = process_time() - began_s
 from pathlib import Path
 from master.rig import load_setup
-from master.world import fresh_world
+from master.dispatcher import new_dispatcher
 setup, began_s = load_setup(Path("calib_json"), "desk"), process_time()
-fresh_world([setup])
+new_dispatcher([setup])
 print(spent_s + process_time() - began_s)
 """
 
@@ -105,7 +105,7 @@ class Played:
         self._master = MasterLink(cameras, _KEY, self._clock, _BROADCAST, "", 0, source, imus, wrists)
         self._slaves = {name: SlaveLink(name, _KEY, self._clock, source) for name in self.senders}
         self._address = {name: (f"10.0.1.{k}", 5) for k, name in enumerate(self._slaves)}
-        self._world = World(setups, [LivePipeline(setup, stages) for setup in setups], stages)
+        self._world = Dispatcher(setups, [LivePipeline(setup, stages) for setup in setups], stages)
         while not all(slave.started for slave in self._slaves.values()):
             if self._clock.t_ns > _BEGIN_NS + _START_NS:
                 raise RuntimeError("the master's start did not come within two simulated seconds")
@@ -146,7 +146,7 @@ class Played:
         for datagram, to in self._master.due():
             for name, slave in self._slaves.items():
                 if to == _BROADCAST:
-                    slave.hear_beacon(datagram, _MASTER, t_ns)
+                    slave.receive_beacon(datagram, _MASTER, t_ns)
                 elif to == self._address[name]:
                     slave.receive(datagram, _MASTER, t_ns)
         for name, slave in self._slaves.items():

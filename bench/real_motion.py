@@ -264,10 +264,10 @@ def jitter(hands: list[FittedHand]) -> tuple[float, float, float]:
     places = np.array([hand.joints.position_m for hand in hands])
     angles = np.array([hand.angles_rad for hand in hands])
     frames = np.array([hand.joints.rotation for hand in hands])
-    turns = matrix_to_rotation_vector(frames @ np.swapaxes(frames[:1], -1, -2))
-    variances = (places.var(axis=0).sum(axis=1), angles.var(axis=0), turns.var(axis=0).sum(axis=1))
-    place, angle, turn = (float(np.sqrt(variance.mean())) for variance in variances)
-    return 1e3 * place, float(np.degrees(angle)), float(np.degrees(turn))
+    rotations = matrix_to_rotation_vector(frames @ np.swapaxes(frames[:1], -1, -2))
+    variances = (places.var(axis=0).sum(axis=1), angles.var(axis=0), rotations.var(axis=0).sum(axis=1))
+    place, angle, rotation = (float(np.sqrt(variance.mean())) for variance in variances)
+    return 1e3 * place, float(np.degrees(angle)), float(np.degrees(rotation))
 
 
 def _held_rows(seeds: int = 5, frames: int = 300, settled: int = 60) -> Iterator[Row]:

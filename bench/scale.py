@@ -134,7 +134,8 @@ _HEAD = (
 def _row(run: ScaleRun, stages: dict[str, float]) -> str:
     alone = f"{cost_per_camera(run, stages):12.3f}" if stages else " " * 12
     return (
-        f"  {run.cameras:7d} {run.cores:6.2f} {run.cores / run.cameras:9.3f}  {alone} {run.poses_hz:8.1f} {run.shed:5d}"
+        f"  {run.cameras:7d} {run.cores:6.2f} {run.cores / run.cameras:9.3f}  {alone} {run.poses_hz:8.1f}"
+        f" {run.dropped_epochs:5d}"
         f" {run.sent:6d} {run.lost:7d} {run.dropped:8d} {run.skipped:8d} {run.latency_p50_ms:8.1f}"
         f" {run.latency_p99_ms:8.1f} {run.threads['ingest']:7.2f} {run.load:5.1f}"
     )

@@ -54,13 +54,13 @@ def hop_ms(folder: Path) -> tuple[float, float]:
         stack.callback(near.close)
         far = _reader(ends[2], keys, SITE)
         stack.callback(far.close)
-        heard = [bus.subscribe("gesture", depth=4 * _MESSAGES) for bus in (near, far)]
-        _until_heard(master, heard)
-        ages = [_ages(master, source) for source in heard]
+        received = [bus.subscribe("gesture", depth=4 * _MESSAGES) for bus in (near, far)]
+        _until_received(master, received)
+        ages = [_ages(master, source) for source in received]
     # The rare long ones at the master are of another moment of the machine: they are no part of what hops add.
-    usual = float(np.median(ages[0]))
+    typical = float(np.median(ages[0]))
     p50, p99 = (float(value) for value in np.percentile(ages[1], [50, 99]))
-    return (p50 - usual) / HOPS, (p99 - usual) / HOPS
+    return (p50 - typical) / HOPS, (p99 - typical) / HOPS
 
 
 def _reader(endpoint: str, keys: Path, site: str | None) -> ZenohBus:
@@ -74,9 +74,9 @@ def _reader(endpoint: str, keys: Path, site: str | None) -> ZenohBus:
             time.sleep(0.2)
 
 
-def _until_heard(master: ZenohBus, heard: list[Subscription]) -> None:
+def _until_received(master: ZenohBus, received: list[Subscription]) -> None:
     deadline = time.monotonic() + _READY_S
-    for source in heard:
+    for source in received:
         while source.get(0.05) is None:
             if time.monotonic() > deadline:
                 raise BusError("nothing comes through the routers")

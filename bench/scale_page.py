@@ -50,7 +50,8 @@ def _row(run: Mapping[str, float]) -> str:
     gone = run["lost"] + run["dropped"] + run["blocked"]
     return (
         f"| {run['layout']}, {run['rate_hz']:g} Hz | {run['cameras']} | {run['cores']:.2f} |"
-        f" {run['cores'] / run['cameras']:.3f} | {run['without_hand']:.3f} | {run['poses_hz']:.1f} | {run['shed']} |"
+        f" {run['cores'] / run['cameras']:.3f} | {run['without_hand']:.3f} | {run['poses_hz']:.1f}"
+        f" | {run['dropped_epochs']} |"
         f" {run['sent']} | {gone} | {run['latency_p50_ms']:.1f} | {run['latency_p99_ms']:.1f} | {run['load']:.0f} |"
     )
 

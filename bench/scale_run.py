@@ -63,7 +63,7 @@ class ScaleRun:
     refused: int
     blocked: int
     skipped: int
-    shed: int
+    dropped_epochs: int
     poses_hz: float
     latency_p50_ms: float
     latency_p99_ms: float
@@ -153,7 +153,7 @@ def measure(folder: Path, layout: str, cameras: int, rate_hz: float, seconds: fl
         refused=came["refused"],
         blocked=came["blocked"],
         skipped=came["skipped"],
-        shed=came["shed"],
+        dropped_epochs=came["shed"],
         poses_hz=median(len(one.latency_ms) for one in running) / took,
         latency_p50_ms=float(np.median([one[0] for one in latencies])) if latencies else nan,
         latency_p99_ms=float(np.median([one[1] for one in latencies])) if latencies else nan,

@@ -5,10 +5,10 @@ import time
 from pathlib import Path
 
 from bench.scale_rig import ROOM, in_order, room, told
+from master.dispatcher import Dispatcher
 from master.rig import load_setups
 from master.stages import StageTimes
 from master.tuning import LivePipeline
-from master.world import World
 
 _POSES, _WARM = 200, 20
 
@@ -19,15 +19,15 @@ def solve_us(cameras: int, rate_hz: float) -> dict[str, float]:
         setups = load_setups(room(Path(name), cameras, rate_hz), [ROOM])
     messages = in_order(told(setups[0], rate_hz))
     stages = StageTimes(time.thread_time_ns)
-    world = World(setups, [LivePipeline(setup, stages) for setup in setups], stages)
+    dispatcher = Dispatcher(setups, [LivePipeline(setup, stages) for setup in setups], stages)
     warm, last = _WARM * cameras, (_WARM + _POSES) * cameras
     for message in messages[:warm]:
-        list(world.push(message))
-    before, poses = stages.total_us(), world.counts["poses"]
+        list(dispatcher.push(message))
+    before, poses = stages.total_us(), dispatcher.counts["poses"]
     begun_ns = time.thread_time_ns()
     for message in messages[warm:last]:
-        list(world.push(message))
+        list(dispatcher.push(message))
     spent_us = (time.thread_time_ns() - begun_ns) * 1e-3
-    count = world.counts["poses"] - poses
+    count = dispatcher.counts["poses"] - poses
     by_stage = {name: (total - before.get(name, 0.0)) / count for name, total in stages.total_us().items()}
     return by_stage | {"all": spent_us / count}

@@ -15,10 +15,10 @@ from dataclasses import asdict
 from pathlib import Path
 
 from bench.local_rig import join_bus
+from bench.soak_monitor import Minute, SoakHistory, Watch
 from bench.soak_plot import draw
 from bench.soak_rig import SoakSettings, running
 from bench.soak_verdict import Finding, judge
-from bench.soak_watch import Course, Minute, Watch
 from common.replacing import replacing
 from master.stopping import stop_on_signals
 
@@ -36,14 +36,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run it; 0 where all is well, 1 where something grows or was lost."""
     settings = _settings(arguments)
     stop = stop_on_signals()
-    course, ended = _run(settings, stop)
-    findings = judge(course, ended)
-    length_min = course.times_s[-1] / 60.0 if course.times_s else 0.0
+    history, ended = _run(settings, stop)
+    findings = judge(history, ended)
+    length_min = history.times_s[-1] / 60.0 if history.times_s else 0.0
     title = (
         f"{length_min:.0f} minutes, marker cameras {settings.marker_hz:g} Hz, wrist {settings.wrist_hz:g} Hz"
     )
-    _save(settings, course, findings)
-    draw(course, title, settings.out / "soak.png")
+    _save(settings, history, findings)
+    draw(history, title, settings.out / "soak.png")
     print(f"\n{title}")
     for one in findings:
         mark = {True: "ok", False: "NOT OK", None: "too short"}[one.ok]
@@ -77,7 +77,7 @@ def _settings(arguments: Sequence[str] | None) -> SoakSettings:
     return SoakSettings(given.minutes, given.out, given.marker_hz, given.wrist_hz, given.every_s, given.nice)
 
 
-def _run(settings: SoakSettings, stop: threading.Event) -> tuple[Course, list[str]]:
+def _run(settings: SoakSettings, stop: threading.Event) -> tuple[SoakHistory, list[str]]:
     """Run for the time asked for, or until `stop`; what was watched, and who ended by himself."""
     with running(settings) as rig:
         names = ", ".join(f"{one.name} (pid {one.pid})" for one in rig.processes)
@@ -88,24 +88,24 @@ def _run(settings: SoakSettings, stop: threading.Event) -> tuple[Course, list[st
             next_read_s, next_minute_s = 0.0, _MINUTE_S
             while not stop.wait(_LISTEN_S) and watch.now_s < _MINUTE_S * settings.minutes:
                 if gone := [one.name for one in rig.processes if one.ended() is not None]:
-                    return watch.course, gone
+                    return watch.history, gone
                 watch.listen()
                 if watch.now_s >= next_read_s:
                     watch.read()
                     next_read_s += settings.every_s
                 if watch.now_s >= next_minute_s:
-                    _tell(watch.end_minute(), watch.course)
-                    _save(settings, watch.course)
+                    _tell(watch.end_minute(), watch.history)
+                    _save(settings, watch.history)
                     next_minute_s += _MINUTE_S
             watch.end_minute()
-            return watch.course, []
+            return watch.history, []
         finally:
             bus.close()
 
 
-def _tell(minute: Minute, course: Course) -> None:
+def _tell(minute: Minute, history: SoakHistory) -> None:
     """A line for each minute."""
-    memory = " ".join(f"{name} {course.series(name, 'rss_mb')[-1]:.1f}" for name in course.footprints)
+    memory = " ".join(f"{name} {history.series(name, 'rss_mb')[-1]:.1f}" for name in history.footprints)
     counts = (
         ", ".join(f"{name} {number}" for name, number in minute.counts.items() if number) or "nothing lost"
     )
@@ -116,7 +116,7 @@ def _tell(minute: Minute, course: Course) -> None:
     )
 
 
-def _save(settings: SoakSettings, course: Course, findings: Sequence[Finding] = ()) -> None:
+def _save(settings: SoakSettings, history: SoakHistory, findings: Sequence[Finding] = ()) -> None:
     """All figures so far; whoever kills the soak still has them."""
     known = {
         "machine": platform.machine(),
@@ -127,7 +127,7 @@ def _save(settings: SoakSettings, course: Course, findings: Sequence[Finding] = 
         "verdict": [asdict(one) for one in findings],
     }
     with replacing(settings.out / "soak.json") as file:
-        file.write(json.dumps(known | course.plain()).encode())
+        file.write(json.dumps(known | history.plain()).encode())
 
 
 if __name__ == "__main__":

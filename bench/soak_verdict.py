@@ -12,8 +12,8 @@ from math import nan, sqrt
 
 import numpy as np
 
+from bench.soak_monitor import Minute, SoakHistory
 from bench.soak_steps import STEP_MB, Step, steps_of
-from bench.soak_watch import Course, Minute
 from common.arrays import Float
 
 MB_PER_H = 1.0
@@ -73,9 +73,9 @@ def warm_up_s(length_s: float) -> float:
     return min(WARM_UP_S, WARM_UP_SHARE * length_s)
 
 
-def memory_slope(course: Course, process: str, quantity: str = "rss_mb") -> Slope:
+def memory_slope(history: SoakHistory, process: str, quantity: str = "rss_mb") -> Slope:
     """Of a process, by medians of minutes, after the warm-up [MB/h]."""
-    times, values = np.array(course.times_s), np.array(course.series(process, quantity))
+    times, values = np.array(history.times_s), np.array(history.series(process, quantity))
     if not len(times) or times[-1] - warm_up_s(times[-1]) < LEAST_S:
         return Slope(nan, nan, nan)
     block = (times // BLOCK_S).astype(np.int64)
@@ -99,11 +99,11 @@ def latency_slope(minutes: Sequence[Minute], quantity: str) -> Slope:
     return slope([one.t_s for one in least], [getattr(one, quantity) for one in least])
 
 
-def judge(course: Course, ended: Sequence[str]) -> list[Finding]:
+def judge(history: SoakHistory, ended: Sequence[str]) -> list[Finding]:
     """The verdict; `ended` are processes that ended by themselves."""
     findings = [Finding("processes that ended", ", ".join(ended) or "none", "none", not ended)]
-    for process in course.footprints:
-        found = memory_slope(course, process)
+    for process in history.footprints:
+        found = memory_slope(history, process)
         findings.append(
             Finding(
                 f"memory of {process}",
@@ -114,9 +114,9 @@ def judge(course: Course, ended: Sequence[str]) -> list[Finding]:
                 None if np.isnan(found.per_h) else found.per_h <= MB_PER_H,
             )
         )
-    findings += [_steps(course, process) for process in course.footprints]
-    findings += [_latency(course.minutes, name) for name in ("p50", "p99")]
-    counts = course.minutes[-1].counts if course.minutes else {}
+    findings += [_steps(history, process) for process in history.footprints]
+    findings += [_latency(history.minutes, name) for name in ("p50", "p99")]
+    counts = history.minutes[-1].counts if history.minutes else {}
     for what in ("lost", "dropped", "refused", "blocked"):
         findings.append(
             Finding(what, str(counts.get(what, 0)), "0", counts.get(what, 0) == 0 if counts else None)
@@ -124,18 +124,18 @@ def judge(course: Course, ended: Sequence[str]) -> list[Finding]:
     return findings
 
 
-def _steps(course: Course, process: str) -> Finding:
-    found, what = steps_of(course.times_s, course.series(process, "rss_mb")), f"steps of {process}"
+def _steps(history: SoakHistory, process: str) -> Finding:
+    found, what = steps_of(history.times_s, history.series(process, "rss_mb")), f"steps of {process}"
     limit = f"none of {STEP_MB:g} MB"
     if found is None:
         return Finding(what, "too short to say", limit, None)
-    told = "; ".join(_told(course, process, step) for step in found)
+    told = "; ".join(_told(history, process, step) for step in found)
     return Finding(what, told or "none", limit, not found)
 
 
-def _told(course: Course, process: str, step: Step) -> str:
+def _told(history: SoakHistory, process: str, step: Step) -> str:
     """By how much, when, and where: what grew in that minute or the one before, for a median is late."""
-    near = [one for one in course.minutes if step.minute - 1 <= one.t_s // BLOCK_S - 1 <= step.minute]
+    near = [one for one in history.minutes if step.minute - 1 <= one.t_s // BLOCK_S - 1 <= step.minute]
     where = [f"{name} +{mb:.1f}" for one in near for name, mb in one.grown.get(process, {}).items()]
     places = ", ".join(where) or "mapping not known"
     return f"+{step.mb:.1f} MB in minute {step.minute} ({places})"
@@ -146,7 +146,7 @@ def _latency(minutes: Sequence[Minute], name: str) -> Finding:
     if np.isnan(found.per_h):
         return Finding(f"latency {name}", "too short to say", "does not grow", None)
     hours = minutes[-1].t_s / 3600.0
-    usual = float(np.nanmedian([getattr(one, f"{name}_ms") for one in minutes]))
-    grew = found.low > 0.0 and found.per_h * hours > max(GROWS_MS, GROWS_SHARE * usual)
-    value = f"{usual:.1f} ms, {found.per_h:+.2f} ms/h ({found.low:+.2f} ... {found.high:+.2f})"
+    typical = float(np.nanmedian([getattr(one, f"{name}_ms") for one in minutes]))
+    grew = found.low > 0.0 and found.per_h * hours > max(GROWS_MS, GROWS_SHARE * typical)
+    value = f"{typical:.1f} ms, {found.per_h:+.2f} ms/h ({found.low:+.2f} ... {found.high:+.2f})"
     return Finding(f"latency {name}", value, "does not grow", not grew)

@@ -7,7 +7,7 @@ import numpy as np
 from common.arrays import Float
 from common.camera_model import CameraModel
 from common.hand_model import HandModel
-from master.estimator.epoch import Epoch, Fitted, Turn
+from master.estimator.epoch import Epoch, Fitted, OrientationMeasurement
 from master.estimator.estimator import Estimator
 from master.estimator.settings import DEFAULT, Settings
 
@@ -40,7 +40,7 @@ class PointHand:
         Raises:
             CalibrationError: The profile mounts no marker of one of the names.
         """
-        settings = settings if faces else settings._replace(facing_rad=inf)
+        settings = settings if faces else settings._replace(back_normal_rad=inf)
         self.estimator = Estimator(
             [NO_RAY],
             model,
@@ -56,20 +56,20 @@ class PointHand:
         t_ns: int,
         points_m: Float,
         cov_m2: Float,
-        facing: Float = TOWARDS,
-        turn: tuple[Float, Float] | None = None,
+        back_normal: Float = TOWARDS,
+        orientation: tuple[Float, Float] | None = None,
     ) -> Fitted:
         """Fit one epoch.
 
         Args:
             t_ns: When.
             points_m, cov_m2: (M, 3) [m] and (M, 3, 3) [m^2] of the markers, rig frame; NaN: not seen.
-            facing: (3,) unit vector from the hand to the cameras.
-            turn: The palm's rotation (3, 3) by a sensor and its covariance (3, 3) [rad^2], rig axes; None: not known.
+            back_normal: (3,) unit vector from the hand to the cameras.
+            orientation: The measured rotation (3, 3) and its covariance (3, 3) [rad^2], rig axes; None: not known.
         """
         told = None
-        if turn is not None:
-            rotation, cov_rad2 = turn
+        if orientation is not None:
+            rotation, cov_rad2 = orientation
             sure = bool(np.linalg.eigvalsh(cov_rad2)[-1] < _SURE_RAD**2)
-            told = Turn(rotation, np.asarray(np.linalg.inv(cov_rad2), np.float64), sure)
-        return self.estimator.push(Epoch(t_ns, points_m, facing, cov_m2=cov_m2, turn=told))
+            told = OrientationMeasurement(rotation, np.asarray(np.linalg.inv(cov_rad2), np.float64), sure)
+        return self.estimator.push(Epoch(t_ns, points_m, back_normal, cov_m2=cov_m2, orientation=told))

@@ -33,7 +33,7 @@ TRACED: Final = 2_000  # frames under tracemalloc, after as many to warm up
 SAMPLES: Final = 100  # frames between two looks at the resident set
 TRACKED: Final = "tracked"
 PAUSE_NS: Final = 2_000_000_000  # longer than any track is held
-BESIDE: Final = 3.2  # radii between a marker and the second spot of its colour
+SPOT_DISTANCE: Final = 3.2  # radii between a marker and the second spot of its colour
 KIND: Final = Kind("steadiness")
 
 
@@ -116,7 +116,7 @@ def shots() -> list[Shot]:
     tracked = [shot(TRACKED, moved) for moved in wobble]
     one_lost = shot("one marker lost", caps[1:])
     cluttered = shot("clutter", caps, messy)
-    ambiguous = shot("ambiguous", (*caps, *(cap.moved(BESIDE * cap.a, 0.0) for cap in caps)))
+    ambiguous = shot("ambiguous", (*caps, *(cap.moved(SPOT_DISTANCE * cap.a, 0.0) for cap in caps)))
     empty = shot("nothing in view", ())
     again = replace(tracked[0], sort="all sought anew", after_ns=PAUSE_NS)
     messy_again = replace(cluttered, sort="all sought anew in clutter", after_ns=PAUSE_NS)

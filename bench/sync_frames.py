@@ -51,7 +51,7 @@ def _scene(rate_hz: float) -> tuple[RigSetup, Scene]:
 
 
 @cache
-def _watched(rate_hz: float, offset_s: float) -> tuple[Watched, ...]:
+def _monitored(rate_hz: float, offset_s: float) -> tuple[Watched, ...]:
     setup, scene = _scene(rate_hz)
     times = np.arange(round(SECONDS * rate_hz)) / rate_hz
     return tuple(watch(scene, name, times + c * offset_s) for c, name in enumerate(setup.rig.cameras))
@@ -60,9 +60,9 @@ def _watched(rate_hz: float, offset_s: float) -> tuple[Watched, ...]:
 def rendered(rate_hz: float, offset_s: float, treatment: Treatment) -> Float:
     """Errors of depth [%] of all caps at all instants, before the filter."""
     setup, scene = _scene(rate_hz)
-    watched = _watched(rate_hz, offset_s)
+    watched = _monitored(rate_hz, offset_s)
     if treatment == "predict":
-        setup = replace(setup, rig=msgspec.structs.replace(setup.rig, pairing="predict"))
+        setup = replace(setup, rig=msgspec.structs.replace(setup.rig, frame_sync="predict"))
     if treatment == "uncorrected":
         watched = tuple(_by_number(one, rate_hz) for one in watched)
         models: dict[str, CameraModel] = {n: replace(m, row_time_ns=0.0) for n, m in setup.models.items()}

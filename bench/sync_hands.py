@@ -1,6 +1,6 @@
 """How fast real hands change their motion: speed, acceleration and jerk of recorded finger tips and palms.
 
-Where the constants of `master.fabrik.carry` come from. The recordings are those of the data folder (`leapjs/*.npz`);
+Where the constants of `master.fabrik.propagate` come from. Recordings: `leapjs/*.npz` of the data folder;
 their samples jitter, so derivatives are those of polynomials of fourth degree over 0.1 s (speed, acceleration) and
 0.14 s (jerk): slower than tremor, faster than a grasp.
 """

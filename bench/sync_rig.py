@@ -147,9 +147,9 @@ def outcome(motion: Making, shooting: Shooting, treatment: Treatment, seeds: ran
     for seed in seeds:
         rng = np.random.default_rng(seed)
         moving = motion(rng)
-        for instant, wait_s in _instants(cameras, moving, shooting, treatment, rng):
-            found = triangulate(arrays, instant.uv, instant.sigma_px)
-            truth = moving(np.full(MARKERS, (instant.t_ns - START_NS) * 1e-9))
+        for epoch, wait_s in _epochs(cameras, moving, shooting, treatment, rng):
+            found = triangulate(arrays, epoch.uv, epoch.sigma_px)
+            truth = moving(np.full(MARKERS, (epoch.t_ns - START_NS) * 1e-9))
             ok = np.isfinite(found.points_m[:, 0])
             error = (found.points_m - truth)[ok]
             depth.append(100.0 * error[:, 2] / truth[ok, 2])
@@ -159,7 +159,7 @@ def outcome(motion: Making, shooting: Shooting, treatment: Treatment, seeds: ran
     return Outcome(np.concatenate(depth), np.concatenate(across), np.concatenate(chi2), np.array(waited))
 
 
-def _instants(
+def _epochs(
     cameras: dict[str, CameraModel],
     motion: Motion,
     shooting: Shooting,
@@ -193,10 +193,10 @@ def _instants(
     for message in sorted((m for stream in streams for m in stream), key=lambda m: m.t_ns):
         model = known[message.camera]
         centre_ns = message.t_ns + 0.5 * (model.height_px - 1) * model.row_time_ns
-        for instant in sync.push(message):
+        for epoch in sync.push(message):
             count += 1
-            if count > _TRACK and not instant.missing.any():
-                yield instant, max(centre_ns - instant.t_ns, 0.0) * 1e-9
+            if count > _TRACK and not epoch.missing.any():
+                yield epoch, max(centre_ns - epoch.t_ns, 0.0) * 1e-9
 
 
 def _stream(

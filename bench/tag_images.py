@@ -87,9 +87,9 @@ def _pose(rng: np.random.Generator, camera: CameraModel, look: Look) -> tuple[Fl
     pose = np.eye(4)
     pose[:3, :3] = np.stack([x, np.cross(normal, x), normal], axis=1)
     pose[:3, 3] = look.distance_m * ray
-    turn = rng.uniform(0.0, 2.0 * np.pi)
+    angle = rng.uniform(0.0, 2.0 * np.pi)
     way_m = look.motion_px * look.distance_m / camera.matrix[0, 0]
-    return pose, way_m * np.array([np.cos(turn), np.sin(turn), 0.0])
+    return pose, way_m * np.array([np.cos(angle), np.sin(angle), 0.0])
 
 
 def _seen(camera: CameraModel, pose: Float, edge_m: float, shift: float) -> Float:

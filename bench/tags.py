@@ -152,8 +152,10 @@ def clutter(rng: np.random.Generator) -> Image:
         patch = np.pad(rng.integers(0, 2, (cells, cells), np.uint8), int(rng.random() < 0.7))
         patch = np.pad(patch, 1, constant_values=1)
         angle, at = rng.uniform(0.0, np.pi), rng.uniform([0, 0], shape)
-        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) * side / len(patch)
-        warp = np.column_stack([turn, at])
+        rotation = (
+            np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) * side / len(patch)
+        )
+        warp = np.column_stack([rotation, at])
         over = cv2.warpAffine(255 * patch, warp, shape, flags=cv2.INTER_NEAREST)
         mask = cv2.warpAffine(np.ones_like(patch), warp, shape, flags=cv2.INTER_NEAREST)
         image[mask > 0] = np.asarray(over)[mask > 0][:, None]

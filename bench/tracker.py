@@ -30,7 +30,7 @@ CALIBRATION = Path(__file__).resolve().parents[1] / "calib_json"
 RIGS = {"cube of tags": "desk-cube", "wand of beads": "desk-wand"}
 SEEDS = (31, 32, 33, 34)  # 1 and 2 served to tune it
 SECONDS, TRACKER_HZ = 12.0, 100.0
-WAY_M, TURN_RAD = 0.11, np.radians(40.0)
+WAY_M, ROTATION_RAD = 0.11, np.radians(40.0)
 LOST_S, LOST_EVERY_S = 0.5, 5.0
 HIDDEN_S, HIDDEN_EVERY_S = 0.7, 6.1
 
@@ -102,8 +102,8 @@ def moved(seed: int, centre_m: Float, axes: tuple[float, float, float]) -> Where
 
     def where(t_s: float) -> Float:
         way = np.sin(rate * t_s + phase)
-        turned = first @ rotation_vector_to_matrix(TURN_RAD * way[0] * np.array(axes))
-        return rigid(turned, centre_m + WAY_M * way[1])
+        rotated = first @ rotation_vector_to_matrix(ROTATION_RAD * way[0] * np.array(axes))
+        return rigid(rotated, centre_m + WAY_M * way[1])
 
     return where
 
@@ -136,7 +136,7 @@ def told(where: Where, X: Float, Y: Float, late_s: float, seed: int) -> Iterator
         off = 0.9 * off + np.sqrt(1.0 - 0.9**2) * size * rng.normal(size=6)
         T = back @ where(t_s) @ Y
         error = off + white * rng.normal(size=6)
-        place, turn = T[:3, 3] + error[:3], rotation_vector_to_matrix(error[3:]) @ T[:3, :3]
+        place, rotation = T[:3, 3] + error[:3], rotation_vector_to_matrix(error[3:]) @ T[:3, :3]
         lost = t_s % LOST_EVERY_S < LOST_S
         nowhere = np.full(4, np.nan)
         yield TrackerPose(
@@ -145,7 +145,7 @@ def told(where: Where, X: Float, Y: Float, late_s: float, seed: int) -> Iterator
             k,
             round(1e9 * (t_s - late_s)),
             nowhere[:3] if lost else place,
-            nowhere if lost else matrix_to_quaternion(turn),
+            nowhere if lost else matrix_to_quaternion(rotation),
         )
 
 
@@ -156,22 +156,22 @@ def against_truth(
     rng = np.random.default_rng([seed, 14])
     axis = rng.normal(size=(200, 3))
     angle = rng.uniform(0.0, np.radians(50.0), (200, 1))
-    turned = facing(0.35) @ rotation_vector_to_matrix(angle * axis / np.linalg.norm(axis, axis=1)[:, None])
+    rotated = facing(0.35) @ rotation_vector_to_matrix(angle * axis / np.linalg.norm(axis, axis=1)[:, None])
     placed = found.fit.placed
-    place, turn = np.zeros((200, 3)), np.zeros((200, 3))
-    for k, R in enumerate(turned):
+    place, rotation = np.zeros((200, 3)), np.zeros((200, 3))
+    for k, R in enumerate(rotated):
         truth = rigid(R, centre_m + rng.uniform(-0.12, 0.12, 3))
         device = np.linalg.inv(X) @ truth @ Y
         pose = placed.T_rig_tracking @ device @ np.linalg.inv(placed.T_object_tracker)
         place[k] = pose[:3, 3] - truth[:3, 3]
-        turn[k] = matrix_to_rotation_vector(pose[:3, :3] @ truth[:3, :3].T)
+        rotation[k] = matrix_to_rotation_vector(pose[:3, :3] @ truth[:3, :3].T)
     figures = found.figures
     return Found(
         1e3 * float(np.sqrt((place**2).sum(axis=1).mean())),
-        float(np.degrees(np.sqrt((turn**2).sum(axis=1).mean()))),
+        float(np.degrees(np.sqrt((rotation**2).sum(axis=1).mean()))),
         figures["position_sigma_mm"],
-        figures["turn_sigma_deg"],
+        figures["rotation_sigma_deg"],
         1e3 * (placed.late_s - late_s),
         figures["position_mm"],
-        figures["turn_deg"],
+        figures["rotation_deg"],
     )

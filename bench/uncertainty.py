@@ -49,15 +49,15 @@ class _Stills:
             pose = list(POSES)[int(rng.integers(len(POSES)))]
             posture = share * np.array(POSES[pose], np.float64) + (1.0 - share) * np.array(REST, np.float64)
             at = centre + rng.uniform([-0.07, -0.04, -0.12], [0.07, 0.04, 0.2])
-            turn = np.radians(rng.normal(0.0, 15.0, 3))
-            self._held.append((at, turn, angles_of(model, posture, rng.uniform(-1.0, 1.0, (5, 4)))))
+            rotation = np.radians(rng.normal(0.0, 15.0, 3))
+            self._held.append((at, rotation, angles_of(model, posture, rng.uniform(-1.0, 1.0, (5, 4)))))
 
     def at(self, t_s: float) -> HandState:
         step, phase = divmod(max(t_s, 0.0), _HOLD_S + _MOVE_S)
         here, there = (self._held[(int(step) + k) % len(self._held)] for k in range(2))
         share = smooth_step((phase - _HOLD_S) / _MOVE_S)
-        at, turn, angles = ((1.0 - share) * a + share * b for a, b in zip(here, there, strict=True))
-        return HandState(base_pose(self._model, at, np.zeros(3), turn), angles)
+        at, rotation, angles = ((1.0 - share) * a + share * b for a, b in zip(here, there, strict=True))
+        return HandState(base_pose(self._model, at, np.zeros(3), rotation), angles)
 
 
 class _Sideways:
@@ -71,13 +71,13 @@ class _Sideways:
         posture = np.array(POSES[list(POSES)[seed % len(POSES)]], np.float64)
         self._model = model
         self._angles = angles_of(model, posture, rng.uniform(-1.0, 1.0, (5, 4)))
-        self._turn = np.radians(rng.normal(0.0, 10.0, 3))
+        self._rotation = np.radians(rng.normal(0.0, 10.0, 3))
         self._centre = centre + rng.uniform([0.0, -0.03, -0.05], [0.0, 0.03, 0.15])
 
     def at(self, t_s: float) -> HandState:
         turns = 2.0 * np.pi * self._RATE_HZ
         shift = np.array([np.sin(turns * max(t_s, 0.0)) / turns, 0.0, 0.0])
-        return HandState(base_pose(self._model, self._centre, shift, self._turn), self._angles)
+        return HandState(base_pose(self._model, self._centre, shift, self._rotation), self._angles)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -146,8 +146,8 @@ class _Run:
         until = time.monotonic() + READY_S
         while True:
             try:
-                gauges = self._bus.ask(Command(SENDER, "report"), 5.0).gauges
-                if all(gauges[f"open.{name}"] for name in OUTPUTS):
+                metrics = self._bus.ask(Command(SENDER, "report"), 5.0).metrics
+                if all(metrics[f"open.{name}"] for name in OUTPUTS):
                     return
             except BusError:  # it is not there yet
                 pass

@@ -37,11 +37,11 @@ from slave.wrist.engine import NUMPY, Engine, engine_named
 from slave.wrist.fingers import Fingers, separate
 from slave.wrist.fingertips import fingertips
 from slave.wrist.laser import laser_lines
-from slave.wrist.strobe import Strobe, Triple
+from slave.wrist.strobe import Strobe, StrobeCycle
 from slave.wrist.view import WristView
 
 ROOT = Path(__file__).resolve().parents[1]
-TRIPLES, REPEATS = 25, 60
+CYCLES, REPEATS = 25, 60
 T = TypeVar("T")
 BRIGHT = 24  # levels: the baseline's threshold
 
@@ -53,8 +53,8 @@ def rows() -> Iterator[Row]:
     name = "curl, recorded" if data.is_dir() else "curl, simulated"
     rig, camera, hand, frames = recorded(data) if data.is_dir() else simulated()
     view = WristView.of(rig, camera, hand)
-    triples = [triple for triple in map(Strobe(camera.frame_rate_hz).push, frames) if triple is not None]
-    steps = slave_steps(camera, view, frames, triples) | master_steps(rig, camera, view, triples)
+    cycles = [cycle for cycle in map(Strobe(camera.frame_rate_hz).push, frames) if cycle is not None]
+    steps = slave_steps(camera, view, frames, cycles) | master_steps(rig, camera, view, cycles)
     took = interleaved(steps, REPEATS)
     slave, whole = took["slave"], took["slave"] + took["master"]
     for stage in steps:
@@ -76,7 +76,7 @@ def recorded(folder: Path) -> tuple[RigCalibration, CameraCalibration, HandProfi
     size = (camera.height_px, camera.width_px)
     frames = [
         Frame(row.seq, row.t_ns, row.t_ns, read_png(folder / row.file, size, grey=True))
-        for row in recording.frames_of(camera.name)[: 3 * TRIPLES]
+        for row in recording.frames_of(camera.name)[: 3 * CYCLES]
     ]
     return rig, camera, load(folder.parents[1] / f"hands/{rig.hand}.json", HandProfile), frames
 
@@ -88,7 +88,7 @@ def simulated() -> tuple[RigCalibration, CameraCalibration, HandProfile, list[Fr
     camera = load(tree / "cameras/wrist.json", CameraCalibration)
     hand = load(tree / f"hands/{rig.hand}.json", HandProfile)
     renderer = WristRenderer(WristScene.by_name("curl", rig, {camera.name: camera}, hand), camera.name)
-    times_ns = [10**9 + round(k * 1e9 / camera.frame_rate_hz) for k in range(3 * TRIPLES)]
+    times_ns = [10**9 + round(k * 1e9 / camera.frame_rate_hz) for k in range(3 * CYCLES)]
     frames = [
         Frame(k, t_ns, t_ns, renderer.render(0.2 * (k // 3), STROBE[k % 3]))
         for k, t_ns in enumerate(times_ns)
@@ -97,28 +97,28 @@ def simulated() -> tuple[RigCalibration, CameraCalibration, HandProfile, list[Fr
 
 
 def slave_steps(
-    camera: CameraCalibration, view: WristView, frames: list[Frame], triples: list[Triple]
+    camera: CameraCalibration, view: WristView, frames: list[Frame], cycles: list[StrobeCycle]
 ) -> dict[str, Step]:
     """The baseline, the whole of the slave, and its stages."""
     lights = [
-        (lit(one.laser.image, one.ambient.image), lit(one.led.image, one.ambient.image)) for one in triples
+        (lit(one.laser.image, one.ambient.image), lit(one.led.image, one.ambient.image)) for one in cycles
     ]
     fingers = [separate(led, view) for _, led in lights]
-    found = [find(one, view) for one in triples]
+    found = [find(one, view) for one in cycles]
     with_fingers = list(zip(lights, fingers, strict=True))
     return {
-        "baseline": baseline(camera, triples),
+        "baseline": baseline(camera, cycles),
         "slave": _slave(camera, view, frames, NUMPY),
         "of it strobe": _strobe(camera, frames),
         "of it background": _each(
-            triples,
+            cycles,
             lambda one: (lit(one.laser.image, one.ambient.image), lit(one.led.image, one.ambient.image)),
         ),
         "of it fingers": _each(lights, lambda pair: separate(pair[1], view)),
         "of it laser": _each(with_fingers, lambda all_: laser_lines(all_[0][0], all_[1], view)),
         "of it fingertips": _each(
             list(zip(lights, found, strict=True)),
-            lambda all_: fingertips(all_[0][1], all_[1].triple.led.image, all_[1].laser.uv, view),
+            lambda all_: fingertips(all_[0][1], all_[1].cycle.led.image, all_[1].laser.uv, view),
         ),
         "of it message": _each(found, lambda one: encode(one.message(camera.name, 1))),
     } | _with_numba(camera, view, frames, lights, with_fingers)
@@ -145,11 +145,11 @@ def _with_numba(
 
 
 def master_steps(
-    rig: RigCalibration, camera: CameraCalibration, view: WristView, triples: list[Triple]
+    rig: RigCalibration, camera: CameraCalibration, view: WristView, cycles: list[StrobeCycle]
 ) -> dict[str, Step]:
     """The whole of the master's line on the messages of the same triples, one after another as if they were live."""
     pipeline = WristPipeline(WristSetup.of(rig, camera, view.model), continuous=True, stage=StageTimes())
-    found = [find(one, view) for one in triples]
+    found = [find(one, view) for one in cycles]
     period_ns = round(3e9 / camera.frame_rate_hz)
     sent = 0
 
@@ -161,7 +161,7 @@ def master_steps(
     return {"master": _each(found, step)}
 
 
-def baseline(camera: CameraCalibration, triples: list[Triple]) -> Step:
+def baseline(camera: CameraCalibration, cycles: list[StrobeCycle]) -> Step:
     """The usual line on the next triple."""
     optics = camera.intrinsics
     assert optics is not None
@@ -175,7 +175,7 @@ def baseline(camera: CameraCalibration, triples: list[Triple]) -> Step:
         cv2.CV_16SC2,
     )
 
-    def usual(one: Triple) -> Float:
+    def typical(one: StrobeCycle) -> Float:
         ambient = one.ambient.image
         laser, _led = (
             cv2.remap(cv2.subtract(frame.image, ambient), across, down, cv2.INTER_LINEAR)
@@ -185,7 +185,7 @@ def baseline(camera: CameraCalibration, triples: list[Triple]) -> Step:
         _count, _labels, sizes, centroids = cv2.connectedComponentsWithStats(bright)
         return np.asarray(centroids[np.argsort(sizes[:, cv2.CC_STAT_AREA])[-6:-1]], np.float64)
 
-    return _each(triples, usual)
+    return _each(cycles, typical)
 
 
 def _slave(camera: CameraCalibration, view: WristView, frames: list[Frame], engine: Engine) -> Step:
@@ -195,8 +195,8 @@ def _slave(camera: CameraCalibration, view: WristView, frames: list[Frame], engi
     def step() -> object:
         out = None
         for _ in range(3):
-            triple = strobe.push(next(endless))
-            out = out if triple is None else encode(find(triple, view, engine=engine).message(camera.name, 1))
+            cycle = strobe.push(next(endless))
+            out = out if cycle is None else encode(find(cycle, view, engine=engine).message(camera.name, 1))
         return out
 
     return step

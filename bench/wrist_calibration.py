@@ -1,7 +1,7 @@
 """What the calibration of a wrist device is worth: laser plane, flat field and palm against the truth they are of.
 
 Boards are rendered before the wrist camera by `common.sim.wrist_board`, each seed another laser and other places of the
-board. Wearers are those of `bench.wrist_wearers`, each seed another person.
+board. Wearers are those of `bench.wrist_subjects`, each seed another person.
 """
 
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from bench.row import Row
-from bench.wrist_wearers import Person
+from bench.wrist_subjects import Person
 from common.arrays import Float
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.camera_model import CameraModel
@@ -27,14 +27,14 @@ from common.hand_model import HandModel
 from common.sim.wrist_board import LED_LOBE, LENS_POWER, WristBoardRenderer, WristBoardScene, board_poses
 from common.wrist_calibration import LaserPlane
 from master.calibrate.cameras.boards import Checkerboard, board_corners
+from master.calibrate.wrist.board_pose import place_corners
 from master.calibrate.wrist.flat_command import white_of
 from master.calibrate.wrist.flat_field import fit_flat_field
 from master.calibrate.wrist.laser_command import LinesSeen, lines_of
 from master.calibrate.wrist.lit_views import LitView
-from master.calibrate.wrist.palm_board import Mounting, palm_from_board
-from master.calibrate.wrist.placed import place_corners
+from master.calibrate.wrist.palm_board import BoardOffset, palm_from_board
 from master.calibrate.wrist.plane import PlaneFit, ViewLine, fit_plane
-from master.calibrate.wrist.wearer import Wearer, calibrate_wearer
+from master.calibrate.wrist.subject import Subject, calibrate_subject
 from master.estimator.wrist_pipeline import WristPipeline
 from master.wrist_setup import WristSetup
 
@@ -45,7 +45,7 @@ VIEWS = (3, 4, 6, 10)
 FLAT_SEEDS, FLAT_VIEWS = range(200, 202), 40
 CURLED = 6  # people whose curl is solved, with three tables each
 BOARD = Checkerboard(9, 6, 0.015)
-PALM_BOARD, MOUNTING = Checkerboard(7, 4, 0.010), Mounting(0.085, 0.0, 0.022, 1.0)
+PALM_BOARD, OFFSET = Checkerboard(7, 4, 0.010), BoardOffset(0.085, 0.0, 0.022, 1.0)
 LENS_SIGMA_PX = (0.35, 0.5)  # focal length, centre: what a calibration from a dozen board views leaves
 KNUCKLES = np.array([0.0, 0.0, 0.08])
 
@@ -57,7 +57,7 @@ def rows() -> Iterator[Row]:
     yield from _planes(camera, rig)
     yield from _fields(camera, rig)
     yield from _palms(camera, rig)
-    yield from _wearers()
+    yield from _subjects()
 
 
 def _planes(camera: CameraCalibration, rig: RigCalibration) -> Iterator[Row]:
@@ -84,11 +84,11 @@ def _planes(camera: CameraCalibration, rig: RigCalibration) -> Iterator[Row]:
 
 
 def _errors(name: str, found: list[tuple[PlaneFit, LaserPlane]], note: str) -> Iterator[Row]:
-    turn = [_angle_deg(np.array(fit.plane.normal), np.array(true.normal)) for fit, true in found]
+    rotation = [_angle_deg(np.array(fit.plane.normal), np.array(true.normal)) for fit, true in found]
     shift = [1e3 * abs(fit.plane.offset_m - true.offset_m) for fit, true in found]
     sigma = [np.degrees(fit.normal_sigma_rad) for fit, _ in found]
-    told = f"largest {max(turn):.4f}, stated sigma {np.median(sigma):.4f}; goal 0.1; {note}"
-    yield Row(f"{name}: normal, median", float(np.median(turn)), "deg", told)
+    told = f"largest {max(rotation):.4f}, stated sigma {np.median(sigma):.4f}; goal 0.1; {note}"
+    yield Row(f"{name}: normal, median", float(np.median(rotation)), "deg", told)
     sigma_mm = np.median([1e3 * fit.offset_sigma_m for fit, _ in found])
     told = f"largest {max(shift):.4f}, stated sigma {sigma_mm:.4f}; goal 0.1"
     yield Row(f"{name}: offset, median", float(np.median(shift)), "mm", told)
@@ -122,44 +122,44 @@ def _fields(camera: CameraCalibration, rig: RigCalibration) -> Iterator[Row]:
 
 def _palms(camera: CameraCalibration, rig: RigCalibration) -> Iterator[Row]:
     optics, true = CameraModel.of(camera, np.eye(4)), np.array(rig.T_camera_palm)
-    uv = optics.project(transform(true @ MOUNTING.T_palm_board(PALM_BOARD), board_corners(PALM_BOARD)))
+    uv = optics.project(transform(true @ OFFSET.T_palm_board(PALM_BOARD), board_corners(PALM_BOARD)))
     by_board: list[tuple[float, float]] = []
     for seed in SEEDS:
         noise = 0.1 * np.random.default_rng(seed).standard_normal(uv.shape)
-        fit = palm_from_board([place_corners(uv + noise, PALM_BOARD, optics)], PALM_BOARD, MOUNTING)
+        fit = palm_from_board([place_corners(uv + noise, PALM_BOARD, optics)], PALM_BOARD, OFFSET)
         by_board.append(_palm_error(fit.T_camera_palm, true))
     yield from _palm_rows(
         "palm by a board, corners 0.1 px", by_board, "one view; the ruler's error comes on top"
     )
 
 
-def _wearers() -> Iterator[Row]:
+def _subjects() -> Iterator[Row]:
     """Mounting and knuckles before and after a guided motion, and the PIP of a natural curl with the files of each."""
-    turn: list[tuple[Float, Float]] = []
+    rotation: list[tuple[Float, Float]] = []
     knuckle: list[tuple[Float, Float]] = []
     unlikely: list[Float] = []
     refused = 0
-    people: list[tuple[Person, Wearer]] = []
+    people: list[tuple[Person, Subject]] = []
     for person in map(Person.of, SEEDS):
         try:
-            found = calibrate_wearer(person.detected("wearer")[0], person.rig, person.camera, person.hand)
+            found = calibrate_subject(person.detected("subject")[0], person.rig, person.camera, person.hand)
         except FitError:
             refused += 1
             continue
         before, after = person.errors(person.rig, person.hand), person.errors(found.rig, found.hand)
-        turn.append((before[0], after[0]))
+        rotation.append((before[0], after[0]))
         knuckle.append((before[1], after[1]))
         unlikely.append(1e-3 * after[1] / found.knuckle_sigma_m)
         people.append((person, found))
     note = f"{len(people)} people, {refused} refused; palm 3 deg, 2 mm, knuckles 5 mm off per axis"
     for k, axis in enumerate(("x, the pitch of the hand", "y", "z")):
-        was, now = (_rms(np.array([one[side][k] for one in turn])) for side in (0, 1))
-        yield Row(f"wearer: palm's turn about {axis}, rms", now, "deg", f"before {was:.2f}; {note}")
+        was, now = (_rms(np.array([one[side][k] for one in rotation])) for side in (0, 1))
+        yield Row(f"subject: palm's turn about {axis}, rms", now, "deg", f"before {was:.2f}; {note}")
     for k, axis in enumerate(("across", "away from the lens, down", "away from the lens, ahead")):
         was, now = (_rms(np.array([one[side][:, k] for one in knuckle])) for side in (0, 1))
-        yield Row(f"wearer: knuckles {axis}, rms", now, "mm", f"before {was:.2f}")
+        yield Row(f"subject: knuckles {axis}, rms", now, "mm", f"before {was:.2f}")
     yield Row(
-        "wearer: knuckles by stated sigma, rms",
+        "subject: knuckles by stated sigma, rms",
         _rms(np.array(unlikely)),
         "sigma",
         "1 is honest, less is careful",
@@ -168,13 +168,13 @@ def _wearers() -> Iterator[Row]:
     for k, name in enumerate(("files as they were", "calibrated", "true files")):
         value = _rms(np.concatenate([one[k] for one in errors]))
         yield Row(
-            f"wearer: PIP of a natural curl, {name}, rms", value, "deg", f"{len(errors)} people, to 90 deg"
+            f"subject: PIP of a natural curl, {name}, rms", value, "deg", f"{len(errors)} people, to 90 deg"
         )
 
 
-def _pip_errors(person: Person, found: Wearer) -> list[Float]:
+def _pip_errors(person: Person, found: Subject) -> list[Float]:
     """Errors [deg] with the old, the new and the true files."""
-    triples, true = person.detected("curl", np.linspace(0.3, 3.6, 24))
+    cycles, true = person.detected("curl", np.linspace(0.3, 3.6, 24))
     out: list[Float] = []
     for rig, hand in (
         (person.rig, person.hand),
@@ -182,7 +182,7 @@ def _pip_errors(person: Person, found: Wearer) -> list[Float]:
         (person.true_rig, person.true_hand),
     ):
         line = WristPipeline(WristSetup.of(rig, person.camera, HandModel.of(hand)), continuous=False)
-        angles = np.array([line.push(triple)[0].pose.angles_rad for triple in triples])
+        angles = np.array([line.push(cycle)[0].pose.angles_rad for cycle in cycles])
         error = np.degrees(angles[:, 1:, 2] - true[:, 1:, 2])
         out.append(error[np.isfinite(error)])
     return out
@@ -193,8 +193,10 @@ def _rms(values: Float) -> float:
 
 
 def _palm_rows(name: str, found: list[tuple[float, float]], note: str) -> Iterator[Row]:
-    turn, shift = np.array(found).T
-    yield Row(f"{name}: turn, median", float(np.median(turn)), "deg", f"largest {turn.max():.2f}; {note}")
+    rotation, shift = np.array(found).T
+    yield Row(
+        f"{name}: turn, median", float(np.median(rotation)), "deg", f"largest {rotation.max():.2f}; {note}"
+    )
     yield Row(f"{name}: knuckles, median", float(np.median(shift)), "mm", f"largest {shift.max():.2f}")
 
 
@@ -243,8 +245,8 @@ def _wrong_lens(camera: CameraCalibration, seed: int) -> CameraModel:
 
 def _palm_error(T: Float, true: Float) -> tuple[float, float]:
     """Turn [deg], and how far the knuckles are off [mm]."""
-    turn = float(np.degrees(np.linalg.norm(matrix_to_rotation_vector(T[:3, :3] @ true[:3, :3].T))))
-    return turn, float(1e3 * np.linalg.norm(transform(T, KNUCKLES) - transform(true, KNUCKLES)))
+    rotation = float(np.degrees(np.linalg.norm(matrix_to_rotation_vector(T[:3, :3] @ true[:3, :3].T))))
+    return rotation, float(1e3 * np.linalg.norm(transform(T, KNUCKLES) - transform(true, KNUCKLES)))
 
 
 def _angle_deg(a: Float, b: Float) -> float:

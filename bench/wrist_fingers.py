@@ -34,13 +34,13 @@ from slave.cameras.replay import read_png
 from slave.cameras.source import Frame
 from slave.cameras.synthetic import STROBE
 from slave.wrist.detector import find
-from slave.wrist.strobe import Triple
+from slave.wrist.strobe import StrobeCycle
 from slave.wrist.view import WristView
 
 POSES, SEEDS = 24, (301, 302, 303)
-MESHES, TRIPLES, MESH_SEED = ("random", "left_random"), 30, 303
+MESHES, CYCLES, MESH_SEED = ("random", "left_random"), 30, 303
 FALSE_DEG = 20.0
-_TRIPLE_NS = 33_333_333
+_CYCLE_NS = 33_333_333
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,9 +60,11 @@ class Found:
     tracked: Bool
 
     @classmethod
-    def of(cls, seen: Seen, level: Literal["fk", "ik", "auto"] = "auto", *, cubic: bool = False) -> Self:
+    def of(
+        cls, seen: Seen, solver_mode: Literal["fk", "ik", "auto"] = "auto", *, cubic: bool = False
+    ) -> Self:
         """Solve, each pose by itself."""
-        line = WristPipeline(replace(seen.setup, level=level, cubic=cubic), continuous=False)
+        line = WristPipeline(replace(seen.setup, solver_mode=solver_mode, cubic=cubic), continuous=False)
         poses = [one.pose for message in seen.messages for one in line.push(message)]
         off = np.array([pose.angles_rad for pose in poses]) - seen.truth_rad
         tracked = np.array([pose.tracked[CHAINS[:, 2]] for pose in poses])
@@ -102,7 +104,7 @@ def rows() -> Iterator[Row]:
         with tempfile.TemporaryDirectory() as folder:
             for name in MESHES:
                 there = Path(folder) / name
-                write_set(set_named(name, data, TRIPLES, MESH_SEED), data, there, MESH_SEED)
+                write_set(set_named(name, data, CYCLES, MESH_SEED), data, there, MESH_SEED)
                 yield Found.of(of_recording(there, data / "hands")).row(f"{name}, mesh: PIP")
     else:
         yield Row("recordings: skipped", 0.0, "", f"none at {data}: set PHALANX_DATASETS")
@@ -131,10 +133,10 @@ def of_recording(folder: Path, hands: Path) -> Seen:
         Frame(row.seq, row.t_ns, row.t_ns, read_png(folder / row.file, size, grey=True))
         for row in recording.frames_of(camera.name)
     ]
-    triples = [Triple(*frames[k : k + 3]) for k in range(0, len(frames) - 2, 3)]
+    cycles = [StrobeCycle(*frames[k : k + 3]) for k in range(0, len(frames) - 2, 3)]
     view = WristView.of(rig, camera, load(hands / f"{rig.hand}.json", HandProfile))
     angles = angles_of(read_npz(folder / "truth.npz")["angles"])
-    return Seen(WristSetup.of(rig, camera, view.model), _messages(triples, view, camera.name), angles)
+    return Seen(WristSetup.of(rig, camera, view.model), _messages(cycles, view, camera.name), angles)
 
 
 def simulated(light: str, seed: int) -> Seen:
@@ -145,18 +147,18 @@ def simulated(light: str, seed: int) -> Seen:
     scene = WristScene.by_name(f"poses@{light}", rig, {camera.name: camera}, hand, seed)
     renderer, view = WristRenderer(scene, camera.name), WristView.of(rig, camera, hand)
     times = (np.arange(POSES) + 0.5) * scene.period_s / POSES
-    triples = [
-        Triple(*(Frame(k, k, k, renderer.render(float(t), kind)) for k, kind in enumerate(STROBE)))
+    cycles = [
+        StrobeCycle(*(Frame(k, k, k, renderer.render(float(t), kind)) for k, kind in enumerate(STROBE)))
         for t in times
     ]
     angles = np.array([scene.truth(float(t)).angles_rad for t in times])
-    return Seen(WristSetup.of(rig, camera, view.model), _messages(triples, view, camera.name), angles)
+    return Seen(WristSetup.of(rig, camera, view.model), _messages(cycles, view, camera.name), angles)
 
 
-def _messages(triples: Sequence[Triple], view: WristView, camera: str) -> list[WristDetections]:
+def _messages(cycles: Sequence[StrobeCycle], view: WristView, camera: str) -> list[WristDetections]:
     """What the detector finds, with times one after another."""
-    found = [find(triple, view).message(camera, session=1) for triple in triples]
+    found = [find(cycle, view).message(camera, session=1) for cycle in cycles]
     return [
-        changed(one, seq=3 * k, t_ns=(k + 1) * _TRIPLE_NS, ready_t_ns=(k + 1) * _TRIPLE_NS)
+        changed(one, seq=3 * k, t_ns=(k + 1) * _CYCLE_NS, ready_t_ns=(k + 1) * _CYCLE_NS)
         for k, one in enumerate(found)
     ]

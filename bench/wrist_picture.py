@@ -22,7 +22,7 @@ from slave.cameras.synthetic import STROBE
 from slave.wrist.background import lit
 from slave.wrist.detector import find
 from slave.wrist.fingers import separate
-from slave.wrist.strobe import Triple
+from slave.wrist.strobe import StrobeCycle
 from slave.wrist.view import WristView
 
 TREE = Path(__file__).resolve().parents[1] / "calib_json"
@@ -44,10 +44,10 @@ def picture(t_s: float = T_S, scene: str = "curl") -> Image:
     frames = [
         Frame(k, 0, 0, renderer.render(t_s + k / camera.frame_rate_hz, kind)) for k, kind in enumerate(STROBE)
     ]
-    triple = Triple(*frames)
-    found = find(triple, view)
-    ambient = triple.ambient.image
-    laser, led = lit(triple.laser.image, ambient), lit(triple.led.image, ambient)
+    cycle = StrobeCycle(*frames)
+    found = find(cycle, view)
+    ambient = cycle.ambient.image
+    laser, led = lit(cycle.laser.image, ambient), lit(cycle.led.image, ambient)
     lines = _shown(laser, "laser - ambient: a point on each finger")
     _points(lines, found.laser.uv, cross=True)
     fingers = _shown(led, "LEDs - ambient: seams, and fingertips")

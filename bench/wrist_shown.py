@@ -15,12 +15,12 @@ from common.npz import read_npz
 from slave.cameras.replay import read_png
 from slave.cameras.source import Frame
 from slave.wrist.background import lit
-from slave.wrist.strobe import Triple
+from slave.wrist.strobe import StrobeCycle
 from slave.wrist.view import WristView
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORDINGS = ("curl", "mcp", "spread", "left_small")
-_TURN_RAD, _SHIFT_M = np.radians(3.0), 3e-3
+_ROTATION_RAD, _SHIFT_M = np.radians(3.0), 3e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,18 +58,16 @@ def recorded(data: Path, name: str) -> Recorded:
         Frame(row.seq, row.t_ns, row.t_ns, read_png(folder / row.file, size, grey=True))
         for row in recording.frames_of(camera.name)
     ]
-    triples = [Triple(*frames[k : k + 3]) for k in range(0, len(frames) - 2, 3)]
-    laser = [lit(triple.laser.image, triple.ambient.image) for triple in triples]
-    led = [lit(triple.led.image, triple.ambient.image) for triple in triples]
-    return Recorded(
-        view, laser, led, [triple.led.image for triple in triples], read_npz(folder / "truth.npz")
-    )
+    cycles = [StrobeCycle(*frames[k : k + 3]) for k in range(0, len(frames) - 2, 3)]
+    laser = [lit(cycle.laser.image, cycle.ambient.image) for cycle in cycles]
+    led = [lit(cycle.led.image, cycle.ambient.image) for cycle in cycles]
+    return Recorded(view, laser, led, [cycle.led.image for cycle in cycles], read_npz(folder / "truth.npz"))
 
 
 def other_palm(rig: RigCalibration, rng: np.random.Generator) -> RigCalibration:
     """The rig before a palm that lies a little differently."""
     palm = np.array(rig.T_camera_palm)
-    palm[:3, :3] = cv2.Rodrigues(rng.normal(0.0, _TURN_RAD, 3))[0] @ palm[:3, :3]
+    palm[:3, :3] = cv2.Rodrigues(rng.normal(0.0, _ROTATION_RAD, 3))[0] @ palm[:3, :3]
     palm[:3, 3] += rng.normal(0.0, _SHIFT_M, 3)
     rows = [tuple(row) for row in palm.tolist()]
     return replace(rig, T_camera_palm=(rows[0], rows[1], rows[2], (0.0, 0.0, 0.0, 1.0)))

@@ -24,7 +24,7 @@ _ROOT = Path(__file__).resolve().parents[1]
 _RECORDINGS = ("curl", "mcp", "spread", "left_small")
 RATE_HZ = 90.0
 FAULTS = 0.05  # each of dropped, doubled, swapped
-TRIPLES = 60  # rendered per light
+CYCLES = 60  # rendered per light
 SPREAD_S = 0.9  # between them: the scene of a minute in unrelated poses
 SEEDS = range(40)
 
@@ -32,7 +32,7 @@ SEEDS = range(40)
 class Shown(NamedTuple):
     """A frame with the truth: which triple it belongs to, and what lit it."""
 
-    triple: int
+    cycle: int
     lit: Illumination
     image: Image
 
@@ -52,7 +52,7 @@ class Score:
     frames: int = 0
     whole: int = 0
     kept: int = 0
-    wrong_kind: int = 0
+    wrong_illumination: int = 0
     mixed: int = 0
     margins: list[float] = field(default_factory=list[float])
 
@@ -85,14 +85,14 @@ def score(shown: Sequence[Shown], delivered: Sequence[Delivered], into: Score) -
         t_ns = round(one.place * 1e9 / RATE_HZ)
         frame = Frame(one.place, t_ns, t_ns, shown[one.index].image, ORDER[number % 2])
         of[t_ns] = shown[one.index]
-        triple = strobe.push(frame)
-        if triple is None:
+        cycle = strobe.push(frame)
+        if cycle is None:
             continue
         into.margins.append(strobe.margin)
-        parts = [of[part.t_ns] for part in (triple.ambient, triple.laser, triple.led)]
+        parts = [of[part.t_ns] for part in (cycle.ambient, cycle.laser, cycle.led)]
         right = [part.lit for part in parts] == list(ORDER)
-        one = len({part.triple for part in parts}) == 1
-        into.wrong_kind += not right
+        one = len({part.cycle for part in parts}) == 1
+        into.wrong_illumination += not right
         into.mixed += right and not one
         into.kept += right and one
     into.frames += len(delivered)
@@ -100,7 +100,7 @@ def score(shown: Sequence[Shown], delivered: Sequence[Delivered], into: Score) -
     return strobe
 
 
-def rendered(ambient: str, triples: int = TRIPLES, seed: int = 0) -> list[Shown]:
+def rendered(ambient: str, cycles: int = CYCLES, seed: int = 0) -> list[Shown]:
     """Unrelated poses of the standard wrist scene in one light; in each the hand goes on moving from frame to frame."""
     rig = load(_ROOT / "calib_json/rigs/wrist.json", RigCalibration)
     cameras = {
@@ -110,7 +110,7 @@ def rendered(ambient: str, triples: int = TRIPLES, seed: int = 0) -> list[Shown]
     renderer = WristRenderer(
         WristScene.by_name(f"standard@{ambient}", rig, cameras, hand, seed), rig.cameras[0]
     )
-    times = [(k, SPREAD_S * (k // 3) + (k % 3) / RATE_HZ) for k in range(3 * triples)]
+    times = [(k, SPREAD_S * (k // 3) + (k % 3) / RATE_HZ) for k in range(3 * cycles)]
     return [Shown(k // 3, ORDER[k % 3], renderer.render(t_s, ORDER[k % 3])) for k, t_s in times]
 
 
@@ -152,7 +152,7 @@ def _scored(name: str, streams: Sequence[Sequence[Shown]], *, hidden: bool) -> l
     mixed = "three hidden losses in a row leave no trace in the order" if hidden else "goal 0"
     return [
         Row(f"{name}: triples kept", 100.0 * found.kept / found.whole, "%", what),
-        Row(f"{name}: of wrong kinds", found.wrong_kind, "", f"goal 0; {margins}"),
+        Row(f"{name}: of wrong kinds", found.wrong_illumination, "", f"goal 0; {margins}"),
         Row(f"{name}: of two poses", found.mixed, "", mixed),
     ]
 

@@ -142,7 +142,7 @@ def _scored(name: str, shown: list[Shown]) -> Iterator[Row]:
 def _found(one: Shown) -> Fingertips:
     fingers = separate(one.led, one.view)
     laser_uv = laser_lines(one.laser, fingers, one.view).uv
-    return fingertips(one.led, one.frame, laser_uv, one.view) if fingers.turn.straight else NO_TIPS
+    return fingertips(one.led, one.frame, laser_uv, one.view) if fingers.palm_pose.straight else NO_TIPS
 
 
 def _kinds(shown: list[Shown], reported: Bool, seen: Bool) -> dict[str, Bool]:

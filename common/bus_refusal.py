@@ -14,7 +14,7 @@ from common.keys import Identity
 
 _PATIENCE_S = 0.5
 _ALONE_S = 2.0  # without anybody for so long, a process says why
-_LOOK_S = 0.25
+_POLL_S = 0.25
 _NOT_YET_VALID, _EXPIRED = 9, 10  # X509_V_ERR_CERT_NOT_YET_VALID, X509_V_ERR_CERT_HAS_EXPIRED of OpenSSL
 _LOG = logging.getLogger(__name__)
 
@@ -56,11 +56,11 @@ def why_refused(endpoint: str, identity: Identity) -> str:
             " somebody who plays the master"
         )
     except ssl.SSLError as error:
-        said = (error.reason or str(error)).lower().replace("_", " ")
-        if "certificate expired" in said:
+        message = (error.reason or str(error)).lower().replace("_", " ")
+        if "certificate expired" in message:
             return _why_expired_there(identity)
         return (
-            f"who listens there refused the certificate of {identity.name!r}, or speaks no TLS ({said}): keys of"
+            f"who listens there refused the certificate of {identity.name!r}, or speaks no TLS ({message}): keys of"
             " another rig?"
         )
     except OSError as error:
@@ -113,7 +113,7 @@ def _shown_there(endpoint: str) -> Shown | None:
         return None
 
 
-def say_why_alone(
+def log_why_alone(
     peers: Callable[[], int], reason: Callable[[], str], where: str, closing: threading.Event
 ) -> threading.Thread:
     """Log, on a thread, why nobody is connected when it is so for two seconds, and again when the reason is another.
@@ -125,18 +125,18 @@ def say_why_alone(
         closing: Ends the thread.
     """
 
-    def watch() -> None:
-        said, since = "", time.monotonic()
-        while not closing.wait(_LOOK_S):
+    def monitor() -> None:
+        message, since = "", time.monotonic()
+        while not closing.wait(_POLL_S):
             now = time.monotonic()
             if peers():
-                said, since = "", now
+                message, since = "", now
             elif now - since > _ALONE_S:
                 why, since = reason(), now
-                if why and why != said and not closing.is_set():
+                if why and why != message and not closing.is_set():
                     _LOG.warning("bus (%s): %s", where, why)
-                said = why
+                message = why
 
-    thread = threading.Thread(target=watch, name="bus alone", daemon=True)
+    thread = threading.Thread(target=monitor, name="bus alone", daemon=True)
     thread.start()
     return thread

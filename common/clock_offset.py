@@ -176,7 +176,7 @@ class OffsetEstimator:
 
 
 @dataclass(frozen=True, slots=True)
-class _Corridor:
+class _OffsetBounds:
     """What the echoes say of a range of drifts; all in ns and ns/s, at the newest echo."""
 
     offset: float
@@ -187,7 +187,7 @@ class _Corridor:
     step: float  # between neighbouring drifts
 
     @classmethod
-    def of(cls, t_s: Float, there: Float, back: Float, centre: float, half: float) -> "_Corridor":
+    def of(cls, t_s: Float, there: Float, back: Float, centre: float, half: float) -> "_OffsetBounds":
         """Posterior mean and spread, for drifts within `half` of `centre`.
 
         Given the drift, the distances of the walls from the shortest possible delays are exponential, with the spacing
@@ -224,11 +224,11 @@ def _fit(echoes: deque[_Echo]) -> ClockEstimate:
     base = (int(table[-1, 1]) - int(table[-1, 2])) // 2
     t_s = (table[:, 0] - newest).astype(np.float64) * 1e-9
     there, back = (table[:, 1] - base).astype(np.float64), (table[:, 2] + base).astype(np.float64)
-    found = _Corridor.of(t_s, there, back, 0.0, _WIDEST_DRIFT * 1e9)
+    found = _OffsetBounds.of(t_s, there, back, 0.0, _WIDEST_DRIFT * 1e9)
     for _ in range(_ZOOMS):
         if found.drift_sigma > 2.0 * found.step:
             break
-        found = _Corridor.of(t_s, there, back, found.drift, 4.0 * max(found.drift_sigma, found.step))
+        found = _OffsetBounds.of(t_s, there, back, found.drift, 4.0 * max(found.drift_sigma, found.step))
     return ClockEstimate(
         t_ns=newest,
         offset_ns=base + round(found.offset),

@@ -80,8 +80,10 @@ class Refusal(StrEnum):
     )
     IMPOSTOR = "impostor"  # speaks for a camera that it is not
     UNKNOWN = "unknown_camera"  # a slave that this rig does not have
-    RIVAL = "rival"  # a beacon of another master while ours is well
-    TWIN = "twin"  # a hello of a second process under a name whose first one is well; a beacon that lists it
+    OTHER_MASTER = "other_master"  # a beacon of another master while ours is well
+    DUPLICATE_SENDER = (
+        "twin"  # a hello of a second process under a name whose first one is well; a beacon that lists it
+    )
 
 
 class Header(NamedTuple):
@@ -153,7 +155,7 @@ class ReplayWindow:
     def __init__(self) -> None:
         """Begin with nothing taken."""
         self._highest = 0
-        self._taken = 1  # bit i: counter `highest - i`; 0 is never used and counts as taken
+        self._received = 1  # bit i: counter `highest - i`; 0 is never used and counts as taken
         self._count = 0
 
     @property
@@ -165,22 +167,22 @@ class ReplayWindow:
         """How many counters between these two, both taken, never came; of what is too old to be known, all."""
         newer, span = self._highest - before + 1, before - after - 1  # where it begins in bits; its length
         known = min(span, max(WINDOW - newer, 0))
-        return span - ((self._taken >> newer) & ((1 << known) - 1)).bit_count()
+        return span - ((self._received >> newer) & ((1 << known) - 1)).bit_count()
 
     def take(self, counter: int) -> Refusal | bool:
         """Take `counter` once: whether a later one came before it, or why it is refused."""
         ahead = counter - self._highest
         if ahead > 0:
-            self._taken = ((self._taken << ahead) | 1) & _MASK if ahead < WINDOW else 1
+            self._received = ((self._received << ahead) | 1) & _MASK if ahead < WINDOW else 1
             self._highest = counter
             self._count += 1
             return False
         if -ahead >= WINDOW:
             return Refusal.REPLAYED
         bit = 1 << -ahead
-        if self._taken & bit:
+        if self._received & bit:
             return Refusal.DUPLICATE
-        self._taken |= bit
+        self._received |= bit
         self._count += 1
         return True
 
@@ -207,8 +209,8 @@ class Opener:
         body = unseal(self._cipher, header, datagram)
         if body is None:
             return Refusal.FORGED
-        taken = self._window.take(header.counter)
-        return taken if isinstance(taken, Refusal) else Opened(body, taken)
+        newness = self._window.take(header.counter)
+        return newness if isinstance(newness, Refusal) else Opened(body, newness)
 
 
 def unseal(cipher: ChaCha20Poly1305, header: Header, datagram: bytes) -> bytes | None:

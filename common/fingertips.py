@@ -3,7 +3,7 @@
 The last joint of a hand file lies inside the fingertip. OpenXR defines its radius as the distance from there to the
 skin (XR_EXT_hand_tracking), so where the file gives radii the tip is that far beyond the joint. If it gives none, the
 reach is that of a hand of this size, in shares of the distance between the knuckles of index and little finger,
-measured like the rest of the skin (`common.hand_skin`) on the generic hand of the WebXR Input Profiles (MIT). The
+measured like the rest of the skin (`common.palmar_surface`) on the generic hand of the WebXR Input Profiles (MIT). The
 outermost point of such a fingertip lies a little towards the nail; that of a sphere does not.
 """
 

@@ -64,10 +64,10 @@ def profile_from_rest(
     if side not in ("left", "right"):
         raise CalibrationError(f"hand {name!r}: side {side!r}: left or right")
     to_palm = np.diag([-1.0, 1.0, -1.0])  # our palm frame has its z to the fingers
-    place, turned = position_m @ to_palm, to_palm @ rotation
+    place, rotated = position_m @ to_palm, to_palm @ rotation
     joints: dict[str, RestJoint] = {}
     for k, joint in enumerate(WEBXR_JOINTS):
-        joints[joint] = RestJoint(position_m=_vector(place[k]), orientation_wxyz=_quaternion(turned[k]))
+        joints[joint] = RestJoint(position_m=_vector(place[k]), orientation_wxyz=_quaternion(rotated[k]))
     knuckle, base = place[CHAINS[2, 0] - 1], place[METACARPALS[1] - 1]
     back = 0.5 * (knuckle + base) + [0.0, _BACK_M, 0.0]
     ends: list[int] = TIPS.tolist()
@@ -188,14 +188,14 @@ def _finger_rest(bones: Float, normals: Float) -> Float:
     # The proximal bone at flexion a: -level sin a above the palm, and ahead and aside of the rest heading in it.
     sine = np.clip(-bones[:, 0, 1] / level, -1.0, 1.0)
     ahead = np.sqrt(1.0 - sine * sine)
-    turned = np.arctan2(bones[:, 0, 0], bones[:, 0, 2]) - np.arctan2(height * sine, ahead)
+    rotated = np.arctan2(bones[:, 0, 0], bones[:, 0, 2]) - np.arctan2(height * sine, ahead)
     shows = ahead > _LEVEL
     if not shows.any():  # a finger that is never opened: across the hinge
         shows = np.linalg.norm(normals, axis=1) > 2.0 * np.sin(_BENT)
-        turned = np.arctan2(-normals[:, 2], normals[:, 0])
-    turned = turned[shows]
-    middle = np.arctan2(np.sin(turned).mean(), np.cos(turned).mean())
-    middle += np.median((turned - middle + np.pi) % (2.0 * np.pi) - np.pi)
+        rotated = np.arctan2(-normals[:, 2], normals[:, 0])
+    rotated = rotated[shows]
+    middle = np.arctan2(np.sin(rotated).mean(), np.cos(rotated).mean())
+    middle += np.median((rotated - middle + np.pi) % (2.0 * np.pi) - np.pi)
     heading = np.array([np.sin(middle), 0.0, np.cos(middle)])
     across = np.cross([0.0, 1.0, 0.0], heading)
     hinge = -(level * across + height * np.array([0.0, 1.0, 0.0]))

@@ -120,7 +120,7 @@ class HandModel:
         mounts: Marker name -> where it sits.
         side_sign: +1 right, -1 left.
         bone_m: (5, 3, 3) link k of each finger in the frame of its joint k.
-        turn: (5, 3, 3, 3) rest rotation of joint k + 1 in the frame of joint k.
+        link_rotation: (5, 3, 3, 3) rest rotation of joint k + 1 in the frame of joint k.
         swing: (3, 5, 4, 3, 3) for each angle a the rotation from the angle before it, its rest turn included, is
             swing[0] + cos a swing[1] + sin a swing[2].
     """
@@ -140,7 +140,7 @@ class HandModel:
     mounts: dict[str, Mount]
     side_sign: float
     bone_m: Float
-    turn: Float
+    link_rotation: Float
     swing: Float
 
     def __post_init__(self) -> None:
@@ -158,11 +158,11 @@ class HandModel:
         where = f"hand {profile.name!r}"
         position, rotation = _rest(profile, where)
         bone = np.empty((5, 3, 3))
-        turn = np.empty((5, 3, 3, 3))
+        link_rotation = np.empty((5, 3, 3, 3))
         for f, chain in enumerate(CHAINS):
             for k, (a, b) in enumerate(pairwise(chain)):
                 bone[f, k] = rotation[a].T @ (position[b] - position[a])
-                turn[f, k] = rotation[a].T @ rotation[b]
+                link_rotation[f, k] = rotation[a].T @ rotation[b]
         if (np.linalg.norm(bone, axis=-1) < 1e-3).any():
             raise CalibrationError(f"{where}: rest_joints: a finger bone is shorter than 1 mm")
         couplings = couplings_of(profile)
@@ -185,8 +185,8 @@ class HandModel:
             mounts=_mounts(profile, where),
             side_sign=side_sign,
             bone_m=bone,
-            turn=turn,
-            swing=_swing(rotation[CHAINS[:, 0]], turn, side_sign),
+            link_rotation=link_rotation,
+            swing=_swing(rotation[CHAINS[:, 0]], link_rotation, side_sign),
         )
 
     def forward(self, T_rig_palm: Float, angles_rad: Float) -> HandJoints:
@@ -196,9 +196,9 @@ class HandModel:
 
     def joints(self, T_rig_palm: Float, chains: Chains) -> HandJoints:
         """All joints of a palm pose (..., 4, 4) whose fingers are bent like `chains`."""
-        lead, R_palm = chains.position_m.shape[:-3], T_rig_palm[..., :3, :3]
-        position = np.empty((*lead, 26, 3))
-        rotation = np.empty((*lead, 26, 3, 3))
+        batch, R_palm = chains.position_m.shape[:-3], T_rig_palm[..., :3, :3]
+        position = np.empty((*batch, 26, 3))
+        rotation = np.empty((*batch, 26, 3, 3))
         position[...] = self.rest_position_m
         rotation[...] = self.rest_rotation
         position[..., CHAINS, :] = chains.position_m
@@ -215,7 +215,7 @@ class HandModel:
         rotation[..., 0, :, :] = frame = local[..., 0, :, :] @ local[..., 1, :, :]
         rotation[..., 1, :, :] = frame = frame @ local[..., 2, :, :]
         rotation[..., 2, :, :] = frame = frame @ local[..., 3, :, :]
-        rotation[..., 3, :, :] = frame @ self.turn[:, 2]
+        rotation[..., 3, :, :] = frame @ self.link_rotation[:, 2]
         position = np.empty((*local.shape[:-2], 3))
         position[..., 0, :] = self.rest_position_m[_ROOTS]
         np.matmul(rotation[..., :3, :, :], self.bone_m[..., None], out=position[..., 1:, :, None])
@@ -277,13 +277,13 @@ class HandModel:
         return legal
 
 
-def _swing(root: Float, turn: Float, side_sign: float) -> Float:
+def _swing(root: Float, link_rotation: Float, side_sign: float) -> Float:
     """`HandModel.swing` of root rotations (5, 3, 3) and rest turns (5, 3, 3, 3)."""
-    abduct, bend = _about(1, side_sign), _about(0, -1.0)  # a flexion turns by -a about +x
+    abduct, flexion = _about(1, side_sign), _about(0, -1.0)  # a flexion turns by -a about +x
     out = np.empty((3, 5, 4, 3, 3))
     out[:, 0, 0], out[:, 1:, 0] = root[0] @ abduct, abduct[:, None] @ root[1:]
-    out[:, :, 1] = bend[:, None]
-    out[:, :, 2:] = turn[:, :2] @ bend[:, None, None]
+    out[:, :, 1] = flexion[:, None]
+    out[:, :, 2:] = link_rotation[:, :2] @ flexion[:, None, None]
     return out
 
 

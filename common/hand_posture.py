@@ -48,25 +48,25 @@ def joint_angles(model: HandModel, fingers_m: Float) -> Float:
         lean = np.arctan2(frame[1, 2], frame[1, 1])  # by which the bone is raised at flexion 0
         flexion: Float = np.arcsin(np.clip(-bone[:, 1] / level, -1.0, 1.0)) - lean
         ahead = np.stack([np.zeros_like(flexion), -np.sin(flexion), -np.cos(flexion)], axis=1) @ frame.T
-        turn: Float = np.arctan2(bone[:, 0], bone[:, 2]) - np.arctan2(ahead[:, 0], ahead[:, 2])
-        turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
-        beyond = np.abs(turn) > 0.5 * np.pi  # bent by more than a right angle, not turned about
+        angle: Float = np.arctan2(bone[:, 0], bone[:, 2]) - np.arctan2(ahead[:, 0], ahead[:, 2])
+        angle = (angle + np.pi) % (2.0 * np.pi) - np.pi
+        beyond = np.abs(angle) > 0.5 * np.pi  # bent by more than a right angle, not turned about
         flexion = np.where(beyond, np.pi - flexion - 2.0 * lean, flexion)
-        turn = np.where(beyond, turn - np.copysign(np.pi, turn), turn)
-        angles[:, f, 0] = np.where(np.cos(flexion) > _UPRIGHT, model.side_sign * turn, 0.0)
+        angle = np.where(beyond, angle - np.copysign(np.pi, angle), angle)
+        angles[:, f, 0] = np.where(np.cos(flexion) > _UPRIGHT, model.side_sign * angle, 0.0)
         angles[:, f, 1] = flexion
-        hinge = _hinge(rest[f], turn, f == 0)
+        hinge = _hinge(rest[f], angle, f == 0)
         for k in (1, 2):
             sine_of = (np.cross(bones[:, f, k - 1], bones[:, f, k]) * hinge).sum(axis=1)
             angles[:, f, 1 + k] = np.arctan2(sine_of, (bones[:, f, k - 1] * bones[:, f, k]).sum(axis=1))
     return angles
 
 
-def _hinge(rest: Float, turn: Float, thumb: bool) -> Float:
+def _hinge(rest: Float, angle: Float, thumb: bool) -> Float:
     """(T, 3) what a flexion turns about, -x of the joint, palm frame, at turns (T,) by the abduction."""
-    about = np.zeros((len(turn), 3, 3))
-    about[:, 0, 0] = about[:, 2, 2] = np.cos(turn)
-    about[:, 0, 2], about[:, 2, 0], about[:, 1, 1] = np.sin(turn), -np.sin(turn), 1.0
+    about = np.zeros((len(angle), 3, 3))
+    about[:, 0, 0] = about[:, 2, 2] = np.cos(angle)
+    about[:, 0, 2], about[:, 2, 0], about[:, 1, 1] = np.sin(angle), -np.sin(angle), 1.0
     return -(rest @ about)[:, :, 0] if thumb else -(about @ rest)[:, :, 0]
 
 

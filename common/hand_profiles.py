@@ -59,8 +59,8 @@ def generated_profile(name: str, side: str, hand_length_m: float = 0.19) -> Hand
 
     def rest(position: Float, rotation: Float) -> RestJoint:
         # Mirroring in x turns a rotation R into M R M, and the joint's own x axis back with the second M.
-        turned = np.diag(mirror) @ rotation @ np.diag(mirror)
-        w, i, j, k = (float(value) for value in np.round(matrix_to_quaternion(turned), 8))
+        rotated = np.diag(mirror) @ rotation @ np.diag(mirror)
+        w, i, j, k = (float(value) for value in np.round(matrix_to_quaternion(rotated), 8))
         return RestJoint(position_m=_vector(position * mirror * hand_length_m), orientation_wxyz=(w, i, j, k))
 
     radius = {joint: round(share * hand_length_m, 6) for joint, share in _radii().items()}
@@ -114,7 +114,7 @@ def mirrored_profile(profile: HandProfile) -> HandProfile:
         x, y, z = vector
         return -x + 0.0, y, z
 
-    def turned(joint: RestJoint) -> RestJoint:
+    def rotated(joint: RestJoint) -> RestJoint:
         # M R M of a rotation keeps w and x of its quaternion and flips y and z.
         w, x, y, z = joint.orientation_wxyz
         return RestJoint(position_m=mirrored(joint.position_m), orientation_wxyz=(w, x, -y, -z))
@@ -122,7 +122,7 @@ def mirrored_profile(profile: HandProfile) -> HandProfile:
     return replace(
         profile,
         side="left" if profile.side == "right" else "right",
-        rest_joints={name: turned(joint) for name, joint in profile.rest_joints.items()},
+        rest_joints={name: rotated(joint) for name, joint in profile.rest_joints.items()},
         markers={
             name: replace(mount, offset_m=mirrored(mount.offset_m)) for name, mount in profile.markers.items()
         },

@@ -19,7 +19,7 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.errors import RecordingError
-from common.imu_csv_columns import ACCEL, AXES, GYRO, MAG, TIME, TURN, UNITS, Columns, find_columns
+from common.imu_csv_columns import ACCEL, AXES, GYRO, MAG, QUATERNION, TIME, UNITS, Columns, find_columns
 from common.recorded_files import read_table
 
 _PREAMBLE = 30  # lines in which the header must stand
@@ -84,24 +84,26 @@ def _read(lines: Sequence[str], given: Mapping[str, str], rate_hz: float | None)
     times, values, late = _rows(lines, first, delimiter, columns)
     if len(values) < 2:
         raise RecordingError(f"{len(values)} rows below the header of line {first}: at least 2 are needed")
-    scaled, said = _scaled(values, columns, given)
+    scaled, units = _scaled(values, columns, given)
     if rate_hz is None:
-        unit, said[TIME] = _time_unit(times, columns[TIME, ""].unit, given.get(TIME))
+        unit, units[TIME] = _time_unit(times, columns[TIME, ""].unit, given.get(TIME))
         ns = [int((one * unit).to_integral_value()) for one in times]
     else:
-        ns, said[TIME] = [round(k * 1e9 / rate_hz) for k in range(len(values))], f"{rate_hz:g} Hz, as given"
+        ns, units[TIME] = [round(k * 1e9 / rate_hz) for k in range(len(values))], f"{rate_hz:g} Hz, as given"
     if max(abs(ns[0]), abs(ns[-1])) >= _MOST_NS:
-        raise RecordingError(f"time: {times[-1]} {said[TIME]} is beyond any clock: say --time-unit")
+        raise RecordingError(f"time: {times[-1]} {units[TIME]} is beyond any clock: say --time-unit")
     measured = np.isfinite(np.column_stack((scaled[GYRO], scaled[ACCEL]))).all(axis=1)
     names = {
         what: ", ".join(columns[what, axis].name for axis in axes)
         for what, axes in AXES.items()
         if all((what, axis) in columns for axis in axes)
     }
-    scaled[TURN][~(np.abs(np.linalg.norm(scaled[TURN], axis=1) - 1.0) < _UNIT_WITHIN)] = nan  # no rotation
+    scaled[QUATERNION][~(np.abs(np.linalg.norm(scaled[QUATERNION], axis=1) - 1.0) < _UNIT_WITHIN)] = (
+        nan  # no rotation
+    )
     t_ns, incomplete = np.array(ns, np.int64), int((~measured).sum())
     return Table(
-        t_ns, scaled[GYRO], scaled[ACCEL], scaled[MAG], scaled[TURN], names, said, late, incomplete
+        t_ns, scaled[GYRO], scaled[ACCEL], scaled[MAG], scaled[QUATERNION], names, units, late, incomplete
     )  # fmt: skip
 
 
@@ -196,8 +198,8 @@ def _scaled(
     """Quantity -> (T, axes) in SI units (field: uT), and quantity -> unit and who said it."""
     places = {key: k for k, key in enumerate(columns)}
     scaled: dict[str, Float] = {}
-    said: dict[str, str] = {}
-    for what in (GYRO, ACCEL, MAG, TURN):
+    units: dict[str, str] = {}
+    for what in (GYRO, ACCEL, MAG, QUATERNION):
         keys = [(what, axis) for axis in AXES[what]]
         if not all(key in places for key in keys):
             scaled[what] = np.full((len(values), len(keys)), nan)
@@ -214,13 +216,13 @@ def _scaled(
             ),
             ("", ""),
         )
-        if not unit and what != TURN:
-            unit, who = _likely(what, raw), "not said"
+        if not unit and what != QUATERNION:
+            unit, who = _likely(what, raw), "not stated"
         scaled[what] = raw * UNITS[what].get(unit, 1.0)
         if unit:
-            said[what] = f"{unit} ({who})"
-    _refuse_impossible(scaled, said)
-    return scaled, said
+            units[what] = f"{unit} ({who})"
+    _refuse_impossible(scaled, units)
+    return scaled, units
 
 
 def _likely(what: str, raw: Float) -> str:
@@ -232,17 +234,17 @@ def _likely(what: str, raw: Float) -> str:
     return next((unit for unit, scale in UNITS[ACCEL].items() if low < size * scale < high), "m/s^2")
 
 
-def _refuse_impossible(scaled: Mapping[str, Float], said: Mapping[str, str]) -> None:
+def _refuse_impossible(scaled: Mapping[str, Float], units: Mapping[str, str]) -> None:
     force, fastest = _size(scaled[ACCEL]), float(np.nanmax(np.abs(scaled[GYRO]), initial=0.0))
     low, high = _GRAVITY_M_S2
     if not low < force < high:
         raise RecordingError(
-            f"accel: the median force is {force:.3g} m/s^2 in {said[ACCEL]}, gravity is 9.81: another unit "
+            f"accel: the median force is {force:.3g} m/s^2 in {units[ACCEL]}, gravity is 9.81: another unit "
             f"(--accel-unit {'|'.join(UNITS[ACCEL])}), or gravity was taken away"
         )
     if fastest > _RATE_RAD_S:
         raise RecordingError(
-            f"gyro: up to {fastest:.3g} rad/s in {said[GYRO]}, no gyroscope has as much: --gyro-unit deg/s?"
+            f"gyro: up to {fastest:.3g} rad/s in {units[GYRO]}, no gyroscope has as much: --gyro-unit deg/s?"
         )
 
 
@@ -261,4 +263,4 @@ def _time_unit(times: Sequence[Decimal], named: str, given: str | None) -> tuple
         raise RecordingError(
             f"time: a step of {step:g} fits no unit: say --time-unit {'|'.join(UNITS[TIME])}"
         )
-    return Decimal(UNITS[TIME][unit]), f"{unit} ({'header' if named else 'given' if given else 'not said'})"
+    return Decimal(UNITS[TIME][unit]), f"{unit} ({'header' if named else 'given' if given else 'not stated'})"

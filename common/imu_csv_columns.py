@@ -11,22 +11,22 @@ from math import pi
 
 from common.errors import RecordingError
 
-TIME, GYRO, ACCEL, MAG, TURN = "time", "gyro", "accel", "mag", "quaternion"
+TIME, GYRO, ACCEL, MAG, QUATERNION = "time", "gyro", "accel", "mag", "quaternion"
 G_M_S2 = 9.80665
 UNITS: dict[str, dict[str, float]] = {
     TIME: {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0},  # to ns
     GYRO: {"rad/s": 1.0, "deg/s": pi / 180.0, "mdeg/s": pi / 180e3},
     ACCEL: {"m/s^2": 1.0, "g": G_M_S2, "mg": 1e-3 * G_M_S2},
     MAG: {"uT": 1.0, "T": 1e6, "mT": 1e3, "nT": 1e-3, "gauss": 100.0, "mgauss": 0.1},
-    TURN: {},
+    QUATERNION: {},
 }
-AXES = {TIME: ("",), GYRO: tuple("xyz"), ACCEL: tuple("xyz"), MAG: tuple("xyz"), TURN: tuple("wxyz")}
+AXES = {TIME: ("",), GYRO: tuple("xyz"), ACCEL: tuple("xyz"), MAG: tuple("xyz"), QUATERNION: tuple("wxyz")}
 _WORDS = {
     TIME: {"t", "time", "timestamp", "stamp", "elapsed", "clock"},
     GYRO: {"gyro", "gyr", "gyroscope", "angular", "omega", "rotation", "w", "g"},
     ACCEL: {"acc", "accel", "accelerometer", "acceleration", "a"},
     MAG: {"mag", "magn", "magnetometer", "magnetic", "m"},
-    TURN: {"quat", "quaternion", "orientation", "q"},
+    QUATERNION: {"quat", "quaternion", "orientation", "q"},
 }
 _OTHERS = {
     "bias",
@@ -49,7 +49,7 @@ _SPELT = {
            "degrees": "deg/s", "mdps": "mdeg/s", "mdegs": "mdeg/s"},
     ACCEL: {"ms2": "m/s^2", "mss": "m/s^2", "mps2": "m/s^2", "ms²": "m/s^2", "gs": "g"},
     MAG: {"ut": "uT", "µt": "uT", "μt": "uT", "t": "T", "mt": "mT", "nt": "nT", "g": "gauss", "mg": "mgauss"},
-    TURN: {},
+    QUATERNION: {},
 }  # fmt: skip
 _FUSED = re.compile(
     r"(gyroscope|gyro|gyr|accel|acc|magn|mag|quat|[gwamq])([xyz]|(?<=q)w|(?<=quat)w|(?<=q)[0-3])"
@@ -88,8 +88,8 @@ def find_columns(header: Sequence[str]) -> dict[tuple[str, str], Column]:
             raise RecordingError(
                 f"columns {before.name!r} and {column.name!r} could both be {what} {axis}: leave one out or rename it"
             )
-    if not all((TURN, axis) in found for axis in AXES[TURN]):
-        found = {key: column for key, column in found.items() if key[0] != TURN}
+    if not all((QUATERNION, axis) in found for axis in AXES[QUATERNION]):
+        found = {key: column for key, column in found.items() if key[0] != QUATERNION}
     return found
 
 
@@ -103,17 +103,17 @@ def _meaning(name: str) -> tuple[str, str, str] | None:
     if fused is not None:  # and what stands before it, `opt_qw`, says nothing more
         axis = fused[2].translate(str.maketrans("0123", "wxyz"))
         words = [fused[1], axis, *words[words.index(fused[0]) + 1 :]]
-    if words[-1] in "0123" and _WORDS[TURN].intersection(words):
+    if words[-1] in "0123" and _WORDS[QUATERNION].intersection(words):
         words[-1] = "wxyz"[int(words[-1])]
-    axis = next((word for word in reversed(words) if word in AXES[TURN]), "")
+    axis = next((word for word in reversed(words) if word in AXES[QUATERNION]), "")
     rest = (
         [word for k, word in enumerate(words) if k != len(words) - 1 - words[::-1].index(axis)]
         if axis
         else words
     )
-    for what, said in _WORDS.items():
+    for what, keywords in _WORDS.items():
         if axis in AXES[what] and any(
-            word in said and (k == 0 or len(word) > 1) for k, word in enumerate(rest)
+            word in keywords and (k == 0 or len(word) > 1) for k, word in enumerate(rest)
         ):
             return what, axis, _unit(what, rest, bracket)
     return None

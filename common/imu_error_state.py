@@ -34,7 +34,7 @@ ATTITUDE, BIAS, SCALE, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9
 BIAS_RAD_S = radians(2.5)
 G_M_S2 = 9.80665
 _SIZE, _HEADING = 11, 2
-_BIAS_WALK = radians(0.01)  # [rad/s per root second]
+_BIAS_PROCESS_NOISE = radians(0.01)  # [rad/s per root second]
 _REST = radians(0.09)  # [rad/s times root second]: with the walk, 0.03 deg/s are reached
 _NOISE = radians(0.015)  # [rad per root second]
 _SCALE = 0.01
@@ -71,7 +71,7 @@ class ErrorState:
         """Standard deviation of the heading against that of the beginning."""
         return min(sqrt(float(self._variance[_HEADING])), _ANYWHERE_RAD)
 
-    def turned(self, step_s: float, world_sensor: Float, rate_rad_s: Float, *, felt: bool) -> None:
+    def propagate(self, step_s: float, world_sensor: Float, rate_rad_s: Float, *, felt: bool) -> None:
         """A step was summed up: at this rate (3,) of the sensor, which then lay so (3, 3), with a force or without."""
         change, fallen = -step_s * world_sensor, step_s * G_M_S2 if felt else 0.0
         self._transition[ATTITUDE, BIAS] = change
@@ -123,4 +123,6 @@ class ErrorState:
         return found
 
     def _warmed(self, step_s: float) -> None:
-        self._variance[BIAS] = np.minimum(self._variance[BIAS] + _BIAS_WALK**2 * step_s, BIAS_RAD_S**2)
+        self._variance[BIAS] = np.minimum(
+            self._variance[BIAS] + _BIAS_PROCESS_NOISE**2 * step_s, BIAS_RAD_S**2
+        )

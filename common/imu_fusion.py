@@ -110,9 +110,9 @@ class OrientationFilter:
         if 0.0 < step_s <= self._bridged_s:
             missing = max(1.0 - self._period_s / step_s, 0.0)
             mean = rate - 0.5 * missing * (rate - self._last_rate)
-            self._q = _turned(self._q, (1.0 - self._scale) * mean - self._bias, step_s)
+            self._q = _integrated(self._q, (1.0 - self._scale) * mean - self._bias, step_s)
             world_sensor = matrix_of(self._q)
-            self._errors.turned(step_s, world_sensor, mean, felt=not falls)
+            self._errors.propagate(step_s, world_sensor, mean, felt=not falls)
             if not falls:
                 self._velocity = self._velocity + step_s * (world_sensor @ force)[:2]
                 self._correct(self._errors.level(step_s, self._velocity))
@@ -157,7 +157,7 @@ class OrientationFilter:
         self._velocity = self._velocity + errors[VELOCITY]
 
 
-def _turned(q: Wxyz, rate: Float, step_s: float) -> Wxyz:
+def _integrated(q: Wxyz, rate: Float, step_s: float) -> Wxyz:
     """An orientation after a step at a rate (3,) [rad/s], sensor axes."""
     x, y, z = (step_s * rate).tolist()
     return quaternion_product(q, _small(x, y, z))
@@ -173,8 +173,8 @@ def _small(x: float, y: float, z: float) -> Wxyz:
 def _upright(q: Wxyz, force: Float) -> Wxyz:
     """The orientation nearest to this one in which a specific force (3,) is up."""
     x, y, z = (matrix_of(q) @ force / sqrt(force @ force)).tolist()
-    turn = (1.0 + z, y, -x, 0.0) if z > -1.0 + 1e-9 else (0.0, 1.0, 0.0, 0.0)
-    return _unit(quaternion_product(_unit(turn), q))
+    quaternion = (1.0 + z, y, -x, 0.0) if z > -1.0 + 1e-9 else (0.0, 1.0, 0.0, 0.0)
+    return _unit(quaternion_product(_unit(quaternion), q))
 
 
 def _unit(q: Wxyz) -> Wxyz:

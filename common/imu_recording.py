@@ -24,9 +24,11 @@ from common.replacing import replacing
 
 IMU = "imu.csv"
 _RATES = ("gx", "gy", "gz", "ax", "ay", "az")
-_FIELD, _TURN, _DRIFT = ("mx", "my", "mz"), ("qw", "qx", "qy", "qz"), "heading_sigma"
+_FIELD, _QUATERNION, _DRIFT = ("mx", "my", "mz"), ("qw", "qx", "qy", "qz"), "heading_sigma"
 HEADERS = tuple(
-    ("t_ns", *_RATES, *field, *turn) for field in ((), _FIELD) for turn in ((), _TURN, (*_TURN, _DRIFT))
+    ("t_ns", *_RATES, *field, *quaternion)
+    for field in ((), _FIELD)
+    for quaternion in ((), _QUATERNION, (*_QUATERNION, _DRIFT))
 )
 _INTEGER = re.compile(r"-?[0-9]{1,18}")
 _MOST = 1e6  # no sensor gives as much, in any of the units
@@ -54,8 +56,8 @@ def read_imu(folder: Path, source: str) -> tuple[ImuSample, ...]:
     except csv.Error as error:
         raise RecordingError(f"{path}: not a table of text: {error}") from error
     if header not in HEADERS:
-        turn = f"{','.join(_TURN)}, with or without {_DRIFT}, or not"
-        allowed = f"t_ns,{','.join(_RATES)}, then {','.join(_FIELD)} or not, then {turn}"
+        quaternion = f"{','.join(_QUATERNION)}, with or without {_DRIFT}, or not"
+        allowed = f"t_ns,{','.join(_RATES)}, then {','.join(_FIELD)} or not, then {quaternion}"
         raise RecordingError(f"{path}: header {','.join(header)}: must be {allowed}")
     samples: list[ImuSample] = []
     for number, line in lines:
@@ -113,7 +115,7 @@ def _sample(where: str, source: str, seq: int, header: Sequence[str], line: Sequ
             gyro_rad_s=vector(*_RATES[:3]),
             accel_m_s2=vector(*_RATES[3:]),
             mag_ut=vector(*_FIELD),
-            orientation_wxyz=vector(*_TURN),
+            orientation_wxyz=vector(*_QUATERNION),
             heading_sigma_rad=drift,
         )
     except ValueError as error:

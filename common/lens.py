@@ -61,13 +61,13 @@ def fold_of(lens: Lens) -> Fold | None:
     shrunk = _least_eigenvalue(lens, radii[:, None, None] * ways)
     bad = shrunk <= _LEAST
     first = np.where(bad.any(axis=0), bad.argmax(axis=0), 0)
-    turns = np.flatnonzero(first)
-    if len(turns) == 0:
+    folds = np.flatnonzero(first)
+    if len(folds) == 0:
         return None  # nowhere around the picture
-    before, at = shrunk[first[turns] - 1, turns], shrunk[first[turns], turns]
+    before, at = shrunk[first[folds] - 1, folds], shrunk[first[folds], folds]
     share = (before - _LEAST) / (before - at)
-    r = radii[first[turns] - 1] + share * (radii[1] - radii[0])
-    seen = distorted(lens, r[:, None] * ways[turns])
+    r = radii[first[folds] - 1] + share * (radii[1] - radii[0])
+    seen = distorted(lens, r[:, None] * ways[folds])
     inside = seen[_within(seen, low, high)]
     if not len(inside):  # between two of the directions a fold may still cut off the tip of a corner
         inside = corners[np.isnan(undistorted(lens, corners)).any(axis=1)]
@@ -169,10 +169,10 @@ def _within(points: Float, low: Float, high: Float) -> Bool:
     with np.errstate(divide="ignore", invalid="ignore"):
         a, b = low / points, high / points
     near, far = np.fmin(a, b), np.fmax(a, b)
-    beside = (points == 0.0) & ((low > 0.0) | (high < 0.0))
+    outside = (points == 0.0) & ((low > 0.0) | (high < 0.0))
     enters = np.where(points == 0.0, -np.inf, near).max(axis=-1)
     leaves = np.where(points == 0.0, np.inf, far).min(axis=-1)
-    return (leaves >= np.maximum(enters, 1.0)) & ~beside.any(axis=-1)
+    return (leaves >= np.maximum(enters, 1.0)) & ~outside.any(axis=-1)
 
 
 def distorted(lens: Lens, xy: Float) -> Float:

@@ -54,7 +54,7 @@ class LinkKey:
                 raise ValueError(f"{what} of {len(key)} bytes, must be {KEY_BYTES}")
 
     @property
-    def apart(self) -> bool:
+    def has_secrets(self) -> bool:
         """Whether secrets of devices are more than the rig key, so that one device cannot make those of others."""
         return self.root is not None or self.own is not None
 

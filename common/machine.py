@@ -60,7 +60,7 @@ class Machine:
         sensors = (path / _WEAK for path in self._root.glob(_SENSORS) if _text(path / "name") == _SUPPLY)
         self._weak = next(sensors, None) if self._flags is None else None
 
-    def gauges(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """temperature_c and temperature_limit_c of the zone nearest to its limit, throttled (flags), disk_free_mb."""
         found: dict[str, float] = {}
         zones = [

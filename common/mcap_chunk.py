@@ -57,7 +57,7 @@ def open_chunk(data: bytes, budget: WorkBudget) -> OpenedChunk:
         RecordingError: It is broken, or beyond a bound; the text says why, not where.
     """
     try:
-        return _walked(_unpacked(Chunk.read(stream(data)), budget), budget)
+        return _traversed(_unpacked(Chunk.read(stream(data)), budget), budget)
     except BROKEN as error:
         raise RecordingError(f"broken: {error or type(error).__name__}") from error
 
@@ -80,7 +80,7 @@ def _unpacked(chunk: Chunk, budget: WorkBudget) -> bytes:
     return content
 
 
-def _walked(content: bytes, budget: WorkBudget) -> OpenedChunk:
+def _traversed(content: bytes, budget: WorkBudget) -> OpenedChunk:
     opened, at, count = OpenedChunk(), 0, 0
     try:
         while at < len(content):

@@ -135,14 +135,14 @@ def messages_of(
 
 
 def _content(path: Path, fd: int, size: int) -> McapContent:
-    first = next(_walk(fd, len(MAGIC), size), None) if os.pread(fd, len(MAGIC), 0) == MAGIC else None
+    first = next(_traverse(fd, len(MAGIC), size), None) if os.pread(fd, len(MAGIC), 0) == MAGIC else None
     header = _header(fd, first)
     if header is None:
         raise RecordingError(f"{path}: no recording of messages: it does not begin as an MCAP file")
     return _indexed(fd, size, header.profile) or _scanned(fd, size, header.profile)
 
 
-def _walk(fd: int, at: int, end: int) -> Iterator[_Place]:
+def _traverse(fd: int, at: int, end: int) -> Iterator[_Place]:
     """The records from `at` on, as far as they are whole.
 
     The walk stops at the first that does not end before `end`, or that is none.
@@ -185,7 +185,7 @@ def _indexed(fd: int, size: int, profile: str) -> McapContent | None:
         return None
     content, budget = McapContent(profile), WorkBudget(size)
     try:
-        for opcode, at, length in _walk(fd, footer.summary_start, size - 37):
+        for opcode, at, length in _traverse(fd, footer.summary_start, size - 37):
             begin = at - footer.summary_start
             _take_summary(content, fd, opcode, summary[begin : begin + length], budget)
     except (*BROKEN, RecordingError):
@@ -221,7 +221,7 @@ def _take_summary(content: McapContent, fd: int, opcode: int, data: bytes, budge
 def _scanned(fd: int, size: int, profile: str) -> McapContent:
     """Record by record, up to the first that is not whole."""
     content, budget = McapContent(profile, cut=True), WorkBudget(size)
-    for opcode, at, length in _walk(fd, len(MAGIC), size):
+    for opcode, at, length in _traverse(fd, len(MAGIC), size):
         if opcode == Opcode.DATA_END:
             break
         if opcode == Opcode.ATTACHMENT:

@@ -37,7 +37,7 @@ MAX_PICTURE = 16_384  # width and height of a picture [px]
 MAX_COUNT = 2**63 - 1
 MAX_TIME_NS = 2**61  # 73 years; sums and differences of two stay within 63 bits
 MAX_NUMBER = 1e18
-_TURN = 1.001  # an element of a unit quaternion, rounded
+_UNIT = 1.001  # an element of a unit quaternion, rounded
 _LENGTH = 0.1  # by how much the squared length of a quaternion may miss 1
 
 
@@ -81,7 +81,7 @@ Pixels = Annotated[
 SigmaPx = Annotated[Float, within(1e-6, MAX_PICTURE)]
 Metres = Annotated[Float, within(-1e4, 1e4)]
 SensedMetres = Annotated[Float, within(-1e3, 1e3)]  # of a device: what is made of it stays within `Metres`
-Turn = Annotated[Float, within(-_TURN, _TURN)]  # a quaternion
+UnitQuaternion = Annotated[Float, within(-_UNIT, _UNIT)]  # a quaternion
 
 
 class Message(Struct, frozen=True, eq=False, forbid_unknown_fields=True, tag_field="type"):
@@ -227,7 +227,7 @@ def refuse_beyond(message: Message, field: str) -> None:
         raise _beyond(field, value, low, high)
 
 
-def refuse_no_turn(message: Message, field: str) -> None:
+def refuse_bad_quaternion(message: Message, field: str) -> None:
     """Refuse a quaternion (4,) that is not of length 1; NaN passes.
 
     Raises:

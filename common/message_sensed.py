@@ -24,9 +24,9 @@ from common.message_parts import (
     SigmaPx,
     TimeNs,
     TimeSigmaNs,
-    Turn,
+    UnitQuaternion,
+    refuse_bad_quaternion,
     refuse_beyond,
-    refuse_no_turn,
     refuse_parts,
     refuse_sigma,
     within,
@@ -47,7 +47,7 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
         quality: Probability (M,) 0..1 that what was found is the marker.
         sigma_px: Standard deviation per axis (M,) [px] of `uv` as the centroid of all that the camera would see of
             the whole marker: noise, doubt of occlusion, size. Positive where `uv` is seen, NaN elsewhere.
-        rival_uv: (M, 2) [px], as `uv`: a second place of the same colour, where the slave could not exclude that
+        alt_uv: (M, 2) [px], as `uv`: a second place of the same colour, where the slave could not exclude that
             this is the marker. NaN: none, the usual case. Only where `uv` is seen.
             A row that is NaN in all was not seen.
         t_sigma_ns: Standard deviation of `t_ns` [ns]: of the sender's stamp until `ingest`, with that of the clock
@@ -63,27 +63,27 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
     area: Annotated[Float, within(0.0, MAX_PICTURE**2)]
     quality: Annotated[Float, within(0.0, 1.0)]
     sigma_px: SigmaPx
-    rival_uv: Pixels
+    alt_uv: Pixels
     t_sigma_ns: TimeSigmaNs = 0.0
 
     def __post_init__(self) -> None:
         m = len(self.area)
         if m > MAX_MARKERS:
             raise ValueError(f"{m} markers, at most {MAX_MARKERS}")
-        if self.rival_uv.size == 0:
-            force_setattr(self, "rival_uv", nowhere(m))
+        if self.alt_uv.size == 0:
+            force_setattr(self, "alt_uv", nowhere(m))
         _marker_arrays(m).freeze(self)
         refuse_sigma(self, "sigma_px", "uv")
-        if self.rival_uv is nowhere(m):
+        if self.alt_uv is nowhere(m):
             return
-        refuse_parts(self, "rival_uv")
-        if not np.isnan(self.rival_uv[np.isnan(self.uv[:, 0])]).all():
-            raise ValueError("rival_uv: a rival of a marker that is not seen")
+        refuse_parts(self, "alt_uv")
+        if not np.isnan(self.alt_uv[np.isnan(self.uv[:, 0])]).all():
+            raise ValueError("alt_uv: a rival of a marker that is not seen")
 
     @property
-    def has_rivals(self) -> bool:
+    def has_alternatives(self) -> bool:
         """Whether a marker has a rival."""
-        return self.rival_uv is not nowhere(len(self.area)) and not bool(np.isnan(self.rival_uv).all())
+        return self.alt_uv is not nowhere(len(self.area)) and not bool(np.isnan(self.alt_uv).all())
 
 
 class WristDetections(Message, frozen=True, eq=False, tag=True):
@@ -123,7 +123,7 @@ class WristDetections(Message, frozen=True, eq=False, tag=True):
     exposure_us: Annotated[float, Meta(ge=0.0, le=1e7)] = 0.0
 
     def __post_init__(self) -> None:
-        _TRIPLE_ARRAYS.freeze(self)
+        _CYCLE_ARRAYS.freeze(self)
         for uv, sigma in (("laser_uv", "laser_sigma_px"), ("tip_uv", "tip_sigma_px")):
             refuse_sigma(self, sigma, uv)
 
@@ -182,12 +182,12 @@ class TrackerPose(Message, frozen=True, eq=False, tag=True):
     seq: Count
     t_ns: TimeNs
     position_m: SensedMetres
-    orientation_wxyz: Turn
+    orientation_wxyz: UnitQuaternion
 
     def __post_init__(self) -> None:
         _TRACKER_ARRAYS.freeze(self)
         refuse_parts(self, "position_m")
-        refuse_no_turn(self, "orientation_wxyz")
+        refuse_bad_quaternion(self, "orientation_wxyz")
 
 
 class ImuSample(Message, frozen=True, eq=False, tag=True):
@@ -213,12 +213,12 @@ class ImuSample(Message, frozen=True, eq=False, tag=True):
     gyro_rad_s: Annotated[Float, within(-200.0, 200.0)]
     accel_m_s2: Annotated[Float, within(-5000.0, 5000.0)]
     mag_ut: Annotated[Float, within(-1e5, 1e5)]
-    orientation_wxyz: Turn
+    orientation_wxyz: UnitQuaternion
     heading_sigma_rad: Annotated[float, within(0.0, 1e3)] = nan
 
     def __post_init__(self) -> None:
         _IMU_ARRAYS.freeze(self)
-        refuse_no_turn(self, "orientation_wxyz")
+        refuse_bad_quaternion(self, "orientation_wxyz")
         refuse_beyond(self, "heading_sigma_rad")
 
 
@@ -235,7 +235,7 @@ def nowhere(markers: int) -> Float:
 
 @cache
 def _marker_arrays(m: int) -> Layout:
-    return Layout(MarkerDetections, uv=(m, 2), area=(m,), quality=(m,), sigma_px=(m,), rival_uv=(m, 2))
+    return Layout(MarkerDetections, uv=(m, 2), area=(m,), quality=(m,), sigma_px=(m,), alt_uv=(m, 2))
 
 
 @cache
@@ -243,7 +243,7 @@ def _tag_arrays(n: int) -> Layout:
     return Layout(TagDetections, ids=(n,), uv=(n, 4, 2), sigma_px=(n,))
 
 
-_TRIPLE_ARRAYS = Layout(
+_CYCLE_ARRAYS = Layout(
     WristDetections,
     laser_uv=(FINGER_COUNT, 2),
     laser_sigma_px=(FINGER_COUNT,),

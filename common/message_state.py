@@ -72,16 +72,16 @@ class Health(Message, frozen=True, eq=False, tag=True):
     session: Count
     t_ns: TimeNs
     counts: Annotated[dict[Name, Count], Meta(max_length=MAX_NUMBERS)]
-    gauges: Annotated[dict[Name, Finite], Meta(max_length=MAX_NUMBERS)]
+    metrics: Annotated[dict[Name, Finite], Meta(max_length=MAX_NUMBERS)]
     host: Text = ""
     version: Text = ""
 
     def __post_init__(self) -> None:
         counts = list(self.counts.items())[:MAX_NUMBERS]
-        gauges = [(name, value) for name, value in self.gauges.items() if isfinite(value)][:MAX_NUMBERS]
+        metrics = [(name, value) for name, value in self.metrics.items() if isfinite(value)][:MAX_NUMBERS]
         force_setattr(self, "counts", {name[:_NAME]: max(0, min(n, MAX_COUNT)) for name, n in counts})
-        clamped = {name[:_NAME]: max(-MAX_NUMBER, min(value, MAX_NUMBER)) for name, value in gauges}
-        force_setattr(self, "gauges", clamped)
+        clamped = {name[:_NAME]: max(-MAX_NUMBER, min(value, MAX_NUMBER)) for name, value in metrics}
+        force_setattr(self, "metrics", clamped)
         force_setattr(self, "host", printable(self.host)[:_NAME])
         force_setattr(self, "version", printable(self.version)[:_NAME])
 
@@ -138,12 +138,12 @@ class Backlog(Message, frozen=True, eq=False, tag=True):
     Attributes:
         source: Process name: "master".
         t_ns: When that message was there [ns], master's clock.
-        leave_out: How many instants of each hand are left out, at most, between two that are solved; 0: none.
+        reject: How many instants of each hand are left out, at most, between two that are solved; 0: none.
     """
 
     source: Name
     t_ns: TimeNs
-    leave_out: Annotated[int, Meta(ge=0, le=64)]
+    reject: Annotated[int, Meta(ge=0, le=64)]
 
 
 class Preview(Message, frozen=True, eq=False, tag=True):

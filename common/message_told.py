@@ -21,7 +21,7 @@ from common.message_parts import (
     Name,
     Numbers,
     TimeNs,
-    Turn,
+    UnitQuaternion,
     refuse_beyond,
     within,
 )
@@ -29,10 +29,10 @@ from common.message_parts import (
 GestureKind = Literal["pose", "pinch", "dial", "tap", "point"]
 Phase = Literal["begin", "update", "end"]
 _NO_LASER = np.full((FINGER_COUNT, 3), np.nan)
-_NO_LEVEL = np.zeros(FINGER_COUNT, dtype=np.uint8)
+_NO_MODE = np.zeros(FINGER_COUNT, dtype=np.uint8)
 _NOT_AMBIGUOUS = np.zeros(FINGER_COUNT, dtype=np.bool_)
 _NO_ROTATION, _NO_SIGMA, _NO_POINT = np.full(4, np.nan), np.full(2, np.nan), np.full(3, np.nan)
-for _nothing in (_NO_LASER, _NO_LEVEL, _NOT_AMBIGUOUS, _NO_ROTATION, _NO_SIGMA, _NO_POINT):
+for _nothing in (_NO_LASER, _NO_MODE, _NOT_AMBIGUOUS, _NO_ROTATION, _NO_SIGMA, _NO_POINT):
     _nothing.flags.writeable = False
 
 
@@ -46,7 +46,7 @@ class Source(IntEnum):
     WRIST = 4
 
 
-class Level(IntEnum):
+class SolverMode(IntEnum):
     """What a wrist device solved a finger from (Digits, UIST 2012: two levels)."""
 
     NONE = 0
@@ -91,21 +91,21 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
             the publication of this pose [ns]; 0 in an offline run.
         laser_m: (5, 3) where the laser of a wrist device meets thumb ... little [m], frame of its camera. NaN: not
             seen, or no such device.
-        level: (5,) `Level` codes: what a wrist device solved each finger from.
+        solver_mode: (5,) `SolverMode` codes: what a wrist device solved each finger from.
         ambiguous: (5,) another pose of the finger explains what the wrist device saw as well; this is the one that
             fits the past, or habit.
         palm_world_wxyz: (4,) quaternion, palm axes -> the world of the IMU on a wrist device, whose z axis is
             vertical. NaN: not known, or no such device.
         palm_world_sigma_rad: (2,) its standard deviations: tilt against the vertical per axis, heading about it.
-        wrist_bend_rad: (2,) flexion and deviation of the wrist between a device on the forearm and the palm
-            (`common.wrist_bend`). NaN: no such device, or nothing tells.
-        wrist_bend_sigma_rad: (2,) their standard deviations.
+        wrist_angles_rad: (2,) flexion and deviation of the wrist between a device on the forearm and the palm
+            (`common.wrist_joint`). NaN: no such device, or nothing tells.
+        wrist_angles_sigma_rad: (2,) their standard deviations.
     """
 
     hand: Name
     t_ns: TimeNs
     position_m: Metres
-    orientation_wxyz: Turn
+    orientation_wxyz: UnitQuaternion
     radius_m: Annotated[Float, within(0.0, 1.0)]
     valid: Bool
     tracked: Bool
@@ -118,19 +118,19 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
     inside_volume: Bool
     latency_ns: TimeNs = 0
     laser_m: Metres = field(default_factory=lambda: _NO_LASER)
-    level: Code = field(default_factory=lambda: _NO_LEVEL)
+    solver_mode: Code = field(default_factory=lambda: _NO_MODE)
     ambiguous: Bool = field(default_factory=lambda: _NOT_AMBIGUOUS)
-    palm_world_wxyz: Turn = field(default_factory=lambda: _NO_ROTATION)
+    palm_world_wxyz: UnitQuaternion = field(default_factory=lambda: _NO_ROTATION)
     palm_world_sigma_rad: Numbers = field(default_factory=lambda: _NO_SIGMA)
-    wrist_bend_rad: Annotated[Float, within(-10.0, 10.0)] = field(default_factory=lambda: _NO_SIGMA)
-    wrist_bend_sigma_rad: Numbers = field(default_factory=lambda: _NO_SIGMA)
+    wrist_angles_rad: Annotated[Float, within(-10.0, 10.0)] = field(default_factory=lambda: _NO_SIGMA)
+    wrist_angles_sigma_rad: Numbers = field(default_factory=lambda: _NO_SIGMA)
 
     def __post_init__(self) -> None:
         m = self.markers_m.size // 3
         if m > MAX_MARKERS:
             raise ValueError(f"{m} markers, at most {MAX_MARKERS}")
         _hand_arrays(m).freeze(self)
-        for name, kind, most in (("source", Source, _MOST_SOURCE), ("level", Level, _MOST_LEVEL)):
+        for name, kind, most in (("source", Source, _MOST_SOURCE), ("solver_mode", SolverMode, _MOST_MODE)):
             if (code := max(getattr(self, name).tolist())) > most:
                 raise ValueError(f"{name}: {code} is no {kind.__name__} code")
 
@@ -175,7 +175,7 @@ class ObjectPose(Message, frozen=True, eq=False, tag=True):
     object: Name
     t_ns: TimeNs
     position_m: Metres
-    orientation_wxyz: Turn
+    orientation_wxyz: UnitQuaternion
     cov: Numbers
     residual_m: Annotated[float, within(0.0, 1e4)]
     source: Annotated[int, Meta(ge=0, le=int(max(ObjectSource)))]
@@ -252,7 +252,7 @@ class Gesture(Message, frozen=True, eq=False, tag=True):
     strength: Annotated[float, within(0.0, 1.0)] = nan
     angle_rad: Annotated[float, within(-1e4, 1e4)] = nan
     origin_m: Metres = field(default_factory=lambda: _NO_POINT)
-    direction: Turn = field(default_factory=lambda: _NO_POINT)
+    direction: UnitQuaternion = field(default_factory=lambda: _NO_POINT)
 
     def __post_init__(self) -> None:
         _GESTURE_ARRAYS.freeze(self)
@@ -281,12 +281,12 @@ def _hand_arrays(m: int) -> Layout:
         markers_cov_m2=(m, 3, 3),
         inside_volume=(j,),
         laser_m=(FINGER_COUNT, 3),
-        level=(FINGER_COUNT,),
+        solver_mode=(FINGER_COUNT,),
         ambiguous=(FINGER_COUNT,),
         palm_world_wxyz=(4,),
         palm_world_sigma_rad=(2,),
-        wrist_bend_rad=(2,),
-        wrist_bend_sigma_rad=(2,),
+        wrist_angles_rad=(2,),
+        wrist_angles_sigma_rad=(2,),
     )
 
 
@@ -299,7 +299,7 @@ _CONTACT_ARRAYS = Layout(
     touching=(FINGER_COUNT,),
 )
 _GESTURE_ARRAYS = Layout(Gesture, origin_m=(3,), direction=(3,))
-_MOST_SOURCE, _MOST_LEVEL = int(max(Source)), int(max(Level))
+_MOST_SOURCE, _MOST_MODE = int(max(Source)), int(max(SolverMode))
 _NEEDED = frozenset(field.name for field in fields(HandPose) if field.required) - {"hand", "t_ns"}
 _nothing_needed: dict[str, Any] = {
     name: np.zeros(shape, of) for name, of, shape in _hand_arrays(0).arrays if name in _NEEDED

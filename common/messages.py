@@ -54,10 +54,10 @@ from common.message_told import (
     Gesture,
     GestureKind,
     HandPose,
-    Level,
     ObjectPose,
     ObjectSource,
     Phase,
+    SolverMode,
     Source,
     Told,
 )
@@ -87,7 +87,6 @@ __all__ = [
     "HandPose",
     "Health",
     "ImuSample",
-    "Level",
     "MarkerDetections",
     "Message",
     "MessageT",
@@ -96,6 +95,7 @@ __all__ = [
     "ObjectSource",
     "Phase",
     "Preview",
+    "SolverMode",
     "Source",
     "Still",
     "TagDetections",
@@ -108,7 +108,7 @@ __all__ = [
     "restamped",
 ]
 
-WIRE_VERSION = 12
+WIRE_VERSION = 13
 
 AnyMessage: TypeAlias = (
     MarkerDetections
@@ -158,9 +158,9 @@ _DECODER = msgspec.msgpack.Decoder(AnyMessage, dec_hook=_from_bytes)
 
 def encode(message: Message) -> bytes:
     """Return the message as msgpack bytes."""
-    if isinstance(message, MarkerDetections) and not message.has_rivals:
+    if isinstance(message, MarkerDetections) and not message.has_alternatives:
         message = copy(message)
-        msgspec.structs.force_setattr(message, "rival_uv", _NONE)
+        msgspec.structs.force_setattr(message, "alt_uv", _NONE)
     return _ENCODER.encode(message)
 
 

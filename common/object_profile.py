@@ -122,8 +122,8 @@ def check_pose(pose: Float, where: str) -> None:
     Raises:
         CalibrationError: With `where`.
     """
-    turned = pose[:3, :3]
-    if not np.allclose(turned @ turned.T, np.eye(3), atol=1e-4) or np.linalg.det(turned) < 0:
+    rotation = pose[:3, :3]
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
         raise CalibrationError(f"{where}: upper left 3x3 is not a rotation")
     if not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]):
         raise CalibrationError(f"{where}: last row must be 0 0 0 1")

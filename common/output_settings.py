@@ -43,7 +43,7 @@ class VmcOutput(Part, frozen=True):
     on: bool = False
     host: Host = LOOPBACK
     port: Port = 39539
-    hand: Literal["palm", "bend", "rest"] = "palm"
+    hand: Literal["palm", "wrist", "rest"] = "palm"
     q_avatar_rig: Quaternion = (0.0, 1.0, 0.0, 0.0)
     forearm_m: Annotated[float, Meta(ge=0.01, le=2.0)] = 0.25
 

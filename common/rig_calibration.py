@@ -109,7 +109,7 @@ class RigCalibration(Part, frozen=True):
     `stamp_offset_us`: how much later the frames of a camera were taken than their stamps say.
     From `laser_plane` on, the keys of a wrist rig, in its camera's frame; `forward`: how the place of the laser on a
     finger becomes its flexion, by the table of this hand or by the cubic printed in the paper; `finger_lines`: finger
-    -> the line along which its laser point moves. `level`: fingers from the laser alone, bent as habit has it (fk),
+    -> the line along which its laser point moves. `solver_mode`: fingers from the laser alone, bent by habit (fk),
     from laser and fingertip, without a tip not at all (ik), or from what there is (auto). `strobe`: laser and LEDs as
     lights, and how long they may shine.
     """
@@ -131,7 +131,7 @@ class RigCalibration(Part, frozen=True):
     power_law: PowerLawCalibration | None = None
     affine_disparity: AffineDisparityCalibration | None = None
     solver: Literal["estimator", "fabrik"] = "estimator"
-    pairing: Literal["interpolate", "predict"] = "interpolate"
+    frame_sync: Literal["interpolate", "predict"] = "interpolate"
     filter: FilterCalibration = FilterCalibration()
     volume: Volume | None = None
     stamp_offset_us: dict[Name, StampOffset] = {}
@@ -143,7 +143,7 @@ class RigCalibration(Part, frozen=True):
     flat_field: FlatField | None = None
     finger_lines: dict[Name, FingerLine] = {}
     forward: Literal["table", "cubic"] = "table"
-    level: Literal["fk", "ik", "auto"] = "auto"
+    solver_mode: Literal["fk", "ik", "auto"] = "auto"
     imu: ImuCalibration | None = None
     strobe: StrobeCalibration | None = None
 

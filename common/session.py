@@ -91,13 +91,13 @@ class Welcome(Handshake, frozen=True):
 class Unproven(Handshake, frozen=True):
     """The hello with this `slave_nonce` was not proven: the master has another secret for its name. No session.
 
-    `apart`: whether the secrets of the master's devices are more than the rig key. It says no more than why: it is not
+    `has_secrets`: whether the secrets of the master's devices are more than the rig key. It says only why: it is not
     proven itself, and whoever has the rig key can say it.
     """
 
     master_nonce: Nonce
     slave_nonce: Nonce
-    apart: bool
+    has_secrets: bool
 
 
 class Start(Handshake, frozen=True):
@@ -174,7 +174,7 @@ class RigKeys:
             ValueError: One is not 32 bytes.
         """
         self._key = key if isinstance(key, LinkKey) else LinkKey(key)
-        self.apart = self._key.apart
+        self.has_secrets = self._key.has_secrets
         self.rig_tag = int.from_bytes(derive(self._key.rig, 4, b"", b"phalanx rig tag"), "big")
 
     def sealer(self, process: int) -> Sealer:
@@ -185,7 +185,7 @@ class RigKeys:
         """Return the body of a handshake datagram if its seal fits, else None."""
         return unseal(ChaCha20Poly1305(self._process_key(header.key_id)), header, datagram)
 
-    def hear(self, header: Header, datagram: bytes, expected: type[HandshakeT]) -> HandshakeT | Refusal:
+    def open_as(self, header: Header, datagram: bytes, expected: type[HandshakeT]) -> HandshakeT | Refusal:
         """Return the message of a handshake datagram, or why it is refused."""
         body = self.open(header, datagram)
         if body is None:

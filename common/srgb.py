@@ -17,7 +17,7 @@ def to_linear(srgb: Float) -> Float:
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
-def relit_bytes(gains: npt.ArrayLike) -> Image:
+def gain_tables(gains: npt.ArrayLike) -> Image:
     """What every byte becomes when the light of its channel is multiplied, as one table per channel.
 
     Args:

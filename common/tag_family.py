@@ -46,7 +46,7 @@ def tag_bits(family: TagFamily, number: int) -> Image:
     if not 0 <= number < grid.tags:
         raise ValueError(f"tag {number}: {family} has 0 to {grid.tags - 1}")
     bits = _opencv_bits(grid, number)
-    return np.rot90(bits, 2).copy() if family.startswith("apriltag") and _half_turned() else bits
+    return np.rot90(bits, 2).copy() if family.startswith("apriltag") and _upside_down() else bits
 
 
 def tag_image(family: TagFamily, number: int, margin: int = 0) -> Image:
@@ -76,7 +76,7 @@ def _opencv_bits(grid: Grid, number: int) -> Image:
 
 
 @cache
-def _half_turned() -> bool:
+def _upside_down() -> bool:
     """Whether this OpenCV holds the AprilTag families upside down."""
     published = np.array([[int(cell) for cell in row] for row in PUBLISHED], np.uint8)
     held = _opencv_bits(GRIDS["apriltag_36h11"], 0)

@@ -18,7 +18,7 @@ from common.hand_model import CHAINS, HandModel
 _ROTATION_WITHIN = 1e-3  # of a rotation matrix: what rounding leaves of one
 _ACROSS = 0.5  # of the normal's length along y: a plane tilted by more than 60 degrees crosses no finger
 _LEAST_M = 1e-3  # a plane nearer to the lens than this tells no distance
-_BESIDE = 1.0  # image sizes from the middle: half an image beside it
+_FIELD_MARGIN = 1.0  # image sizes from the middle: half an image beside it
 _FARTHEST_M = 0.5  # a forearm
 _ORIGIN = np.zeros(3)
 
@@ -94,7 +94,7 @@ def _check_before(optics: CameraModel, knuckles_m: Float, where: str) -> None:
     """Refuse a palm whose knuckles (4, 3) [m] lie behind the camera, or far beside its image: in another unit, say."""
     size = np.array([optics.width_px, optics.height_px])
     uv = optics.project(knuckles_m) / size
-    if not (np.abs(uv - 0.5) <= _BESIDE).all() or knuckles_m[:, 2].max() > _FARTHEST_M:
+    if not (np.abs(uv - 0.5) <= _FIELD_MARGIN).all() or knuckles_m[:, 2].max() > _FARTHEST_M:
         places = ", ".join(f"{1e3 * x:.0f} {1e3 * y:.0f} {1e3 * z:.0f}" for x, y, z in knuckles_m)
         raise CalibrationError(
             f"{where}: T_camera_palm: puts the knuckles of index ... little at {places} mm from the camera, where it"
@@ -109,10 +109,10 @@ def _palm(rig: RigCalibration, where: str) -> Float:
             f"{where}: T_camera_palm is missing, which `phalanx-master calibrate palm` measures"
         )
     palm = np.array(rig.T_camera_palm, dtype=np.float64)
-    turned = palm[:3, :3]
+    rotation = palm[:3, :3]
     if (
-        not np.allclose(turned @ turned.T, np.eye(3), atol=_ROTATION_WITHIN)
-        or np.linalg.det(turned) < 0.0
+        not np.allclose(rotation @ rotation.T, np.eye(3), atol=_ROTATION_WITHIN)
+        or np.linalg.det(rotation) < 0.0
         or not np.array_equal(palm[3], [0.0, 0.0, 0.0, 1.0])
     ):
         raise CalibrationError(f"{where}: T_camera_palm: not a rotation and a shift, last row 0 0 0 1")

@@ -24,7 +24,7 @@ from typing import Protocol
 import zenoh
 
 from common.bus import ANY, Handler, Inbox, Subscription, decoded, payload_of, stream_key
-from common.bus_refusal import say_why_alone, why_refused
+from common.bus_refusal import log_why_alone, why_refused
 from common.bus_settings import settings
 from common.certificates import MASTER, OPERATOR
 from common.endpoints import check, encrypted, loopback
@@ -122,7 +122,7 @@ class ZenohBus:
         atexit.register(self.close)
         self._closing = threading.Event()
         if self._sealed and not beyond:
-            self._threads.append(say_why_alone(lambda: self.peers, self._refusal, self._where, self._closing))
+            self._threads.append(log_why_alone(lambda: self.peers, self._refusal, self._where, self._closing))
 
     @property
     def peers(self) -> int:

@@ -48,7 +48,7 @@ def _demo(options: argparse.Namespace) -> int:
         bus=options.bus,
         console=options.console,
     )
-    summary = run_demo(settings, stop_on_signals(), _say)
+    summary = run_demo(settings, stop_on_signals(), _print)
     _finish(summary, options.json)
     print(
         f"\npicture {settings.out / 'hand.png'}\nRerun   {settings.out / 'run.rrd'}   (open with: rerun FILE)"
@@ -62,14 +62,14 @@ def _replay(options: argparse.Namespace) -> int:
         options.out,
         options.calibration,
         options.hand,
-        level=options.level,
+        solver_mode=options.solver_mode,
         solver=options.solver,
         only=options.only,
         cameras=options.camera,
         rig=options.rig,
         times=options.times,
     )
-    _finish(run_replay(settings, _say), None)
+    _finish(run_replay(settings, _print), None)
     print(f"\nposes   {settings.out / 'poses.npz'}\nsummary {settings.out / 'summary.json'}")
     return 0
 
@@ -77,18 +77,18 @@ def _replay(options: argparse.Namespace) -> int:
 def _deploy(options: argparse.Namespace) -> int:
     rig = rig_of(options)
     targets = targets_of(options.hosts, rig)
-    wish, ears, reached, say = wish_of(options, rig), ears_of(options), reached_of(options), Lines(_say)
+    wish, ears, reached, notify = wish_of(options, rig), ears_of(options), reached_of(options), Lines(_print)
     names = [name for target in targets for name in target.names]
-    with prepared_keys(options.keys, names, options.dry_run, say) as keys:
-        return _told(deploy(targets, replace(wish, keys=keys), reached, ears, say))
+    with prepared_keys(options.keys, names, options.dry_run, notify) as keys:
+        return _told(deploy(targets, replace(wish, keys=keys), reached, ears, notify))
 
 
 def _rollback(options: argparse.Namespace) -> int:
-    return _told(roll_back(_all(options.hosts), reached_of(options), options.dry_run, Lines(_say)))
+    return _told(roll_back(_all(options.hosts), reached_of(options), options.dry_run, Lines(_print)))
 
 
 def _uninstall(options: argparse.Namespace) -> int:
-    return _told(uninstall(_all(options.hosts), reached_of(options), options.dry_run, Lines(_say)))
+    return _told(uninstall(_all(options.hosts), reached_of(options), options.dry_run, Lines(_print)))
 
 
 def _all(hosts: Sequence[str]) -> list[Target]:
@@ -106,17 +106,17 @@ def _told(results: dict[str, str | None]) -> int:
 
 def _wheels(options: argparse.Namespace) -> int:
     kind = Kind(options.machine, options.python, tuple(options.more), ("wrist",))
-    made = export(kind, options.folder, _say)
-    _say(f"{options.folder}: {len(made.files)} wheels, {made.size_mb:.0f} MB, release {made.release}")
+    made = export(kind, options.folder, _print)
+    _print(f"{options.folder}: {len(made.files)} wheels, {made.size_mb:.0f} MB, release {made.release}")
     return 0
 
 
 def _fleet(options: argparse.Namespace) -> int:
     keys = keys_of_fleet(options)
     if options.watch:
-        return watch_fleet(keys, options.bus, _say)
+        return watch_fleet(keys, options.bus, _print)
     devices = fleet_once(keys, options.bus)
-    _say(json.dumps(devices) if options.json else "\n".join(table(devices)))
+    _print(json.dumps(devices) if options.json else "\n".join(table(devices)))
     return 0
 
 
@@ -129,7 +129,7 @@ def _finish(summary: dict[str, object], file: Path | None) -> None:
         print(f"  {line}")
 
 
-def _say(line: str) -> None:
+def _print(line: str) -> None:
     if line.startswith("\r"):
         end = "" if sys.stdout.isatty() else "\n"
         print(line if sys.stdout.isatty() else line[1:], end=end, flush=True)

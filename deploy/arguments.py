@@ -28,7 +28,7 @@ _EXAMPLES = {
   phalanx replay CURL --hand HAND.json --out out/curl       recorded frames of a wrist device
   phalanx replay GRASP --out out/grasp          cameras and wrist device of one hand, solved together
   phalanx replay GRASP --only markers --out out/grasp-markers    without what the wrist device tells, to compare
-  phalanx replay CURL --hand HAND.json --level fk --out out/fk   its fingers from the laser alone, to compare
+  phalanx replay CURL --hand HAND.json --solver-mode fk --out out/fk   its fingers from the laser alone, to compare
 """,
 }
 
@@ -108,7 +108,7 @@ def _add_scene(demo: argparse.ArgumentParser) -> None:
         default="standard",
         help="standard, lights (it changes), poses, hand-routine (of calibrate hand), object (that is tracked, on its "
         "way), or leap:FILE.npz; of a wrist device "
-        "standard, curl, wearer, poses, spread or random; of both kinds of rig at once grasp, gestures, both-poses, "
+        "standard, curl, subject, poses, spread or random; of both kinds of rig at once grasp, gestures, both-poses, "
         "both-curl, both-travel or both-moves; the last two kinds each with @dark, @indoor, @bright or @sun",
     )
 
@@ -161,7 +161,7 @@ def _add_replay(add_parser: AddParser) -> None:
         help="of a recording of both: what the cameras, or what the wrist device tells alone",
     )
     replay.add_argument(
-        "--level",
+        "--solver-mode",
         choices=("fk", "ik", "auto"),
         help="fingers before a wrist device from the laser alone (fk), from laser and fingertip (ik), or from what "
         "there is (auto); default: what its rig says",

@@ -87,7 +87,9 @@ class _State:
     told: set[str] = field(default_factory=set[str])
 
 
-def run_demo(settings: DemoSettings, stop: threading.Event, say: Callable[[str], None]) -> dict[str, object]:
+def run_demo(
+    settings: DemoSettings, stop: threading.Event, notify: Callable[[str], None]
+) -> dict[str, object]:
     """Run the demo and return its summary.
 
     Args:
@@ -100,8 +102,8 @@ def run_demo(settings: DemoSettings, stop: threading.Event, say: Callable[[str],
     """
     with demo_keys(settings) as keys:
         epoch_ns = time.monotonic_ns() + round(1e9 * lead_s(len(settings.sensors()) + 1, os.getloadavg()[0]))
-        restarts = play(settings, keys, epoch_ns, stop, say)
-    summary = _report(settings, epoch_ns, say)
+        restarts = play(settings, keys, epoch_ns, stop, notify)
+    summary = _report(settings, epoch_ns, notify)
     if restarts:
         summary["restarts"] = restarts
         (settings.out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
@@ -132,7 +134,7 @@ def lead_s(processes: int, load: float) -> float:
 
 
 def play(
-    settings: DemoSettings, keys: Path, epoch_ns: int, stop: threading.Event, say: Callable[[str], None]
+    settings: DemoSettings, keys: Path, epoch_ns: int, stop: threading.Event, notify: Callable[[str], None]
 ) -> dict[str, int]:
     """Run the processes for as long as wanted; the master leaves live.json and poses.npz. Who was restarted how often.
 
@@ -162,10 +164,10 @@ def play(
             nice = _GIVES_WAY if name in drawn else 0
             processes.append(Process(name, command, environment, out / f"{name}.log", _listener(state), nice))
         if settings.bus is not None and not settings.bus.startswith("tcp/"):
-            say(f"programs that read along at {settings.bus} need PHALANX_KEYS={keys}")
-        say(f"started {', '.join(f'{p.name} (pid {p.pid})' for p in processes)}; logs in {out}")
-        _wait_until_tracking(state, processes, stop, say)
-        _until_end(settings, state, processes, epoch_ns, stop, say)
+            notify(f"programs that read along at {settings.bus} need PHALANX_KEYS={keys}")
+        notify(f"started {', '.join(f'{p.name} (pid {p.pid})' for p in processes)}; logs in {out}")
+        _wait_until_tracking(state, processes, stop, notify)
+        _until_end(settings, state, processes, epoch_ns, stop, notify)
     finally:
         _stop(processes)
     return {p.name: p.restarts for p in processes if p.restarts}
@@ -232,14 +234,14 @@ def _listener(state: _State) -> Callable[[str, str], None]:
 
 
 def _wait_until_tracking(
-    state: _State, processes: list[Process], stop: threading.Event, say: Callable[[str], None]
+    state: _State, processes: list[Process], stop: threading.Event, notify: Callable[[str], None]
 ) -> None:
-    say("waiting until every camera is there and the first pose is out ...")
+    notify("waiting until every camera is there and the first pose is out ...")
     deadline = time.monotonic() + _READY_S
     while not state.tracking.wait(0.1):
         if stop.is_set():
             return
-        _look_at_viewer(state, processes, say)
+        _look_at_viewer(state, processes, notify)
         failed = next((p for p in processes if p.name != "viewer" and p.ended() is not None), None)
         if failed is not None or time.monotonic() > deadline:
             late = failed or next(p for p in processes if p.name == "master")
@@ -247,7 +249,7 @@ def _wait_until_tracking(
             raise DemoError(f"{late.name}: {what}; its last lines:\n  " + "\n  ".join(late.tail))
 
 
-def _look_at_viewer(state: _State, processes: list[Process], say: Callable[[str], None]) -> None:
+def _look_at_viewer(state: _State, processes: list[Process], notify: Callable[[str], None]) -> None:
     """Say once where the viewer is, and once that it ended: nobody needs it, the run goes on without."""
     viewer = next((p for p in processes if p.name == "viewer"), None)
     if viewer is None:
@@ -261,7 +263,7 @@ def _look_at_viewer(state: _State, processes: list[Process], say: Callable[[str]
         line = f"no viewer: {reason}; the run goes on" if code else "the viewer was closed; the run goes on"
     if line and line not in state.told:
         state.told.add(line)
-        say(line)
+        notify(line)
 
 
 def _until_end(
@@ -270,33 +272,33 @@ def _until_end(
     processes: list[Process],
     epoch_ns: int,
     stop: threading.Event,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
 ) -> None:
     """Let it run for the wanted time; report the rate, and any process that died and was started again."""
     end = max(time.monotonic(), epoch_ns * 1e-9) + settings.seconds
     next_line = 0.0
     while not stop.is_set() and (left := end - time.monotonic()) > 0:
         stop.wait(min(0.05, left))
-        _look_at_viewer(state, processes, say)
+        _look_at_viewer(state, processes, notify)
         for process in processes:
             if process.name == "viewer":
                 continue
             if (code := process.check()) is not None:
                 reason = f" ({process.tail[-1]})" if code > 0 and process.tail else ""
-                say(f"{process.name} ended with code {code}{reason}: started again")
+                notify(f"{process.name} ended with code {code}{reason}: started again")
         if time.monotonic() >= next_line:
             next_line = time.monotonic() + 1.0
             done = min(settings.seconds, max(0.0, settings.seconds - left))
-            say(f"\r{done:4.0f} of {settings.seconds:.0f} s   {state.rate:3.0f} poses/s")
+            notify(f"\r{done:4.0f} of {settings.seconds:.0f} s   {state.rate:3.0f} poses/s")
 
 
-def _report(settings: DemoSettings, epoch_ns: int, say: Callable[[str], None]) -> dict[str, object]:
+def _report(settings: DemoSettings, epoch_ns: int, notify: Callable[[str], None]) -> dict[str, object]:
     out = settings.out
     if not (out / "live.json").exists():
         log = out / "master.log"
         last = (log.read_text(errors="replace").splitlines() or ["nothing"])[-1].partition(" ")[2]
         raise DemoError(f"the master wrote no summary; its last line in {log}: {last}")
-    say("comparing with the exact truth, drawing the hand ...")
+    notify("comparing with the exact truth, drawing the hand ...")
     scene = ["--scene", settings.scene, "--seed", str(settings.seed)]
     place = [*rig_options(settings.rigs), "--calibration", str(settings.calibration), *scene]
     files = ["--poses", str(out / "poses.npz"), "--summary", str(out / "live.json"), "--out", str(out)]

@@ -7,13 +7,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from deploy.hearing import Before, Ears, Heard, heard_of
 from deploy.one_host import Host, Wish
 from deploy.remote import Deadline, Remote, printable, run_bounded
+from deploy.sender_check import Before, Ears, Received, received_of
 from deploy.targets import DeployError, Target
 
 _KEYS_S = 60.0
-Say = Callable[[str], None]
+Notify = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class Reached:
     deadline_s: float
 
 
-def make_keys(folder: Path, names: Sequence[str], say: Say) -> None:
+def make_keys(folder: Path, names: Sequence[str], notify: Notify) -> None:
     """Make what a keys folder lacks for these senders, by `phalanx-master keys make`.
 
     Raises:
@@ -39,7 +39,7 @@ def make_keys(folder: Path, names: Sequence[str], say: Say) -> None:
     wanted += [folder / f"devices/{name}.{kind}" for name in names for kind in ("pem", "secret")]
     if all(path.is_file() for path in wanted):
         return
-    say(f"making keys in {folder}")
+    notify(f"making keys in {folder}")
     devices = [word for name in names for word in ("--device", name)]
     words = [sys.executable, "-m", "master.keys_command", "make", str(folder), *devices]
     lines: list[str] = []
@@ -49,7 +49,7 @@ def make_keys(folder: Path, names: Sequence[str], say: Say) -> None:
 
 
 def deploy(
-    targets: Sequence[Target], wish: Wish, reached: Reached, ears: Ears | None, say: Say
+    targets: Sequence[Target], wish: Wish, reached: Reached, ears: Ears | None, notify: Notify
 ) -> dict[str, str | None]:
     """Deploy to all of them at once; host -> None, or one line why it failed there.
 
@@ -60,7 +60,7 @@ def deploy(
         ears: How their first datagrams are heard; None: nobody listens.
         say: Told one line a step, each with its host.
     """
-    hosts = _hosts(targets, reached, say)
+    hosts = _hosts(targets, reached, notify)
     if ears is None or wish.dry_run:
         return _each(hosts, lambda host: host.deploy(wish))
     before = Before([name for target in targets for name in target.names], ears)
@@ -68,7 +68,7 @@ def deploy(
     def one(host: Host) -> None:
         host.deploy(wish)
         if not host.reboot and before.at_master:  # at once: others may take longer, and it may be silent
-            _wait_heard(host, before.ears(host.start_s))
+            _wait_received(host, before.ears(host.start_s))
 
     try:
         failed = _each(hosts, one)
@@ -76,31 +76,35 @@ def deploy(
         before.end()
     there = [host for host in hosts if failed[host.target.host] is None and not host.reboot]
     if there and not before.at_master:  # then all are listened for together: one port, one start
-        failed |= _hear(there, ears)
+        failed |= _wait_for_senders(there, ears)
     return failed
 
 
-def uninstall(targets: Sequence[Target], reached: Reached, dry_run: bool, say: Say) -> dict[str, str | None]:
+def uninstall(
+    targets: Sequence[Target], reached: Reached, dry_run: bool, notify: Notify
+) -> dict[str, str | None]:
     """Take everything of ours away from all of them; host -> None, or one line why it failed there."""
-    return _each(_hosts(targets, reached, say), lambda host: host.uninstall(dry_run))
+    return _each(_hosts(targets, reached, notify), lambda host: host.uninstall(dry_run))
 
 
-def roll_back(targets: Sequence[Target], reached: Reached, dry_run: bool, say: Say) -> dict[str, str | None]:
+def roll_back(
+    targets: Sequence[Target], reached: Reached, dry_run: bool, notify: Notify
+) -> dict[str, str | None]:
     """Let all of them go back to what was before; host -> None, or one line why it failed there."""
 
     def one(host: Host) -> None:
         host.look()
-        host.say(host.roll_back(dry_run))
+        host.notify(host.roll_back(dry_run))
 
-    return _each(_hosts(targets, reached, say), one)
+    return _each(_hosts(targets, reached, notify), one)
 
 
-def _hosts(targets: Sequence[Target], reached: Reached, say: Say) -> list[Host]:
+def _hosts(targets: Sequence[Target], reached: Reached, notify: Notify) -> list[Host]:
     known: dict[str, str] = {}
 
     def host(target: Target) -> Host:
         remote = Remote(target.host, reached.options, Deadline(reached.deadline_s))
-        return Host(target, remote, lambda line: say(f"{target.host}: {line}"), known=known)
+        return Host(target, remote, lambda line: notify(f"{target.host}: {line}"), known=known)
 
     return [host(target) for target in targets]
 
@@ -111,7 +115,7 @@ def _each(hosts: Sequence[Host], act: Callable[[Host], None]) -> dict[str, str |
             act(host)
         except DeployError as error:
             if len(hosts) > 1:  # the others go on, which takes a while
-                host.say(f"failed: {error}")
+                host.notify(f"failed: {error}")
             return str(error)
         return None
 
@@ -126,36 +130,36 @@ def _each(hosts: Sequence[Host], act: Callable[[Host], None]) -> dict[str, str |
     return {host.target.host: result for host, result in zip(hosts, results, strict=True)}
 
 
-def _hear(hosts: Sequence[Host], ears: Ears) -> dict[str, str | None]:
+def _wait_for_senders(hosts: Sequence[Host], ears: Ears) -> dict[str, str | None]:
     """Wait until each sender was heard; a machine that is silent goes back to what it was."""
     for host in hosts:
-        host.say("waiting for its first datagram")
-    heard = heard_of([name for host in hosts for name in host.target.names], ears)
-    return _each(hosts, lambda host: _judge(host, heard, ears))
+        host.notify("waiting for its first datagram")
+    received = received_of([name for host in hosts for name in host.target.names], ears)
+    return _each(hosts, lambda host: _judge(host, received, ears))
 
 
-def _wait_heard(host: Host, ears: Ears) -> None:
+def _wait_received(host: Host, ears: Ears) -> None:
     """The same for one machine.
 
     Raises:
         DeployError: It is silent, and went back.
     """
-    host.say("waiting for its first datagram")
-    _judge(host, heard_of(host.target.names, ears, host.remote.deadline.ended), ears)
+    host.notify("waiting for its first datagram")
+    _judge(host, received_of(host.target.names, ears, host.remote.deadline.ended), ears)
 
 
-def _judge(host: Host, heard: Heard, ears: Ears) -> None:
+def _judge(host: Host, received: Received, ears: Ears) -> None:
     """Let a machine go back of which somebody is not heard.
 
     Raises:
         DeployError: It is so.
     """
-    missing = [name for name in host.target.names if name not in heard.rates]
+    missing = [name for name in host.target.names if name not in received.rates]
     if not missing:
-        host.say(f"streams: {', '.join(f'{n} {heard.rates[n]:.0f}/s' for n in host.target.names)}")
+        host.notify(f"streams: {', '.join(f'{n} {received.rates[n]:.0f}/s' for n in host.target.names)}")
         return
-    why = heard.cause or f"no datagram of {', '.join(missing)} in {ears.seconds:.0f} s at the master"
-    if heard.cause is not None or not host.changed:
+    why = received.cause or f"no datagram of {', '.join(missing)} in {ears.seconds:.0f} s at the master"
+    if received.cause is not None or not host.changed:
         raise DeployError(why)
     try:
         back = host.roll_back()
@@ -167,7 +171,7 @@ def _judge(host: Host, heard: Heard, ears: Ears) -> None:
 class Lines:
     """Lines of several threads, one after the other. Holds the lock."""
 
-    def __init__(self, write: Say) -> None:
+    def __init__(self, write: Notify) -> None:
         """To `write`."""
         self._write, self._lock = write, threading.Lock()
 

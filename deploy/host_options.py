@@ -7,8 +7,8 @@ from pathlib import Path
 
 from deploy.checks import check_reach, check_wish, default_keys
 from deploy.deployment import Reached, reach_of
-from deploy.hearing import HEAR_S, Ears
 from deploy.one_host import Wish
+from deploy.sender_check import WAIT_SENDERS_S, Ears
 from deploy.targets import DeployError, RigFile, read_rig
 
 _DEADLINE_S = 900.0
@@ -117,10 +117,10 @@ def _add_deploy(add_parser: AddParser, calibration: Path) -> None:
     )
     deploy.add_argument("--no-apt", action="store_true", help="install no packages of the system there")
     deploy.add_argument(
-        "--no-hear", action="store_true", help="do not wait for datagrams, only until slaves are ready"
+        "--no-wait", action="store_true", help="do not wait for datagrams, only until slaves are ready"
     )
     deploy.add_argument("--ready-s", type=float, default=_READY_S, metavar="S", help=argparse.SUPPRESS)
-    deploy.add_argument("--hear-s", type=float, default=HEAR_S, metavar="S", help=argparse.SUPPRESS)
+    deploy.add_argument("--hear-s", type=float, default=WAIT_SENDERS_S, metavar="S", help=argparse.SUPPRESS)
     deploy.add_argument(
         "--beacon", metavar="ADDRESS:PORT", help="where slaves listen for the start (default: broadcast)"
     )
@@ -214,7 +214,7 @@ def wish_of(options: argparse.Namespace, rig: RigFile) -> Wish:
 
 def ears_of(options: argparse.Namespace) -> Ears | None:
     """How first datagrams are heard: here, or at the master of another machine."""
-    if options.no_hear:
+    if options.no_wait:
         return None
     address = _here(options.master)
     bus_host = "127.0.0.1" if address else options.master
@@ -223,7 +223,7 @@ def ears_of(options: argparse.Namespace) -> Ears | None:
     words += ["--bind", options.bind or f"{address or '0.0.0.0'}:{DATA_PORT}"]
     default = "127.255.255.255" if (address or "").startswith("127.") else _EVERYWHERE
     words += ["--beacon", options.beacon or f"{default}:{BEACON_PORT}"]
-    return Ears(tuple(words), options.keys, options.hear_s)
+    return Ears(tuple(words), options.keys, options.wait_senders_s)
 
 
 def reached_of(options: argparse.Namespace) -> Reached:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from deploy.deployment import make_keys
 
-Say = Callable[[str], None]
+Notify = Callable[[str], None]
 
 
 @contextlib.contextmanager
-def prepared_keys(folder: Path, names: Sequence[str], dry_run: bool, say: Say) -> Generator[Path]:
+def prepared_keys(folder: Path, names: Sequence[str], dry_run: bool, notify: Notify) -> Generator[Path]:
     """A keys folder that has all that these senders need.
 
     Args:
@@ -25,7 +25,7 @@ def prepared_keys(folder: Path, names: Sequence[str], dry_run: bool, say: Say) -
         DeployError: They cannot be made.
     """
     if not dry_run:
-        make_keys(folder, names, say)
+        make_keys(folder, names, notify)
         yield folder
         return
     with tempfile.TemporaryDirectory(prefix="phalanx-keys-") as private:
@@ -40,5 +40,5 @@ def prepared_keys(folder: Path, names: Sequence[str], dry_run: bool, say: Say) -
             else:
                 lacking += 1
         if lacking:
-            say(f"would make keys in {folder}")
+            notify(f"would make keys in {folder}")
         yield keys

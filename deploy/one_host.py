@@ -53,8 +53,8 @@ class Wish:
         """
         drivers: list[str] = []
         for name in [one for one in names if one in self.rig.cameras]:
-            said = [one.partition("=") for one in self.cameras]
-            own = [driver if whose == name else whose + sign + driver for whose, sign, driver in said
+            pairs_of = [one.partition("=") for one in self.cameras]
+            own = [driver if whose == name else whose + sign + driver for whose, sign, driver in pairs_of
                    if whose == name or whose not in self.rig.names]  # fmt: skip
             drivers.append(own[-1] if own else _PICAMERA2)
         return next((one for one in drivers if one.startswith(_PICAMERA2)), (drivers or [""])[0])
@@ -77,7 +77,7 @@ class Host:
 
     target: Target
     remote: Remote
-    say: Callable[[str], None]
+    notify: Callable[[str], None]
     sudo: bool = False
     changed: bool = False
     reboot: bool = False
@@ -101,11 +101,11 @@ class Host:
             ("simplejpeg",) if picamera2 and old else (),
             ("wrist",) if wish.rig.kind == "wrist" else (),
         )
-        wheels = wheelhouse(kind, wish.wheels, self.say)
+        wheels = wheelhouse(kind, wish.wheels, self.notify)
         there = wheels.release in cast(list[str], facts["releases"])
         stage = f"{STAGE}/{wheels.release}"
         if not there:
-            self.say(f"{'would send' if wish.dry_run else 'sending'} {wheels.size_mb:.0f} MB of wheels")
+            self.notify(f"{'would send' if wish.dry_run else 'sending'} {wheels.size_mb:.0f} MB of wheels")
         if not there and not wish.dry_run:
             self.remote.send(wheels.files, stage, self.sudo)
         words = ["install", "--json", "--bundle", BUNDLE, "--master", wish.master, "--rig", wish.rig.name]
@@ -124,7 +124,7 @@ class Host:
         done = self._act(words, packed)
         self.changed = bool(done.get("changed")) or bool(done.get("restarted"))
         self.reboot = bool(done.get("reboot"))
-        self.say(str(done["text"]))
+        self.notify(str(done["text"]))
 
     def look(self, camera: str = "", apt: bool = True) -> dict[str, object]:
         """What it is like.
@@ -151,10 +151,10 @@ class Host:
         self.sudo = facts["user"] != "root"
         self.start_s = cast("float | None", facts["start_s"])
         python = ".".join(str(part) for part in cast(list[int], facts["python"]))
-        self.say(f"{facts['model']}, {facts['os']}, {facts['machine']}, Python {python}")
+        self.notify(f"{facts['model']}, {facts['os']}, {facts['machine']}, Python {python}")
         ahead_s = cast(int, facts["t_unix_ns"]) * 1e-9 - arrived
         if abs(ahead_s) > _CLOCK_S:
-            self.say(
+            self.notify(
                 f"its clock is {ahead_s:+.1f} s from this one; chrony brings it here, if this machine answers"
             )
         return facts
@@ -176,7 +176,7 @@ class Host:
         """
         self.look()
         words = ["install", "--json", "--uninstall", *(["--dry-run"] if dry_run else [])]
-        self.say(str(self._act(words, _plain_bundle())["text"]))
+        self.notify(str(self._act(words, _plain_bundle())["text"]))
 
     def _packages(self, facts: dict[str, object], wish: Wish, picamera2: bool) -> None:
         """Bring what the system lacks, or say what it lacks.
@@ -192,7 +192,7 @@ class Host:
         if wish.apt and not wish.dry_run:
             self._act(["packages", *missing], _plain_bundle())
             return
-        self.say(f"{'would install' if wish.apt else 'not installed'}: {' '.join(missing)}")
+        self.notify(f"{'would install' if wish.apt else 'not installed'}: {' '.join(missing)}")
 
     def _act(self, words: Sequence[str], packed: bytes) -> dict[str, object]:
         """Run the installer there; its result.
@@ -203,15 +203,15 @@ class Host:
         result: dict[str, object] = {}
         last = ""
 
-        def hear(line: str) -> None:
+        def on_line(line: str) -> None:
             nonlocal last
             if (found := _result(line)) is not None:
                 result.update(found)
             else:
                 last = line
-                self.say(line)
+                self.notify(line)
 
-        code = self.remote.run(command(words, self.sudo), packed, hear)
+        code = self.remote.run(command(words, self.sudo), packed, on_line)
         if "error" in result:
             raise DeployError(str(result["error"]))
         if code != 0 or not result:

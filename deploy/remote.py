@@ -17,7 +17,7 @@ from deploy.targets import DeployError
 CONNECT_S = 10
 ALIVE_S, ALIVE_TIMES = 3, 3  # a link that is gone shows after nine seconds
 STALLED_S = 15
-_LOOK_S = 0.5
+_POLL_S = 0.5
 _SETTINGS = (
     "BatchMode=yes",
     f"ConnectTimeout={CONNECT_S}",
@@ -177,7 +177,7 @@ def run_bounded(
     assert child.stderr is not None
     errors: list[str] = []
     threads = [
-        threading.Thread(target=_feed, args=(child.stdin, send), daemon=True),
+        threading.Thread(target=_write_input, args=(child.stdin, send), daemon=True),
         threading.Thread(target=_lines, args=(child.stdout, on_line), daemon=True),
         threading.Thread(target=_lines, args=(child.stderr, errors.append), daemon=True),
     ]
@@ -188,7 +188,7 @@ def run_bounded(
     try:
         while code is None and time.monotonic() < end and not (ended is not None and ended.is_set()):
             with contextlib.suppress(subprocess.TimeoutExpired):
-                code = child.wait(min(_LOOK_S, max(0.0, end - time.monotonic())))
+                code = child.wait(min(_POLL_S, max(0.0, end - time.monotonic())))
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(child.pid, signal.SIGKILL)
@@ -198,7 +198,7 @@ def run_bounded(
     return code, [line for line in errors if line.strip()]
 
 
-def _feed(pipe: IO[bytes], content: bytes) -> None:
+def _write_input(pipe: IO[bytes], content: bytes) -> None:
     with contextlib.suppress(BrokenPipeError), pipe:
         pipe.write(content)
 

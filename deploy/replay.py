@@ -29,7 +29,7 @@ class ReplaySettings:
         out: Folder for detections, poses and summary.
         calibration: calib_json tree for marker colours and hands, or None.
         hand: Hand profile, or None for the rig's.
-        level: What the fingers before a wrist device are solved from: fk, ik, auto; None: as its rig says.
+        solver_mode: What the fingers before a wrist device are solved from: fk, ik, auto; None: as its rig says.
         solver: Whose hand a rig of markers publishes: estimator, fabrik; None: as it says.
         cameras, rig, times: Of videos: NAME=PATH each, the rig's name, the table of times.
         only: "markers" or "wrist": the rigs of that kind alone; None: all.
@@ -39,7 +39,7 @@ class ReplaySettings:
     out: Path
     calibration: Path | None
     hand: Path | None
-    level: str | None = None
+    solver_mode: str | None = None
     solver: str | None = None
     only: str | None = None
     cameras: Sequence[str] = ()
@@ -47,16 +47,16 @@ class ReplaySettings:
     times: Path | None = None
 
 
-def run_replay(settings: ReplaySettings, say: Callable[[str], None]) -> dict[str, object]:
+def run_replay(settings: ReplaySettings, notify: Callable[[str], None]) -> dict[str, object]:
     """Detect in every camera and solve, and return the summary.
 
     Raises:
         ReplayError: The recording is unreadable, or a step failed (its own message is on stderr).
     """
-    folder = _recording_of(settings, say)
+    folder = _recording_of(settings, notify)
     rigs = _rigs(folder, settings.only)
-    if settings.level is not None and all(rig.kind != "wrist" for rig in rigs):
-        raise ReplayError(f"--level: {folder} is of no wrist device, which alone has levels")
+    if settings.solver_mode is not None and all(rig.kind != "wrist" for rig in rigs):
+        raise ReplayError(f"--solver-mode: {folder} is of no wrist device, which alone has levels")
     if settings.solver is not None and all(rig.kind != "markers" for rig in rigs):
         raise ReplayError(f"--solver: {folder} is of no rig of markers, which alone has solvers")
     if settings.hand is not None and not settings.hand.is_file():  # said now, not after all the detection
@@ -71,19 +71,19 @@ def run_replay(settings: ReplaySettings, say: Callable[[str], None]) -> dict[str
     hand = [] if settings.hand is None else ["--hand", str(settings.hand)]
     for camera, kind in {camera: rig.kind for rig in rigs for camera in rig.cameras}.items():
         what, needs = ("markers", []) if kind == "markers" else ("fingers", hand)
-        say(f"detecting {what} in camera {camera} ...")
+        notify(f"detecting {what} in camera {camera} ...")
         target = ["-o", str(out / f"detections_{camera}.npz")]
         _step("slave", "detect", recording, "--camera", camera, *calibration, *needs, *target)
-    say("solving ...")
+    notify("solving ...")
     which = [] if settings.only is None else ["--only", settings.only]
-    which += [] if settings.level is None else ["--level", settings.level]
+    which += [] if settings.solver_mode is None else ["--solver-mode", settings.solver_mode]
     which += [] if settings.solver is None else ["--solver", settings.solver]
     results = ["--detections", str(out), "--out", str(out)]
     _step("master", "solve", recording, *calibration, *hand, *which, *results)
     return cast(dict[str, object], json.loads((out / "summary.json").read_text()))
 
 
-def _recording_of(settings: ReplaySettings, say: Callable[[str], None]) -> Path:
+def _recording_of(settings: ReplaySettings, notify: Callable[[str], None]) -> Path:
     """The recording, made of videos or pictures in OUT/recording if need be.
 
     Raises:
@@ -101,7 +101,7 @@ def _recording_of(settings: ReplaySettings, say: Callable[[str], None]) -> Path:
         raise ReplayError(
             "videos and pictures need --calibration DIR: lenses, places and colours of their cameras"
         )
-    say("reading the videos or pictures ...")
+    notify("reading the videos or pictures ...")
     made = settings.out / "recording"
     options = ["--calibration", str(settings.calibration), "-o", str(made)]
     options += [text for camera in settings.cameras for text in ("--camera", camera)]

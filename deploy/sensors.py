@@ -61,11 +61,11 @@ def sensors_of(calibration: Path, rigs: tuple[str, ...], scene: str) -> list[Sen
         raise DemoError(
             f"--scene object: rig {', '.join(read)} tracks no object; --rig desk-wand or desk-cube does"
         )
-    worn = any(rig.kind == "wrist" for rig in read.values())
+    has_wrist_rig = any(rig.kind == "wrist" for rig in read.values())
     found: dict[SensorKind, list[Sensor]] = {"camera": [], "imu": [], "tracker": []}
     for name, rig in read.items():
         # The light behind the @ is that of a wrist device; cameras that watch markers have their own.
-        own = moves if light and worn and rig.kind == "markers" else scene
+        own = moves if light and has_wrist_rig and rig.kind == "markers" else scene
         found["camera"] += [Sensor(one, name, own) for one in rig.cameras]
         found["imu"] += [Sensor(one, name, own, "imu") for one in rig.imus]
         found["tracker"] += [Sensor(one, name, own, "tracker") for one in rig.trackers]

@@ -69,7 +69,7 @@ class Wheels:
         return sum(file.stat().st_size for file in self.files) * 1e-6
 
 
-def wheelhouse(kind: Kind, given: Path | None, say: Callable[[str], None]) -> Wheels:
+def wheelhouse(kind: Kind, given: Path | None, notify: Callable[[str], None]) -> Wheels:
     """The wheels for machines of this kind.
 
     Args:
@@ -81,14 +81,14 @@ def wheelhouse(kind: Kind, given: Path | None, say: Callable[[str], None]) -> Wh
         DeployError: A wheel cannot be had.
     """
     try:
-        return _gathered(kind, given, say)
+        return _gathered(kind, given, notify)
     except OSError as error:
         raise DeployError(f"wheels: {error.filename or cache()}: {error.strerror or error}") from error
 
 
-def _gathered(kind: Kind, given: Path | None, say: Callable[[str], None]) -> Wheels:
+def _gathered(kind: Kind, given: Path | None, notify: Callable[[str], None]) -> Wheels:
     with _LOCK:  # the second machine of a kind waits for the first
-        folder = _downloaded(kind, say) if given is None else given
+        folder = _downloaded(kind, notify) if given is None else given
         files = sorted(folder.glob("*.whl"))
         if not files:
             raise DeployError(f"--wheelhouse {given}: no wheels in it")
@@ -135,7 +135,7 @@ def fits(wheel: str, kind: Kind) -> bool:
     return False
 
 
-def export(kind: Kind, folder: Path, say: Callable[[str], None]) -> Wheels:
+def export(kind: Kind, folder: Path, notify: Callable[[str], None]) -> Wheels:
     """Put the wheels for machines of this kind into a folder, for a machine without a network.
 
     Raises:
@@ -143,7 +143,7 @@ def export(kind: Kind, folder: Path, say: Callable[[str], None]) -> Wheels:
     """
     if folder.exists() and any(folder.iterdir()):
         raise DeployError(f"{folder}: is not empty")
-    wheels = wheelhouse(kind, None, say)
+    wheels = wheelhouse(kind, None, notify)
     folder.mkdir(parents=True, exist_ok=True)
     for file in wheels.files:
         shutil.copy2(file, folder)
@@ -202,14 +202,14 @@ def _digest(content: bytes) -> str:
     return urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
 
 
-def _downloaded(kind: Kind, say: Callable[[str], None]) -> Path:
+def _downloaded(kind: Kind, notify: Callable[[str], None]) -> Path:
     requirements = [*_requirements(kind.extras), *kind.more, "pip"]
     limits = _limits()
     key = "\n".join([*requirements, *([] if limits is None else [limits.read_text()])])
     digest = hashlib.sha256(key.encode()).hexdigest()[:12]
     folder = cache() / f"{kind.machine}-{kind.python}-{digest}"
     if not folder.is_dir():
-        say(f"downloading wheels for {kind.machine}, Python {kind.python}")
+        notify(f"downloading wheels for {kind.machine}, Python {kind.python}")
         fresh = folder.with_name(f".{folder.name}.{os.getpid()}")
         shutil.rmtree(fresh, ignore_errors=True)
         fresh.mkdir(parents=True)

@@ -20,7 +20,7 @@ from common.messages import (
 )
 from common.token_bucket import TokenBucket
 from master.rig_setup import RigSetup
-from master.sequence import TRIPLE
+from master.sequence import CYCLE_FRAMES
 
 READY_NS = 10_000_000_000  # between the exposure of a frame and the slave's having it
 OLD_NS = 1_000_000_000  # no message is older when it comes: it would be of no use
@@ -84,7 +84,7 @@ def limits_of(setups: Iterable[RigSetup]) -> dict[str, SenderLimits]:
             own = None if name in setup.wrist_cameras else len(setup.rows.get(name, setup.markers))
             before = limits[name].markers if name in limits else None  # of a rig that watches several hands
             markers = own if before is None or own is None else own + before
-            rate_hz = camera.frame_rate_hz / (TRIPLE if name in setup.wrist_cameras else 1)
+            rate_hz = camera.frame_rate_hz / (CYCLE_FRAMES if name in setup.wrist_cameras else 1)
             limits[name] = SenderLimits(size, markers, rate_hz)
         for rig in (setup.rig, setup.wrist_rig):
             if rig is not None and rig.imu is not None:
@@ -96,8 +96,8 @@ def limits_of(setups: Iterable[RigSetup]) -> dict[str, SenderLimits]:
 def _points(message: Detections | TagDetections) -> tuple[Float, ...]:
     if isinstance(message, WristDetections):
         return message.laser_uv, message.tip_uv
-    if isinstance(message, MarkerDetections) and message.has_rivals:
-        return message.uv, message.rival_uv
+    if isinstance(message, MarkerDetections) and message.has_alternatives:
+        return message.uv, message.alt_uv
     return (message.uv,)
 
 

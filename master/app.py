@@ -32,8 +32,10 @@ _OBJECT_KEPT = 2_000  # and of objects, some seconds of each
 SeenT = TypeVar("SeenT", bound=Detections)
 SeenT_co = TypeVar("SeenT_co", bound=Detections, covariant=True)
 SeenT_contra = TypeVar("SeenT_contra", bound=Detections, contravariant=True)
-Beside: TypeAlias = TagDetections | ImuSample | TrackerPose  # what comes beside the frames of cameras
-_BESIDE = (TagDetections, ImuSample, TrackerPose)
+AuxiliaryMessage: TypeAlias = (
+    TagDetections | ImuSample | TrackerPose
+)  # what comes beside the frames of cameras
+_AUXILIARY = (TagDetections, ImuSample, TrackerPose)
 
 
 class SolvedT(Protocol):
@@ -56,7 +58,7 @@ Solved: TypeAlias = SolvedT | Contact | Gesture
 class Source(Protocol[SeenT_co]):
     """Where detections, samples and poses come from: the network, or a test."""
 
-    def get(self, timeout_s: float) -> SeenT_co | Beside | None:
+    def get(self, timeout_s: float) -> SeenT_co | AuxiliaryMessage | None:
         """The next message, or None when none came in time."""
         ...
 
@@ -64,7 +66,7 @@ class Source(Protocol[SeenT_co]):
 class Solver(Protocol[SeenT_contra]):
     """What is made of all that comes: the world of a master."""
 
-    def push(self, message: SeenT_contra | Beside) -> Iterable[Solved]:
+    def push(self, message: SeenT_contra | AuxiliaryMessage) -> Iterable[Solved]:
         """Take one message; give what it completes: each is out before the next is worked out."""
         ...
 
@@ -125,20 +127,20 @@ class RunFigures:
 class Observed(Generic[SeenT]):
     """A solver, with measurements of the cameras' messages around it.
 
-    Rates are counted before it; `watch` is called once all is out.
+    Rates are counted before it; `monitor` is called once all is out.
     """
 
-    def __init__(self, solver: Solver[SeenT], rates: CameraRates, watch: Callable[[SeenT], None]) -> None:
-        self._solver, self._rates, self._watch = solver, rates, watch
+    def __init__(self, solver: Solver[SeenT], rates: CameraRates, monitor: Callable[[SeenT], None]) -> None:
+        self._solver, self._rates, self._monitor = solver, rates, monitor
 
-    def push(self, message: SeenT | Beside) -> Iterator[Solved]:
+    def push(self, message: SeenT | AuxiliaryMessage) -> Iterator[Solved]:
         """Take one message; give what it completes."""
-        if isinstance(message, _BESIDE):
+        if isinstance(message, _AUXILIARY):
             yield from self._solver.push(message)
             return
         self._rates.push(message)
         yield from self._solver.push(message)
-        self._watch(message)
+        self._monitor(message)
 
 
 def run(
@@ -177,9 +179,9 @@ def health(
     times: Mapping[str, float] | None = None,
 ) -> Health:
     """The master's report; gauges tell what a camera runs at (camera_hz.NAME) from what is solved (poses_per_s)."""
-    gauges = {name: value for name, value in figures.summary().items() if name != "poses"}
-    gauges |= {f"camera_hz.{camera}"[:_NAME]: hz for camera, hz in figures.rates.camera_hz.items()}
-    gauges |= times or {}
+    metrics = {name: value for name, value in figures.summary().items() if name != "poses"}
+    metrics |= {f"camera_hz.{camera}"[:_NAME]: hz for camera, hz in figures.rates.camera_hz.items()}
+    metrics |= times or {}
     told = {name: number for name, number in figures.told.items() if number}
     events = {"poses": figures.poses} | told | counts
-    return Health("master", session, clock.now_ns(), events, gauges, *program())
+    return Health("master", session, clock.now_ns(), events, metrics, *program())

@@ -151,13 +151,13 @@ def tell(bus: Bus, steps: list[Command]) -> Health:
 def table(health: Health) -> list[str]:
     """Lines for a person: each setting, what is wanted, what was read back; then what else the camera says."""
     rows = [("setting", "wanted", "read back")]
-    for gauge, value in health.gauges.items():
-        if gauge.startswith(WANTED):
-            setting = gauge.removeprefix(WANTED)
-            got = health.gauges.get(setting)
+    for metric, value in health.metrics.items():
+        if metric.startswith(WANTED):
+            setting = metric.removeprefix(WANTED)
+            got = health.metrics.get(setting)
             rows.append((setting, f"{value:.6g}", "-" if got is None else f"{got:.6g}"))
-    also = [gauge for gauge in health.gauges if gauge in _ALSO or gauge.startswith(_MORE)]
-    rows += [(gauge, "", f"{health.gauges[gauge]:.6g}") for gauge in also]
+    also = [metric for metric in health.metrics if metric in _ALSO or metric.startswith(_MORE)]
+    rows += [(metric, "", f"{health.metrics[metric]:.6g}") for metric in also]
     rows += [(event, "", str(n)) for event, n in health.counts.items() if event.startswith(_EVENTS)]
     return [f"{name:<22} {wanted:>10} {got:>10}".rstrip() for name, wanted, got in rows]
 

@@ -18,7 +18,7 @@ COMMANDS = {
     "check": "master.checklist.command:check",
     "export": "master.export.command:export",
     "fleet": "master.fleet:fleet",
-    "hear": "master.hear:hear",
+    "hear": "master.wait_for_senders:wait_for_senders",
     "record": "master.recording.record_command:record",
     "play": "master.recording.play_command:play",
     "info": "master.recording.info_command:info",

@@ -19,8 +19,8 @@ from master.options import (
     KeyFile,
     address,
 )
-from master.said import say
 from master.stopping import stop_on_signals
+from master.terminal import print_line
 
 
 def console(
@@ -82,4 +82,4 @@ def console(
         password_file,
         is_open(os.environ),
     )
-    run_console(settings, stop_on_signals(), say)
+    run_console(settings, stop_on_signals(), print_line)

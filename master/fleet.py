@@ -19,7 +19,7 @@ from master.master_bus import join_bus
 from master.options import HERE_BUS, BusEnd
 from master.stopping import stop_on_signals
 
-_LOOK_S = 0.1
+_POLL_S = 0.1
 _SILENT_S = 3.0  # three reports
 
 
@@ -76,7 +76,7 @@ class Roll:
 
     def _device(self, name: str, now_s: float) -> Device:
         master = self._last.get(MASTER)
-        told = {} if master is None else master.gauges
+        told = {} if master is None else master.metrics
         rate = self._rate(name)
         clock = (told.get(f"{name}.clock_offset_us"), told.get(f"{name}.clock_sigma_us"))
         own = self._last.get(name)
@@ -93,14 +93,14 @@ class Roll:
             if rate
             else "waiting"
         )
-        gauges = own.gauges
-        throttled = gauges.get("throttled")
+        metrics = own.metrics
+        throttled = metrics.get("throttled")
         return Device(
             name,
             state,
             own.host,
             own.version,
-            gauges.get("temperature_c"),
+            metrics.get("temperature_c"),
             None if throttled is None else bool(throttled),
             rate,
             *clock,
@@ -160,7 +160,7 @@ def _listen(bus: Bus, roll: Roll, period_s: float, watch: bool, stop: threading.
     inbox = bus.subscribe("health", depth=256)
     told = time.monotonic() + period_s
     while not stop.is_set():
-        health = inbox.get(_LOOK_S)
+        health = inbox.get(_POLL_S)
         if isinstance(health, Health):
             roll.push(health, time.monotonic())
         if time.monotonic() >= told:

@@ -21,11 +21,11 @@ from common.supervisor import until
 from common.udp import UdpSocket
 from master.admission import SenderLimits
 from master.link import MasterLink
-from master.link_senders import Taken
+from master.link_senders import SensorMessage
 from master.message_queue import MessageQueue
 from master.quarantine import Quarantine
+from master.rejected_peers import MarkerCounts, RejectedPeer
 from master.sequence import CameraCounts
-from master.turned_away import Away, MarkerCounts
 
 AT_ONCE = 64  # datagrams between two looks at what is due: less than a millisecond
 DUE_NS = 1_000_000  # nor is it looked at more often while nothing but data comes
@@ -170,13 +170,15 @@ class Ingest:
         with self._lock:
             return self._link.counts_of(sender)
 
-    def turned_away(self) -> tuple[dict[str, Away], dict[str, Away], dict[str, Away]]:
+    def rejected_peers(
+        self,
+    ) -> tuple[dict[str, RejectedPeer], dict[str, RejectedPeer], dict[str, RejectedPeer]]:
         """Sender -> where a second process of its name was turned away lately; where it speaks another version; where
         somebody says hello without its secret."""
         t_ns = self._clock.now_ns()
         with self._lock:
-            away = self._link.turned_away
-            return away.twins(t_ns), away.versions(t_ns), away.secrets(t_ns)
+            rejected = self._link.rejected_peers
+            return rejected.duplicates(t_ns), rejected.versions(t_ns), rejected.secrets(t_ns)
 
     def marker_counts(self) -> dict[str, MarkerCounts]:
         """Camera -> how many markers its slave sent lately and its rig has here.
@@ -185,7 +187,7 @@ class Ingest:
         """
         t_ns = self._clock.now_ns()
         with self._lock:
-            return self._link.turned_away.marker_counts(t_ns)
+            return self._link.rejected_peers.marker_counts(t_ns)
 
     def clock_of(self, camera: str) -> ClockEstimate | None:
         """Return how the clock of `camera` runs against this one; None while unknown.
@@ -196,7 +198,7 @@ class Ingest:
         with self._lock:
             return self._link.clock_of(camera)
 
-    def get(self, timeout_s: float) -> Taken | None:
+    def get(self, timeout_s: float) -> SensorMessage | None:
         """Return the oldest waiting message, times on the master's clock; None after `timeout_s`."""
         return self.queue.get(timeout_s)
 
@@ -211,24 +213,24 @@ class Ingest:
         due_ns = self._clock.now_ns()
         while not self._closing.is_set():
             first = self._socket.receive()
-            taken: list[Taken] = []
+            messages: list[SensorMessage] = []
             outbox: list[tuple[bytes, Address]] = []
-            come = 0
+            pending = 0
             with self._lock:
-                for datagram, address in self._come(first):
-                    come += 1
+                for datagram, address in self._pending(first):
+                    pending += 1
                     message = self._link.receive(datagram, address, self._clock.now_ns())
                     if message is not None:
-                        taken.append(message)
+                        messages.append(message)
                 now_ns = self._clock.now_ns()
-                if come != len(taken) or come == 0 or now_ns >= due_ns:
+                if pending != len(messages) or pending == 0 or now_ns >= due_ns:
                     outbox, due_ns = self._link.due(), now_ns + DUE_NS
             for datagram, address in outbox:
                 self._socket.send(datagram, address)
-            if taken:
-                self.queue.put(taken)
+            if messages:
+                self.queue.put(messages)
 
-    def _come(self, first: tuple[bytes, Address] | None) -> Iterator[tuple[bytes, Address]]:
+    def _pending(self, first: tuple[bytes, Address] | None) -> Iterator[tuple[bytes, Address]]:
         """What has come, at most `AT_ONCE`: under a flood it is not for each that all that is due is seen to."""
         if first is None:
             return

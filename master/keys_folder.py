@@ -104,8 +104,8 @@ def renew(folder: Path, now: datetime, without: Iterable[str] = ()) -> list[str]
     try:
         with tempfile.TemporaryDirectory(
             prefix=".new.", dir=folder
-        ) as beside:  # one file system: each file is replaced
-            fresh = Path(beside)
+        ) as temporary:  # one file system: each file is replaced
+            fresh = Path(temporary)
             made = make(fresh, left, now)
             for name in gone:
                 for ending in _ENDINGS:

@@ -58,10 +58,10 @@ from common.session import (
 )
 from common.streams import sender_of
 from master.admission import SenderLimits
-from master.link_senders import ASKED, Sender, Session, Taken, not_admitted, on_master_clock
+from master.link_senders import ASKED, Sender, SensorMessage, Session, not_admitted, on_master_clock
 from master.quarantine import Quarantine
-from master.sequence import TRIPLE, CameraCounts
-from master.turned_away import TurnedAway
+from master.rejected_peers import RejectedPeers
+from master.sequence import CYCLE_FRAMES, CameraCounts
 
 BEACON_NS = 100_000_000
 ECHO_FAST_NS = 10_000_000  # in the first two seconds, and until the clock is settled
@@ -71,7 +71,7 @@ ECHO_NS = 200_000_000
 EARLY_NS = 5_000_000_000
 PENDING_NS = 1_000_000_000  # a hello whose slave never confirms is forgotten
 SILENT_NS = 1_000_000_000
-START_LEAD_NS = 100_000_000  # room for two repetitions of the start before it is due
+START_DELAY_NS = 100_000_000  # room for two repetitions of the start before it is due
 START_AGAIN_NS = 50_000_000
 
 
@@ -125,9 +125,9 @@ class MasterLink:
         self._start_timeout_ns = start_timeout_ns
         self._nonce = random(NONCE_BYTES)
         self._sealer = self._keys.sealer(new_process_id(random(8)))
-        kinds: tuple[tuple[tuple[str, ...], dict[type[Taken], int | None]], ...] = (
+        kinds: tuple[tuple[tuple[str, ...], dict[type[SensorMessage], int | None]], ...] = (
             (cameras, {MarkerDetections: 1, TagDetections: None}),
-            (wrists, {WristDetections: TRIPLE}),
+            (wrists, {WristDetections: CYCLE_FRAMES}),
             (imus, {ImuSample: 1}),
             (trackers, {TrackerPose: 1}),
         )
@@ -148,19 +148,19 @@ class MasterLink:
         self.refused: Counter[Refusal] = Counter()
         self.unsynchronised = 0
         self.quarantine = Quarantine()
-        self.turned_away = TurnedAway(self._keys, self._senders)
+        self.rejected_peers = RejectedPeers(self._keys, self._senders)
 
-    def receive(self, datagram: bytes, address: Address, t_ns: int) -> Taken | None:
+    def receive(self, datagram: bytes, address: Address, t_ns: int) -> SensorMessage | None:
         """Take one datagram that arrived from `address` at `t_ns`; return what it brought."""
         header = parse(datagram, self._keys.rig_tag)
         if isinstance(header, Refusal):
             result = header
             if header is Refusal.VERSION:
-                self.turned_away.other_version(datagram, address[0], t_ns)
+                self.rejected_peers.other_version(datagram, address[0], t_ns)
         elif header.kind is Kind.HELLO:
-            result = self._hear_hello(header, datagram, address, t_ns)
+            result = self._on_hello(header, datagram, address, t_ns)
         elif header.kind in (Kind.ECHO_ANSWER, Kind.STARTED, Kind.DATA):
-            result = self._hear_slave(header, datagram, t_ns)
+            result = self._on_slave(header, datagram, t_ns)
         else:
             result = Refusal.UNEXPECTED
         if isinstance(result, Refusal):
@@ -199,13 +199,15 @@ class MasterLink:
         of = self._senders[sender]
         if of.live is None:
             return State.IDLE if of.pending is None else State.PENDING
-        return State.LIVE if t_ns - of.live.heard_ns < WELL_NS else State.SILENT
+        return State.LIVE if t_ns - of.live.received_ns < WELL_NS else State.SILENT
 
     def connected(self) -> frozenset[str]:
         """Return the senders heard in a live session within the last second."""
         t_ns = self._clock.now_ns()
         live = ((name, sender.live) for name, sender in self._senders.items())
-        return frozenset(name for name, link in live if link is not None and t_ns - link.heard_ns < SILENT_NS)
+        return frozenset(
+            name for name, link in live if link is not None and t_ns - link.received_ns < SILENT_NS
+        )
 
     def clock_of(self, sender: str) -> ClockEstimate | None:
         """Return how the clock of `sender` runs, or None before its first echo."""
@@ -246,8 +248,8 @@ class MasterLink:
         known = {name: session.key_id for name, session in live.items() if session is not None}
         return Beacon(self._nonce, self._zenoh_endpoint, known)
 
-    def _hear_hello(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
-        hello = self._keys.hear(header, datagram, Hello)
+    def _on_hello(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
+        hello = self._keys.open_as(header, datagram, Hello)
         if isinstance(hello, Refusal):
             return hello
         sender = self._senders.get(hello.name)
@@ -255,11 +257,11 @@ class MasterLink:
             return Refusal.UNKNOWN if hello.master_nonce == self._nonce else Refusal.REPLAYED
         event = self._hello_event(hello, sender)
         rule = RULES[Role.MASTER, self.state(hello.name, t_ns), event]
-        if rule.refusal is Refusal.TWIN:
-            self.turned_away.twin(hello.name, address[0], WIRE_VERSION, t_ns)
+        if rule.refusal is Refusal.DUPLICATE_SENDER:
+            self.rejected_peers.duplicate(hello.name, address[0], WIRE_VERSION, t_ns)
         if rule.reply is Kind.UNPROVEN:
-            self.turned_away.unproven(hello.name, address[0], WIRE_VERSION, t_ns)
-            unproven = Unproven(self._nonce, hello.slave_nonce, self._keys.apart)
+            self.rejected_peers.unproven(hello.name, address[0], WIRE_VERSION, t_ns)
+            unproven = Unproven(self._nonce, hello.slave_nonce, self._keys.has_secrets)
             self._outbox.append((seal(self._sealer, unproven), address))
         if rule.reply is Kind.WELCOME:
             session = self._of_nonce(sender, hello.slave_nonce)  # its welcome was lost
@@ -301,14 +303,14 @@ class MasterLink:
         sealer = self._keys.session_sealer(keys.to_slave, keys.key_id)
         return Session(
             hello.name, hello, session_nonce, keys.proof, keys.key_id, address, sealer, Opener(keys.to_master),
-            since_ns=t_ns, heard_ns=t_ns, next_echo_ns=t_ns, next_start_ns=t_ns,
+            since_ns=t_ns, received_ns=t_ns, next_echo_ns=t_ns, next_start_ns=t_ns,
         )  # fmt: skip
 
     def _welcome(self, session: Session) -> None:
         welcome = Welcome(self._nonce, session.hello.slave_nonce, session.session_nonce, session.proof)
         self._outbox.append((seal(self._sealer, welcome), session.address))
 
-    def _hear_slave(self, header: Header, datagram: bytes, t_ns: int) -> Taken | Refusal | None:
+    def _on_slave(self, header: Header, datagram: bytes, t_ns: int) -> SensorMessage | Refusal | None:
         session = self._sessions.get(header.key_id)
         if session is None:
             return Refusal.STALE
@@ -324,13 +326,13 @@ class MasterLink:
 
     def _opened(
         self, session: Session, sender: Sender, header: Header, datagram: bytes, t_ns: int
-    ) -> Taken | Refusal | None:
+    ) -> SensorMessage | Refusal | None:
         opened = session.opener.open(header, datagram)
         if isinstance(opened, Refusal):
             if opened is Refusal.DUPLICATE:
                 sender.main.sequence.duplicate()
             return opened
-        session.heard_ns = t_ns
+        session.received_ns = t_ns
         if sender.pending is session:
             self._confirm(sender, session, t_ns)
         if opened.reordered:
@@ -365,7 +367,7 @@ class MasterLink:
 
     def _take_data(
         self, session: Session, sender: Sender, opened: Opened, counter: int, now_ns: int
-    ) -> Taken | Refusal | None:
+    ) -> SensorMessage | Refusal | None:
         if self.quarantine.holds(session.name, now_ns):
             return Refusal.FAULTY
         try:
@@ -374,7 +376,7 @@ class MasterLink:
             return Refusal.OUT_OF_BOUNDS
         except MessageError:
             return Refusal.UNDECODABLE
-        if not isinstance(message, Taken):
+        if not isinstance(message, SensorMessage):
             return Refusal.UNDECODABLE
         name = sender_of(message)
         kind = sender.kinds.get(type(message))
@@ -382,7 +384,7 @@ class MasterLink:
             return Refusal.IMPOSTOR
         if (why := not_admitted(message, session, sender, now_ns)) is not None:
             if why is Refusal.MARKER_COUNT and isinstance(message, MarkerDetections):
-                self.turned_away.marker_count(name, len(message.area), sender.limits.markers or 0, now_ns)
+                self.rejected_peers.marker_count(name, len(message.area), sender.limits.markers or 0, now_ns)
             return why
         session.started = True
         if opened.reordered:
@@ -397,7 +399,7 @@ class MasterLink:
         t_ns = self._clock.now_ns()  # asked for each: it is the time stamp itself
         if t_ns < session.next_echo_ns:
             return
-        if t_ns - session.heard_ns > SILENT_NS:
+        if t_ns - session.received_ns > SILENT_NS:
             period = ECHO_NS
         elif not session.clock.settled or t_ns - session.since_ns < FAST_NS:
             period = ECHO_FAST_NS
@@ -415,7 +417,7 @@ class MasterLink:
             return
         ready = all(sender.live is not None and sender.live.clock.ready for sender in self._awaited)
         if ready or t_ns - self._first_ns > self._start_timeout_ns:
-            self._start_ns = t_ns + START_LEAD_NS
+            self._start_ns = t_ns + START_DELAY_NS
 
     def _send_start(self, sender: Sender, t_ns: int) -> None:
         session = sender.live

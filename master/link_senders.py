@@ -22,7 +22,7 @@ ASKED = 256  # echoes that wait for an answer; later ones are worth nothing
 AHEAD_NS = 50_000_000  # by how much the conversion of a time to this clock may be wrong
 _MAX_SIGMA_NS = 1e10
 
-Taken: TypeAlias = Sensed
+SensorMessage: TypeAlias = Sensed
 
 
 @dataclass(slots=True)
@@ -38,7 +38,7 @@ class Session:
     sealer: Sealer
     opener: Opener
     since_ns: int
-    heard_ns: int
+    received_ns: int
     next_echo_ns: int
     next_start_ns: int
     started: bool = False
@@ -53,9 +53,9 @@ class Sender:
     `kinds` are the kinds of message that it sends, the main one first.
     """
 
-    kinds: dict[type[Taken], Counted]
+    kinds: dict[type[SensorMessage], Counted]
     limits: SenderLimits
-    buckets: dict[type[Taken], TokenBucket]
+    buckets: dict[type[SensorMessage], TokenBucket]
     live: Session | None = None
     pending: Session | None = None
     old_nonces: deque[bytes] = field(default_factory=lambda: deque[bytes](maxlen=OLD_NONCES))
@@ -64,7 +64,7 @@ class Sender:
     refused: int = 0  # of what it sealed in a session
 
     @classmethod
-    def of(cls, steps: Mapping[type[Taken], int | None], limits: SenderLimits) -> "Sender":
+    def of(cls, steps: Mapping[type[SensorMessage], int | None], limits: SenderLimits) -> "Sender":
         """A sender of these kinds of message, within these limits.
 
         The number of each kind rises by the step in `steps` from one message to the next.
@@ -92,7 +92,7 @@ class Sender:
                 kind.losses.late(counter, 0)
 
 
-def not_admitted(message: Taken, session: Session, sender: Sender, now_ns: int) -> Refusal | None:
+def not_admitted(message: SensorMessage, session: Session, sender: Sender, now_ns: int) -> Refusal | None:
     """Why a message that came at `now_ns` [ns] is not taken of this sender.
 
     None: it is taken.
@@ -107,7 +107,9 @@ def not_admitted(message: Taken, session: Session, sender: Sender, now_ns: int) 
     return None if sender.kinds[kind].plausible(message.session, message.seq, now_ns) else Refusal.SEQUENCE
 
 
-def on_master_clock(message: Taken, clock: ClockEstimate | None, kind: Counted, now_ns: int) -> Taken | None:
+def on_master_clock(
+    message: SensorMessage, clock: ClockEstimate | None, kind: Counted, now_ns: int
+) -> SensorMessage | None:
     """The message with its times on the master's clock; None where they cannot be.
 
     They cannot while the clock is not known (data before the start), nor where the time is more than `AHEAD_NS` after

@@ -15,28 +15,28 @@ from common.supervisor import until
 from common.zenoh_bus import ZenohBus
 from master.admission import limits_of
 from master.app import Observed, RunFigures, run
-from master.checklist.feed import ChecklistFeed
-from master.checklist.files import FileWatch
-from master.guard import SolverGuard
-from master.hurry import Hurry, Shedding
+from master.checklist.files import FileMonitor
+from master.checklist.publisher import ChecklistPublisher
+from master.clock_monitor import ClockMonitor
+from master.dispatcher import Dispatcher, new_dispatcher
+from master.extrinsics_monitor import ExtrinsicsMonitor
 from master.ingest import Ingest
 from master.live_report import Reporter, cameras_line, unplaced_line
-from master.loop_watch import WatchedLoop
-from master.master_bus import carry_bus
-from master.odd_watch import OddWatch
+from master.load_shedding import LoadShedding, Shedding
+from master.loop_monitor import MonitoredLoop
+from master.master_bus import host_bus
 from master.outputs.bus import BusSink
 from master.outputs.devices import DevicePoses
 from master.outputs.files import RunFiles
 from master.outputs.sink import Sink
 from master.recording.child import RecorderProcess
-from master.recording.tap import Tap, Tapped
+from master.recording.probe import Probe, Tapped
 from master.rig import RigFiles
 from master.rig_setup import RigSetup
+from master.solver_supervisor import SolverSupervisor
 from master.stages import StageTimes
 from master.summary import write_summary
-from master.time_watch import TimeWatch
 from master.tuning import LivePipeline, RigTuning, renew
-from master.world import World, fresh_world
 
 __all__ = ["LiveSettings", "cameras_line", "cameras_of", "devices_of", "ingest_of", "run_live", "trackers_of"]
 
@@ -79,7 +79,7 @@ def run_live(
     key: LinkKey | bytes,
     settings: LiveSettings,
     stop: threading.Event,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
 ) -> dict[str, object]:
     """Track until `stop` is set.
 
@@ -99,52 +99,60 @@ def run_live(
     """
     clock: Clock = SystemClock()
     stages, figures = StageTimes(), RunFigures()
-    hurry = Hurry(setups)
-    pipelines = [LivePipeline(setup, stages, Shedding(hurry)) for setup in setups]
-    world = World(setups, pipelines, stages)
-    tuning = None if settings.files is None else RigTuning(settings.files, setups, pipelines, say, world)
+    load_shedding = LoadShedding(setups)
+    pipelines = [LivePipeline(setup, stages, Shedding(load_shedding)) for setup in setups]
+    dispatcher = Dispatcher(setups, pipelines, stages)
+    tuning = (
+        None if settings.files is None else RigTuning(settings.files, setups, pipelines, notify, dispatcher)
+    )
     with ExitStack() as stack:
-        bus = carry_bus(settings.bus, devices_of(setups))
+        bus = host_bus(settings.bus, devices_of(setups))
         stack.callback(bus.close)
-        tap = Tap(bus, clock, always=settings.record is not None)
-        stack.callback(tap.close)
+        probe = Probe(bus, clock, always=settings.record is not None)
+        stack.callback(probe.close)
         if settings.record is not None and settings.files is not None:
-            recorder = RecorderProcess(settings.record, settings.files, settings.bus, say, tap.end_always)
+            recorder = RecorderProcess(
+                settings.record, settings.files, settings.bus, notify, probe.end_always
+            )
             stack.callback(recorder.close)
             recorder.wait_ready(bus)
         ingest = ingest_of(setups, key, clock, settings)
         stack.callback(ingest.close)
-        hurry.waiting = ingest.queue.frame_spans
+        load_shedding.waiting = ingest.queue.frame_spans
         sinks = _sinks(setups, settings, bus)
         for sink in sinks:
             stack.callback(sink.close)
-        watch = TimeWatch(setups)
-        odd = [OddWatch(setup.rig.cameras) for setup in setups]
+        monitor = ClockMonitor(setups)
+        extrinsics = [ExtrinsicsMonitor(setup.rig.cameras) for setup in setups]
         reporter = Reporter(
             cameras_of(setups),
             trackers_of(setups),
             clock,
             bus,
             ingest,
-            world,
-            list(zip(odd, pipelines, strict=True)),
+            dispatcher,
+            list(zip(extrinsics, pipelines, strict=True)),
             tuning,
-            watch,
+            monitor,
             figures,
-            tap,
+            probe,
             stop,
-            say,
+            notify,
         )
-        files = None if settings.files is None else FileWatch(settings.files.calibration, settings.files.rigs)
+        files = (
+            None if settings.files is None else FileMonitor(settings.files.calibration, settings.files.rigs)
+        )
         writes_to = Path.cwd() if settings.poses is None else settings.poses.parent
-        checklist = ChecklistFeed(bus, clock, ingest, setups, pipelines, files, reporter.session, writes_to)
+        checklist = ChecklistPublisher(
+            bus, clock, ingest, setups, pipelines, files, reporter.session, writes_to
+        )
         in_use = (lambda: setups) if tuning is None else (lambda: tuning.setups)
-        guard = SolverGuard(
-            Observed(world, figures.rates, watch.push),
+        supervisor = SolverSupervisor(
+            Observed(dispatcher, figures.rates, monitor.push),
             ingest.quarantine,
             clock,
-            (lambda sender: renew(setups, pipelines, world, sender)) if tuning is None else tuning.renew,
-            lambda sender: fresh_world([setup for setup in in_use() if sender in setup.senders]),
+            (lambda sender: renew(setups, pipelines, dispatcher, sender)) if tuning is None else tuning.renew,
+            lambda sender: new_dispatcher([setup for setup in in_use() if sender in setup.senders]),
         )
         threads = (
             threading.Thread(target=until(stop.is_set, reporter.work), name="master health", daemon=True),
@@ -157,15 +165,15 @@ def run_live(
         stack.callback(stop.set)  # before anything is closed that a thread uses
         for thread in threads:
             thread.start()
-        for one in world.unplaced:
-            say(unplaced_line(one.name, one.tracker or ""))
-        say(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
+        for one in dispatcher.unplaced:
+            notify(unplaced_line(one.name, one.tracker or ""))
+        notify(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
-        source = Tapped(DevicePoses(ingest.queue, bus), tap, hurry)
-        run(WatchedLoop(source, ServiceManager(os.environ)), guard, sinks, clock, figures, stop)
+        source = Tapped(DevicePoses(ingest.queue, bus), probe, load_shedding)
+        run(MonitoredLoop(source, ServiceManager(os.environ)), supervisor, sinks, clock, figures, stop)
         source.flush()
-        tap.drain()
+        probe.drain()
         stop.set()
         for thread in threads:
             thread.join(_JOIN_S)

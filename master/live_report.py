@@ -11,13 +11,13 @@ from common.streams import MASTER
 from common.zenoh_bus import ZenohBus
 from master.admission import limits_of
 from master.app import RunFigures, health
+from master.clock_monitor import ClockMonitor
+from master.dispatcher import Dispatcher
+from master.extrinsics_monitor import ExtrinsicsMonitor
 from master.ingest import Ingest
-from master.odd_watch import OddWatch
-from master.recording.tap import Tap
-from master.time_watch import TimeWatch
+from master.recording.probe import Probe
+from master.rejected_peers import MarkerCounts
 from master.tuning import LivePipeline, RigTuning
-from master.turned_away import MarkerCounts
-from master.world import World
 
 _REPORT_S = 1.0
 
@@ -35,21 +35,21 @@ class Reporter:
         clock: Clock,
         bus: ZenohBus,
         ingest: Ingest,
-        world: World,
-        odd: Sequence[tuple[OddWatch, LivePipeline]],
+        dispatcher: Dispatcher,
+        extrinsics: Sequence[tuple[ExtrinsicsMonitor, LivePipeline]],
         tuning: RigTuning | None,
-        watch: TimeWatch,
+        monitor: ClockMonitor,
         figures: RunFigures,
-        tap: Tap,
+        probe: Probe,
         stop: threading.Event,
-        say: Callable[[str], None],
+        notify: Callable[[str], None],
     ) -> None:
         """Be there on the bus from now on; `work` belongs to a thread."""
         self.session = secrets.randbits(63)
         self._cameras, self._trackers, self._clock, self._bus = cameras, trackers, clock, bus
-        self._ingest, self._world, self._figures = ingest, world, figures
-        self._tuning, self._watch, self._odd = tuning, watch, odd
-        self._tap, self._stop, self._say = tap, stop, say
+        self._ingest, self._dispatcher, self._figures = ingest, dispatcher, figures
+        self._tuning, self._monitor, self._extrinsics = tuning, monitor, extrinsics
+        self._probe, self._stop, self._notify = probe, stop, notify
         self._mismatched: frozenset[str] = frozenset()
         bus.announce(MASTER)
         bus.serve(MASTER, self.answer)
@@ -59,8 +59,8 @@ class Reporter:
         events = self._ingest.counts | self._bus.counts
         told = {name: number for name, number in events.items() if number or name.endswith("received")}
         changes = {} if self._tuning is None else self._tuning.counts()
-        counts = dict(self._world.counts) | told | changes | self._tap.counts
-        times = dict(self._watch.gauges(self._ingest.clock_of)) | (
+        counts = dict(self._dispatcher.counts) | told | changes | self._probe.counts
+        times = dict(self._monitor.metrics(self._ingest.clock_of)) | (
             {"open_bus": 1.0} if self._bus.open else {}
         )
         return health(self.session, self._clock, self._figures, counts, times)
@@ -73,7 +73,7 @@ class Reporter:
             CalibrationError: The files cannot be used; the old ones still are.
             ValueError: Another verb; the asker reads which ones there are.
         """
-        verbs = {"report": lambda: None, "stop": self._stop.set, "tap": self._tap.lease}
+        verbs = {"report": lambda: None, "stop": self._stop.set, "tap": self._probe.lease}
         if self._tuning is not None:
             tuning = self._tuning
             verbs |= {"reload": tuning.reload, "filter": lambda: tuning.try_filter(command.body)}
@@ -95,19 +95,19 @@ class Reporter:
                 if self._stop.is_set():
                     return  # the run has ended
                 raise
-            heard = self._ingest.connected
-            if heard != connected:
-                connected = heard
-                self._say(cameras_line(self._cameras, connected, self._trackers))
+            received = self._ingest.connected
+            if received != connected:
+                connected = received
+                self._notify(cameras_line(self._cameras, connected, self._trackers))
             if self._ingest.started and not started:
                 started = True
-                self._say("started")
+                self._notify("started")
             if self._figures.poses and not poses:
-                self._say("tracking")
+                self._notify("tracking")
             if started:
-                self._say(f"rate {self._figures.poses - poses} poses/s")
+                self._notify(f"rate {self._figures.poses - poses} poses/s")
             for line in lines:
-                self._say(line)
+                self._notify(line)
             poses = self._figures.poses
 
     def _looked(self) -> list[str]:
@@ -118,10 +118,12 @@ class Reporter:
         try:
             if self._tuning is not None:
                 self._tuning.look()
-                self._watch.follow(self._tuning.setups)
+                self._monitor.follow(self._tuning.setups)
                 self._ingest.limit(limits_of(self._tuning.setups))
-            lines = self._watch.look()
-            lines += [line for odd, pipeline in self._odd for line in odd.look(pipeline.counts)]
+            lines = self._monitor.look()
+            lines += [
+                line for extrinsics, pipeline in self._extrinsics for line in extrinsics.look(pipeline.counts)
+            ]
         except Exception as error:  # noqa: BLE001
             self._ingest.quarantine.note(MASTER, error)
             lines = []

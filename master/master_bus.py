@@ -21,7 +21,7 @@ def join_bus(endpoint: str, site: str | None = None) -> ZenohBus:
     return ZenohBus(None, endpoint, access_of(os.environ, OPERATOR), beyond=True, namespace=site)
 
 
-def carry_bus(endpoint: str, devices: Iterable[str] = ()) -> ZenohBus:
+def host_bus(endpoint: str, devices: Iterable[str] = ()) -> ZenohBus:
     """The bus of a master, which listens at `endpoint`.
 
     Args:
@@ -44,15 +44,15 @@ def bus_of_master(
     Raises:
         BusError: The endpoint is malformed, or keys are missing.
     """
-    said = False
+    notified = False
     while not stop.is_set():
         try:
             return join_bus(endpoint, site)
         except BusError as error:
             if error.__cause__ is None:  # refused by us, not by the network: endpoint or keys
                 raise
-            if not said:
+            if not notified:
                 waiting(error)
-            said = True
+            notified = True
             stop.wait(_TRY_AGAIN_S)
     return None

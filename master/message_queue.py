@@ -11,18 +11,18 @@ from typing import NamedTuple
 
 from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerPose, WristDetections
 from common.streams import sender_of
-from master.link_senders import Taken
+from master.link_senders import SensorMessage
 
 QUEUE = 64  # frames, or triples, that may wait, of one or two cameras
 QUEUE_PER_CAMERA = 32  # of more: a third of a second at 90 Hz
-ROOM = {
+CAPACITY = {
     "frame": QUEUE,
     "tags": QUEUE,
     "imu": 16 * QUEUE,
     "tracker": 16 * QUEUE,
 }  # what comes while so many frames do
 # Whose room in the queue a message takes.
-_KIND: dict[type[Taken], str] = {
+_KIND: dict[type[SensorMessage], str] = {
     MarkerDetections: "frame",
     WristDetections: "frame",
     TagDetections: "tags",
@@ -50,9 +50,9 @@ class MessageQueue:
     def __init__(self, cameras: int) -> None:
         """Have room for what so many cameras send."""
         self.overflowed = 0
-        self._queue: deque[Taken] = deque()
-        self._room = room(cameras)
-        self._waiting = dict.fromkeys(ROOM, 0)
+        self._queue: deque[SensorMessage] = deque()
+        self._has_capacity = capacity(cameras)
+        self._waiting = dict.fromkeys(CAPACITY, 0)
         self._times: dict[tuple[str, str], deque[int]] = {}
         self._changed = threading.Condition()
         self._closed = False
@@ -73,7 +73,7 @@ class MessageQueue:
                 if kind == "frame" and times
             }
 
-    def put(self, messages: Sequence[Taken]) -> None:
+    def put(self, messages: Sequence[SensorMessage]) -> None:
         """Let them wait, and wake who waits for them: once for all that came together.
 
         Where there is no more room for a kind, the oldest of the sender goes of which most wait: who sends too much
@@ -85,12 +85,12 @@ class MessageQueue:
                 self._queue.append(message)
                 self._waiting[kind] += 1
                 self._times.setdefault((kind, sender), deque()).append(message.t_ns)
-                if self._waiting[kind] > self._room[kind]:
+                if self._waiting[kind] > self._has_capacity[kind]:
                     self.overflowed += 1
                     self._drop_oldest(kind)
             self._changed.notify()
 
-    def get(self, timeout_s: float) -> Taken | None:
+    def get(self, timeout_s: float) -> SensorMessage | None:
         """Return the oldest waiting message; None after `timeout_s`, or once closed and empty."""
         with self._changed:
             if not self._queue:
@@ -115,14 +115,14 @@ class MessageQueue:
                 self._left(message)
                 return
 
-    def _left(self, message: Taken) -> None:
+    def _left(self, message: SensorMessage) -> None:
         """It waits no more; it was the oldest of its kind and sender."""
         kind = _KIND[type(message)]
         self._waiting[kind] -= 1
         self._times[kind, sender_of(message)].popleft()
 
 
-def room(cameras: int) -> dict[str, int]:
+def capacity(cameras: int) -> dict[str, int]:
     """How many messages of each kind may wait."""
     frames = max(QUEUE, QUEUE_PER_CAMERA * cameras)
-    return ROOM | {"frame": frames, "tags": frames}
+    return CAPACITY | {"frame": frames, "tags": frames}

@@ -38,8 +38,8 @@ class ObjectTruth:
         span = np.maximum(self.t_ns[after] - self.t_ns[before], 1)
         share = (t_ns - self.t_ns[before]) / span
         a, b = self.T_rig_object[before], self.T_rig_object[after]
-        turn = matrix_to_rotation_vector(np.swapaxes(a[:, :3, :3], 1, 2) @ b[:, :3, :3])
-        out[:, :3, :3] = a[:, :3, :3] @ rotation_vector_to_matrix(share[:, None] * turn)
+        rotation = matrix_to_rotation_vector(np.swapaxes(a[:, :3, :3], 1, 2) @ b[:, :3, :3])
+        out[:, :3, :3] = a[:, :3, :3] @ rotation_vector_to_matrix(share[:, None] * rotation)
         out[:, :3, 3] = a[:, :3, 3] + share[:, None] * (b[:, :3, 3] - a[:, :3, 3])
         out[:, 3] = (0.0, 0.0, 0.0, 1.0)
         out[(share < 0.0) | (share > 1.0) | (span > _NEAR_NS)] = np.nan
@@ -71,8 +71,8 @@ def errors(poses: ObjectPoses, truth: ObjectTruth) -> tuple[Float, Float]:
     """Distance [mm] of the origin and angle [deg] of each pose (T,) from the truth; NaN where either is not known."""
     true = truth.at(poses.t_ns)
     off_mm = 1e3 * np.linalg.norm(poses.position_m - true[:, :3, 3], axis=1)
-    turn = np.swapaxes(true[:, :3, :3], 1, 2) @ quaternion_to_matrix(poses.orientation_wxyz)
-    off_deg = np.degrees(np.linalg.norm(matrix_to_rotation_vector(turn), axis=1))
+    rotation = np.swapaxes(true[:, :3, :3], 1, 2) @ quaternion_to_matrix(poses.orientation_wxyz)
+    off_deg = np.degrees(np.linalg.norm(matrix_to_rotation_vector(rotation), axis=1))
     return np.asarray(off_mm, np.float64), np.asarray(off_deg, np.float64)
 
 
@@ -132,8 +132,8 @@ def score_objects(scores: dict[str, dict[str, float]]) -> dict[str, object]:
 def _nees(poses: ObjectPoses, truth: ObjectTruth) -> Float:
     """Normalised squared errors (T,); NaN where something is not known."""
     true = truth.at(poses.t_ns)
-    turn = quaternion_to_matrix(poses.orientation_wxyz) @ np.swapaxes(true[:, :3, :3], 1, 2)
-    off = np.concatenate([poses.position_m - true[:, :3, 3], matrix_to_rotation_vector(turn)], axis=1)
+    rotation = quaternion_to_matrix(poses.orientation_wxyz) @ np.swapaxes(true[:, :3, :3], 1, 2)
+    off = np.concatenate([poses.position_m - true[:, :3, 3], matrix_to_rotation_vector(rotation)], axis=1)
     out = np.full(len(poses), np.nan)
     known = np.isfinite(off).all(axis=1) & np.isfinite(poses.cov).all(axis=(1, 2))
     off, cov = off[known], poses.cov[known]

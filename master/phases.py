@@ -40,22 +40,24 @@ class CameraPhases:
         self._leader = next(iter(frame_rate_hz))
         self._period_ns = 1e9 / frame_rate_hz[self._leader]
         self._lead_ns: int | None = None
-        self._turns = {name: deque[float](maxlen=_FRAMES) for name in frame_rate_hz if name != self._leader}
-        self._near = dict.fromkeys(self._turns, 0)
-        self._in_step: dict[str, bool | None] = dict.fromkeys(self._turns)
+        self._fractions = {
+            name: deque[float](maxlen=_FRAMES) for name in frame_rate_hz if name != self._leader
+        }
+        self._near = dict.fromkeys(self._fractions, 0)
+        self._in_step: dict[str, bool | None] = dict.fromkeys(self._fractions)
 
     def push(self, message: MarkerDetections) -> None:
         """Take one frame, on the master's clock."""
         if message.camera == self._leader:
             self._lead_ns = message.t_ns
-        elif self._lead_ns is not None and (turns := self._turns.get(message.camera)) is not None:
-            turns.append((message.t_ns - self._lead_ns) / self._period_ns)
+        elif self._lead_ns is not None and (fractions := self._fractions.get(message.camera)) is not None:
+            fractions.append((message.t_ns - self._lead_ns) / self._period_ns)
 
     def phases(self) -> dict[str, Phase]:
         """Phase of every camera but the leading one of which enough frames came: the mean direction on a circle."""
         found: dict[str, Phase] = {}
-        for name, turns in self._turns.items():
-            kept = np.array(turns.copy())
+        for name, fractions in self._fractions.items():
+            kept = np.array(fractions.copy())
             if len(kept) < _AT_LEAST:
                 continue
             mean = np.exp(2j * np.pi * kept).mean()

@@ -9,7 +9,7 @@ from common.arrays import Float, Int
 from common.errors import RecordingError
 from common.messages import FINGER_COUNT, MarkerDetections, WristDetections
 from common.npz import read_npz
-from master.sequence import TRIPLE
+from master.sequence import CYCLE_FRAMES
 
 # Sigma of detections that state none: of full quality, and added where it is 0.
 _CLEAR_PX, _DOUBT_PX = 0.1, 0.6
@@ -23,20 +23,20 @@ def recorded_detections(folder: Path, camera: str, count: int) -> Iterator[Marke
         RecordingError: The file is missing or broken, or has another number of markers.
     """
     path, fix = _file_of(folder, camera)
-    data = read_npz(path, ("t_ns", "seq", "uv", "area_px2", "quality"), fix, also=("sigma_px", "rival_uv"))
+    data = read_npz(path, ("t_ns", "seq", "uv", "area_px2", "quality"), fix, also=("sigma_px", "alt_uv"))
     try:
         t_ns, seq = (data[name].astype(np.int64, casting="same_kind") for name in ("t_ns", "seq"))
         uv, area, quality = (data[name].astype(np.float64) for name in ("uv", "area_px2", "quality"))
         sigma = data["sigma_px"].astype(np.float64) if "sigma_px" in data else _sigma_of(uv, quality)
-        rival = data["rival_uv"].astype(np.float64) if "rival_uv" in data else np.full_like(uv, np.nan)
+        alternative = data["alt_uv"].astype(np.float64) if "alt_uv" in data else np.full_like(uv, np.nan)
     except (TypeError, ValueError) as error:
         raise RecordingError(f"{path}: {error}: {fix}") from error
     _check_times(path, t_ns, seq, fix)
     if uv.shape != (len(t_ns), count, 2) or area.shape != uv.shape[:2] or quality.shape != uv.shape[:2]:
         raise RecordingError(f"{path}: uv has shape {uv.shape}, the rig needs ({len(t_ns)}, {count}, 2)")
-    if sigma.shape != uv.shape[:2] or rival.shape != uv.shape:
+    if sigma.shape != uv.shape[:2] or alternative.shape != uv.shape:
         raise RecordingError(
-            f"{path}: sigma_px and rival_uv have shapes {sigma.shape} and {rival.shape}, expected {uv.shape[:2]}"
+            f"{path}: sigma_px and alt_uv have shapes {sigma.shape} and {alternative.shape}, expected {uv.shape[:2]}"
             f" and {uv.shape}: {fix}"
         )
     for row in range(len(t_ns)):
@@ -51,13 +51,13 @@ def recorded_detections(folder: Path, camera: str, count: int) -> Iterator[Marke
                 area=area[row],
                 quality=quality[row],
                 sigma_px=sigma[row],
-                rival_uv=rival[row],
+                alt_uv=alternative[row],
             )
         except ValueError as error:
             raise RecordingError(f"{path}: row {row}: {error}: {fix}") from error
 
 
-def recorded_triples(folder: Path, camera: str) -> Iterator[WristDetections]:
+def recorded_cycles(folder: Path, camera: str) -> Iterator[WristDetections]:
     """The rows of detections_<camera>.npz of the camera of a wrist device.
 
     Raises:
@@ -69,14 +69,14 @@ def recorded_triples(folder: Path, camera: str) -> Iterator[WristDetections]:
     try:
         t_ns = data["t_ns"].astype(np.int64, casting="same_kind")
         laser, tip = (data[name].astype(np.float64) for name in ("laser_uv", "tip_uv"))
-        usual = {
-            "seq": TRIPLE * np.arange(len(laser)),
+        typical = {
+            "seq": CYCLE_FRAMES * np.arange(len(laser)),
             "laser_sigma_px": _where_seen(laser, _LASER_PX),
             "laser_px": np.full(laser.shape[:2], np.nan),
             "tip_sigma_px": _where_seen(tip, _TIP_PX),
             "tip_depth": np.full(tip.shape[:2], np.nan),
         }
-        rest = {name: data[name] if name in data else usual[name] for name in also}
+        rest = {name: data[name] if name in data else typical[name] for name in also}
         seq = rest.pop("seq").astype(np.int64, casting="same_kind")
         each = {name: array.astype(np.float64) for name, array in rest.items()}
     except (TypeError, ValueError, IndexError) as error:

@@ -63,6 +63,6 @@ def _with_imu(setup: RigSetup, imu: ImuCalibration) -> RigSetup:
         return with_fields(setup, rig=replace(setup.rig, imu=imu))
     if setup.wrist is None or setup.wrist_rig is None:
         return setup
-    worn = replace(setup.wrist_rig, imu=imu)
-    rig = setup.rig if setup.has_markers else worn
-    return with_fields(setup, rig=rig, wrist=with_fields(setup.wrist, imu=imu), wrist_rig=worn)
+    wrist_rig = replace(setup.wrist_rig, imu=imu)
+    rig = setup.rig if setup.has_markers else wrist_rig
+    return with_fields(setup, rig=rig, wrist=with_fields(setup.wrist, imu=imu), wrist_rig=wrist_rig)

@@ -58,7 +58,7 @@ class Relay:
             counts |= {name: number for name, number in lost.items() if number}
         return Health(NAME, self.session, self._clock.now_ns(), counts, {}, *program())
 
-    def report(self, say: Callable[[str], None], stop: threading.Event) -> None:
+    def report(self, notify: Callable[[str], None], stop: threading.Event) -> None:
         """Once a second until `stop`: health below, which is repeated above as all health is; a line each minute."""
         minute = 0
         while not stop.wait(REPORT_S):
@@ -66,7 +66,7 @@ class Relay:
             self._below.publish("health", NAME, health)
             minute += 1
             if minute % 60 == 1:
-                say(", ".join(f"{name} {number}" for name, number in health.counts.items() if number))
+                notify(", ".join(f"{name} {number}" for name, number in health.counts.items() if number))
 
     def close(self) -> None:
         """End. Safe to call twice."""

@@ -39,12 +39,12 @@ class Played:
 
     Attributes:
         shown: What cameras of markers saw, or None.
-        worn: What a wrist device saw, or None.
+        wrist_scene: What a wrist device saw, or None.
         together: The scene is one for both kinds of rig, whether or not there are both.
     """
 
     shown: Scene | None = None
-    worn: WristScene | None = None
+    wrist_scene: WristScene | None = None
     together: bool = False
 
     @classmethod
@@ -59,14 +59,14 @@ class Played:
         together = moves in TOGETHER
         if setup.wrist_rig is None:
             return cls(scene_by_name(name, setup.rig, setup.cameras, hand, seed, watched), None, together)
-        worn = WristScene.by_name(name, setup.wrist_rig, setup.cameras, hand, seed)
+        wrist_scene = WristScene.by_name(name, setup.wrist_rig, setup.cameras, hand, seed)
         if not setup.has_markers:
-            return cls(None, worn, together)
+            return cls(None, wrist_scene, together)
         if not together:
             raise PhalanxError(
                 f"scene {name!r}: cameras and wrist device see one hand only in {', '.join(TOGETHER)}"
             )
-        return cls(scene_by_name(moves, setup.rig, setup.cameras, hand, seed, watched), worn, together)
+        return cls(scene_by_name(moves, setup.rig, setup.cameras, hand, seed, watched), wrist_scene, together)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,14 +131,14 @@ def _judge(
 ) -> _Judged:
     """Against what was truly there, whichever sensors there are."""
     if played.shown is None:
-        assert played.worn is not None, "one of the two there is"
-        return _of_wrist(poses, row, setup, played.worn, epoch_ns, tell)
+        assert played.wrist_scene is not None, "one of the two there is"
+        return _of_wrist(poses, row, setup, played.wrist_scene, epoch_ns, tell)
     judged = _of_markers(poses, setup, played.shown, epoch_ns, tell, hidden=played.together)
-    if played.worn is None:
+    if played.wrist_scene is None:
         return judged
-    worn = laser_scores(poses, played.worn, epoch_ns, tell)
-    images = chain(judged.images, wrist_images(poses, played.worn, epoch_ns, tell))
-    return _Judged(judged.scores | worn, judged.truth, images, WristPicture.of(setup))
+    wrist_scene = laser_scores(poses, played.wrist_scene, epoch_ns, tell)
+    images = chain(judged.images, wrist_images(poses, played.wrist_scene, epoch_ns, tell))
+    return _Judged(judged.scores | wrist_scene, judged.truth, images, WristPicture.of(setup))
 
 
 def _of_markers(

@@ -10,8 +10,8 @@ from common.sim.wrist.scene import WRIST_NAMES
 from master.options import CALIB_JSON, Calibration, Rigs
 from master.outputs.files import path_of_hand
 from master.rig import load_setups
-from master.said import progress
 from master.summary import read_summary, write_summary
+from master.terminal import progress
 
 
 def report(

@@ -18,7 +18,7 @@ from common.geometry import matrix_to_quaternion, quaternion_to_matrix, transfor
 from common.hand_model import HandModel
 from common.rig_calibration import check_places
 
-_ALIKE = ("markers", "free_markers", "pairing", "filter", "solver")
+_ALIKE = ("markers", "free_markers", "frame_sync", "filter", "solver")
 _UNTURNED = 1e-9  # of a rotation matrix that turns nothing
 
 
@@ -160,8 +160,8 @@ def in_world(rig: RigCalibration) -> RigCalibration:
 def _imu(imu: ImuCalibration | None, T_world_rig: Float) -> ImuCalibration | None:
     if imu is None or imu.q_rig_world is None:
         return imu
-    turned = matrix_to_quaternion(T_world_rig[:3, :3] @ quaternion_to_matrix(np.array(imu.q_rig_world)))
-    return replace(imu, q_rig_world=_quaternion(turned))
+    rotated = matrix_to_quaternion(T_world_rig[:3, :3] @ quaternion_to_matrix(np.array(imu.q_rig_world)))
+    return replace(imu, q_rig_world=_quaternion(rotated))
 
 
 def _volume(volume: Volume | None, T_world_rig: Float) -> Volume | None:

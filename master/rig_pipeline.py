@@ -13,13 +13,13 @@ from common.geometry import cross
 from common.messages import Detections
 from master.estimator.cameras import CameraArrays
 from master.estimator.cubic import CubicLaw
+from master.estimator.cycle_reader import CycleReader
 from master.estimator.estimator import Estimator
 from master.estimator.fused import FusedPipeline, WristSide
 from master.estimator.gate import rehearse
 from master.estimator.pipeline import MarkerPipeline, SolvedPose, Stage
 from master.estimator.settings import Settings
 from master.estimator.smooth import HandOneEuro
-from master.estimator.triple_reader import TripleReader
 from master.estimator.wrist_model import WristModel, loosened
 from master.estimator.wrist_pipeline import WristPipeline
 from master.fabrik.caps import CapTables
@@ -35,7 +35,7 @@ from master.rig_setup import RigSetup
 
 _ANY_CURL_RAD = 100.0  # a finger that is not seen may be bent anyhow
 _MOUNTED_RAD = np.radians(0.5)  # standard deviation of the pitch of cameras mounted by eye
-_LEAD_M_S = 0.3  # of a palm, and of a finger on it, where it is solved elsewhere: 5 mm a frame at 60 Hz
+_BLEND_M_S = 0.3  # of a palm, and of a finger on it, where it is solved elsewhere: 5 mm a frame at 60 Hz
 
 
 class Pipeline(Protocol):
@@ -70,9 +70,9 @@ def _point_filter(setup: RigSetup) -> PointFilter:
 
 def _hand_filter(setup: RigSetup) -> HandOneEuro:
     """The filter of the solved hand, by the same settings."""
-    lead_m_s = None if setup.wrist is None else _LEAD_M_S
+    blend_m_s = None if setup.wrist is None else _BLEND_M_S
     hand = setup.hand if setup.wrist is None else loosened(setup.hand)
-    return HandOneEuro(hand, setup.hand_markers, OneEuroParameters.of(setup.rig.filter), lead_m_s)
+    return HandOneEuro(hand, setup.hand_markers, OneEuroParameters.of(setup.rig.filter), blend_m_s)
 
 
 def _rays(setup: RigSetup) -> RayTriangulator | None:
@@ -146,7 +146,7 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
         setup.hand,
         rig.markers,
         setup.hand_markers,
-        sync=FrameSync(setup.models, rates, len(rig.markers), policy=rig.pairing, continuous=continuous),
+        sync=FrameSync(setup.models, rates, len(rig.markers), policy=rig.frame_sync, continuous=continuous),
         triangulate=triangulate,
         one_euro=_point_filter(setup) if continuous else None,
         palm=_estimator(setup, continuous=continuous, natural=True),
@@ -167,7 +167,7 @@ def build_pipeline(
     continuous: bool = True,
     side: WristSide | None = None,
     counts: Counter[str] | None = None,
-    shed: Callable[[], bool] | None = None,
+    dropped_epochs: Callable[[], bool] | None = None,
 ) -> MarkerPipeline:
     """The pipeline this marker rig's file describes; of a wrist device beside it nothing is used but through `side`.
 
@@ -187,9 +187,9 @@ def build_pipeline(
         raise CalibrationError(f"rig {rig.name!r}: kind is 'wrist', this needs a rig of 'markers'")
     refine = rig.solver == "estimator"
     if not refine and (side is not None or rig.imu is not None):
-        beside = "an IMU" if side is None else "a wrist device"
+        sensor = "an IMU" if side is None else "a wrist device"
         raise CalibrationError(
-            f"rig {rig.name!r}: solver 'fabrik' knows markers alone, but {beside} watches this hand too: set solver to"
+            f"rig {rig.name!r}: solver 'fabrik' knows markers alone, but {sensor} watches this hand too: set solver to"
             " 'estimator'"
         )
     with log_if_slow():
@@ -208,7 +208,7 @@ def build_pipeline(
             side=side,
             counts=counts,
             stage=stage,
-            shed=shed,
+            dropped_epochs=dropped_epochs,
         )
 
 
@@ -217,7 +217,7 @@ def pipeline_of(
     stage: Stage,
     *,
     continuous: bool = True,
-    shed: Callable[[], bool] | None = None,
+    dropped_epochs: Callable[[], bool] | None = None,
 ) -> Pipeline:
     """The pipeline of a rig of either kind, or of both; arguments and errors as of `build_pipeline`.
 
@@ -225,14 +225,18 @@ def pipeline_of(
     what those of the other kind do.
     """
     if setup.wrist is None:
-        return cast(Pipeline, build_pipeline(setup, stage, continuous=continuous, shed=shed))
+        return cast(
+            Pipeline, build_pipeline(setup, stage, continuous=continuous, dropped_epochs=dropped_epochs)
+        )
     try:
         if setup.has_markers:
             counts = Counter[str]()
             cubic = CubicLaw(setup.wrist) if setup.wrist.cubic else None
-            reader = TripleReader(setup.wrist, cubic, counts)
+            reader = CycleReader(setup.wrist, cubic, counts)
             side = WristSide(setup.wrist, reader, counts, continuous=continuous)
-            markers = build_pipeline(setup, stage, continuous=continuous, side=side, counts=counts, shed=shed)
+            markers = build_pipeline(
+                setup, stage, continuous=continuous, side=side, counts=counts, dropped_epochs=dropped_epochs
+            )
             return FusedPipeline(
                 markers, side, min(setup.cameras[name].frame_rate_hz for name in setup.models)
             )

@@ -100,7 +100,7 @@ class RigSetup:
             area=message.area[chosen],
             quality=message.quality[chosen],
             sigma_px=message.sigma_px[chosen],
-            rival_uv=message.rival_uv[chosen],
+            alt_uv=message.alt_uv[chosen],
         )
 
     @classmethod
@@ -155,23 +155,27 @@ class RigSetup:
                 name or two IMUs, name two files of gestures, or the marker rigs cannot be merged (`merged_rig`).
         """
         marked = [setup for setup in setups if setup.has_markers]
-        worn = [setup for setup in setups if not setup.has_markers]
+        wrist_setups = [setup for setup in setups if not setup.has_markers]
         rigs = [setup.rig for setup in setups]
-        _refuse_two(setups, worn)
+        _refuse_two(setups, wrist_setups)
         refuse_shared_senders(rigs)
         gestures_named(rigs)
         if not marked:
-            return worn[0]
+            return wrist_setups[0]
         cameras = {name: file for setup in marked for name, file in setup.cameras.items()}
         objects = {one.name: one for setup in marked for one in setup.objects}
         merged = merged_rig([setup.rig for setup in marked])
         out = cls.of(merged, cameras, setups[0].hand, objects or None)
         out = with_fields(out, gestures=_gestures(setups))
         rows = {name: which for setup in marked for name, which in setup.rows.items()}
-        if not worn:
+        if not wrist_setups:
             return with_fields(out, rows=rows)
         return with_fields(
-            out, cameras=cameras | worn[0].cameras, wrist=worn[0].wrist, wrist_rig=worn[0].rig, rows=rows
+            out,
+            cameras=cameras | wrist_setups[0].cameras,
+            wrist=wrist_setups[0].wrist,
+            wrist_rig=wrist_setups[0].rig,
+            rows=rows,
         )
 
 
@@ -198,7 +202,7 @@ def _gestures(setups: Sequence[RigSetup]) -> GestureSettings:
     return next(named, setups[0].gestures)
 
 
-def _refuse_two(setups: Sequence[RigSetup], worn: Sequence[RigSetup]) -> None:
+def _refuse_two(setups: Sequence[RigSetup], wrist_setups: Sequence[RigSetup]) -> None:
     """Refuse rigs that are not of one hand, or of which two claim what a hand has once.
 
     Raises:
@@ -211,9 +215,9 @@ def _refuse_two(setups: Sequence[RigSetup], worn: Sequence[RigSetup]) -> None:
                 f"rigs {first.rig.name!r} and {setup.rig.name!r} are of different hands,"
                 f" {first.hand.profile.name!r} and {setup.hand.profile.name!r}"
             )
-    if len(worn) > 1:
+    if len(wrist_setups) > 1:
         raise CalibrationError(
-            f"rigs {worn[0].rig.name!r} and {worn[1].rig.name!r} are both of kind 'wrist' and of hand"
+            f"rigs {wrist_setups[0].rig.name!r} and {wrist_setups[1].rig.name!r} are both of kind 'wrist' and of hand"
             f" {first.hand.profile.name!r}: a hand wears one wrist device"
         )
     sensed = [setup.rig.name for setup in setups if setup.rig.imu is not None]

@@ -15,7 +15,7 @@ from master.options import HERE_BUS, BusEnd, site_name
 from master.relay import Relay
 from master.stopping import stop_on_signals
 
-_LOOK_S = 0.5
+_POLL_S = 0.5
 
 
 def router(
@@ -41,12 +41,12 @@ def router(
     stop = stop_on_signals()
     bus = ZenohBus(listen, connect or [], access_of(os.environ, MASTER), router=True)
     try:
-        _say("router", f"listening on {listen}" + "".join(f", joined with {one}" for one in connect or []))
+        _print("router", f"listening on {listen}" + "".join(f", joined with {one}" for one in connect or []))
         joined = 0
-        while not stop.wait(_LOOK_S):
+        while not stop.wait(_POLL_S):
             if bus.peers != joined:
                 joined = bus.peers
-                _say("router", f"joined with {joined} of other routers")
+                _print("router", f"joined with {joined} of other routers")
     finally:
         bus.close()
 
@@ -69,12 +69,12 @@ def relay(
     """
     site_name(site)
     stop = stop_on_signals()
-    below = bus_of_master(bus, stop, lambda error: _say("relay", f"waiting for the master: {error}"))
+    below = bus_of_master(bus, stop, lambda error: _print("relay", f"waiting for the master: {error}"))
     if below is None:
         return
     try:
         above = bus_of_master(
-            router, stop, lambda error: _say("relay", f"waiting for the router: {error}"), site
+            router, stop, lambda error: _print("relay", f"waiting for the router: {error}"), site
         )
         if above is not None:
             _repeat(below, above, site, stop)
@@ -85,14 +85,14 @@ def relay(
 def _repeat(below: ZenohBus, above: ZenohBus, site: str, stop: threading.Event) -> None:
     try:
         repeats = Relay(below, above, SystemClock())
-        _say("relay", f"repeating as {site}")
+        _print("relay", f"repeating as {site}")
         try:
-            repeats.report(lambda line: _say("relay", line), stop)
+            repeats.report(lambda line: _print("relay", line), stop)
         finally:
             repeats.close()
     finally:
         above.close()
 
 
-def _say(who: str, line: str) -> None:
+def _print(who: str, line: str) -> None:
     typer.echo(f"{who}: {line}")

@@ -28,8 +28,8 @@ from master.options import (
     address,
 )
 from master.rig import RigFiles
-from master.said import say
 from master.stopping import stop_on_signals
+from master.terminal import print_line
 
 
 def run(
@@ -99,7 +99,7 @@ def run(
         files,
         record,
     )
-    run_live(setups, link_key(os.environ, key_file), settings, stop_on_signals(), say)
+    run_live(setups, link_key(os.environ, key_file), settings, stop_on_signals(), print_line)
 
 
 def checked_ends(beacon: str, bind: str, bus: str) -> tuple[Address, Address]:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 REMEMBERED = 1024
 SEQ_JUMP, SEQ_PER_S = 100_000, 10_000.0  # numbers rise by no more: at once, and with time besides
-TRIPLE = 3  # frames that become one message of a wrist device
+CYCLE_FRAMES = 3  # frames that become one message of a wrist device
 
 
 @dataclass(frozen=True, slots=True)

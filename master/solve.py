@@ -1,4 +1,4 @@
-"""The same line offline: detections of every camera and a recording's calibration -> all that a `World` tells, scored.
+"""Solve offline: detections of every camera and a recording's calibration -> what a `Dispatcher` returns, scored.
 
 No clock is read for the poses: messages are pushed in the order of their capture times, so two runs write the
 same bytes. Only the stage times of the summary are measured.
@@ -28,30 +28,30 @@ from common.messages import (
     WristDetections,
 )
 from master.app import Solved
+from master.dispatcher import Dispatcher
 from master.object_score import load_object_truth, score_object, score_objects
 from master.outputs.files import RunFiles, path_of_hand
 from master.outputs.poses import Poses
 from master.outputs.told_files import ObjectPoses
 from master.rates import CameraRates
-from master.recorded import recorded_detections, recorded_triples
+from master.recorded import recorded_cycles, recorded_detections
 from master.recorded_imu import recorded_samples
 from master.recorded_tags import recorded_tags
 from master.rig_pipeline import pipeline_of
 from master.rig_setup import RigSetup
 from master.score import load_truth, score, score_hidden
-from master.sequence import TRIPLE
+from master.sequence import CYCLE_FRAMES
 from master.sequence import Sequence as FrameSequence
 from master.stages import StageTimes
 from master.summary import write_summary
-from master.world import World
-from master.wrist_score import load_wrist_truth, score_tips, score_triples, score_wrist, triples_missed
+from master.wrist_score import cycles_missed, load_wrist_truth, score_cycles, score_tips, score_wrist
 
 
 def rigs_to_solve(
     manifest: Manifest,
     names: Sequence[str],
     only: Literal["markers", "wrist"] | None = None,
-    level: Literal["fk", "ik", "auto"] | None = None,
+    solver_mode: Literal["fk", "ik", "auto"] | None = None,
     solver: Literal["estimator", "fabrik"] | None = None,
 ) -> list[RigCalibration]:
     """The rigs of a recording that are solved, those of markers first.
@@ -60,7 +60,7 @@ def rigs_to_solve(
         manifest: Of the recording.
         names: Rigs that are wanted; none: all.
         only: Of one kind alone.
-        level: Of the wrist rigs in place of their own.
+        solver_mode: Of the wrist rigs in place of their own.
         solver: Of the marker rigs in place of their own.
 
     Raises:
@@ -80,11 +80,15 @@ def rigs_to_solve(
                 f"--solver: rig {rigs[0].name!r} is of a wrist device; a rig of markers has solvers"
             )
         rigs = [msgspec.structs.replace(rig, solver=solver) if rig.kind == "markers" else rig for rig in rigs]
-    if level is None:
+    if solver_mode is None:
         return rigs
     if all(rig.kind != "wrist" for rig in rigs):
-        raise CalibrationError(f"--level: rig {rigs[0].name!r} is of markers; a wrist device has levels")
-    return [msgspec.structs.replace(rig, level=level) if rig.kind == "wrist" else rig for rig in rigs]
+        raise CalibrationError(
+            f"--solver-mode: rig {rigs[0].name!r} is of markers; a wrist device has levels"
+        )
+    return [
+        msgspec.structs.replace(rig, solver_mode=solver_mode) if rig.kind == "wrist" else rig for rig in rigs
+    ]
 
 
 def solve_hands(
@@ -120,28 +124,28 @@ def solve_hands(
     pipelines = [
         pipeline_of(setup, stage, continuous=continuous) for setup, stage in zip(setups, stages, strict=True)
     ]
-    world = World(setups, pipelines, stages[0], gestures=continuous)
+    dispatcher = Dispatcher(setups, pipelines, stages[0], gestures=continuous)
     counts = {setup.hand.profile.name: len(setup.markers) for setup in setups}
     files = RunFiles(out / "poses.npz", counts, [one.name for setup in setups for one in setup.objects])
     told = _Told({name: [] for name in counts})
     messages = _messages(recording, setups, detections)
     done = 0
     for message in heapq.merge(*(samples for samples, _ in sensed), messages, key=lambda one: one.t_ns):
-        told.take(world.push(message), files)
+        told.take(dispatcher.push(message), files)
         if not isinstance(message, ImuSample):
             if not isinstance(message, TagDetections):
                 told.rates.push(message)
             progress(done := done + 1, len(messages))
-    told.take(world.flush(), files)
+    told.take(dispatcher.flush(), files)
     files.close()
     summaries: list[dict[str, object]] = []
     for number, (setup, pipeline, stage) in enumerate(zip(setups, pipelines, stages, strict=True)):
-        beside = dict[str, int]() if number else world.counts_beside
+        auxiliary = dict[str, int]() if number else dispatcher.auxiliary_counts
         own = [one for one in messages if not isinstance(one, TagDetections) and one.camera in setup.cameras]
         summary = _summarise(recording, setup, own, told.poses[setup.hand.profile.name]) | {
             "camera_hz": {name: hz for name, hz in told.rates.camera_hz.items() if name in setup.cameras},
             "lost": _lost(setup, own),
-            "counts": dict(sorted((dict(pipeline.counts) | beside).items())),
+            "counts": dict(sorted((dict(pipeline.counts) | auxiliary).items())),
             "stage_us": stage.mean_us(),
         }
         summary |= score_objects(_object_scores(recording, setup, told.objects))
@@ -204,7 +208,7 @@ def _summarise(
     stacked = Poses.of(poses)
     if setup.has_markers:
         summary |= _score_markers(recording, setup, stacked)
-    return summary | _score_worn(recording, setup, messages, stacked)
+    return summary | _score_wrist(recording, setup, messages, stacked)
 
 
 def _score_markers(recording: FrameRecording, setup: RigSetup, poses: Poses) -> dict[str, float]:
@@ -219,7 +223,7 @@ def _score_markers(recording: FrameRecording, setup: RigSetup, poses: Poses) -> 
     return scores
 
 
-def _score_worn(
+def _score_wrist(
     recording: FrameRecording, setup: RigSetup, messages: Sequence[Detections], poses: Poses
 ) -> dict[str, float]:
     """Of what a wrist device saw; of a hand without markers also the hand made of that."""
@@ -228,11 +232,11 @@ def _score_worn(
     exact = load_wrist_truth(recording, setup.wrist_cameras[0])
     if exact is None:
         return {}
-    triples = [message for message in messages if isinstance(message, WristDetections)]
+    cycles = [message for message in messages if isinstance(message, WristDetections)]
     if setup.has_markers:
-        return score_triples(setup.wrist, triples, exact) | score_tips(triples, exact)
-    missed = float(triples_missed(poses, exact))
-    return {"triples_missed": missed} | score_wrist(poses, exact) | score_tips(triples, exact)
+        return score_cycles(setup.wrist, cycles, exact) | score_tips(cycles, exact)
+    missed = float(cycles_missed(poses, exact))
+    return {"cycles_missed": missed} | score_wrist(poses, exact) | score_tips(cycles, exact)
 
 
 def fingers_of(setup: RigSetup) -> tuple[int, ...]:
@@ -255,7 +259,7 @@ def _messages(
                 continue  # it watches two hands
             order[camera] = len(order)
             if camera in setup.wrist_cameras:
-                messages += recorded_triples(folder, camera)
+                messages += recorded_cycles(folder, camera)
             else:
                 messages += recorded_detections(folder, camera, shown.get(camera, len(setup.markers)))
     tagged = [setup for setup in setups if any(one.tags is not None for one in setup.objects)]
@@ -266,7 +270,9 @@ def _messages(
 
 def _lost(setup: RigSetup, messages: Sequence[Detections]) -> int:
     """Frames, or triples, that a camera skipped: lost before they were recorded, or none was made of them."""
-    numbers = {name: FrameSequence(TRIPLE if name in setup.wrist_cameras else 1) for name in setup.cameras}
+    numbers = {
+        name: FrameSequence(CYCLE_FRAMES if name in setup.wrist_cameras else 1) for name in setup.cameras
+    }
     for message in messages:
         numbers[message.camera].take(message.session, message.seq)
     return sum(sequence.counts.lost for sequence in numbers.values())

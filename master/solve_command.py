@@ -8,10 +8,10 @@ import typer
 from common.frame_recording import open_recording
 from master.options import Hand
 from master.rig import setups_with_hands
-from master.said import progress, say
 from master.solve import rigs_to_solve, solve_hands
+from master.terminal import print_line, progress
 
-Level = Literal["fk", "ik", "auto"]
+SolverMode = Literal["fk", "ik", "auto"]
 Solver = Literal["estimator", "fabrik"]
 Kind = Literal["markers", "wrist"]
 
@@ -37,8 +37,8 @@ def solve(
             help="Of a recording of both kinds: what the cameras, or what the wrist device tells alone."
         ),
     ] = None,
-    level: Annotated[
-        Level | None,
+    solver_mode: Annotated[
+        SolverMode | None,
         typer.Option(
             help="Of a wrist device: fingers from the laser alone (fk), from laser and fingertip (ik), or from what "
             "there is (auto); default: what the rig says."
@@ -63,11 +63,11 @@ def solve(
 
       phalanx-master solve GRASP --detections DIR --out DIR/markers --only markers
 
-      phalanx-master solve CURL --detections DIR --out DIR --hand HAND.json --level fk
+      phalanx-master solve CURL --detections DIR --out DIR --hand HAND.json --solver-mode fk
     """
     opened = open_recording(recording)
-    rigs = rigs_to_solve(opened.manifest, rig_names or [], only, level, solver)
+    rigs = rigs_to_solve(opened.manifest, rig_names or [], only, solver_mode, solver)
     setups = setups_with_hands(rigs, opened.manifest.cameras, calibration, hand, opened.manifest.objects)
     out.mkdir(parents=True, exist_ok=True)
     solve_hands(opened, setups, detections, out, lambda done, total: progress("solving", done, total))
-    say(f"wrote {out / 'poses.npz'} and {out / 'summary.json'}")
+    print_line(f"wrote {out / 'poses.npz'} and {out / 'summary.json'}")

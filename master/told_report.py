@@ -29,7 +29,7 @@ _GAP_NS = 200_000_000  # between two rows of one contact
 _TRUTH_HZ = 60.0
 
 
-class Said(Protocol):
+class Annotation(Protocol):
     """One thing that a simulated hand says: as of a Gesture message, and when it begins and has done it [s]."""
 
     @property
@@ -43,11 +43,11 @@ class Said(Protocol):
 
 
 @runtime_checkable
-class Saying(Protocol):
+class Annotated(Protocol):
     """A simulated hand that knows what it says."""
 
     @property
-    def said(self) -> Sequence[Said]:
+    def annotations(self) -> Sequence[Annotation]:
         """Everything that it says in a period, in order."""
         ...
 
@@ -123,7 +123,7 @@ class ToldRun:
         made = Counter(_label(one) for one in _beginnings(self.gestures))
         if made:
             out["gestures"] = dict(made.most_common())
-        if scene is not None and isinstance(scene.motion, Saying):
+        if scene is not None and isinstance(scene.motion, Annotated):
             out |= judge_gestures(self.gestures, scene.motion, epoch_ns, from_ns, until_ns)
         return out
 
@@ -139,7 +139,7 @@ def truth_of_object(scene: Scene, poses: ObjectPoses, epoch_ns: int) -> ObjectTr
 
 
 def judge_gestures(
-    told: Sequence[Gesture], motion: Saying, epoch_ns: int, from_ns: int, until_ns: int
+    told: Sequence[Gesture], motion: Annotated, epoch_ns: int, from_ns: int, until_ns: int
 ) -> dict[str, object]:
     """What the hand of a scene said against what was told of it; poses of the hand are not judged.
 
@@ -153,30 +153,34 @@ def judge_gestures(
     begun = [one for one in _beginnings(told) if one.kind != "pose"]
     first_s, end_s = (from_ns - epoch_ns) * 1e-9, (until_ns - epoch_ns) * 1e-9
     made = [
-        (one, turn * motion.period_s)
-        for turn in range(int(end_s // motion.period_s) + 1)
-        for one in motion.said
-        if first_s <= one.start_s + turn * motion.period_s and one.stop_s + turn * motion.period_s <= end_s
+        (one, cycle * motion.period_s)
+        for cycle in range(int(end_s // motion.period_s) + 1)
+        for one in motion.annotations
+        if first_s <= one.start_s + cycle * motion.period_s and one.stop_s + cycle * motion.period_s <= end_s
     ]
-    heard: set[int] = set()
+    received: set[int] = set()
     right = 0
     for one, after_s in made:
         span = (one.start_s + after_s, one.stop_s + after_s + _LATE_S)
-        own = [k for k, told_one in enumerate(begun) if k not in heard and _is(told_one, one, span, epoch_ns)]
+        own = [
+            k for k, told_one in enumerate(begun) if k not in received and _is(told_one, one, span, epoch_ns)
+        ]
         right += bool(own)
-        heard.update(own)
+        received.update(own)
     # One that begin or end of the run cut off was made all the same.
-    cut = [k for k, one in enumerate(begun) if k not in heard and _cut(one, motion, epoch_ns, first_s, end_s)]
+    cut = [
+        k for k, one in enumerate(begun) if k not in received and _cut(one, motion, epoch_ns, first_s, end_s)
+    ]
     out: dict[str, object] = {
         "gestures_right": right,
         "gestures_made": len(made),
-        "gestures_false": len(begun) - len(heard) - len(cut),
+        "gestures_false": len(begun) - len(received) - len(cut),
     }
-    turned = [one for one in told if one.kind == "dial" and np.isfinite(one.angle_rad)]
-    began_s = [(one.began_t_ns - epoch_ns) * 1e-9 for one in turned]
+    dials = [one for one in told if one.kind == "dial" and np.isfinite(one.angle_rad)]
+    began_s = [(one.began_t_ns - epoch_ns) * 1e-9 for one in dials]
     error = [
         abs(one.angle_rad - motion.dial_rad(_seconds_of(one, epoch_ns)) + motion.dial_rad(t_s))
-        for one, t_s in zip(turned, began_s, strict=True)
+        for one, t_s in zip(dials, began_s, strict=True)
     ]
     return out | ({"dial_deg": round(float(np.degrees(np.median(error))), 2)} if error else {})
 
@@ -223,12 +227,12 @@ def _label(one: Gesture) -> str:
     return one.kind if one.name == one.kind else f"{one.kind} {one.name}"
 
 
-def _cut(told: Gesture, motion: Saying, epoch_ns: int, first_s: float, end_s: float) -> bool:
+def _cut(told: Gesture, motion: Annotated, epoch_ns: int, first_s: float, end_s: float) -> bool:
     """Whether it is one that the hand had begun before the first pose, or not done at the last."""
     turns = range(int(end_s // motion.period_s) + 1)
     spans = (
         (one, one.start_s + k * motion.period_s, one.stop_s + k * motion.period_s)
-        for one in motion.said
+        for one in motion.annotations
         for k in turns
     )
     return any(
@@ -237,7 +241,7 @@ def _cut(told: Gesture, motion: Saying, epoch_ns: int, first_s: float, end_s: fl
     )
 
 
-def _is(told: Gesture, made: Said, span_s: tuple[float, float], epoch_ns: int) -> bool:
+def _is(told: Gesture, made: Annotation, span_s: tuple[float, float], epoch_ns: int) -> bool:
     same = (told.kind, told.name) == (made.kind, made.name)
     return same and span_s[0] <= _seconds_of(told, epoch_ns) <= span_s[1]
 

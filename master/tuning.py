@@ -1,7 +1,7 @@
 """Other geometry, depth model, filter, hand, object or gestures while the master tracks: a new pipeline takes the old
 one's place.
 
-Each hand has a pipeline, and only those change whose files did; objects and gestures change together (`master.world`).
+Each hand has a pipeline; only those change whose files did; objects and gestures change together (`master.dispatcher`).
 
 The new pipeline is built on another thread and shown the last messages, so that its tracks, filter and hand stand when
 it takes over, between two messages. An instant is never solved twice: poses go on with rising times.
@@ -20,14 +20,14 @@ from common.arrays import Float
 from common.calibration import FilterCalibration, parse
 from common.calibration_parts import Part
 from common.errors import CalibrationError, PhalanxError
+from common.file_monitor import MonitoredFiles
 from common.messages import Detections, Name
-from common.watching import WatchedFiles
+from master.dispatcher import Dispatcher
 from master.estimator.pipeline import SolvedPose, Stage
 from master.needs_restart import refuse_other_hands, refuse_restart
 from master.rig import RigFiles
 from master.rig_pipeline import Pipeline, pipeline_of
 from master.rig_setup import RigSetup
-from master.world import World
 
 _WARM_FRAMES = 6  # of each camera: tracks need two, and the shipped 1 € filter has settled after 0.1 s
 _CLOSE_FRAMES = 2  # of each camera: what may be left for the loop to catch up with
@@ -53,7 +53,7 @@ class _WhenOpen:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Turn:
+class _OrientationSample:
     """What an IMU said of its orientation: the arguments of `Pipeline.push_orientation`."""
 
     t_ns: int
@@ -67,19 +67,23 @@ class LivePipeline:
     Holds it, its setup, what it was told last, and the one that is to take over with the next message.
     """
 
-    def __init__(self, setup: RigSetup, stage: Stage, shed: Callable[[], bool] | None = None) -> None:
-        """Begin with the pipeline of `setup`; `stage` measures the stages of whichever is in use, `shed` is asked for
-        each of its instants whether it is left out.
+    def __init__(
+        self, setup: RigSetup, stage: Stage, dropped_epochs: Callable[[], bool] | None = None
+    ) -> None:
+        """Begin with the pipeline of `setup`; `stage` measures the stages of whichever is in use, `dropped_epochs` is
+        asked for each of its epochs whether it is rejected.
 
         Raises:
             CalibrationError: The depth model does not fit the rig.
         """
-        self._stage, self._shed = stage, shed
+        self._stage, self._dropped_epochs = stage, dropped_epochs
         self._setup: RigSetup = setup
-        self._now = pipeline_of(setup, stage, shed=shed)
+        self._now = pipeline_of(setup, stage, dropped_epochs=dropped_epochs)
         per_frame = _told_per_frame(setup)
         self._close = _CLOSE_FRAMES * per_frame
-        self._recent: deque[tuple[int, Detections | _Turn]] = deque(maxlen=_WARM_FRAMES * per_frame)
+        self._recent: deque[tuple[int, Detections | _OrientationSample]] = deque(
+            maxlen=_WARM_FRAMES * per_frame
+        )
         self._number = 0
         self._last_ns = -(2**63)
         # And the number of the last message it has seen. One thread fills it, another empties it.
@@ -102,7 +106,7 @@ class LivePipeline:
     def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
         """Take what the hand's IMU says of its orientation (4,)."""
         self._number += 1
-        self._recent.append((self._number, _Turn(t_ns, orientation_wxyz, heading_sigma_rad)))
+        self._recent.append((self._number, _OrientationSample(t_ns, orientation_wxyz, heading_sigma_rad)))
         self._now.push_orientation(t_ns, orientation_wxyz, heading_sigma_rad)
 
     def flush(self) -> list[SolvedPose]:
@@ -134,8 +138,12 @@ class LivePipeline:
         """
         stage = _WhenOpen(self._stage)
         # What it is shown to warm up has been solved by the other already: nothing of it is left out.
-        shed = self._shed
-        new = pipeline_of(setup, stage, shed=None if shed is None else lambda: stage.open and shed())
+        dropped_epochs = self._dropped_epochs
+        new = pipeline_of(
+            setup,
+            stage,
+            dropped_epochs=None if dropped_epochs is None else lambda: stage.open and dropped_epochs(),
+        )
 
         def take() -> None:
             shown = self._warm(new)
@@ -180,17 +188,17 @@ class RigTuning:
         files: RigFiles,
         setups: Sequence[RigSetup],
         pipelines: Sequence[LivePipeline],
-        say: Callable[[str], None],
-        world: World | None = None,
+        notify: Callable[[str], None],
+        dispatcher: Dispatcher | None = None,
     ) -> None:
-        """Follow `files`, which say `setups`, and change `pipelines`; `say` is told one line for each change.
+        """Follow `files`, which say `setups`, and change `pipelines`; `notify` is told one line for each change.
 
-        Objects and gestures are those of `world`; None: nobody asks for any.
+        Objects and gestures are those of `dispatcher`; None: nobody asks for any.
         """
-        self._files, self._say, self._world = files, say, world
+        self._files, self._notify, self._dispatcher = files, notify, dispatcher
         self._setups, self._pipelines = tuple(setups), tuple(pipelines)
-        self._watched = WatchedFiles()
-        self._turn = threading.Lock()
+        self._monitored = MonitoredFiles()
+        self._lock = threading.Lock()
         self._applied = self._refused = 0
 
     @property
@@ -204,14 +212,14 @@ class RigTuning:
 
     def look(self) -> None:
         """Use the files if they were changed; where that fails, say so once and go on as before."""
-        with self._turn:
-            changed = self._watched.changed(self._files.paths(self._setups))
+        with self._lock:
+            changed = self._monitored.changed(self._files.paths(self._setups))
         if not changed:
             return
         try:
             self.reload()
         except PhalanxError as error:
-            self._say(f"changed files are not used: {error}")
+            self._notify(f"changed files are not used: {error}")
 
     def reload(self) -> None:
         """Use the files as they are now, those of all hands or none.
@@ -219,10 +227,10 @@ class RigTuning:
         Raises:
             CalibrationError: One is broken, they contradict each other, or they need a restart. Nothing has changed.
         """
-        with self._turn:
+        with self._lock:
             changed = self._use(self._files.load)
         if changed:
-            self._say("changed files are in use")
+            self._notify("changed files are in use")
 
     def try_filter(self, body: str) -> None:
         """Use another 1 € filter for one rig, until its files change or `reload` (body: `FilterTrial`).
@@ -234,13 +242,13 @@ class RigTuning:
         """
         trial = parse(body.encode(), FilterTrial, "filter")
         self.look()
-        with self._turn:
+        with self._lock:
             self._use(lambda: _with_filter(self._setups, trial))
 
     def renew(self, sender: str) -> None:
         """As the function `renew`, of the setups in use."""
-        with self._turn:
-            renew(self._setups, self._pipelines, self._world, sender)
+        with self._lock:
+            renew(self._setups, self._pipelines, self._dispatcher, sender)
 
     def _use(self, get: Callable[[], Sequence[RigSetup]]) -> bool:
         """Have these setups in use, all or none; False if they were."""
@@ -252,8 +260,10 @@ class RigTuning:
                 refuse_restart(old, new)
             changed = [(old, new, line) for old, new, line in both if _content(old) != _content(new)]
             switches = [line.prepare(new) for _, new, line in changed]
-            if self._world is not None and any(_beside(old) != _beside(new) for old, new, _ in both):
-                switches.append(self._world.prepare(setups))
+            if self._dispatcher is not None and any(
+                _auxiliary_inputs(old) != _auxiliary_inputs(new) for old, new, _ in both
+            ):
+                switches.append(self._dispatcher.prepare(setups))
         except PhalanxError:
             self._refused += 1
             raise
@@ -267,7 +277,7 @@ class RigTuning:
 
 
 def renew(
-    setups: Sequence[RigSetup], pipelines: Sequence[LivePipeline], world: World | None, sender: str
+    setups: Sequence[RigSetup], pipelines: Sequence[LivePipeline], dispatcher: Dispatcher | None, sender: str
 ) -> None:
     """Let new solvers take over from all that `sender` feeds: the state of the old ones may be broken.
 
@@ -280,8 +290,8 @@ def renew(
     for setup, pipeline in zip(setups, pipelines, strict=True):
         if sender in setup.senders:
             pipeline.renew()
-    if world is not None:
-        world.prepare(setups)()
+    if dispatcher is not None:
+        dispatcher.prepare(setups)()
 
 
 def _with_filter(setups: Sequence[RigSetup], trial: FilterTrial) -> list[RigSetup]:
@@ -309,9 +319,9 @@ def _told_per_frame(setup: RigSetup) -> int:
     return len(setup.camera_names) + ceil(samples)
 
 
-def _show(pipeline: Pipeline, told: Detections | _Turn) -> list[SolvedPose]:
+def _show(pipeline: Pipeline, told: Detections | _OrientationSample) -> list[SolvedPose]:
     """Tell it what came; the poses that completes."""
-    if isinstance(told, _Turn):
+    if isinstance(told, _OrientationSample):
         pipeline.push_orientation(told.t_ns, told.orientation_wxyz, told.heading_sigma_rad)
         return []
     return pipeline.push(told)
@@ -321,5 +331,5 @@ def _content(setup: RigSetup) -> tuple[object, ...]:
     return setup.rig, setup.wrist_rig, setup.cameras, setup.hand.profile, setup.rows, setup.settings
 
 
-def _beside(setup: RigSetup) -> tuple[object, ...]:
+def _auxiliary_inputs(setup: RigSetup) -> tuple[object, ...]:
     return setup.rig, setup.cameras, setup.hand.profile, setup.rows, setup.objects, setup.gestures

@@ -8,8 +8,8 @@ import typer
 from master.master_bus import bus_of_master
 from master.options import CALIB_JSON, HERE_BUS, BusEnd, Calibration, Hand, Rigs, Site
 from master.rig import load_setups
-from master.said import say
 from master.stopping import stop_on_signals
+from master.terminal import print_line
 
 
 def view(
@@ -40,7 +40,7 @@ def view(
 
     setups = load_setups(calibration, rig, hand)
     stop = stop_on_signals()
-    connection = bus_of_master(bus, stop, lambda error: say(f"waiting for a master: {error}"), site)
+    connection = bus_of_master(bus, stop, lambda error: print_line(f"waiting for a master: {error}"), site)
     if connection is None:
         return
     try:
@@ -52,7 +52,7 @@ def view(
             path=save,
             stop=stop,
             web_port=web_port,
-            on_ready=say,
+            on_ready=print_line,
         )
     finally:
         connection.close()

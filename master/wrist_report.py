@@ -11,7 +11,7 @@ from common.geometry import quaternion_to_matrix
 from common.sim.wrist.motion import OnForearm
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
-from common.sim.wrist.scene import WristTruth as WristInstant
+from common.sim.wrist.scene import WristTruth as WristEpoch
 from master.outputs.poses import Poses
 from master.wrist_score import WristTruth, score_laser
 
@@ -21,7 +21,7 @@ Progress = Callable[[str, int, int], None]
 
 def wrist_truth_of(t_ns: Int, scene: WristScene, epoch_ns: int, tell: Progress) -> WristTruth:
     """The scene at the instants (N,) [ns] of poses; `epoch_ns` is scene time 0 on their clock."""
-    now: list[WristInstant] = []
+    now: list[WristEpoch] = []
     for row, at_ns in enumerate(t_ns.tolist()):
         now.append(scene.truth((at_ns - epoch_ns) * 1e-9))
         if row % 20 == 0:
@@ -62,8 +62,8 @@ def forearm_tilt(poses: Poses, scene: WristScene, epoch_ns: int) -> dict[str, fl
     for k, row in enumerate(rows):
         t_s = (int(poses.t_ns[row]) - epoch_ns) * 1e-9
         true_up[k] = up @ OnForearm(scene.motion).at(t_s).T_rig_palm[:3, :3]
-    said_up = quaternion_to_matrix(poses.palm_world_wxyz[rows])[:, 2]
-    off_rad: Float = np.arccos(np.clip((true_up * said_up).sum(axis=1), -1.0, 1.0))
+    stated_up = quaternion_to_matrix(poses.palm_world_wxyz[rows])[:, 2]
+    off_rad: Float = np.arccos(np.clip((true_up * stated_up).sum(axis=1), -1.0, 1.0))
     return {"forearm_tilt_deg": round(float(np.degrees(np.sqrt((off_rad**2).mean()))), 4)}
 
 

@@ -13,7 +13,7 @@ from common.arrays import Bool, Float, Int
 from common.errors import RecordingError
 from common.frame_recording import FrameRecording, Illumination
 from common.hand_model import FINGER_JOINTS, FINGERS
-from common.messages import FINGER_COUNT, Level, WristDetections
+from common.messages import FINGER_COUNT, SolverMode, WristDetections
 from common.recorded_files import TRUTH, has_truth, read_truth
 from master.outputs.poses import Poses
 from master.score import put
@@ -141,11 +141,11 @@ def score_wrist(poses: Poses, truth: WristTruth) -> dict[str, float]:
     found = row[there]
     error = np.degrees(poses.angles_rad[found][:, 1:, 2] - truth.pip_rad[there, 1:])
     tracked = _any_of(poses.tracked[found]) & np.isfinite(error)
-    usual = truth.pip_rad[there, 1:] <= _STRAIGHT_RAD
-    put(out, "pip_rms_deg", error[tracked & usual], _rms)
+    typical = truth.pip_rad[there, 1:] <= _STRAIGHT_RAD
+    put(out, "pip_rms_deg", error[tracked & typical], _rms)
     for f, name in enumerate(FINGERS[1:]):
-        put(out, f"pip_rms_deg_{name}", error[:, f][(tracked & usual)[:, f]], _rms)
-    out["pip_untracked"] = float((usual & ~tracked).sum())
+        put(out, f"pip_rms_deg_{name}", error[:, f][(tracked & typical)[:, f]], _rms)
+    out["pip_untracked"] = float((typical & ~tracked).sum())
     valid = poses.valid[found][:, 1:]
     distance = np.linalg.norm(poses.position_m[found][:, 1:] - truth.joints_m[there], axis=2)
     put(out, "pip_deg", np.abs(error[_any_of(poses.valid[found]) & np.isfinite(error)]), np.mean)
@@ -154,24 +154,24 @@ def score_wrist(poses: Poses, truth: WristTruth) -> dict[str, float]:
     return out
 
 
-def triples_missed(poses: Poses, truth: WristTruth) -> int:
+def cycles_missed(poses: Poses, truth: WristTruth) -> int:
     """Triples of a recording without a pose."""
     return int((rows_at(truth.t_ns, poses.t_ns) < 0).sum())
 
 
-def score_triples(
+def score_cycles(
     setup: WristSetup, messages: Sequence[WristDetections], truth: WristTruth
 ) -> dict[str, float]:
     """Errors of the laser points of triples, whatever hand is made of them.
 
     Returns:
-        triples: How many there are; triples_missed: how many of the truth's are missing. Of the laser points as
+        triples: How many there are; cycles_missed: how many of the truth's are missing. Of the laser points as
         `score_wrist`.
     """
     at_ns = np.array([message.t_ns for message in messages], np.int64)
     uv = np.array([message.laser_uv for message in messages]).reshape(-1, FINGER_COUNT, 2)
     row = rows_at(truth.t_ns, at_ns)
-    counted = {"triples": float(len(messages)), "triples_missed": float((row < 0).sum())}
+    counted = {"cycles": float(len(messages)), "cycles_missed": float((row < 0).sum())}
     return counted | score_laser(at_rows(setup.on_plane(uv), row), truth)
 
 
@@ -218,7 +218,7 @@ def _score_both(poses: Poses, row: Int, truth: WristTruth) -> dict[str, float]:
     """What became of the fingers whose laser line and tip are both in sight; `row` (N,) of the poses."""
     both = clear_line(truth) & truth.tip_visible
     error = np.abs(np.degrees(at_rows(poses.angles_rad[:, :, 2], row) - truth.pip_rad))
-    by_ik = at_rows((poses.level == Level.IK).astype(np.float64), row) == 1.0
+    by_ik = at_rows((poses.solver_mode == SolverMode.IK).astype(np.float64), row) == 1.0
     out: dict[str, float] = {}
     for f, name in enumerate(FINGERS):
         out[f"both_{name}"] = float(both[:, f].sum())

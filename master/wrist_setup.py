@@ -8,9 +8,9 @@ import numpy as np
 from common.arrays import Float
 from common.calibration import CameraCalibration, FilterCalibration, ImuCalibration, RigCalibration, Volume
 from common.hand_model import FINGERS, HandModel
-from common.wrist_bend import forearm_palm
 from common.wrist_calibration import FingerLine
 from common.wrist_device import WristDevice
+from common.wrist_joint import forearm_palm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,7 +21,7 @@ class WristSetup(WristDevice):
         laser_m: (3,) where the laser light comes from, in its plane.
         lines: Finger -> the measured line its laser point moves along; of none, the simulated one counts.
         cubic: Flexion by the cubic printed in the paper and not by the table of this hand.
-        level: What fingers are solved from: "fk", "ik" or "auto".
+        solver_mode: What fingers are solved from: "fk", "ik" or "auto".
         filter: Of the laser points, where frames follow each other.
         volume: What the rig states, or None.
         frame_s: From frame to frame of its camera.
@@ -32,7 +32,7 @@ class WristSetup(WristDevice):
     laser_m: Float
     lines: dict[str, FingerLine]
     cubic: bool
-    level: Literal["fk", "ik", "auto"]
+    solver_mode: Literal["fk", "ik", "auto"]
     filter: FilterCalibration
     volume: Volume | None = None
     late_ns: int = 0
@@ -62,7 +62,7 @@ class WristSetup(WristDevice):
             laser_m=laser + (offset_m - laser @ normal) * normal,
             lines={name: rig.finger_lines[name] for name in FINGERS if name in rig.finger_lines},
             cubic=rig.forward == "cubic",
-            level=rig.level,
+            solver_mode=rig.solver_mode,
             filter=rig.filter,
             volume=rig.volume,
             frame_s=1.0 / camera.frame_rate_hz,
@@ -70,8 +70,8 @@ class WristSetup(WristDevice):
             imu=rig.imu if rig.imu is not None and rig.imu.q_palm_imu is not None else None,
         )
 
-    def bent(self, bend_rad: Float) -> "WristSetup":
-        """The same before the palm of a wrist that is bent by (2,) [rad] (`common.wrist_bend`)."""
+    def flexed(self, wrist_angles_rad: Float) -> "WristSetup":
+        """The same before the palm of a wrist that is bent by (2,) [rad] (`common.wrist_joint`)."""
         T = self.T_camera_palm.copy()
-        T[:3, :3] = T[:3, :3] @ forearm_palm(bend_rad)
+        T[:3, :3] = T[:3, :3] @ forearm_palm(wrist_angles_rad)
         return replace(self, T_camera_palm=T)

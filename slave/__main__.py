@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _install(options: argparse.Namespace) -> int:
     from slave.install.command import run
 
-    return run(options, _say)
+    return run(options, _print)
 
 
 def _doctor(options: argparse.Namespace) -> int:
@@ -50,11 +50,11 @@ def _doctor(options: argparse.Namespace) -> int:
     from slave.doctor.system import System
 
     findings = list(examine(options, System.here()))
-    _say(as_json(findings, program()) if options.json else as_text(findings))
+    _print(as_json(findings, program()) if options.json else as_text(findings))
     return exit_code(findings)
 
 
-def _say(line: str) -> None:
+def _print(line: str) -> None:
     print(line, flush=True)
 
 
@@ -63,17 +63,17 @@ def _aside(line: str) -> None:
 
 
 COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
-    "run": lambda options: run.run(options, _say),
-    "imu": lambda options: imu.run(options, _say),
-    "tracker": lambda options: tracker.run(options, _say),
-    "lights": lambda options: lights.run(options, _say),
-    "record": lambda options: record.run(options, _say, _aside),
-    "join": lambda options: join.run(options, _say, _aside),
-    "import": lambda options: importing.run(options, _say),
+    "run": lambda options: run.run(options, _print),
+    "imu": lambda options: imu.run(options, _print),
+    "tracker": lambda options: tracker.run(options, _print),
+    "lights": lambda options: lights.run(options, _print),
+    "record": lambda options: record.run(options, _print, _aside),
+    "join": lambda options: join.run(options, _print, _aside),
+    "import": lambda options: importing.run(options, _print),
     "detect": lambda options: detect.run(options, _aside),
     "install": _install,
     "doctor": _doctor,
-    "colours": lambda options: colours.run(options, _say, _aside),
+    "colours": lambda options: colours.run(options, _print, _aside),
 }
 
 

@@ -14,13 +14,13 @@ import numpy as np
 from common.arrays import Image
 from common.messages import MarkerDetections, Message, TagDetections
 from slave.cameras.source import Frame, FrameSource
+from slave.counters import Counters
 from slave.markers.detector import Detections
-from slave.tally import Tally
 from slave.wrist.detector import WristFound
 
 
 class Detector(Protocol):
-    """What finds the markers; a `MarkerDetector` or a `FollowingDetector`."""
+    """What finds the markers; a `MarkerDetector` or a `LightAdaptiveDetector`."""
 
     def push(self, image: Image, t_ns: int) -> Detections:
         """Markers of one frame; times [ns] rise."""
@@ -86,7 +86,7 @@ def run(
     detector: Detector,
     sender: Sender,
     camera: str,
-    tally: Tally,
+    counters: Counters,
     stop: threading.Event,
     show: Callable[[Frame], None] = lambda _frame: None,
     tags: Tags | None = None,
@@ -116,17 +116,17 @@ def run(
             found.area,
             found.quality,
             found.sigma_px,
-            found.rival_uv,
+            found.alt_uv,
             frame.t_sigma_ns,
         )
         sender.send(message)
-        tally.frame(frame.seq, detect_ns, found.uv)
+        counters.frame(frame.seq, detect_ns, found.uv)
         if tags is not None and (seen := tags.push(frame, sender.session, detect_ns)) is not None:
             sender.send(seen)
         show(frame)
         alive()
 
-    _each_frame(source, stop, tally, work)
+    _each_frame(source, stop, counters, work)
 
 
 def run_wrist(
@@ -134,7 +134,7 @@ def run_wrist(
     detector: StrobedDetector,
     sender: Sender,
     camera: str,
-    tally: Tally,
+    counters: Counters,
     stop: threading.Event,
     show: Callable[[Frame], None] = lambda _frame: None,
     alive: Callable[[], None] = nothing,
@@ -156,22 +156,22 @@ def run_wrist(
         found = detector.push(frame)
         took_ns.append(time.perf_counter_ns() - began_ns)
         if found is None:
-            tally.part(frame.seq)
+            counters.part(frame.seq)
             parts += 1
             if parts > DARK_AFTER:
                 show(frame)
         else:
             sender.send(found.message(camera, sender.session))
-            tally.frame(frame.seq, sum(took_ns), np.vstack([found.laser.uv, found.tips.uv]))
+            counters.frame(frame.seq, sum(took_ns), np.vstack([found.laser.uv, found.tips.uv]))
             parts = 0
-            show(found.triple.led)
+            show(found.cycle.led)
         alive()
 
-    _each_frame(source, stop, tally, work)
+    _each_frame(source, stop, counters, work)
 
 
 def _each_frame(
-    source: FrameSource, stop: threading.Event, tally: Tally, work: Callable[[Frame], None]
+    source: FrameSource, stop: threading.Event, counters: Counters, work: Callable[[Frame], None]
 ) -> None:
     """Do `work` with every frame until the source ends or `stop` is set.
 
@@ -184,4 +184,4 @@ def _each_frame(
         try:
             work(frame)
         except Exception as error:  # noqa: BLE001 - one frame; it is counted and logged
-            tally.failed(frame.seq, error)
+            counters.failed(frame.seq, error)

@@ -74,7 +74,7 @@ def join_recordings(
         ),
         key=lambda frame: (frame[0], frame[1].camera),
     )
-    _check_room(output, [path for _, _, path in frames])
+    _check_space(output, [path for _, _, path in frames])
     _write(RecordingWriter(output, manifest), frames, progress)
     if samples:
         write_imu(output, samples)
@@ -223,7 +223,7 @@ def _check_overlap(parts: Sequence[FrameRecording], shifts_ns: Sequence[int]) ->
         )
 
 
-def _check_room(output: Path, files: Sequence[Path]) -> None:
+def _check_space(output: Path, files: Sequence[Path]) -> None:
     needed = 0
     for path in files:
         try:

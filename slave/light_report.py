@@ -8,7 +8,7 @@ import numpy as np
 
 from common.arrays import Float
 from slave.cameras.source import Frame
-from slave.markers.colour_watch import ColourWarning
+from slave.markers.colour_monitor import ColourWarning
 
 LOG_EVERY_NS = 10_000_000_000  # the same subject is logged no more often
 NAME = 64  # characters of a name in `Health`
@@ -16,11 +16,11 @@ ALL = "light"  # the subject of what concerns every marker
 _LOG = logging.getLogger(__name__)
 
 
-class Following(Protocol):
-    """What is reported on: a `ChangingDetector`."""
+class LightAdaptive(Protocol):
+    """What is reported on: a `ReloadableDetector`."""
 
     @property
-    def follows(self) -> bool:
+    def adapts(self) -> bool:
         """Whether the light is followed at present."""
         ...
 
@@ -46,13 +46,13 @@ class Following(Protocol):
 
 
 class Numbers(Protocol):
-    """Counts and gauges of something else; a `Tally`."""
+    """Counts and gauges of something else; a `Counters`."""
 
     def counts(self) -> Mapping[str, int]:
         """Event -> how often."""
         ...
 
-    def gauges(self) -> Mapping[str, float]:
+    def metrics(self) -> Mapping[str, float]:
         """Quantity with unit -> value."""
         ...
 
@@ -67,7 +67,7 @@ class LightReport:
     def __init__(
         self,
         name: str,
-        detector: Following,
+        detector: LightAdaptive,
         others: Numbers,
         markers: tuple[str, ...],
         show: Callable[[Frame], None] = lambda _frame: None,
@@ -101,18 +101,22 @@ class LightReport:
         own = {"refused.light": self._detector.refused, "colour_tables": self._detector.tables}
         return {**self._others.counts(), **warned, **own}
 
-    def gauges(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """Those of the others, and, while the light is followed, what it is against calibration.
 
         That is red and blue relative to green, and green. Of markers that look alike
         twins.<one>..<other>, the hues between them.
         """
-        if not self._detector.follows:
-            return dict(self._others.gauges())
+        if not self._detector.adapts:
+            return dict(self._others.metrics())
         blue, green, red = np.exp(self._detector.log_gains).tolist()
         light = {"light_red": red / green, "light_blue": blue / green, "light_exposure": green}
-        return {**self._others.gauges(), **light, **_twins(self._detector.warnings)}
+        return {**self._others.metrics(), **light, **_ambiguous(self._detector.warnings)}
 
 
-def _twins(warnings: list[ColourWarning]) -> dict[str, float]:
-    return {f"twins.{one.marker}..{one.twin}"[:NAME]: one.hues for one in warnings if one.twin is not None}
+def _ambiguous(warnings: list[ColourWarning]) -> dict[str, float]:
+    return {
+        f"twins.{one.marker}..{one.ambiguous}"[:NAME]: one.hues
+        for one in warnings
+        if one.ambiguous is not None
+    }

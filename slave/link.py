@@ -46,10 +46,12 @@ UNLISTED_NS = 1_000_000_000
 HELLO_AGAIN_NS = 50_000_000
 OFFER_NS = 1_000_000_000  # how long hello is repeated after the last beacon
 NONCE_NS = 2_000_000_000
-TWIN_NS = 1_000_000_000  # unanswered for so long while the beacons list the name: another process has it
+DUPLICATE_SENDER_NS = (
+    1_000_000_000  # unanswered for so long while the beacons list the name: another process has it
+)
 STRANGE_NS = 1_000_000_000  # between two hellos to a master of another wire version
 LATELY_NS = 2_500_000_000  # so long after it was last seen something is told to be wrong
-_TWIN = "the master has another process that is {!r}: two of one name, end one of them"
+_DUPLICATE_SENDER = "the master has another process that is {!r}: two of one name, end one of them"
 _OTHER_VERSION = "the master at {} speaks wire version {}, this slave {}: install one version on both"
 
 _SECRET = (
@@ -74,7 +76,7 @@ class _Offer:
     beacon: Beacon
     beacon_counter: int
     address: Address
-    heard_ns: int
+    received_ns: int
     next_ns: int
     since_ns: int
     drawn_ns: int  # its nonce
@@ -93,7 +95,7 @@ class _Session:
     sealer: Sealer
     opener: Opener
     since_ns: int
-    heard_ns: int
+    received_ns: int
     start_t_ns: int | None = None
 
 
@@ -133,7 +135,7 @@ class SlaveLink:
         """Return how far the session with a master is at `t_ns`, on this slave's clock."""
         if self._session is None:
             return State.IDLE if self._offer is None else State.OFFERED
-        return State.LIVE if t_ns - self._session.heard_ns < WELL_NS else State.SILENT
+        return State.LIVE if t_ns - self._session.received_ns < WELL_NS else State.SILENT
 
     @property
     def started(self) -> bool:
@@ -141,7 +143,7 @@ class SlaveLink:
         session = self._session
         if session is None or session.start_t_ns is None:
             return False
-        return self._clock.now_ns() - session.heard_ns < VANISHED_NS
+        return self._clock.now_ns() - session.received_ns < VANISHED_NS
 
     @property
     def start_t_ns(self) -> int | None:
@@ -156,9 +158,9 @@ class SlaveLink:
         """
         return None if self._session is None else self._session.zenoh_endpoint
 
-    def hear_beacon(self, datagram: bytes, address: Address, t_ns: int) -> None:
+    def receive_beacon(self, datagram: bytes, address: Address, t_ns: int) -> None:
         """Take a datagram from the beacon's port."""
-        self._count(self._hear_beacon(datagram, address, t_ns))
+        self._count(self._on_beacon(datagram, address, t_ns))
 
     def receive(self, datagram: bytes, address: Address, t_ns: int) -> None:
         """Take a datagram from the port of this slave that arrived at `t_ns`."""
@@ -166,11 +168,11 @@ class SlaveLink:
         if isinstance(header, Refusal):
             self._count(header)
         elif header.kind is Kind.WELCOME:
-            self._count(self._hear_welcome(header, datagram, address, t_ns))
+            self._count(self._on_welcome(header, datagram, address, t_ns))
         elif header.kind is Kind.UNPROVEN:
-            self._count(self._hear_unproven(header, datagram, address, t_ns))
+            self._count(self._on_unproven(header, datagram, address, t_ns))
         elif header.kind in (Kind.START, Kind.ECHO_ASK):
-            self._count(self._hear_master(header, datagram, t_ns))
+            self._count(self._on_master(header, datagram, t_ns))
         else:
             self._count(Refusal.UNEXPECTED)
 
@@ -192,10 +194,10 @@ class SlaveLink:
         # A clock that was set back is no reason to be silent until it is there again.
         if (
             offer is not None
-            and t_ns - offer.heard_ns < OFFER_NS
+            and t_ns - offer.received_ns < OFFER_NS
             and not 0 < offer.next_ns - t_ns <= HELLO_AGAIN_NS
         ):
-            self._say_hello(offer, t_ns)
+            self._send_hello(offer, t_ns)
         outbox, self._outbox = self._outbox, []
         return outbox
 
@@ -203,15 +205,15 @@ class SlaveLink:
         if refusal is not None:
             self.refused[refusal] += 1
 
-    def _hear_beacon(self, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
+    def _on_beacon(self, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
         header = parse(datagram, self._keys.rig_tag)
         if isinstance(header, Refusal):
             if header is Refusal.VERSION:
-                self._answer_stranger(datagram, address, t_ns)
+                self._answer_other_version(datagram, address, t_ns)
             return header
         if header.kind is not Kind.BEACON:
             return Refusal.UNEXPECTED
-        beacon = self._keys.hear(header, datagram, Beacon)
+        beacon = self._keys.open_as(header, datagram, Beacon)
         if isinstance(beacon, Refusal):
             return beacon
         event = self._beacon_event(beacon, header.counter, t_ns)
@@ -221,7 +223,7 @@ class SlaveLink:
         if rule.reply is not Kind.HELLO:
             return rule.refusal
         self._answer(beacon, header.counter, address, t_ns)
-        return self._has_twin(beacon, t_ns)
+        return self._has_duplicate(beacon, t_ns)
 
     def _rule(self, event: Event, t_ns: int) -> Rule:
         return RULES[Role.SLAVE, self.state(t_ns), event]
@@ -230,7 +232,7 @@ class SlaveLink:
         session = self._session
         if session is None or beacon.master_nonce != session.master_nonce:
             return Event.BEACON_OTHER
-        vanished = t_ns - session.heard_ns >= VANISHED_NS  # then no counter is worth being deaf for it
+        vanished = t_ns - session.received_ns >= VANISHED_NS  # then no counter is worth being deaf for it
         if counter <= session.beacon_counter and not vanished:
             return Event.BEACON_OLD
         listed = beacon.sessions.get(self._name) == session.key_id
@@ -243,7 +245,7 @@ class SlaveLink:
         if (
             old is not None
             and old.beacon.master_nonce == beacon.master_nonce
-            and t_ns - old.heard_ns < OFFER_NS
+            and t_ns - old.received_ns < OFFER_NS
         ):
             since_ns = old.since_ns
         if old is not None and 0 <= t_ns - old.drawn_ns < NONCE_NS:
@@ -251,18 +253,22 @@ class SlaveLink:
         else:
             nonce, drawn_ns = self._random(NONCE_BYTES), t_ns
         self._offer = _Offer(nonce, beacon, counter, address, t_ns, t_ns, since_ns, drawn_ns)
-        self._say_hello(self._offer, t_ns)
+        self._send_hello(self._offer, t_ns)
 
-    def _has_twin(self, beacon: Beacon, t_ns: int) -> Refusal | None:
+    def _has_duplicate(self, beacon: Beacon, t_ns: int) -> Refusal | None:
         """Whether the master says no more than that it has somebody of this name already."""
         listed = beacon.sessions.get(self._name)
         ours = None if self._session is None else self._session.key_id
-        if self._offer is None or listed in (None, ours) or not t_ns - self._offer.since_ns >= TWIN_NS:
+        if (
+            self._offer is None
+            or listed in (None, ours)
+            or not t_ns - self._offer.since_ns >= DUPLICATE_SENDER_NS
+        ):
             return None
-        self._wrong = t_ns, _TWIN.format(self._name)
-        return Refusal.TWIN
+        self._wrong = t_ns, _DUPLICATE_SENDER.format(self._name)
+        return Refusal.DUPLICATE_SENDER
 
-    def _answer_stranger(self, datagram: bytes, address: Address, t_ns: int) -> None:
+    def _answer_other_version(self, datagram: bytes, address: Address, t_ns: int) -> None:
         """Say who we are to a master of this rig that cannot understand us; its word is not proven, so seldom."""
         if len(datagram) < OVERHEAD:
             return
@@ -277,15 +283,15 @@ class SlaveLink:
         hello = self._keys.hello(self._name, self.process, *nonces)
         self._outbox.append((seal(self._sealer, hello), address))
 
-    def _say_hello(self, offer: _Offer, t_ns: int) -> None:
+    def _send_hello(self, offer: _Offer, t_ns: int) -> None:
         offer.next_ns = t_ns + HELLO_AGAIN_NS
         self._outbox.append((seal(self._sealer, self._hello(offer)), offer.address))
 
     def _hello(self, offer: _Offer) -> Hello:
         return self._keys.hello(self._name, self.process, offer.slave_nonce, offer.beacon.master_nonce)
 
-    def _hear_welcome(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
-        welcome = self._keys.hear(header, datagram, Welcome)
+    def _on_welcome(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
+        welcome = self._keys.open_as(header, datagram, Welcome)
         if isinstance(welcome, Refusal):
             return welcome
         offer = self._offer
@@ -303,7 +309,7 @@ class SlaveLink:
             self._keys.session_sealer(keys.to_master, keys.key_id),
             Opener(keys.to_slave),
             since_ns=t_ns,
-            heard_ns=t_ns,
+            received_ns=t_ns,
         )
         self._offer = None
         return None
@@ -321,20 +327,20 @@ class SlaveLink:
             return Event.WELCOME_UNPROVEN, None
         return Event.WELCOME, keys
 
-    def _hear_unproven(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
+    def _on_unproven(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
         """Why there is no welcome. It changes nothing here: whoever has the rig key can say it."""
-        unproven = self._keys.hear(header, datagram, Unproven)
+        unproven = self._keys.open_as(header, datagram, Unproven)
         if isinstance(unproven, Refusal):
             return unproven
         ours = self._offer is not None and unproven.slave_nonce == self._offer.slave_nonce
         if ours:
             why = _SECRET
-            if unproven.apart != self._keys.apart:
-                why = _NO_SECRET if unproven.apart else _MASTER_HAS_NONE
+            if unproven.has_secrets != self._keys.has_secrets:
+                why = _NO_SECRET if unproven.has_secrets else _MASTER_HAS_NONE
             self._wrong = t_ns, why.format(self._name, address[0])
         return self._rule(Event.UNPROVEN if ours else Event.UNPROVEN_UNASKED, t_ns).refusal
 
-    def _hear_master(self, header: Header, datagram: bytes, t_ns: int) -> Refusal | None:
+    def _on_master(self, header: Header, datagram: bytes, t_ns: int) -> Refusal | None:
         session = self._session
         if session is None or header.key_id != session.key_id:
             return Refusal.STALE
@@ -342,7 +348,7 @@ class SlaveLink:
         if isinstance(opened, Refusal):
             return opened
         message = read(header.kind, opened.body)
-        session.heard_ns = t_ns
+        session.received_ns = t_ns
         if isinstance(message, EchoAsk):
             answer = EchoAnswer(message.t1_ns, t_ns, self._clock.now_ns())
             self._outbox.append((seal(session.sealer, answer), session.address))

@@ -15,29 +15,29 @@ from common.keys import Access
 from common.zenoh_bus import ZenohBus
 from slave.app import run, run_wrist, wait_for_start
 from slave.cameras.source import FrameSource
+from slave.colour_sampler import ColourSampler
+from slave.counters import Counters
 from slave.light_report import LightReport
-from slave.markers.beside import told_frames, told_places
-from slave.markers.blind import BlindDetector
-from slave.markers.changing import Changeable, ChangingDetector, marker_changes
+from slave.markers.ambiguity import told_frames, told_places
+from slave.markers.calibrated import CalibratedDetector
 from slave.markers.detector import MarkerDetector
 from slave.markers.engine import Engine
-from slave.markers.following import can_follow, detector_for
-from slave.markers.known import KnownDetector
+from slave.markers.light_adaptive import can_adapt, detector_for
+from slave.markers.null_detector import NullDetector
+from slave.markers.reloadable import AnyDetector, ReloadableDetector, marker_changes
 from slave.markers.scan_choice import Scan, ScanChoice
 from slave.overlay import MarkerOverlay, WristOverlay
-from slave.picker import LivePicker
 from slave.preview import Previews
 from slave.raw import RawFrames, RawSettings
 from slave.report import Numbers, Reporter
 from slave.service import Service
 from slave.tags.live import LiveTags, finder_of
-from slave.tally import Tally
 from slave.tuning import CameraFiles, CameraTuning, Prepare
 from slave.uplink import Uplink
-from slave.wrist.blind import BlindWrist
-from slave.wrist.changing import view_of, wrist_changes
 from slave.wrist.detector import WristDetector
 from slave.wrist.engine import Engine as WristEngine
+from slave.wrist.null_detector import NullWristDetector
+from slave.wrist.reloadable import view_of, wrist_changes
 
 Colours = Literal["follow", "fixed", "none"]
 NO_REFERENCE = (
@@ -61,7 +61,7 @@ def run_live(
     scan: Scan,
     engine: Engine | WristEngine,
     stop: threading.Event,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
     service: Service,
     access: Access,
     raw_frames: RawSettings | None = None,
@@ -95,7 +95,7 @@ def run_live(
     else:
         line = _marker_line(name, files, read, uplink, clock, colours, scan, engine, stop, workers, service)
     tuning = CameraTuning(
-        files, source, line.prepare, lambda: line.numbers.counts()["frames"] > 0, line.picker
+        files, source, line.prepare, lambda: line.numbers.counts()["frames"] > 0, line.sampler
     )
     reporter = Reporter(
         name,
@@ -111,7 +111,7 @@ def run_live(
     try:
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
-        say("ready, waiting for the master")
+        notify("ready, waiting for the master")
         service.ready(lambda: uplink.started)
         if wait_for_start(uplink, stop, service.waiting):
             line.run()
@@ -123,7 +123,7 @@ def run_live(
         source.close()
         raw.close()
         workers.shutdown(cancel_futures=True)
-    say(f"{line.numbers.counts()['frames']} frames, sent {uplink.counts['sent']}")
+    notify(f"{line.numbers.counts()['frames']} frames, sent {uplink.counts['sent']}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,14 +135,14 @@ class _Line:
         numbers: What it counts.
         previews: Who shows them.
         prepare: How changed files reach it; None: it uses none of them.
-        picker: Who makes a colour of a click; None: it uses none.
+        sampler: Who makes a colour of a click; None: it uses none.
     """
 
     run: Callable[[], None]
     numbers: Numbers
     previews: Previews
     prepare: Prepare | None
-    picker: LivePicker | None = None
+    sampler: ColourSampler | None = None
 
 
 def _marker_line(
@@ -161,18 +161,18 @@ def _marker_line(
     rig, alive = files.rig, service.working
     tags = LiveTags(files.camera, files.objects)
     if colours == "none":
-        blind, tally = BlindDetector(len(rig.markers)), Tally(rig.markers, tags.counts)
+        null_detector, counters = NullDetector(len(rig.markers)), Counters(rig.markers, tags.counts)
         plain = Previews(name, clock)
         return _Line(
-            lambda: run(source, blind, uplink, name, tally, stop, plain.offer, alive=alive),
-            tally,
+            lambda: run(source, null_detector, uplink, name, counters, stop, plain.offer, alive=alive),
+            counters,
             plain,
             None,
         )
     make = _maker(files, colours, engine, workers)
     choice = ScanChoice(scan, files.camera)
-    detector = ChangingDetector(make(files.camera, rig), choice)
-    tally = Tally(
+    detector = ReloadableDetector(make(files.camera, rig), choice)
+    counters = Counters(
         rig.markers,
         lambda: (
             tags.counts()
@@ -183,16 +183,16 @@ def _marker_line(
         lambda: told_places(detector.plain),
     )
     previews = Previews(name, clock, MarkerOverlay(detector, rig.markers))
-    numbers, seen = tally, previews.offer
+    numbers, seen = counters, previews.offer
     if colours == "follow":
-        numbers = LightReport(name, detector, tally, rig.markers, previews.offer)
+        numbers = LightReport(name, detector, counters, rig.markers, previews.offer)
         seen = numbers.offer
     return _Line(
-        lambda: run(source, detector, uplink, name, tally, stop, seen, tags, alive),
+        lambda: run(source, detector, uplink, name, counters, stop, seen, tags, alive),
         numbers,
         previews,
         _both(marker_changes(detector, make), _tag_changes(tags)),
-        LivePicker(detector, previews.shown, rig.markers),
+        ColourSampler(detector, previews.shown, rig.markers),
     )
 
 
@@ -238,20 +238,20 @@ def _wrist_line(
 ) -> _Line:
     alive = service.working
     if colours == "none":
-        tally, plain = Tally(()), Previews(name, clock)
+        counters, plain = Counters(()), Previews(name, clock)
         return _Line(
-            lambda: run_wrist(source, BlindWrist(), uplink, name, tally, stop, plain.offer, alive),
-            tally,
+            lambda: run_wrist(source, NullWristDetector(), uplink, name, counters, stop, plain.offer, alive),
+            counters,
             plain,
             None,
         )
     detector = WristDetector(view_of(files), files.camera.frame_rate_hz, engine=engine)
     names = tuple(f"{what}.{finger}" for what in ("laser", "tip") for finger in FINGERS)
-    tally = Tally(names, lambda: {f"strobe.{event}": count for event, count in detector.counts.items()})
+    counters = Counters(names, lambda: {f"strobe.{event}": count for event, count in detector.counts.items()})
     previews = Previews(name, clock, WristOverlay(detector))
     return _Line(
-        lambda: run_wrist(source, detector, uplink, name, tally, stop, previews.offer, alive),
-        tally,
+        lambda: run_wrist(source, detector, uplink, name, counters, stop, previews.offer, alive),
+        counters,
         previews,
         wrist_changes(detector),
     )
@@ -264,15 +264,15 @@ def _uncalibrated(missing: Sequence[str]) -> dict[str, int]:
 
 def _maker(
     files: CameraFiles, colours: Colours, engine: Engine, workers: ThreadPoolExecutor
-) -> Callable[[CameraCalibration, RigCalibration], Changeable]:
+) -> Callable[[CameraCalibration, RigCalibration], AnyDetector]:
     """What makes a detector for given content of the files, now and whenever it changes."""
 
-    def make(camera: CameraCalibration, rig: RigCalibration) -> Changeable:
+    def make(camera: CameraCalibration, rig: RigCalibration) -> AnyDetector:
         if missing := [name for name in rig.markers if name not in (camera.markers or {})]:
             _LOG.warning("%s", NO_COLOUR.format(files.camera_path, ", ".join(missing)))
-            return KnownDetector(camera, rig.markers, engine, rig.free_markers)
+            return CalibratedDetector(camera, rig.markers, engine, rig.free_markers)
         if colours == "follow":
-            if not can_follow(camera, rig.markers):
+            if not can_adapt(camera, rig.markers):
                 _LOG.warning("%s", NO_REFERENCE.format(files.camera_path))
             return detector_for(camera, rig.markers, workers, engine=engine, free=rig.free_markers)
         return MarkerDetector(camera, rig.markers, engine=engine, free=rig.free_markers)

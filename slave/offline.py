@@ -17,9 +17,9 @@ from common.npz import write_npz
 from slave.markers.autocolour import calibrate_moving, frames_for
 from slave.markers.autocolour_names import by_clicks, by_hand, by_hues, checked
 from slave.markers.autocolour_surroundings import spread
-from slave.markers.changing import plain_of
 from slave.markers.colours import ColourRow, calibrate
-from slave.markers.following import detector_for
+from slave.markers.light_adaptive import detector_for
+from slave.markers.reloadable import plain_of
 from slave.markers.workers import Inline
 from slave.wrist.offline import RecordedWristDetections
 
@@ -38,7 +38,7 @@ class RecordedDetections:
         area_px2: (T, M) visible areas [px^2].
         quality: (T, M) 0..1, the probability that it is the marker.
         sigma_px: (T, M) standard deviation of the centroids per axis [px].
-        rival_uv: (T, M, 2) second places of the same colour [px]; NaN: none.
+        alt_uv: (T, M, 2) second places of the same colour [px]; NaN: none.
     """
 
     t_ns: Int
@@ -47,7 +47,7 @@ class RecordedDetections:
     area_px2: Float
     quality: Float
     sigma_px: Float
-    rival_uv: Float
+    alt_uv: Float
 
 
 def camera_of(recording: FrameRecording, camera: str, calibration: Path | None) -> CameraCalibration:
@@ -116,7 +116,7 @@ def detect_recording(
     if (plain := plain_of(detector)) is not None:
         plain.windows_only = windows_only
     shape = (len(rows), len(names))
-    uv, rival_uv = np.full((*shape, 2), np.nan), np.full((*shape, 2), np.nan)
+    uv, alt_uv = np.full((*shape, 2), np.nan), np.full((*shape, 2), np.nan)
     area, quality, sigma_px = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan)
     pictures = FramePictures(folder, (model.width_px, model.height_px))
     for i, row in enumerate(rows):
@@ -127,11 +127,11 @@ def detect_recording(
         if tags is not None:
             tags.push(image, row)
         uv[i], area[i], quality[i] = found.uv, found.area, found.quality
-        sigma_px[i], rival_uv[i] = found.sigma_px, found.rival_uv
+        sigma_px[i], alt_uv[i] = found.sigma_px, found.alt_uv
         progress(i + 1, len(rows))
     t_ns = np.array([row.t_ns for row in rows], np.int64)
     seq = np.array([row.seq for row in rows], np.int64)
-    return RecordedDetections(t_ns, seq, uv, area, quality, sigma_px, rival_uv)
+    return RecordedDetections(t_ns, seq, uv, area, quality, sigma_px, alt_uv)
 
 
 def calibrate_colours(
@@ -143,7 +143,7 @@ def calibrate_colours(
     auto: bool = False,
     like: Path | None = None,
     hand: Path | None = None,
-    say: Callable[[str], None] = lambda _text: None,
+    notify: Callable[[str], None] = lambda _text: None,
 ) -> list[ColourRow]:
     """Make the colour ranges of one camera from a recording and write its camera file.
 
@@ -192,19 +192,19 @@ def calibrate_colours(
     else:
         profile = Path("calib_json/hands") / f"{rig.hand}.json" if hand is None else hand
         if like is not None:
-            namer = by_hues(load(like, CameraCalibration).markers, rig.markers, str(like), say)
+            namer = by_hues(load(like, CameraCalibration).markers, rig.markers, str(like), notify)
             if hand is not None or profile.exists():
                 shape = load(profile, HandProfile)
                 if hand is not None or shape.markers.keys() >= set(rig.markers):
-                    namer = checked(namer, by_hand(shape, rig.markers, say), say)
+                    namer = checked(namer, by_hand(shape, rig.markers, notify), notify)
         elif hand is None and not missing:
             namer = by_clicks(clicks, rig.markers, own.width_px)
         else:
-            namer = by_hand(load(profile, HandProfile), rig.markers, say)
+            namer = by_hand(load(profile, HandProfile), rig.markers, notify)
         chosen = spread(len(rows), frames_for(own.width_px * own.height_px))
-        say(f"{camera}: reading {len(chosen)} of {len(rows)} frames")
+        notify(f"{camera}: reading {len(chosen)} of {len(rows)} frames")
         images = [pictures.read(rows[k].file) for k in chosen]
-        table = calibrate_moving(images, rig.markers, namer, say)
+        table = calibrate_moving(images, rig.markers, namer, notify)
     make_folder(output.parent)
     save(output, msgspec.structs.replace(own, markers={row.name: row.range for row in table}))
     return table

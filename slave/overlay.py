@@ -13,8 +13,8 @@ import numpy as np
 from common.arrays import Float, Image
 from common.calibration import HsvRange
 from slave.cameras.source import Frame
-from slave.markers.changing import ChangingDetector
 from slave.markers.classify import HUES
+from slave.markers.reloadable import ReloadableDetector
 from slave.wrist.detector import WristDetector
 
 TINT = 0.7  # of the tint in a tinted pixel: what lies below stays to be seen
@@ -47,7 +47,7 @@ class Overlay(Protocol):
 class MarkerOverlay:
     """Overlay of a camera that looks for markers, by the detector in use. Holds nothing of its own."""
 
-    def __init__(self, detector: ChangingDetector, markers: tuple[str, ...]) -> None:
+    def __init__(self, detector: ReloadableDetector, markers: tuple[str, ...]) -> None:
         """Draw what `detector` finds of the rig's `markers`."""
         self._detector, self._markers = detector, markers
 

@@ -27,7 +27,7 @@ from slave.failures import Failures
 from slave.overlay import Overlay
 
 PERIOD_NS = 100_000_000
-LOOK_NS = 3_000_000_000
+POLL_NS = 3_000_000_000
 SHOWN = 10  # frames that are kept for a click on one of them: the last second
 FOUND = ""  # stands beside the names of markers for the wish to see what was found
 QUALITY = 80
@@ -50,7 +50,7 @@ class Gate:
 
     def ask(self, now_ns: int) -> None:
         """Somebody looks at `now_ns` [ns], same clock as the frames."""
-        self._end_ns = now_ns + LOOK_NS
+        self._end_ns = now_ns + POLL_NS
 
     def wants(self, t_ns: int) -> bool:
         """Whether the frame taken at `t_ns` [ns] is to be shown; a yes counts as shown."""
@@ -108,7 +108,7 @@ class Previews:
                 f"{', '.join(known) or 'no markers'}"
             )
         now_ns = self._clock.now_ns()
-        until = dict.fromkeys((*wish.mask, *((FOUND,) if wish.found else ())), now_ns + LOOK_NS)
+        until = dict.fromkeys((*wish.mask, *((FOUND,) if wish.found else ())), now_ns + POLL_NS)
         self._wishes = {what: end for what, end in self._wishes.items() if end >= now_ns} | until
         self._gate.ask(now_ns)
 

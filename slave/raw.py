@@ -75,7 +75,7 @@ class RawFrames:
         """
         self._camera, self._settings, self._files, self._clock = camera, settings, files, clock
         self._here, self._free = here, free_bytes
-        self._turn = threading.Lock()  # of commands, and of whoever looks
+        self._command_lock = threading.Lock()  # of commands, and of whoever looks
         self._lock = threading.Lock()  # the loop's: held for as long as a frame is handed over
         self._recorder: Recorder | None = None
         self._last: Recorder | None = None
@@ -85,14 +85,14 @@ class RawFrames:
         self._failure: RecordingError | None = None  # why the recording of that name ended
         self._closer: threading.Thread | None = None
         self._ended = 0
-        self._tap: RawTap | None = None
+        self._probe: RawProbe | None = None
 
     def reading(self, source: FrameSource) -> FrameSource:
         """The camera for the loop, all of whose frames are offered; without a folder the camera itself."""
         if self._settings is None:
             return source
-        self._tap = RawTap(source, self.offer)
-        return self._tap
+        self._probe = RawProbe(source, self.offer)
+        return self._probe
 
     def offer(self, frame: Frame) -> None:
         """Take a frame while something is recorded; by the loop. Never waits, never raises."""
@@ -122,21 +122,21 @@ class RawFrames:
 
     def look(self) -> None:
         """Once a period: end what has failed, what nobody asks for any more, and what has no master any more."""
-        with self._turn:
+        with self._command_lock:
             self._look()
 
     def close(self) -> None:
         """The slave ends: so does the recording, with the last frame that was read. Safe to call twice."""
-        if self._tap is not None:
-            self._tap.flush()
-        with self._turn:
+        if self._probe is not None:
+            self._probe.flush()
+        with self._command_lock:
             self._end("the slave ends")
             self._join()
 
     def _raw(self, body: str) -> dict[str, float]:
         settings = self._wanted("raw")
         wish = RawWish.of(body)
-        with self._turn:
+        with self._command_lock:
             self._look()
             if self._recorder is None:
                 if self._failure is not None and wish.name == self._name:
@@ -153,7 +153,7 @@ class RawFrames:
         self._wanted("raw_stop")
         if body:
             raise CalibrationError("raw_stop: takes no body")
-        with self._turn:
+        with self._command_lock:
             self._look()
             self._end("raw_stop")
             self._join()
@@ -252,7 +252,7 @@ class RawFrames:
             closer.join()
 
 
-class RawTap:
+class RawProbe:
     """A camera all of whose frames are offered to somebody, each when the loop comes back for the next one.
 
     Holds the frame that the loop is at.

@@ -45,13 +45,13 @@ class Link(Protocol):
 
 
 class Numbers(Protocol):
-    """Where the counts and gauges of the loop come from; a `Tally`."""
+    """Where the counts and gauges of the loop come from; a `Counters`."""
 
     def counts(self) -> Mapping[str, int]:
         """Event -> how often."""
         ...
 
-    def gauges(self) -> Mapping[str, float]:
+    def metrics(self) -> Mapping[str, float]:
         """Quantity with unit -> value."""
         ...
 
@@ -137,7 +137,7 @@ class Reporter:
         self._parts = tuple(part for part in (camera, raw) if part is not None)
         self._commands = {verb: act for part in self._parts for verb, act in part.commands().items()}
         self._machine = Machine(Path.cwd())
-        self._gauges: dict[str, float] = {}
+        self._metrics: dict[str, float] = {}
         self._bus: Bus | None = None
         self._endpoint: str | None = None
         self._failures = Failures(f"{name} health")
@@ -150,8 +150,8 @@ class Reporter:
         counts = {**self._numbers.counts(), **self._link.counts}
         for part in self._parts:
             counts |= part.counts()
-        gauges = self._gauges | dict(now or {})
-        return Health(self._name, self._link.session, self._clock.now_ns(), counts, gauges, *program())
+        metrics = self._metrics | dict(now or {})
+        return Health(self._name, self._link.session, self._clock.now_ns(), counts, metrics, *program())
 
     def answer(self, command: Command) -> Health:
         """Obey a command.
@@ -187,7 +187,7 @@ class Reporter:
             try:
                 for part in self._parts:
                     part.look()
-                self._gauges = dict(self._numbers.gauges()) | self._figures()
+                self._metrics = dict(self._numbers.metrics()) | self._figures()
                 self._follow(self._link.zenoh_endpoint)
                 if self._bus is not None:
                     self._bus.publish("health", self._name, self.health())
@@ -198,13 +198,13 @@ class Reporter:
             except Exception as error:  # noqa: BLE001 - whatever it is of, the next report is tried
                 self._failures.log("no report", error)
             if count % LOG_EVERY == 0 and self._numbers.counts().get("frames", 0):
-                _LOG.info("%s", "  ".join(f"{k} {_short(v)}" for k, v in self._gauges.items()))
+                _LOG.info("%s", "  ".join(f"{k} {_short(v)}" for k, v in self._metrics.items()))
             count += 1
         self._leave()
 
     def _figures(self) -> dict[str, float]:
         own = {name: value for part in self._parts for name, value in part.figures().items()}
-        return own | self._machine.gauges()
+        return own | self._machine.metrics()
 
     def _follow(self, endpoint: str | None) -> None:
         if endpoint is None or endpoint == self._endpoint:

@@ -14,24 +14,26 @@ from typing import Protocol
 
 from common.service_manager import WATCHDOG, ServiceManager, one_line
 
-FEEDS = 4  # in a period of the watchdog
+NOTIFIES = 4  # in a period of the watchdog
 STATUS_NS = 5_000_000_000  # between two lines of status where there is no watchdog
-AWAY_S = 90.0  # to open a camera again takes seconds, with all its settings checked; one that hangs is given up then
+LOST_PATIENCE_S = (
+    90.0  # opening a camera again, all settings checked, takes seconds; one that hangs is given up
+)
 COMPILE_S = 180.0  # numba compiles 15 s on a desktop processor, more than a minute on a Raspberry Pi
 NEVER_NS = 2**63
 WAITING = "waits for the master"
 
 
-class Away(Protocol):
-    """Told that a device is lost, before it is given back and at each try to open it; `Service.away`."""
+class ConnectionLost(Protocol):
+    """Told that a device is lost, before it is given back and at each try to open it; `Service.connection_lost`."""
 
-    def __call__(self, what: str, patience_s: float = AWAY_S) -> None:
+    def __call__(self, what: str, patience_s: float = LOST_PATIENCE_S) -> None:
         """`what` is lost; the next try may take so long [s]."""
         ...
 
 
-def nobody(what: str, patience_s: float = AWAY_S) -> None:
-    """An `Away` that tells nobody."""
+def nobody(what: str, patience_s: float = LOST_PATIENCE_S) -> None:
+    """An `ConnectionLost` that tells nobody."""
 
 
 class Service:
@@ -58,7 +60,7 @@ class Service:
         self._send, self._period_us = self._manager.send, self._manager.watchdog_us
         self._now_ns, self._noun = now_ns, noun
         self._linked: Callable[[], bool] = lambda: False
-        self._every_ns = self._period_us * 1000 // FEEDS or STATUS_NS
+        self._every_ns = self._period_us * 1000 // NOTIFIES or STATUS_NS
         self._ready = self._patient = False
         self._rounds, self._since_ns = 0, 0
         self._due_ns = NEVER_NS
@@ -82,7 +84,7 @@ class Service:
         """The loop came round, but there is no master yet."""
         now_ns = self._now_ns()
         if now_ns >= self._due_ns or self._patient:
-            self._say(WAITING, now_ns)
+            self._notify(WAITING, now_ns)
 
     def working(self) -> None:
         """The loop came round with one of what it is for."""
@@ -93,13 +95,13 @@ class Service:
         if now_ns < self._due_ns and not self._patient:
             return
         if self._patient:
-            self._say(f"{self._noun} come", now_ns)
+            self._notify(f"{self._noun} come", now_ns)
             return
         rate_hz = (self._rounds - 1) * 1e9 / max(1, now_ns - self._since_ns)
         alone = "" if self._linked() else ", but the master is away"
-        self._say(f"{rate_hz:.3g} {self._noun}/s{alone}", now_ns)
+        self._notify(f"{rate_hz:.3g} {self._noun}/s{alone}", now_ns)
 
-    def away(self, what: str, patience_s: float = AWAY_S) -> None:
+    def connection_lost(self, what: str, patience_s: float = LOST_PATIENCE_S) -> None:
         """A device is lost, or something else takes time: the next round may be so late [s]."""
         if not self._ready:
             self.starting(patience_s, what)
@@ -116,7 +118,7 @@ class Service:
         """It ends because of an error; the last line of status tells which."""
         self._send(f"STATUS=failed: {one_line(why)}")
 
-    def _say(self, doing: str, now_ns: int) -> None:
+    def _notify(self, doing: str, now_ns: int) -> None:
         """What it does; from now on with no more patience than usual."""
         if self._send(f"STATUS={one_line(doing)}{self._fed(self._period_us if self._patient else 0)}"):
             self._patient = False

@@ -32,8 +32,8 @@ from common.camera_settings import (
     same_exposed,
 )
 from common.errors import CalibrationError, PhalanxError
+from common.file_monitor import MonitoredFiles
 from common.object_profile import ObjectProfile
-from common.watching import WatchedFiles
 from slave.cameras.settings import Tunable
 from slave.colours_in_use import in_use
 
@@ -96,8 +96,8 @@ def object_paths(rig_path: Path, rig: RigCalibration) -> tuple[Path, ...]:
 Prepare: TypeAlias = Callable[[CameraFiles, CameraFiles], Callable[[], None] | None]
 
 
-class Picker(Protocol):
-    """What makes a colour of a click; a `slave.picker.LivePicker`."""
+class Sampler(Protocol):
+    """What makes a colour of a click; a `slave.colour_sampler.ColourSampler`."""
 
     def pick(
         self, wish: ColourPick, camera: CameraCalibration
@@ -123,7 +123,7 @@ class CameraTuning:
         source: object,
         prepare: Prepare | None,
         running: Callable[[], bool],
-        picker: Picker | None = None,
+        sampler: Sampler | None = None,
     ) -> None:
         """Tune a camera.
 
@@ -132,13 +132,13 @@ class CameraTuning:
             source: The camera; a `Tunable`, or nothing can be changed but what senses.
             prepare: Makes what senses for other files; None: nobody senses.
             running: Whether frames are read: before, no change can be verified.
-            picker: Makes a colour of a click; None: no markers are sought.
+            sampler: Makes a colour of a click; None: no markers are sought.
         """
         self._used = self._on_disk = files
         self._source = source if isinstance(source, Tunable) else None
-        self._prepare, self._running, self._picker = prepare, running, picker
-        self._turn = threading.Lock()
-        self._watched = WatchedFiles()
+        self._prepare, self._running, self._sampler = prepare, running, sampler
+        self._lock = threading.Lock()
+        self._monitored = MonitoredFiles()
         self._applied = self._refused = 0
 
     @property
@@ -167,14 +167,14 @@ class CameraTuning:
     def figures(self) -> dict[str, float]:
         """What the camera has and does now, and what the content in use says of settings, size and colours."""
         used = self._used
-        said = {WANTED + name: value for name, value in figures(used.camera).items()}
-        said |= in_use(used.camera, used.rig.markers)
-        return said if self._source is None else self._source.figures() | said
+        stated = {WANTED + name: value for name, value in figures(used.camera).items()}
+        stated |= in_use(used.camera, used.rig.markers)
+        return stated if self._source is None else self._source.figures() | stated
 
     def look(self) -> None:
         """Apply the files if they were changed; where that fails, say so once and go on as before."""
-        with self._turn:
-            if not self._running() or not self._watched.changed(self._used.paths):
+        with self._lock:
+            if not self._running() or not self._monitored.changed(self._used.paths):
                 return
             try:
                 was, self._on_disk = self._on_disk, self._used.read_again()
@@ -193,7 +193,7 @@ class CameraTuning:
         return self.figures() | range_figures(used.camera, used.rig.markers)
 
     def _set(self, body: str) -> dict[str, float]:
-        with self._turn:
+        with self._lock:
             wanted = parse(body.encode(), CameraSettings, "set")
             camera = wanted.over(self._used.camera)
             if wanted.markers is not None:
@@ -203,26 +203,26 @@ class CameraTuning:
         return self._settings("")
 
     def _pick(self, body: str) -> dict[str, float]:
-        with self._turn:
+        with self._lock:
             wish = parse(body.encode(), ColourPick, "pick")
-            if self._picker is None:
+            if self._sampler is None:
                 raise CalibrationError(
                     "pick: this slave seeks no markers: the camera of a wrist device, or started with --colours none"
                 )
             refuse_strange((wish.marker,), self._used.rig.markers, "pick: marker")
-            camera, told = self._picker.pick(wish, self._used.camera)
+            camera, told = self._sampler.pick(wish, self._used.camera)
             self._apply(replace(self._used, camera=_told(camera, "pick", (wish.marker,))))
         return self._settings("") | dict(told)
 
     def _load(self, body: str) -> dict[str, float]:
-        with self._turn:
+        with self._lock:
             self._apply(replace(self._used, camera=parse(body.encode(), CameraCalibration, "load")))
         return self._settings("")
 
     def _save(self, body: str) -> dict[str, float]:
         if body:
             raise CalibrationError("save: takes no body; what is in use is saved")
-        with self._turn:
+        with self._lock:
             path = self._used.camera_path
             camera = self._used.camera
             if path.exists():  # what somebody else has written there stays: a lens is calibrated elsewhere

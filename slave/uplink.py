@@ -24,7 +24,7 @@ from slave.link import SlaveLink
 ANYWHERE = "0.0.0.0"
 LOOPBACK_BROADCAST = "127.255.255.255"
 BEACON_TIMEOUT_S = 0.1
-SAY_NS = 1_000_000_000
+LOG_NS = 1_000_000_000
 _LOG = logging.getLogger(__name__)
 
 
@@ -67,8 +67,10 @@ class Uplink:
         self._unsent = 0
         self._closing = threading.Event()
         self._threads = [
-            threading.Thread(target=self._hear, args=(self._beacons, self._link.hear_beacon), name=f"{name} beacons"),
-            threading.Thread(target=self._hear, args=(self._data, self._link.receive), name=f"{name} data"),
+            threading.Thread(
+                target=self._receive, args=(self._beacons, self._link.receive_beacon), name=f"{name} beacons"
+            ),
+            threading.Thread(target=self._receive, args=(self._data, self._link.receive), name=f"{name} data"),
         ]  # fmt: skip
         for thread in self._threads:
             thread.daemon = True
@@ -147,7 +149,7 @@ class Uplink:
         self._beacons.close()
         self._data.close()
 
-    def _hear(self, source: UdpSocket, take: Callable[[bytes, Address, int], None]) -> None:
+    def _receive(self, source: UdpSocket, take: Callable[[bytes, Address, int], None]) -> None:
         news = News()
         while not self._closing.is_set():
             arrived = source.receive()
@@ -166,7 +168,7 @@ class Uplink:
 
 
 class News:
-    """What of the lines that are told again and again is worth saying: another one, `SAY_NS` after the last at least.
+    """What of the lines that are told again and again is worth saying: another one, `LOG_NS` after the last at least.
 
     Whoever has the rig key can have this slave told something else with each datagram; its log is not filled by that.
     """
@@ -174,16 +176,16 @@ class News:
     def __init__(self) -> None:
         """Nothing was said yet."""
         self._line: str | None = None
-        self._said_ns: int | None = None
+        self._logged_ns: int | None = None
 
     def is_new(self, line: str | None, t_ns: int) -> bool:
         """Whether to say `line` at `t_ns` [ns]; None: there is nothing to say, and whatever comes next is new."""
         if line is None or line == self._line:
             self._line = line
             return False
-        if self._said_ns is not None and 0 <= t_ns - self._said_ns < SAY_NS:
+        if self._logged_ns is not None and 0 <= t_ns - self._logged_ns < LOG_NS:
             return False
-        self._line, self._said_ns = line, t_ns
+        self._line, self._logged_ns = line, t_ns
         return True
 
 

@@ -40,7 +40,7 @@ OTHER_HANDS = ("tests/master/estimator/", "tests/master/fabrik/test_any_input.py
 _KERNELS = (
     "common/kernels.py",
     "common/records.py",
-    "common/skin_gaps.py",
+    "common/capsule_gaps.py",
     "master/fabrik/*.py",
     "master/estimator/*.py",
     "master/gestures/*.py",

@@ -43,15 +43,15 @@ RIGHT = walled("made-right", "right")
 LEFT = walled("made-left", "left")
 
 # The back of the hand towards cameras at the origin that look along +z, fingers up (-y in the image).
-FACING = np.array([0.0, 0.0, -1.0])
+BACK_NORMAL = np.array([0.0, 0.0, -1.0])
 R_FRONT = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
 
 
-def palm(turn_deg: Float | None = None, at_m: Float | None = None) -> Float:
+def palm(rotation_deg: Float | None = None, at_m: Float | None = None) -> Float:
     """Palm pose (4, 4) in front of the cameras, turned by Euler angles x, y, z [deg] in the rig frame."""
-    turn = np.zeros(3) if turn_deg is None else turn_deg
+    rotation = np.zeros(3) if rotation_deg is None else rotation_deg
     at = np.array([0.0, 0.08, 0.5]) if at_m is None else at_m
-    return rigid(Rotation.from_euler("xyz", turn, degrees=True).as_matrix() @ R_FRONT, at)
+    return rigid(Rotation.from_euler("xyz", rotation, degrees=True).as_matrix() @ R_FRONT, at)
 
 
 def any_rotation(rng: np.random.Generator) -> Float:
@@ -168,7 +168,7 @@ def detections(
         area=np.where(seen, area_px2, np.nan),
         quality=np.where(seen, 1.0, np.nan),
         sigma_px=np.where(seen, 0.1, np.nan),
-        rival_uv=np.full_like(uv, np.nan),
+        alt_uv=np.full_like(uv, np.nan),
     )
 
 

@@ -70,7 +70,7 @@ def detections(camera: str, session: int, seq: int, t_ns: int = 0) -> MarkerDete
     )
 
 
-def triple(camera: str, session: int, seq: int, t_ns: int = 0) -> WristDetections:
+def cycle(camera: str, session: int, seq: int, t_ns: int = 0) -> WristDetections:
     """Return what a wrist device saw in one strobed triple; nobody saw the little finger."""
     uv = np.arange(2.0 * FINGER_COUNT).reshape(FINGER_COUNT, 2)
     uv[-1] = np.nan

@@ -115,12 +115,12 @@ def imported(text: str) -> Iterator[str]:
 def wrong_side(path: str, text: str) -> set[str]:
     """Imports that this package, or this file, may not have."""
     names = set(imported(text))
-    strangers = {
+    unexpected = {
         name
         for name, files in ONLY_IN.items()
         if name in names and not any(fnmatch(path, file) for file in files)
     }
-    return (names & (FORBIDDEN[path.split("/")[0]] | NEVER)) | strangers
+    return (names & (FORBIDDEN[path.split("/")[0]] | NEVER)) | unexpected
 
 
 def undeclared(path: str, text: str) -> set[str]:

@@ -31,7 +31,7 @@ def clone(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def usual(tmp_path: Path) -> str:
+def typical(tmp_path: Path) -> str:
     """The PATH of a machine that has a program of no list."""
     (tmp_path / "bin").mkdir()
     written(tmp_path / "bin/foreign", "#!/bin/sh\n")
@@ -46,20 +46,20 @@ def lines(command: list[str], folder: Path, path: str) -> list[str]:
 
 
 @pytest.fixture
-def bare(clone: Path, usual: str) -> str:
+def bare(clone: Path, typical: str) -> str:
     """The PATH of the gate on that machine."""
     (clone / "bare").mkdir()
-    assert lines([".ci/bare_path", "bare"], clone, usual) == []
+    assert lines([".ci/bare_path", "bare"], clone, typical) == []
     return str(clone / "bare")
 
 
 def test_the_gate_runs_the_command_of_the_readme_and_it_finds_only_what_is_listed(
-    clone: Path, usual: str
+    clone: Path, typical: str
 ) -> None:
-    assert lines(["make", "test"], clone, usual)[-1].endswith("bin/foreign"), (
+    assert lines(["make", "test"], clone, typical)[-1].endswith("bin/foreign"), (
         "planted: everybody else finds it"
     )
-    asked, path, found = lines(["bash", ".ci/run"], clone, usual)
+    asked, path, found = lines(["bash", ".ci/run"], clone, typical)
     assert asked == "test"
     assert found == "no foreign program"
     assert not Path(path).exists(), "it leaves nothing behind"
@@ -88,10 +88,10 @@ def test_its_python_is_the_interpreter_itself(clone: Path, bare: str) -> None:
     assert Path(real).samefile(base)
 
 
-def test_what_make_installs_after_the_path_was_made_is_found(clone: Path, usual: str) -> None:
+def test_what_make_installs_after_the_path_was_made_is_found(clone: Path, typical: str) -> None:
     (clone / ".ci/programs").write_text("later: installed-later\n")
     (clone / "bare").mkdir()
-    lines([".ci/bare_path", "bare"], clone, usual)
+    lines([".ci/bare_path", "bare"], clone, typical)
     link = clone / "bare/installed-later"
     assert shutil.which(link.name, path=str(link.parent)) is None
     assert link.readlink() == Path("/usr/bin/installed-later")

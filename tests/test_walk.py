@@ -7,8 +7,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from master.dispatcher import Dispatcher
 from master.rig_pipeline import pipeline_of
-from master.world import World
 from tests.synthetic_run import synthetic_run
 
 ROOMS = "master", "common"
@@ -26,7 +26,7 @@ def nothing(name: str) -> AbstractContextManager[None]:
 def test_a_marker_becomes_a_pose_by_few_files_and_functions() -> None:
     """Kernels are counted as well; what a kernel calls is part of it."""
     run = synthetic_run(SETTLED + POSES)
-    world = World([run.setup], [pipeline_of(run.setup, nothing)], nothing, gestures=False)
+    dispatcher = Dispatcher([run.setup], [pipeline_of(run.setup, nothing)], nothing, gestures=False)
     walked: Counter[tuple[str, str]] = Counter()
 
     def note(frame: FrameType, event: str, what: Any) -> None:
@@ -41,7 +41,7 @@ def test_a_marker_becomes_a_pose_by_few_files_and_functions() -> None:
         for message in run.messages:
             if poses == SETTLED:
                 sys.setprofile(note)
-            poses += sum(1 for _ in world.push(message))
+            poses += sum(1 for _ in dispatcher.push(message))
     finally:
         sys.setprofile(None)
     files = {file for file, _ in walked}

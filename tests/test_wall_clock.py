@@ -14,7 +14,7 @@ PACKAGES = ("common", "slave", "master")
 WALL = {"time": {"time", "time_ns", "localtime", "gmtime", "ctime", "CLOCK_REALTIME", "CLOCK_TAI"}}
 WALL |= {"datetime": {"now", "utcnow", "today"}, "date": {"today"}}
 # Beside the line: what people set up, look at and keep, and what is sent on in the time of other programs.
-BESIDE = ("slave/install/", "slave/doctor/", "master/calibrate/", "master/console/", "master/send/", "master/export/",
+NOT_LIVE = ("slave/install/", "slave/doctor/", "master/calibrate/", "master/console/", "master/send/", "master/export/",
           "master/study/", "master/keys_command.py", "master/keys_folder.py", "master/listening.py",
           "common/certificates.py")  # fmt: skip
 REASONS = {
@@ -49,7 +49,7 @@ def uses(text: str) -> set[str]:
 def files() -> list[Path]:
     """Everything on the line from light to pose."""
     everything = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
-    return [path for path in everything if not path.relative_to(ROOT).as_posix().startswith(BESIDE)]
+    return [path for path in everything if not path.relative_to(ROOT).as_posix().startswith(NOT_LIVE)]
 
 
 def test_nothing_on_the_line_asks_the_wall_clock() -> None:

@@ -22,7 +22,7 @@ Motion = Callable[[Float], Float]
 
 def moving(
     way: Callable[[Float], Float],
-    turn: Callable[[Float], Float] | None = None,
+    rotation: Callable[[Float], Float] | None = None,
     bend: Callable[[Float], Float] | None = None,
 ) -> Motion:
     """A hand on a way (..., 3) [m], turned by rotation vectors (..., 3), with tips moved by a share 0..1 of a fist."""
@@ -32,9 +32,9 @@ def moving(
         if bend is not None:
             share = bend(t_s)[..., :5, None]
             shape[..., :5, :] += share * np.array([0.0, 0.05, -0.03])
-        if turn is not None:
-            turns = Rotation.from_rotvec(turn(t_s).reshape(-1, 3))
-            shape = np.asarray(turns.apply(shape.reshape(-1, 3)), np.float64).reshape(shape.shape)
+        if rotation is not None:
+            rotations = Rotation.from_rotvec(rotation(t_s).reshape(-1, 3))
+            shape = np.asarray(rotations.apply(shape.reshape(-1, 3)), np.float64).reshape(shape.shape)
         return shape + CENTRE + way(t_s)
 
     return points
@@ -159,5 +159,5 @@ def message_of(camera: str, seq: int, t_s: float, uv: Float) -> MarkerDetections
         area=400.0 * mask,
         quality=mask,
         sigma_px=0.15 * mask,
-        rival_uv=np.full_like(uv, np.nan),
+        alt_uv=np.full_like(uv, np.nan),
     )

@@ -16,7 +16,7 @@ from master.rig import load_setup
 from master.rig_setup import RigSetup
 from master.wrist_setup import WristSetup
 
-TRIPLE_NS = 33_333_333
+CYCLE_NS = 33_333_333
 START_NS = 1_000_000_000
 _MIRROR = np.array([-1.0, 1.0, 1.0])
 
@@ -31,11 +31,11 @@ def wrist_scene(setup: RigSetup, name: str = "standard", seed: int = 7) -> Wrist
     return WristScene.by_name(name, setup.rig, setup.cameras, setup.hand.profile, seed)
 
 
-def exact_triple(setup: RigSetup, now: WristTruth, k: int, t_ns: int | None = None) -> WristDetections:
+def exact_cycle(setup: RigSetup, now: WristTruth, k: int, t_ns: int | None = None) -> WristDetections:
     """Triple number `k` without errors: laser points and tips where the truth has them."""
     laser = now.laser_uv[1:6]
     tips = np.where(now.tip_visible[:, None], now.tip_uv, np.nan)
-    at_ns = START_NS + k * TRIPLE_NS if t_ns is None else t_ns
+    at_ns = START_NS + k * CYCLE_NS if t_ns is None else t_ns
     return WristDetections(
         camera=setup.rig.cameras[0],
         session=1,
@@ -58,7 +58,7 @@ def true_poses(setup: RigSetup, truths: list[WristTruth]) -> Poses:
         [
             HandPose(
                 hand=setup.hand.profile.name,
-                t_ns=START_NS + k * TRIPLE_NS,
+                t_ns=START_NS + k * CYCLE_NS,
                 position_m=now.joints.position_m,
                 orientation_wxyz=matrix_to_quaternion(now.joints.rotation),
                 radius_m=setup.hand.radius_m,

@@ -71,8 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _count(cases: list[str], *, parts: bool, record: bool, cpu: str) -> int:
     old = baseline.read() if cpu == CPU and not record else None
-    sysroot = prepare(_say)
-    fast = fast_wheels(_say) if set(cases) & set(MACHINE_CODE) else None
+    sysroot = prepare(_print)
+    fast = fast_wheels(_print) if set(cases) & set(MACHINE_CODE) else None
     with tempfile.TemporaryDirectory(dir=CACHE, prefix="frames-") as folder:
         scene.write_all(Path(folder))
         equal = [case for case in cases if case not in MACHINE_CODE]  # whose sums may be in any order
@@ -90,7 +90,7 @@ def _count(cases: list[str], *, parts: bool, record: bool, cpu: str) -> int:
     return 0 if good else 1
 
 
-def _say(line: str) -> None:
+def _print(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 

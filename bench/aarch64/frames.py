@@ -48,7 +48,7 @@ class StrobedFrames(NamedTuple):
     hand: HandProfile
     images: list[Image]
 
-    def triple(self, k: int) -> list[Image]:
+    def cycle(self, k: int) -> list[Image]:
         """Triple `k` of the endless sequence forth and back."""
         first = 3 * forth_and_back(k, len(self.images) // 3)
         return self.images[first : first + 3]

@@ -26,10 +26,10 @@ from common.messages import Message, WristDetections, encode
 from master.link import MasterLink
 from slave.app import run
 from slave.cameras.source import Frame
+from slave.counters import Counters
 from slave.link import SlaveLink
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.engine import engine_named
-from slave.tally import Tally
 from slave.wrist import engine as wrist_engine
 from slave.wrist.detector import WristDetector
 from slave.wrist.view import WristView
@@ -101,7 +101,7 @@ class _Wire:
         self.datagrams: list[bytes] = []
         for _ in range(200):
             for datagram, _to in master.due():
-                self._link.hear_beacon(datagram, MASTER, clock.now_ns())
+                self._link.receive_beacon(datagram, MASTER, clock.now_ns())
                 self._link.receive(datagram, MASTER, clock.now_ns())
             for datagram, _to in self._link.due():
                 master.receive(datagram, SLAVE, clock.now_ns())
@@ -162,7 +162,14 @@ def run_case(case: str, folder: Path, marks: Marks) -> str:
         each(lambda k: digest.add(seed_markers.detect(frames.image(k), ranges)))
     elif case == "step":
         wire = _Wire(frames.camera.name)
-        run(_Source(frames, mark), detector, wire, frames.camera.name, Tally(frames.names), threading.Event())
+        run(
+            _Source(frames, mark),
+            detector,
+            wire,
+            frames.camera.name,
+            Counters(frames.names),
+            threading.Event(),
+        )
         digest.add(np.frombuffer(b"".join(wire.datagrams), np.uint8))
     else:
         raise ValueError(f"no case {case!r}")
@@ -194,7 +201,7 @@ def _run_strobed(case: str, folder: Path, marks: Marks) -> str:
     told: list[WristDetections] = []
 
     def step(k: int) -> None:
-        for seq, image in enumerate(frames.triple(k), 3 * k):
+        for seq, image in enumerate(frames.cycle(k), 3 * k):
             t_ns = frames.t_ns(seq)
             if (found := detector.push(Frame(seq, t_ns, t_ns, image))) is not None:
                 told.append(found.message(frames.camera.name, 7))

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from bench.made_once import key_of, made_once
+from bench.cached import key_of, made_once
 
 ROOT = Path(__file__).resolve().parents[2]
 CACHE = ROOT / "out" / "aarch64"
@@ -68,7 +68,7 @@ def missing() -> list[str]:
     return absent
 
 
-def prepare(say: Callable[[str], None]) -> Sysroot:
+def prepare(notify: Callable[[str], None]) -> Sysroot:
     """Make what is not there yet; of several that call at once, one makes it and the others wait.
 
     Raises:
@@ -86,16 +86,18 @@ def prepare(say: Callable[[str], None]) -> Sysroot:
     CACHE.mkdir(parents=True, exist_ok=True)
     with (CACHE / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        return _prepared(say)
+        return _prepared(notify)
 
 
-def _prepared(say: Callable[[str], None]) -> Sysroot:
+def _prepared(notify: Callable[[str], None]) -> Sysroot:
     architecture, loader = HOSTS[platform.machine()]
-    root = _debian("arm64", PACKAGES, say)
-    tools = _debian(architecture, ("qemu-user",), say)
+    root = _debian("arm64", PACKAGES, notify)
+    tools = _debian(architecture, ("qemu-user",), notify)
     names = [*WHEELS, *WHEELS_OF_WHEELS]
-    wheels = _made("wheels", f"{PYTHON} {WHEELS} {_pins(names)}", lambda place: _download(place, WHEELS), say)
-    plugin = _made("plugin", PLUGIN.read_text(), _compile_plugin, say)
+    wheels = _made(
+        "wheels", f"{PYTHON} {WHEELS} {_pins(names)}", lambda place: _download(place, WHEELS), notify
+    )
+    plugin = _made("plugin", PLUGIN.read_text(), _compile_plugin, notify)
     triplet = f"{platform.machine()}-linux-gnu"
     # The loader by its real path: the usual one is a link to / and would be the machine's own, of another libc.
     start = (
@@ -112,15 +114,15 @@ def _prepared(say: Callable[[str], None]) -> Sysroot:
     return Sysroot(root, wheels, qemu, plugin / "count.so", packages | _wheel_versions(wheels))
 
 
-def _made(name: str, inputs: str, make: Callable[[Path], None], say: Callable[[str], None]) -> Path:
+def _made(name: str, inputs: str, make: Callable[[Path], None], notify: Callable[[str], None]) -> Path:
     """The folder `name` of the cache, made afresh if its inputs are others than those it was made of."""
     place = CACHE / f"{name}-{key_of(inputs)}"
     if not place.is_dir():
-        say(f"making {place.relative_to(ROOT)} ...")
+        notify(f"making {place.relative_to(ROOT)} ...")
     return made_once(place, make)
 
 
-def _debian(architecture: str, packages: tuple[str, ...], say: Callable[[str], None]) -> Path:
+def _debian(architecture: str, packages: tuple[str, ...], notify: Callable[[str], None]) -> Path:
     """A folder with `packages` and all that they need, unpacked."""
 
     def unpack(folder: Path) -> None:
@@ -130,13 +132,13 @@ def _debian(architecture: str, packages: tuple[str, ...], say: Callable[[str], N
         what = [f"--arch={architecture}", f"--include={','.join(packages)}"]
         _run(["mmdebstrap", "--quiet", *modes, *what, SUITE, str(archive), MIRROR])
         # A /tmp in here would hide the real one from what is emulated, a /dev the real devices.
-        leave_out = [f"--exclude=./{name}" for name in ("dev", "tmp", "proc", "sys", "run")]
-        _run(["tar", "-x", "--no-same-owner", *leave_out, "-f", str(archive), "-C", str(folder)])
+        reject = [f"--exclude=./{name}" for name in ("dev", "tmp", "proc", "sys", "run")]
+        _run(["tar", "-x", "--no-same-owner", *reject, "-f", str(archive), "-C", str(folder)])
 
-    return _made(f"{SUITE}-{architecture}-{packages[0]}", f"{packages} {MIRROR}", unpack, say)
+    return _made(f"{SUITE}-{architecture}-{packages[0]}", f"{packages} {MIRROR}", unpack, notify)
 
 
-def fast_wheels(say: Callable[[str], None]) -> Path:
+def fast_wheels(notify: Callable[[str], None]) -> Path:
     """The folder of the extra `fast`, 200 MB, made if it is not there; beside what `prepare` made.
 
     Raises:
@@ -146,7 +148,7 @@ def fast_wheels(say: Callable[[str], None]) -> Path:
     with (CACHE / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         return _made(
-            "fast", f"{PYTHON} {_pins(FAST)}", lambda place: _download(place, FAST, "--no-deps"), say
+            "fast", f"{PYTHON} {_pins(FAST)}", lambda place: _download(place, FAST, "--no-deps"), notify
         )
 
 

@@ -69,26 +69,28 @@ class Hinges:
         Args:
             angles_rad: The named angles (21,).
         """
-        turned = np.tile(np.eye(3), (25, 1, 1))
+        rotated = np.tile(np.eye(3), (25, 1, 1))
         at = self.rest_m.copy()
         for f, chain in enumerate(CHAINS):
             across, up, along = self.frame[f].T
             if f:
                 flexion, spread, second, third = angles_rad[1 + 4 * f : 5 + 4 * f]
-                first = _turn(np.array([0.0, 1.0, 0.0]), self.side_sign * (spread - self.ahead_rad[f]))
+                first = _rotation(np.array([0.0, 1.0, 0.0]), self.side_sign * (spread - self.ahead_rad[f]))
             else:
                 flexion, spread, twist, second, third = angles_rad[:5]
-                first = _turn(along, -self.side_sign * twist) @ _turn(up, self.side_sign * spread)
-            turn = first @ _turn(across, flexion)
+                first = _rotation(along, -self.side_sign * twist) @ _rotation(up, self.side_sign * spread)
+            rotation = first @ _rotation(across, flexion)
             for k, bend in enumerate((0.0, second, third)):
-                turn = turn @ _turn(across, bend)
-                turned[chain[k]] = turn
-                at[chain[k + 1]] = at[chain[k]] + turn @ (self.rest_m[chain[k + 1]] - self.rest_m[chain[k]])
-            turned[chain[3]] = turn
-        return at, turned
+                rotation = rotation @ _rotation(across, bend)
+                rotated[chain[k]] = rotation
+                at[chain[k + 1]] = at[chain[k]] + rotation @ (
+                    self.rest_m[chain[k + 1]] - self.rest_m[chain[k]]
+                )
+            rotated[chain[3]] = rotation
+        return at, rotated
 
 
-def _turn(axis: Float, angle_rad: float) -> Float:
+def _rotation(axis: Float, angle_rad: float) -> Float:
     """Rotation (3, 3) about a unit axis (3,)."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

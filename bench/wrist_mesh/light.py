@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from bench.wrist_mesh.hand_mesh import HandMesh, Posed
 from bench.wrist_mesh.line import Fan
 from bench.wrist_mesh.raster import SUPER, Samples
-from bench.wrist_mesh.skin import Posed, Skin
 from common.arrays import Float, Int
 from common.kernels import kernel
 
@@ -46,7 +46,7 @@ class Optics(NamedTuple):
 
 def shade(
     samples: Samples,
-    skin: Skin,
+    hand_mesh: HandMesh,
     posed: Posed,
     ambient: Float,
     leds: Float,
@@ -58,7 +58,7 @@ def shade(
 
     Args:
         samples: What the camera sees.
-        skin, posed: The hand.
+        hand_mesh, posed: The hand.
         ambient: The room's light on each vertex (V,) [grey].
         leds: (L, 3) [m].
         fan: The laser.
@@ -70,7 +70,7 @@ def shade(
     sheet = np.stack([fan.origin, fan.normal, fan.forward, fan.across])
     reach = np.where(np.isfinite(reach_m), reach_m, 1e9)
     numbers = np.array(constants)
-    arrays = posed.verts, posed.normals, ambient, skin.albedo, skin.faces
+    arrays = posed.verts, posed.normals, ambient, hand_mesh.albedo, hand_mesh.faces
     _shade(samples.face, samples.share, *arrays, leds, sheet, fan.half_rad, reach, numbers, out)
     return out[0], out[1], out[2], out[3]
 

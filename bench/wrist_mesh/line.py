@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bench.wrist_mesh.hand_mesh import HandMesh, Posed
 from bench.wrist_mesh.raster import Samples
-from bench.wrist_mesh.skin import Posed, Skin
 from common.arrays import Bool, Float, Int
 from common.calibration import RigCalibration
 from common.camera_model import CameraModel
@@ -73,23 +73,23 @@ class Curve:
     chord_m: Float
 
 
-def cross(fan: Fan, skin: Skin, posed: Posed, optics: CameraModel, samples: Samples) -> Curve:
+def cross(fan: Fan, hand_mesh: HandMesh, posed: Posed, optics: CameraModel, samples: Samples) -> Curve:
     """Where the fan meets the posed hand, of which the camera has `samples`."""
     away: Float = (posed.verts - fan.origin) @ fan.normal
-    side: Bool = np.greater(away[skin.faces], 0.0)
+    side: Bool = np.greater(away[hand_mesh.faces], 0.0)
     cut = np.flatnonzero(side.any(axis=1) & ~side.all(axis=1))
     reach = np.full(RAYS, np.inf)
     face = np.full(RAYS, -1, dtype=np.int64)
-    corners = posed.verts[skin.faces[cut]] - fan.origin
+    corners = posed.verts[hand_mesh.faces[cut]] - fan.origin
     plane = np.stack([corners @ fan.forward, corners @ fan.across], axis=-1)
-    _nearest(plane, away[skin.faces[cut]], cut, fan.half_rad, reach, face)
+    _nearest(plane, away[hand_mesh.faces[cut]], cut, fan.half_rad, reach, face)
     angle = fan.angles_rad
     with np.errstate(invalid="ignore"):
         rays = np.cos(angle)[:, None] * fan.forward + np.sin(angle)[:, None] * fan.across
         points = np.where(face[:, None] >= 0, fan.origin + reach[:, None] * rays, np.nan)
     uv = optics.project(points)
     seen = _seen(uv, points[:, 2], samples, (optics.width_px, optics.height_px))
-    label = np.where(face >= 0, skin.label[face], 255)
+    label = np.where(face >= 0, hand_mesh.label[face], 255)
     chord = np.zeros(RAYS)
     chord[:-1] = np.linalg.norm(np.diff(points, axis=0), axis=1)
     same = np.zeros(RAYS, dtype=np.bool_)

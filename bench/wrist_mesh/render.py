@@ -7,18 +7,18 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from bench.wrist_mesh.hand_mesh import HandMesh, Posed
 from bench.wrist_mesh.light import Optics, shade
 from bench.wrist_mesh.line import Curve, Fan, cross
 from bench.wrist_mesh.raster import SUPER, Samples, rasterise
 from bench.wrist_mesh.room import Room, grained, picture
-from bench.wrist_mesh.skin import Posed, Skin
 from bench.wrist_mesh.truth import laser_truth, tip_truth
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.camera_model import CameraModel
 from common.frame_recording import Illumination, Manifest
 from common.hand_model import HandModel
-from common.wrist_bend import forearm_palm
+from common.wrist_joint import forearm_palm
 
 ORDER = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
 Arrays = dict[str, npt.NDArray[np.generic]]
@@ -28,7 +28,7 @@ class Moment(NamedTuple):
     """The hand at one instant: named angles (21,) [rad], and flexion and deviation of the wrist (2,) [rad]."""
 
     angles_rad: Float
-    bend_rad: Float
+    wrist_angles_rad: Float
 
 
 class View(NamedTuple):
@@ -47,7 +47,7 @@ class Device:
         rig, camera: Their files.
         optics: The camera.
         fan: The laser.
-        skin: The hand.
+        hand_mesh: The hand.
         leds: (L, 3) [m].
     """
 
@@ -55,7 +55,7 @@ class Device:
     camera: CameraCalibration
     optics: CameraModel
     fan: Fan
-    skin: Skin
+    hand_mesh: HandMesh
     leds: Float
 
     @classmethod
@@ -66,26 +66,26 @@ class Device:
         assert rig.led is not None
         model = HandModel.of(load(datasets / "hands" / f"{rig.hand}.json", HandProfile))
         optics = CameraModel.of(camera, np.eye(4))
-        return cls(rig, camera, optics, Fan.of(rig), Skin.of(model, datasets), np.array(rig.led))
+        return cls(rig, camera, optics, Fan.of(rig), HandMesh.of(model, datasets), np.array(rig.led))
 
     def view(self, moment: Moment) -> View:
         """Pose the hand and look at it."""
         T = np.array(self.rig.T_camera_palm)
-        T[:3, :3] = T[:3, :3] @ forearm_palm(moment.bend_rad)
-        posed = self.skin.pose(moment.angles_rad, T)
+        T[:3, :3] = T[:3, :3] @ forearm_palm(moment.wrist_angles_rad)
+        posed = self.hand_mesh.pose(moment.angles_rad, T)
         uv = self.optics.project(posed.verts)
         size = self.optics.width_px, self.optics.height_px
-        samples = rasterise(uv, posed.verts[:, 2], self.skin.faces, size)
-        return View(posed, samples, cross(self.fan, self.skin, posed, self.optics, samples))
+        samples = rasterise(uv, posed.verts[:, 2], self.hand_mesh.faces, size)
+        return View(posed, samples, cross(self.fan, self.hand_mesh, posed, self.optics, samples))
 
     def light(self, view: View, room: Room, constants: Optics) -> tuple[Float, Float, Float]:
         """Light (H, W) [grey] of the room, and what the laser and the LEDs add; noise and black left out."""
-        skin_light = room.on_skin(view.posed, self.skin.faces)
+        surface_light = room.on_surface(view.posed, self.hand_mesh.faces)
         hand, laser, led, cover = shade(
             view.samples,
-            self.skin,
+            self.hand_mesh,
             view.posed,
-            skin_light,
+            surface_light,
             self.leds,
             self.fan,
             view.curve.reach_m,
@@ -104,10 +104,10 @@ class Device:
     def label(self, view: View) -> Image:
         """finger * 10 + segment (H, W), 255 behind the hand."""
         face = view.samples.face[SUPER // 2 :: SUPER, SUPER // 2 :: SUPER]
-        return np.where(face >= 0, self.skin.label[face], 255).astype(np.uint8)
+        return np.where(face >= 0, self.hand_mesh.label[face], 255).astype(np.uint8)
 
     def truth(self, view: View, label: Image) -> Arrays:
         """All that is true of one moment but the angles."""
         out: Arrays = {"joints": view.posed.joints}
         out |= laser_truth(view.curve, self.fan, self.optics)
-        return out | tip_truth(self.skin, view.posed, self.optics, view.samples, label)
+        return out | tip_truth(self.hand_mesh, view.posed, self.optics, view.samples, label)

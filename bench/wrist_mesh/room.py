@@ -10,8 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from bench.wrist_mesh.hand_mesh import Posed
 from bench.wrist_mesh.shadows import from_afar, sky
-from bench.wrist_mesh.skin import Posed
 from common.arrays import Float, Image, Int
 from common.frame_recording import Illumination, open_recording
 
@@ -82,7 +82,7 @@ class Room:
         level = LEVELS[name] / RECORDED
         return cls(behind * level, level, SUN if name == "sun" else 0.0)
 
-    def on_skin(self, posed: Posed, faces: Int) -> Float:
+    def on_surface(self, posed: Posed, faces: Int) -> Float:
         """Light (V,) [grey] on the vertices of a posed hand of triangles (F, 3)."""
         out = np.full(len(posed.verts), EVERYWHERE)
         for direction, grey in zip(sky(), FROM_SKY, strict=True):

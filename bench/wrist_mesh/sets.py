@@ -16,7 +16,7 @@ from common.arrays import Float
 from common.calibration import HandProfile, load
 from common.frame_recording import Manifest, load_manifest
 from common.hand_model import WEBXR_JOINTS, HandModel
-from common.sim.record import ANGLE_NAMES, FIRST_NS, TakenFrame, write_frames, write_truth
+from common.sim.record import ANGLE_NAMES, FIRST_NS, RenderedFrame, write_frames, write_truth
 
 PERIOD_S = 1.0 / 90.0
 STRAIGHT = np.zeros(2)
@@ -109,9 +109,9 @@ def write_set(one: Set, datasets: Path, folder: Path, seed: int) -> None:
     write_frames(
         folder, manifest, _frames(one, device, room, folder, truths, np.random.default_rng(seed + 1))
     )
-    three = np.array([[moment.angles_rad for moment in triple] for triple in one.moments])
+    three = np.array([[moment.angles_rad for moment in cycle] for cycle in one.moments])
     truth: Arrays = {"angles": three[:, 1], "angles_3frames": three}
-    truth["bend"] = np.array([triple[1].bend_rad for triple in one.moments])
+    truth["flexion"] = np.array([cycle[1].wrist_angles_rad for cycle in one.moments])
     truth["ambient"] = np.array([one.light] * len(three))
     truth |= {key: np.array([row[key] for row in truths]) for key in truths[0]}
     write_truth(folder, truth, _meta(one, device, manifest, seed))
@@ -119,11 +119,11 @@ def write_set(one: Set, datasets: Path, folder: Path, seed: int) -> None:
 
 def _frames(
     one: Set, device: Device, room: Room, folder: Path, truths: list[Arrays], rng: np.random.Generator
-) -> Iterator[TakenFrame]:
+) -> Iterator[RenderedFrame]:
     """All frames; beside them the label pictures are written and the truths are gathered, of the laser's moment."""
-    for k, triple in enumerate(one.moments):
+    for k, cycle in enumerate(one.moments):
         last: View | None = None
-        for i, (moment, lit) in enumerate(zip(triple, ORDER, strict=True)):
+        for i, (moment, lit) in enumerate(zip(cycle, ORDER, strict=True)):
             if last is None or one.continuous:
                 last = device.view(moment)
             if i == 1:
@@ -131,7 +131,7 @@ def _frames(
                 cv2.imwrite(str(folder / f"label_{k:06d}.png"), label)
                 truths.append(device.truth(last, label))
             t_ns = FIRST_NS + round((3 * k + i) * PERIOD_S * 1e9)
-            yield TakenFrame(device.camera.name, 3 * k + i, t_ns, lit, device.frame(last, room, lit, rng))
+            yield RenderedFrame(device.camera.name, 3 * k + i, t_ns, lit, device.frame(last, room, lit, rng))
 
 
 def _meta(one: Set, device: Device, manifest: Manifest, seed: int) -> dict[str, object]:
@@ -139,7 +139,7 @@ def _meta(one: Set, device: Device, manifest: Manifest, seed: int) -> dict[str, 
         "name": one.name,
         "scene": "wrist",
         "note": manifest.note + "; rasterised after the rendered recordings; truth is of the laser's frame",
-        "side": "right" if device.skin.hinges.side_sign > 0.0 else "left",
+        "side": "right" if device.hand_mesh.hinges.side_sign > 0.0 else "left",
         "frames": len(one.moments),
         "groups": GROUPS,
         "fingers": FINGERS,

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from bench.wrist_mesh.hand_mesh import Posed
 from bench.wrist_mesh.raster import rasterise
-from bench.wrist_mesh.skin import Posed
 from common.arrays import Float, Int
 
 WITHIN_M = 0.002  # behind what the light sees first: lit
@@ -16,9 +16,9 @@ def sky() -> Float:
     """Unit directions (SKY, 3), evenly over the sphere (spherical Fibonacci points)."""
     k = np.arange(SKY) + 0.5
     z = 1.0 - 2.0 * k / SKY
-    turn = np.pi * (1.0 + np.sqrt(5.0)) * k
+    angle = np.pi * (1.0 + np.sqrt(5.0)) * k
     across = np.sqrt(1.0 - z * z)
-    return np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
+    return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
 
 
 def from_afar(posed: Posed, faces: Int, direction: Float) -> Float:

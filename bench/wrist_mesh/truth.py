@@ -3,10 +3,10 @@
 import numpy as np
 import numpy.typing as npt
 
+from bench.wrist_mesh.hand_mesh import HandMesh, Posed
 from bench.wrist_mesh.hinges import CHAINS
 from bench.wrist_mesh.line import Curve, Fan
 from bench.wrist_mesh.raster import Samples
-from bench.wrist_mesh.skin import Posed, Skin
 from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 
@@ -53,7 +53,7 @@ def laser_truth(curve: Curve, fan: Fan, optics: CameraModel) -> dict[str, npt.ND
 
 
 def tip_truth(
-    skin: Skin, posed: Posed, optics: CameraModel, samples: Samples, label: npt.NDArray[np.uint8]
+    hand_mesh: HandMesh, posed: Posed, optics: CameraModel, samples: Samples, label: npt.NDArray[np.uint8]
 ) -> dict[str, npt.NDArray[np.generic]]:
     """The tips (5, …), and the nearest visible point of each last segment; `label` (H, W) as in its picture."""
     tip = np.full((5, 3), np.nan)
@@ -66,7 +66,7 @@ def tip_truth(
     depth = samples.depth[fine // 2 :: fine, fine // 2 :: fine]
     for f, chain in enumerate(CHAINS):
         along = posed.joints[chain[3]] - posed.joints[chain[2]]
-        own = np.unique(skin.faces[skin.label == 10 * (f + 1) + 3])
+        own = np.unique(hand_mesh.faces[hand_mesh.label == 10 * (f + 1) + 3])
         tip[f] = posed.verts[own[(posed.verts[own] @ along).argmax()]]
         uv[f] = optics.project(tip[f])
         u, v = np.rint(np.nan_to_num(uv[f], nan=-9.0)).astype(np.int64)

@@ -78,7 +78,7 @@ def _slave() -> dict[Key, Rule]:
     rules: dict[tuple[State, Event], Rule] = {
         (State.IDLE, Event.BEACON_OTHER): Rule(State.OFFERED, Kind.HELLO),
         (State.OFFERED, Event.BEACON_OTHER): Rule(State.OFFERED, Kind.HELLO),
-        (State.LIVE, Event.BEACON_OTHER): Rule(State.LIVE, refusal=Refusal.RIVAL),
+        (State.LIVE, Event.BEACON_OTHER): Rule(State.LIVE, refusal=Refusal.OTHER_MASTER),
         (State.SILENT, Event.BEACON_OTHER): Rule(State.SILENT, Kind.HELLO),
         (State.OFFERED, Event.WELCOME): Rule(State.LIVE),
         (State.LIVE, Event.SILENCE): Rule(State.SILENT),
@@ -111,7 +111,7 @@ def _master() -> dict[Key, Rule]:
         (State.IDLE, Event.HELLO): Rule(State.PENDING, Kind.WELCOME),
         (State.PENDING, Event.SEALED): Rule(State.LIVE),
         (State.PENDING, Event.EXPIRED): Rule(State.IDLE),
-        (State.LIVE, Event.HELLO_OTHER_PROCESS): Rule(State.LIVE, refusal=Refusal.TWIN),
+        (State.LIVE, Event.HELLO_OTHER_PROCESS): Rule(State.LIVE, refusal=Refusal.DUPLICATE_SENDER),
         (State.SILENT, Event.HELLO_OTHER_PROCESS): Rule(State.SILENT, Kind.WELCOME),
         (State.LIVE, Event.SILENCE): Rule(State.SILENT),
     }

@@ -38,7 +38,7 @@ class Places:
 
 def hand_before(snapshot: Snapshot, places: Places) -> list[list[Shape]]:
     """Outlines of the phalanges, the sleeve and the palm that may lie before each marker."""
-    skin = _phalanges_before(snapshot, places)
+    surface = _phalanges_before(snapshot, places)
     speed = 0.5 * snapshot.speed_uv[CAPSULES].sum(axis=1)
     sleeve = Shape(snapshot.sleeve[0], snapshot.speed_uv[SLEEVE_SPHERES[0]])
     palm = Shape(snapshot.palm[0], snapshot.palm_speed)
@@ -49,7 +49,7 @@ def hand_before(snapshot: Snapshot, places: Places) -> list[list[Shape]]:
             *([palm] if behind else []),
         ]
         for phalanges, covered, behind in zip(
-            skin, _sleeve_before(snapshot, places).tolist(), places.behind_palm.tolist(), strict=True
+            surface, _sleeve_before(snapshot, places).tolist(), places.behind_palm.tolist(), strict=True
         )
     ]
 
@@ -71,10 +71,10 @@ def things_before(
 
 def _phalanges_before(snapshot: Snapshot, places: Places) -> Bool:
     """Which phalanges (N, PHALANGES) reach into the box of a marker before it."""
-    skin = snapshot.outlines[:, 0]
-    found = raster.overlaps(places.low[:, None], places.high[:, None], skin.min(axis=1), skin.max(axis=1)) & (
-        _depth_along(snapshot, places.uv[:, None], CAPSULES[:, 0], CAPSULES[:, 1]) < places.depth[:, None]
-    )
+    surface = snapshot.outlines[:, 0]
+    found = raster.overlaps(
+        places.low[:, None], places.high[:, None], surface.min(axis=1), surface.max(axis=1)
+    ) & (_depth_along(snapshot, places.uv[:, None], CAPSULES[:, 0], CAPSULES[:, 1]) < places.depth[:, None])
     return found & (places.phalanx[:, None] != np.arange(PHALANGES))
 
 

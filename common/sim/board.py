@@ -205,8 +205,8 @@ def _poses(optics: list[CameraModel], seed: int) -> Float:
     rng = np.random.default_rng([seed, 5])
     found: list[Float] = []
     for _ in range(200 * POSES):
-        lead = optics[len(found) % len(optics)]
-        T = lead.T_rig_camera @ _before(lead, rng)
+        first_camera = optics[len(found) % len(optics)]
+        T = first_camera.T_rig_camera @ _before(first_camera, rng)
         seen = [_sees(camera, T) for camera in optics]
         if seen[len(found) % len(optics)] and (all(seen) or len(found) % 4 == 3):
             found.append(T)
@@ -238,8 +238,8 @@ def _sees(camera: CameraModel, T: Float) -> bool:
 def _between(now: Float, then: Float, share: float) -> Float:
     """The pose on the way from one to the other: smooth start and end, about one axis."""
     s = share * share * (3.0 - 2.0 * share)
-    turn = np.asarray(cv2.Rodrigues(then[:3, :3] @ now[:3, :3].T)[0], np.float64)
+    rotation = np.asarray(cv2.Rodrigues(then[:3, :3] @ now[:3, :3].T)[0], np.float64)
     T = np.eye(4)
-    T[:3, :3] = np.asarray(cv2.Rodrigues(turn * s)[0], np.float64) @ now[:3, :3]
+    T[:3, :3] = np.asarray(cv2.Rodrigues(rotation * s)[0], np.float64) @ now[:3, :3]
     T[:3, 3] = (1.0 - s) * now[:3, 3] + s * then[:3, 3]
     return T

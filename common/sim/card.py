@@ -13,7 +13,7 @@ from common.arrays import Float
 from common.errors import CalibrationError
 from common.geometry import axis_rotation
 from common.sim.board import TEXELS_PER_M, BoardScene, Print
-from common.sim.light import DESK_LINEAR_RGB, TO_LIGHT_RIG, face_shade, paint
+from common.sim.light import DESK_LINEAR_RGB, TO_LIGHT_RIG, face_shade, marker_colour
 from common.srgb import to_linear
 
 MARKER = "index"
@@ -54,7 +54,7 @@ class CardScene(BoardScene):
         """As `BoardScene`."""
         columns, rows = round(WIDTH_M * TEXELS_PER_M), round(HEIGHT_M * TEXELS_PER_M)
         facing = -float(TO_LIGHT_RIG @ self.poses[0, :3, 2])
-        colour = np.array(face_shade(paint(MARKER), facing)) / 255.0
+        colour = np.array(face_shade(marker_colour(MARKER), facing)) / 255.0
         return Print(
             np.ones((rows, columns), np.float32),
             np.array([0.5 * columns - 0.5, 0.5 * rows - 0.5]),

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float, Int
+from common.capsule_gaps import TaperedCapsules, gaps_between
 from common.hand_model import CHAINS, TIPS, HandModel
 from common.sim.motion import POSES, angles_of
-from common.skin_gaps import RoundCones, gaps_between
 
 PAD_DEG = ((18, 8, 14), (2, 68, 34), (0, 68, 34), (-1, 68, 34), (-2, 68, 34))
 # Thumb, then MCP and PIP of all fingers, from which a key is reached for.
@@ -63,20 +63,20 @@ class Posed:
         posture_deg: (N, 5, 3).
         joints_m: (N, 26, 3) [m].
         rotation: (N, 26, 3, 3).
-        cones: (N, 5, 3) segments.
+        capsules: (N, 5, 3) segments.
     """
 
     posture_deg: Float
     joints_m: Float
     rotation: Float
-    cones: RoundCones
+    capsules: TaperedCapsules
 
     @classmethod
     def of(cls, model: HandModel, posture_deg: Float, wobble: Float) -> "Posed":
         """Of postures (N, 5, 3) [deg] with the wobble (5, 4) of `angles_of`."""
         found = model.joints(np.eye(4), model.chains(angles_of(model, posture_deg, wobble)))
-        cones = RoundCones.of_segments(found.position_m, model.radius_m)
-        return cls(posture_deg, found.position_m, found.rotation, cones)
+        capsules = TaperedCapsules.of_segments(found.position_m, model.radius_m)
+        return cls(posture_deg, found.position_m, found.rotation, capsules)
 
     def palmar(self, finger: int, segment: int) -> Float:
         """Unit vectors (N, 3) out of the palmar side of a segment: -y of the joint it begins at."""
@@ -91,7 +91,7 @@ def pinch_posture(model: HandModel, finger: int, wobble: Float) -> Float:
     others = [f for f in range(1, 5) if f != finger]
 
     def misses(posed: Posed) -> Float:
-        found = gaps_between(posed.cones.part(slice(0, 1), 2), posed.cones.part(slice(1, 5), 2))
+        found = gaps_between(posed.capsules.part(slice(0, 1), 2), posed.capsules.part(slice(1, 5), 2))
         way, gap = found.a_to_b[:, finger - 1], found.gap_m[:, finger - 1]
         face = np.stack(
             [1.0 - np.vecdot(way, posed.palmar(0, 2)), 1.0 + np.vecdot(way, posed.palmar(finger, 2))], axis=1
@@ -112,7 +112,7 @@ def key_posture(model: HandModel, finger: int, segment: int, wobble: Float) -> F
 
     def misses(posed: Posed) -> Float:
         found = gaps_between(
-            posed.cones.part(slice(0, 1), slice(2, 3)), posed.cones.part(slice(1, 5), slice(0, 3))
+            posed.capsules.part(slice(0, 1), slice(2, 3)), posed.capsules.part(slice(1, 5), slice(0, 3))
         )
         count = len(posed.joints_m)
         gap, way = found.gap_m.reshape(count, 12), found.a_to_b[:, finger - 1, segment]
@@ -162,7 +162,10 @@ def pad_before(model: HandModel, hover_deg: Float, wobble: Float) -> Float:
     for k, thumb in enumerate(aside):
         ways[k, :, 0] = (1.0 - share) * np.array(thumb) + share * hover_deg[0]
     posed = Posed.of(model, ways.reshape(-1, 5, 3), wobble)
-    thumb, fingers = posed.cones.part(slice(0, 1), slice(2, 3)), posed.cones.part(slice(1, 5), slice(0, 3))
+    thumb, fingers = (
+        posed.capsules.part(slice(0, 1), slice(2, 3)),
+        posed.capsules.part(slice(1, 5), slice(0, 3)),
+    )
     nearest = gaps_between(thumb, fingers).gap_m.reshape(len(aside), -1).min(axis=1)
     return ways[int(nearest.argmax()), 0]
 
@@ -256,7 +259,7 @@ def reachable_keys(model: HandModel, wobble: Float) -> tuple[Key, ...]:
             posture = key_posture(model, finger, segment, wobble)
             posed = Posed.of(model, posture[None], wobble)
             found = gaps_between(
-                posed.cones.part(slice(0, 1), slice(2, 3)), posed.cones.part(slice(1, 5), slice(0, 3))
+                posed.capsules.part(slice(0, 1), slice(2, 3)), posed.capsules.part(slice(1, 5), slice(0, 3))
             )
             gap, on = found.gap_m[0], float(found.on_b[0, finger - 1, segment])
             others = np.delete(gap, finger - 1, axis=0).min()

@@ -35,7 +35,7 @@ from common.sim.motion import FIST, POSES, REST, WAVE_CREST, Drift, HandState, W
 
 KEY_NAMES = (("3", "2", "1"), ("6", "5", "4"), ("9", "8", "7"), ("hash", "0", "star"))
 PERIOD_S = 75.0
-TURN_DEG = 14.0
+ROTATION_DEG = 14.0
 # Act -> two ways to show it: fingers towards the cameras, and rolled about them, 0: the palm to the cameras.
 _SHOWN_DEG = {
     "pinches": ((15.0, 0.0), (35.0, -30.0)),
@@ -45,13 +45,13 @@ _SHOWN_DEG = {
     "point": ((50.0, 175.0), (25.0, 140.0)),
 }
 REACH_M = np.array([0.04, 0.025, 0.04])
-BEND_DEG = np.array([5.0, 3.0])
+WRIST_DEG = np.array([5.0, 3.0])
 _FREE = (REST, POSES["open_palm"], FIST, WAVE_CREST, POSES["counting_two"], REST)
 _LOOSEN_DEG = np.array([[14.0, -14.0, -14.0], *[[0.0, -17.0, -16.0]] * 4])
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class Annotation:
     """One thing that the hand says.
 
     Attributes:
@@ -114,7 +114,7 @@ class Gestures:
         self._own = np.zeros((5, 4))  # how DIPs differ from their coupling while the hand is held
         self._own[:, 3] = rng.uniform(-0.5, 0.5, 5)
         self._posture, self._steady = Track(np.array(REST)), Track(np.zeros(1))
-        self._place, self._turned, self._knob_turned = (
+        self._place, self._rotation_vector, self._knob_angle = (
             Track(np.zeros(6)),
             Track(np.zeros(1)),
             Track(np.zeros(1)),
@@ -125,7 +125,7 @@ class Gestures:
         self._shown = Track(np.array(_SHOWN_DEG["dial"][0]))
         self._knobs: list[tuple[float, Knob]] = []
         self._keys = reachable_keys(model, self._own)
-        self.said: tuple[Said, ...] = ()
+        self.annotations: tuple[Annotation, ...] = ()
         self._now = 0.6
         second = self._ways.integers(0, 2, len(_SHOWN_DEG))
         for k in range(2):
@@ -141,27 +141,29 @@ class Gestures:
 
     def dial_rad(self, t_s: float) -> float:
         """By how much knobs have been turned up to a time [s], clockwise as seen from the back of the hand."""
-        return float(self._knob_turned.at(max(t_s, 0.0) % PERIOD_S)[0])
+        return float(self._knob_angle.at(max(t_s, 0.0) % PERIOD_S)[0])
 
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
         t = max(t_s, 0.0) % PERIOD_S
-        wobble, shift, turn = self._drift.at(t)
+        wobble, shift, rotation_vector = self._drift.at(t)
         steady = float(self._steady.at(t)[0])
         angles = angles_of(self._model, self._posture.at(t), wobble + steady * (self._own - wobble))
         place = self._place.at(t)
         loose = 1.0 - steady
-        pose = self._pose(np.radians(self._shown.at(t)), place[:3] + loose * shift, place[3:] + loose * turn)
+        pose = self._pose(
+            np.radians(self._shown.at(t)), place[:3] + loose * shift, place[3:] + loose * rotation_vector
+        )
         knob = next((knob for start, knob in reversed(self._knobs) if t >= start), None)
         if knob is not None:
-            pose = pose @ _about(knob, float(self._turned.at(t)[0]))
-        return HandState(pose, angles, np.radians(BEND_DEG) * self._sway.at(t))
+            pose = pose @ _about(knob, float(self._rotation_vector.at(t)[0]))
+        return HandState(pose, angles, np.radians(WRIST_DEG) * self._sway.at(t))
 
-    def _pose(self, shown_rad: Float, shift_m: Float, turn_rad: Float) -> Float:
+    def _pose(self, shown_rad: Float, shift_m: Float, rotation_rad: Float) -> Float:
         """`T_rig_palm` (4, 4): shown like that (2,), fingers up in the image."""
         to_cameras = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
         shown = axis_rotation(0, float(shown_rad[0])) @ to_cameras @ axis_rotation(2, float(shown_rad[1]))
-        rotation = rotation_vector_to_matrix(turn_rad) @ shown
+        rotation = rotation_vector_to_matrix(rotation_rad) @ shown
         middle = np.array([0.0, 0.0, 0.5 * float(self._model.rest_position_m[:, 2].max())])
         return rigid(rotation, self._centre + shift_m - rotation @ middle)
 
@@ -208,8 +210,8 @@ class Gestures:
             self._steady.to(np.array([steady]), self._now, stop)
         self._now = stop + rest_s
 
-    def _say(self, kind: GestureKind, name: str, start_s: float) -> None:
-        self.said = (*self.said, Said(kind, name, start_s, self._now))
+    def _record_begin(self, kind: GestureKind, name: str, start_s: float) -> None:
+        self.annotations = (*self.annotations, Annotation(kind, name, start_s, self._now))
 
     def _order(self, first: int, end: int) -> list[int]:
         """The numbers from one to before the other, shuffled."""
@@ -225,24 +227,26 @@ class Gestures:
             posture = pinch_posture(self._model, finger, self._own)
             self._go(posture, self._some(0.28, 0.5), self._some(0.25, 0.6), 1.0)
             self._go(relaxed, self._some(0.28, 0.45), self._some(0.1, 0.2), 0.0)
-            self._say("pinch", FINGERS[finger], start)
+            self._record_begin("pinch", FINGERS[finger], start)
 
     def _dial(self) -> None:
         knob, start = self._grip(), self._now
         self._go(knob.posture_deg, self._some(0.4, 0.6), 0.35, 1.0)
-        self._turn_knob(np.radians(self._some(35.0, 55.0)) * self._rng.choice((-1.0, 1.0)), 0.2)
-        self._turn_knob(-0.6 * float(self._turned.last[0]), 0.3)
+        self._rotate_knob(np.radians(self._some(35.0, 55.0)) * self._rng.choice((-1.0, 1.0)), 0.2)
+        self._rotate_knob(-0.6 * float(self._rotation_vector.last[0]), 0.3)
         self._leave(knob, start)
 
     def _dial_again(self) -> None:
         knob, start = self._grip(), self._now
         self._go(knob.posture_deg, self._some(0.4, 0.6), 0.35, 1.0)
         way = float(self._rng.choice((-1.0, 1.0)))
-        self._turn_knob(way * np.radians(self._some(35.0, 50.0)), 0.1)
+        self._rotate_knob(way * np.radians(self._some(35.0, 50.0)), 0.1)
         self._go(knob.posture_deg + _LOOSEN_DEG, 0.25, 0.0, 1.0)
-        self._turn_palm(-way * np.radians(self._some(20.0, 30.0)), 0.3)
+        self._rotate_palm(-way * np.radians(self._some(20.0, 30.0)), 0.3)
         self._go(knob.posture_deg, 0.22, 0.12, 1.0)
-        self._turn_knob(way * np.radians(self._some(55.0, 70.0)) - float(self._turned.last[0]), 0.3)
+        self._rotate_knob(
+            way * np.radians(self._some(55.0, 70.0)) - float(self._rotation_vector.last[0]), 0.3
+        )
         self._leave(knob, start)
 
     def _grip(self) -> Knob:
@@ -252,19 +256,19 @@ class Gestures:
 
     def _leave(self, knob: Knob, start_s: float) -> None:
         self._go(knob.posture_deg + 1.6 * _LOOSEN_DEG, 0.35, 0.0, 1.0)
-        self._turn_palm(0.0, 0.6)
+        self._rotate_palm(0.0, 0.6)
         self._go(np.array(REST), 0.4, 0.3, 0.0)
-        self._say("dial", "dial", start_s)
+        self._record_begin("dial", "dial", start_s)
 
-    def _turn_palm(self, to_rad: float, seconds: float) -> None:
-        self._turned.to(np.array([to_rad]), self._now, self._now + seconds)
+    def _rotate_palm(self, to_rad: float, seconds: float) -> None:
+        self._rotation_vector.to(np.array([to_rad]), self._now, self._now + seconds)
         self._now += seconds
 
-    def _turn_knob(self, by_rad: float, rest_s: float) -> None:
+    def _rotate_knob(self, by_rad: float, rest_s: float) -> None:
         """Turn palm and knob together, at a pace of up to two radians a second."""
         seconds = max(abs(by_rad) / self._some(0.8, 1.4), 0.3)
-        self._knob_turned.to(self._knob_turned.last + by_rad, self._now, self._now + seconds)
-        self._turn_palm(float(self._turned.last[0]) + by_rad, seconds)
+        self._knob_angle.to(self._knob_angle.last + by_rad, self._now, self._now + seconds)
+        self._rotate_palm(float(self._rotation_vector.last[0]) + by_rad, seconds)
         self._now += rest_s
 
     def _taps(self) -> None:
@@ -280,18 +284,20 @@ class Gestures:
             start = self._now
             self._go(key.posture_deg, self._some(0.12, 0.18), self._some(0.04, 0.1), 1.0)
             self._go(hover, self._some(0.12, 0.18), self._some(0.1, 0.2), 1.0)
-            self._say("tap", KEY_NAMES[key.finger - 1][key.segment], start)
+            self._record_begin("tap", KEY_NAMES[key.finger - 1][key.segment], start)
         self._go(door, 0.25, 0.05, 1.0)
         self._go(aside, 0.25, 0.05, 1.0)
         self._go(np.array(REST), 0.5, 0.1, 0.0)
 
     def _point(self) -> None:
         start = self._now
-        turn = np.append(np.zeros(3), np.radians([self._some(-10.0, 25.0), self._some(-15.0, 15.0), 0.0]))
-        self._place.to(turn, self._now, self._now + 0.6)
+        rotation_vector = np.append(
+            np.zeros(3), np.radians([self._some(-10.0, 25.0), self._some(-15.0, 15.0), 0.0])
+        )
+        self._place.to(rotation_vector, self._now, self._now + 0.6)
         self._go(np.array(POSES["pointing"]), self._some(0.4, 0.6), self._some(1.0, 1.4), 0.0)
         self._go(np.array(REST), self._some(0.4, 0.6), 0.2, 0.0)
-        self._say("point", "point", start)
+        self._record_begin("point", "point", start)
 
     def _free(self) -> None:
         """Fingers from posture to posture, the palm from place to place."""
@@ -300,7 +306,7 @@ class Gestures:
             place = np.concatenate(
                 [
                     self._rng.uniform(-1.0, 1.0, 3) * REACH_M,
-                    np.radians(TURN_DEG) * self._rng.uniform(-1.0, 1.0, 3),
+                    np.radians(ROTATION_DEG) * self._rng.uniform(-1.0, 1.0, 3),
                 ]
             )
             self._place.to(place, self._now, self._now + seconds)

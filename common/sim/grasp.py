@@ -36,8 +36,8 @@ LEAVE_S, ARRIVE_S, CLOSED_S = 0.8, 2.4, 3.3
 LIFT_S, LIFTED_S, LOWER_S, LOWERED_S = 3.7, 4.8, 8.4, 9.5
 RELEASE_S, OPEN_S, BACK_S = 9.8, 10.5, 11.8
 _STILL_S = 0.5  # in which the hand comes to stand still, and moves again
-_TURN_S, _TURN_FADE_S = 1.7, 0.3
-TURN_DEG = 25.0
+_ROTATION_S, _ROTATION_FADE_S = 1.7, 0.3
+ROTATION_DEG = 25.0
 PACE = (0.92, 1.0)
 LIFT_M = (0.08, 0.12)
 PLACE_M = np.array([0.025, 0.015, 0.02])  # half of the box of places, rig axes
@@ -47,7 +47,7 @@ LEAN_DEG = np.array(
     [-26.0, -10.0, 0.0]
 )  # of the whole hand: fingers and thumb a little away from the cameras
 FLEXED_DEG = 3.0
-SWAY_DEG, TURNING_DEG = np.array([3.0, 3.0]), np.array([4.0, 5.0])  # flexion, deviation
+SWAY_DEG, SWING_DEG = np.array([3.0, 3.0]), np.array([4.0, 5.0])  # flexion, deviation
 _OPEN = ((30, -8, 0), (3, 4, 5), (0, 4, 5), (-3, 4, 5), (-6, 4, 5))
 
 
@@ -101,7 +101,7 @@ class Grasp:
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
         k, s = self.round_at(t_s)
-        wobble, drift, drift_turn = self._drift.at(max(t_s, 0.0) % PERIOD_S)
+        wobble, drift, drift_rotation = self._drift.at(max(t_s, 0.0) % PERIOD_S)
         near = _between(s, LEAVE_S, ARRIVE_S, OPEN_S, BACK_S)
         ready = _between(s, LEAVE_S, ARRIVE_S - 0.5, OPEN_S + 0.3, BACK_S)
         closed = _between(s, ARRIVE_S, CLOSED_S, RELEASE_S, OPEN_S)
@@ -113,28 +113,30 @@ class Grasp:
         side = np.array([self._model.side_sign, 1.0, 1.0])
         shift = self._T_grip[:3, :3] @ ((1.0 - near) * side * self._comes)
         shift = shift + (1.0 - still) * drift - lifted * np.array([0.0, self._lift_m[k], 0.0])
-        turn, swing = self._turning(k, s)
-        pose = base_pose(self._model, self._centre, shift, self._lean + turn + (1.0 - still) * drift_turn)
+        rotation, swing = self._rotation_and_swing(k, s)
+        pose = base_pose(
+            self._model, self._centre, shift, self._lean + rotation + (1.0 - still) * drift_rotation
+        )
         held = CLOSED_S <= s < RELEASE_S
         bar = (pose if held else self._T_grip) @ self._T_palm_object
-        bend = np.radians(
+        wrist_angles = np.radians(
             SWAY_DEG * self._sway.at(max(t_s, 0.0)) + swing + near * np.array([FLEXED_DEG, 0.0])
         )
-        return HandState(pose, angles, bend, (Cylinder(bar, self._radius_m, BAR_LENGTH_M, held),))
+        return HandState(pose, angles, wrist_angles, (Cylinder(bar, self._radius_m, BAR_LENGTH_M, held),))
 
-    def _turning(self, k: int, s: float) -> tuple[Float, Float]:
+    def _rotation_and_swing(self, k: int, s: float) -> tuple[Float, Float]:
         """How round `k` turns the palm about the rig's axes (3,) [rad], and bends the wrist by that (2,) [deg]."""
-        turn, swing = np.zeros(3), np.zeros(2)
+        rotation, swing = np.zeros(3), np.zeros(2)
         for place in (0, 1):
-            start = LIFTED_S + 0.1 + place * _TURN_S
-            if not start < s < start + _TURN_S:
+            start = LIFTED_S + 0.1 + place * _ROTATION_S
+            if not start < s < start + _ROTATION_S:
                 continue
             which = int(self._first[k]) ^ place
-            inside = window(s, start, start + _TURN_S, _TURN_FADE_S)
-            swung = self._sign[k, place] * inside * np.sin(2.0 * np.pi * (s - start) / _TURN_S)
-            turn[(2, 0)[which]] = np.radians(TURN_DEG) * swung
-            swing[(1, 0)[which]] = TURNING_DEG[(1, 0)[which]] * swung
-        return turn, swing
+            inside = window(s, start, start + _ROTATION_S, _ROTATION_FADE_S)
+            swung = self._sign[k, place] * inside * np.sin(2.0 * np.pi * (s - start) / _ROTATION_S)
+            rotation[(2, 0)[which]] = np.radians(ROTATION_DEG) * swung
+            swing[(1, 0)[which]] = SWING_DEG[(1, 0)[which]] * swung
+        return rotation, swing
 
 
 def _between(s: float, up: float, top: float, down: float, bottom: float) -> float:

@@ -78,7 +78,7 @@ class Light:
 
 
 @dataclass(frozen=True, slots=True)
-class LightCourse:
+class LightSchedule:
     """How the light of a scene changes: knots (time [s], kelvin, exposure), straight lines between them.
 
     Two knots at one time are a jump. Before the first knot and after the last nothing changes.
@@ -127,7 +127,7 @@ class LightCourse:
 
 
 # One minute of a room: dusk under a lamp, then the lamp is dimmed, a cloud, noon; back at the end, so that it repeats.
-ROOM = LightCourse(
+ROOM = LightSchedule(
     (
         (2.0, CALIBRATED_KELVIN, 1.0),
         (12.0, 3000.0, 1.0),

@@ -27,7 +27,7 @@ GRAVITY_M_S2 = 9.81
 _WANDER_RAD_S, _WANDER_S = radians(0.03), 200.0
 _HALF_STEP_S = 1e-3  # for accelerations
 _BEFORE_S, _AFTER_S = 2.0, 0.1  # a filter has to settle before the first frame
-_NOTHING, _NO_TURN = np.full(3, np.nan), np.full(4, np.nan)
+_NOTHING, _NO_QUATERNION = np.full(3, np.nan), np.full(4, np.nan)
 _UNPLACED = "imu: q_palm_imu and q_rig_world: missing; an IMU is simulated as it is mounted"
 
 
@@ -113,11 +113,11 @@ class SimulatedImu:
         before, now, after = (self._motion.at(t_s + h).T_rig_palm for h in (-_HALF_STEP_S, 0.0, _HALF_STEP_S))
         rig_imu = now[:3, :3] @ self._palm_imu
         last = self._motion.at(t_s - 1.0 / self._imu.rate_hz).T_rig_palm[:3, :3]
-        turned = matrix_to_rotation_vector(last.T @ now[:3, :3])  # palm axes
+        step = matrix_to_rotation_vector(last.T @ now[:3, :3])  # palm axes
         moved = (after[:3, 3] - 2.0 * now[:3, 3] + before[:3, 3]) / _HALF_STEP_S**2
         new = sqrt(0.5 * self._imu.rate_hz) * np.random.default_rng([self._seed, 1, seq]).normal(size=(2, 3))
         rate = (
-            self._palm_imu.T @ turned * self._imu.rate_hz
+            self._palm_imu.T @ step * self._imu.rate_hz
         )  # the mean since the last sample, as a low-pass leaves it
         return ImuSample(
             source=self._imu.name,
@@ -129,5 +129,5 @@ class SimulatedImu:
             + self._zero_g
             + self._part.accel_noise * new[1],
             mag_ut=_NOTHING,
-            orientation_wxyz=_NO_TURN,
+            orientation_wxyz=_NO_QUATERNION,
         )

@@ -16,7 +16,7 @@ from common.srgb import to_linear, to_srgb
 
 Float32 = npt.NDArray[np.float32]
 
-PAINT_LINEAR_RGB = {
+MARKER_LINEAR_RGB = {
     "thumb": (0.03, 0.30, 0.33),
     "index": (0.035, 0.33, 0.09),
     "middle": (0.02, 0.075, 0.43),
@@ -25,7 +25,7 @@ PAINT_LINEAR_RGB = {
     "back": (0.26, 0.52, 0.06),
 }
 # Of markers that no rendered recording has; their hues lie in the widest gaps between those of the six.
-MORE_PAINT_LINEAR_RGB = {
+MORE_MARKER_LINEAR_RGB = {
     "back2": (0.30, 0.03, 0.31),
     "back3": (0.075, 0.42, 0.04),
     # A tracked object has those of the second and third marker of the back, and the only hue that is left: yellow.
@@ -93,13 +93,13 @@ def face_shade(linear_rgb: tuple[float, float, float], cosine: float) -> tuple[i
     return bgr_bytes((AMBIENT + (1.0 - AMBIENT) * max(cosine, 0.0)) * np.array(linear_rgb))
 
 
-def paint(marker: str) -> tuple[float, float, float]:
+def marker_colour(marker: str) -> tuple[float, float, float]:
     """Linear RGB reflectance of a marker's paint.
 
     Raises:
         CalibrationError: The simulator has no paint of that name.
     """
-    known = PAINT_LINEAR_RGB | MORE_PAINT_LINEAR_RGB
+    known = MARKER_LINEAR_RGB | MORE_MARKER_LINEAR_RGB
     if marker not in known:
         raise CalibrationError(
             f"marker {marker!r}: the simulator has no such paint; it has {', '.join(known)}"

@@ -17,7 +17,7 @@ from common.arrays import Float
 from common.geometry import axis_rotation, rigid
 from common.hand_model import HandModel
 from common.sim.held import Cylinder
-from common.wrist_bend import STRAIGHT
+from common.wrist_joint import STRAIGHT
 
 PERIOD_S = 60.0
 PEAK_SPEED_M_S = 1.0
@@ -52,14 +52,14 @@ class HandState:
     Attributes:
         T_rig_palm: Palm pose (4, 4) [m].
         angles_rad: (5, 4) [rad].
-        bend_rad: (2,) how the wrist is bent between forearm and palm (`common.wrist_bend`).
+        wrist_angles_rad: (2,) how the wrist is bent between forearm and palm (`common.wrist_joint`).
         things: What stands about, or is held.
         objects: Poses (4, 4) [m], rig frame, of the tracked objects that move by themselves, in the rig's order.
     """
 
     T_rig_palm: Float
     angles_rad: Float
-    bend_rad: Float = field(default_factory=lambda: STRAIGHT)
+    wrist_angles_rad: Float = field(default_factory=lambda: STRAIGHT)
     things: tuple[Cylinder, ...] = ()
     objects: tuple[Float, ...] = ()
 
@@ -83,7 +83,7 @@ class Change:
 
     posture: Float
     shift: Float
-    turn: Float
+    rotation: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,7 +137,7 @@ class ScriptedMotion:
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
         t = max(t_s, 0.0) % PERIOD_S
-        wobble, shift, turn = self._drift.at(t)
+        wobble, shift, rotation = self._drift.at(t)
         posture = self._rest.copy()
         for act in self.acts:
             if act.start_s < t < act.stop_s:
@@ -145,9 +145,9 @@ class ScriptedMotion:
                 change = act.change(t - act.start_s)
                 posture += weight * change.posture
                 shift = shift + weight * change.shift
-                turn = turn + weight * change.turn
+                rotation = rotation + weight * change.rotation
         angles = angles_of(self._model, posture, wobble)
-        return HandState(base_pose(self._model, self._centre, shift, turn), angles)
+        return HandState(base_pose(self._model, self._centre, shift, rotation), angles)
 
 
 def angles_of(model: HandModel, posture_deg: Float, wobble: Float) -> Float:
@@ -163,13 +163,13 @@ def angles_of(model: HandModel, posture_deg: Float, wobble: Float) -> Float:
     return model.clamp(np.radians(angles))
 
 
-def base_pose(model: HandModel, centre_m: Float, shift_m: Float, turn_rad: Float) -> Float:
+def base_pose(model: HandModel, centre_m: Float, shift_m: Float, rotation_rad: Float) -> Float:
     """`T_rig_palm` (4, 4) of the hand seen from behind its back, fingers up in the image.
 
-    The wrist is placed so that the flat hand's middle is at `centre_m` + `shift_m`; `turn_rad` (3,) turns the
+    The wrist is placed so that the flat hand's middle is at `centre_m` + `shift_m`; `rotation_rad` (3,) turns the
     palm about the rig's axes through that middle. Fingers point a little towards the cameras.
     """
-    rotation = np.asarray(cv2.Rodrigues(turn_rad)[0], np.float64) @ _SEEN_FROM_BEHIND
+    rotation = np.asarray(cv2.Rodrigues(rotation_rad)[0], np.float64) @ _SEEN_FROM_BEHIND
     middle = 0.5 * float(model.rest_position_m[:, 2].max())
     return rigid(rotation, centre_m + shift_m - middle * rotation[:, 2])
 
@@ -261,17 +261,17 @@ def _travel(direction: Float, rate_hz: float) -> Callable[[float], Change]:
     return change
 
 
-def _turns(axes: tuple[int, ...], each_s: float) -> Callable[[float], Change]:
+def _rotate_about(axes: tuple[int, ...], each_s: float) -> Callable[[float], Change]:
     swing = np.radians(PALM_SWING_DEG)
 
     def change(s: float) -> Change:
-        turn = np.zeros(3)
+        rotation = np.zeros(3)
         for place, axis in enumerate(axes):
             start = place * each_s
             if start <= s <= start + each_s:
                 inside = window(s, start, start + each_s, 0.2 * each_s)
-                turn[axis] = swing * inside * np.sin(2.0 * np.pi * (s - start) / each_s)
-        return Change(np.zeros((5, 3)), np.zeros(3), turn)
+                rotation[axis] = swing * inside * np.sin(2.0 * np.pi * (s - start) / each_s)
+        return Change(np.zeros((5, 3)), np.zeros(3), rotation)
 
     return change
 
@@ -297,5 +297,5 @@ def _half(rng: np.random.Generator, start_s: float, half: int) -> tuple[Act, ...
     add("wave", 3.0, 0.5, _wave((0.7, 0.9)[half], np.radians(12.0)))
     direction = (np.array([1.0, 0.1, 0.0]), np.array([0.8, 0.25, 0.55]))[half]
     add("travel", 3.0, 0.5, _travel(direction, (1.35, 1.8)[half]))
-    add("turns", 4.5, 0.2, _turns(((2, 0, 1), (1, 0, 2))[half], 1.5))
+    add("turns", 4.5, 0.2, _rotate_about(((2, 0, 1), (1, 0, 2))[half], 1.5))
     return tuple(acts)

@@ -14,7 +14,7 @@ from common.sim.motion import PERIOD_S, POSES, Drift, HandState, angles_of, base
 ROUNDS = 4
 STATION_S = PERIOD_S / (ROUNDS * len(POSES))
 MOVE_S = 1.0  # of each station: the way to it
-TURN_DEG = 35.0  # as far as a wrist turns without the elbow, about any axis
+ROTATION_DEG = 35.0  # as far as a wrist turns without the elbow, about any axis
 REACH_M = np.array([0.05, 0.03, 0.05])  # half of the box that the palm's middle moves in, rig axes
 
 
@@ -44,8 +44,8 @@ class StudyPoses:
         self._shift = rng.uniform(-1.0, 1.0, (count, 3)) * REACH_M
         axis = rng.normal(size=(count, 3))
         # Evenly over the ball: most turns are large ones.
-        size = np.radians(TURN_DEG) * np.cbrt(rng.uniform(size=(count, 1)))
-        self._turn = size * axis / np.linalg.norm(axis, axis=1, keepdims=True)
+        size = np.radians(ROTATION_DEG) * np.cbrt(rng.uniform(size=(count, 1)))
+        self._rotations = size * axis / np.linalg.norm(axis, axis=1, keepdims=True)
 
     @property
     def period_s(self) -> float:
@@ -62,9 +62,11 @@ class StudyPoses:
             before = stations[place - 1]  # that of the first is the last
             return before + share * (stations[place] - before)
 
-        wobble, shift, turn = self._drift.at(t)
+        wobble, shift, rotation = self._drift.at(t)
         angles = angles_of(self._model, between(self._posture), wobble)
-        pose = base_pose(self._model, self._centre, between(self._shift) + shift, between(self._turn) + turn)
+        pose = base_pose(
+            self._model, self._centre, between(self._shift) + shift, between(self._rotations) + rotation
+        )
         return HandState(pose, angles)
 
     def held(self, t_s: float) -> str | None:

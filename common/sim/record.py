@@ -21,8 +21,8 @@ from common.hand_model import CHAINS, FINGERS, WEBXR_JOINTS, HandModel
 from common.imu_recording import write_imu
 from common.npz import write_npz
 from common.sim.imu import SimulatedImu
-from common.sim.light import paint
-from common.sim.paint import MarkerView
+from common.sim.light import marker_colour
+from common.sim.painter import MarkerView
 from common.sim.render import Renderer
 from common.sim.scene import Scene, SceneTruth
 
@@ -38,7 +38,7 @@ ANGLE_NAMES = (
 Arrays = dict[str, npt.NDArray[Any]]
 
 
-class TakenFrame(NamedTuple):
+class RenderedFrame(NamedTuple):
     """A frame as its camera delivers it: counter, stamp [ns], what lit it, picture."""
 
     camera: str
@@ -55,7 +55,7 @@ class _Row:
     views: tuple[MarkerView, ...]
     t_row0: tuple[float, ...]
     reference: SceneTruth
-    bend_rad: Float
+    wrist_angles_rad: Float
 
 
 class SceneTake:
@@ -81,8 +81,8 @@ class SceneTake:
         self.count = max(round(seconds / self._period_s), 1)
         self._renderers = [Renderer(scene, name) for name in names]
         self._offsets = [scene.timing(name).start_offset_ns * 1e-9 for name in names]
-        lead = scene.cameras[names[0]]
-        self._centre_s = 0.5 * (lead.height_px - 1) * lead.row_time_us * 1e-6
+        reference = scene.cameras[names[0]]
+        self._centre_s = 0.5 * (reference.height_px - 1) * reference.row_time_us * 1e-6
         self._rows: list[_Row] = []
 
     @property
@@ -113,7 +113,7 @@ class SceneTake:
             objects={name: scene.objects[name] for name in scene.rig.objects},
         )
 
-    def frames(self) -> Iterator[TakenFrame]:
+    def frames(self) -> Iterator[RenderedFrame]:
         """All frames, row by row."""
         scene = self._scene
         for k in range(self.count):
@@ -122,9 +122,11 @@ class SceneTake:
             for name, renderer, t in zip(scene.rig.cameras, self._renderers, times, strict=True):
                 image, view = renderer.observe(t)
                 views.append(view)
-                yield TakenFrame(name, k, FIRST_NS + round(t * 1e9), Illumination.NONE, image)
+                yield RenderedFrame(name, k, FIRST_NS + round(t * 1e9), Illumination.NONE, image)
             at_s = times[0] + self._centre_s
-            self._rows.append(_Row(tuple(views), times, scene.truth(at_s), scene.motion.at(at_s).bend_rad))
+            self._rows.append(
+                _Row(tuple(views), times, scene.truth(at_s), scene.motion.at(at_s).wrist_angles_rad)
+            )
 
     def truth(self) -> Arrays:
         """One row per frame of each camera."""
@@ -140,7 +142,7 @@ class SceneTake:
             "joints": np.array([truth.joints.position_m[1:] for truth in truths]),
             "angles": np.array([named_angles(self._scene.model, truth.angles_rad) for truth in truths]),
             "T_palm": np.array([truth.T_rig_palm for truth in truths]),
-            "bend": np.array([row.bend_rad for row in rows]),
+            "flexion": np.array([row.wrist_angles_rad for row in rows]),
         } | self._truth_of_objects()
 
     def _truth_of_objects(self) -> Arrays:
@@ -163,7 +165,7 @@ class SceneTake:
             "joints": WEBXR_JOINTS,
             "angles": ANGLE_NAMES,
             "seed": scene.seed,
-            "paint_reflectance_linear_srgb": {name: paint(name) for name in self._painted()},
+            "paint_reflectance_linear_srgb": {name: marker_colour(name) for name in self._painted()},
             "objects": {name: scene.tracked.features(k) for k, name in enumerate(scene.rig.objects)},
         }
 
@@ -206,7 +208,7 @@ def record_scene(
     return take.count
 
 
-def write_frames(folder: Path, manifest: Manifest, frames: Iterable[TakenFrame]) -> None:
+def write_frames(folder: Path, manifest: Manifest, frames: Iterable[RenderedFrame]) -> None:
     """Write a recording without its truth, frames in the order in which they come.
 
     Raises:

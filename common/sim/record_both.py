@@ -53,8 +53,8 @@ def record_both(
     sensor = SimulatedImu.of(wrist_scene) if imu else None
     seen = SceneTake(marker_scene, seconds, start_s)
     first_ns = FIRST_NS + round(start_s * 1e9) + wrist_late_ns
-    worn = WristTake(wrist_scene, seconds, start_s=start_s, step=step, first_ns=first_ns)
-    of_markers, of_wrist = seen.manifest(), worn.manifest(wrist_rig)
+    device = WristTake(wrist_scene, seconds, start_s=start_s, step=step, first_ns=first_ns)
+    of_markers, of_wrist = seen.manifest(), device.manifest(wrist_rig)
     manifest = replace(
         of_markers,
         kind="both",
@@ -62,15 +62,15 @@ def record_both(
         rigs=(wrist_rig or wrist_scene.rig,),
         note=f"{of_markers.note}; {of_wrist.note}",
     )
-    frames = heapq.merge(seen.frames(), worn.frames(), key=lambda frame: frame.t_ns)
+    frames = heapq.merge(seen.frames(), device.frames(), key=lambda frame: frame.t_ns)
     write_frames(folder, manifest, frames)
     if sensor is not None:
-        first, last = zip(seen.span_s, worn.span_s, strict=True)
+        first, last = zip(seen.span_s, device.span_s, strict=True)
         write_imu(folder, sensor.around(min(first), max(last), FIRST_NS))
-    truth = seen.truth() | {f"wrist_{key}": value for key, value in worn.truth().items()}
-    meta = seen.meta() | {"scene": "both", "wrist": worn.meta(), "wrist_late_ns": wrist_late_ns}
+    truth = seen.truth() | {f"wrist_{key}": value for key, value in device.truth().items()}
+    meta = seen.meta() | {"scene": "both", "wrist": device.meta(), "wrist_late_ns": wrist_late_ns}
     write_truth(folder, truth, meta)
-    return seen.count, worn.count
+    return seen.count, device.count
 
 
 def _check_alike(marker_scene: Scene, wrist_scene: WristScene, times_s: tuple[float, ...]) -> None:
@@ -79,8 +79,9 @@ def _check_alike(marker_scene: Scene, wrist_scene: WristScene, times_s: tuple[fl
     if hands[0] != hands[1]:
         raise ValueError(f"hands differ: {hands[0]!r} and {hands[1]!r}")
     for t_s in times_s:
-        seen, worn = marker_scene.motion.at(t_s), wrist_scene.motion.at(t_s)
+        seen, device = marker_scene.motion.at(t_s), wrist_scene.motion.at(t_s)
         if not (
-            np.array_equal(seen.angles_rad, worn.angles_rad) and np.array_equal(seen.bend_rad, worn.bend_rad)
+            np.array_equal(seen.angles_rad, device.angles_rad)
+            and np.array_equal(seen.wrist_angles_rad, device.wrist_angles_rad)
         ):
             raise ValueError(f"the scenes move differently at {t_s} s")

@@ -1,7 +1,7 @@
 """Scene -> camera image: hand, paint, desk, card, blur and noise, with the truth of what each marker shows.
 
 Order of drawing: desk; finger parts, palm and things from far to near, each as nested outlines that make it look round;
-sleeve (first where the camera looks into it); motion blur; card; markers (see `paint`); lens blur; the light, where
+sleeve (first where the camera looks into it); motion blur; card; markers (see `painter`); lens blur; the light, where
 it is not the calibrated one; noise.
 
 Another light multiplies the finished picture, channel by channel, in linear light. A highlight that is already white
@@ -19,13 +19,13 @@ from common.arrays import Float, Image
 from common.sim import light, raster
 from common.sim.desk import LENS_SIGMA_PX, NoiseTiles, desk_image
 from common.sim.objects_seen import SeenPart
-from common.sim.paint import Covered, MarkerView, Painter
+from common.sim.painter import Covered, MarkerView, Painter
 from common.sim.raster import Shape
 from common.sim.scene import DESK_DEPTH_M, Scene
 from common.sim.surface import CAPSULES, PALM_HULL
 from common.sim.things import SeenThing
 from common.sim.view import LAYERS, Snapshot, View
-from common.srgb import relit_bytes
+from common.srgb import gain_tables
 
 Box = tuple[int, int, int, int]
 
@@ -111,7 +111,7 @@ class Renderer:
         if self._light is not None:
             gains_bgr = gains_bgr * self._light.gains_bgr(max(t_s, 0.0) % self._view.scene.period_s)
         if (gains_bgr != 1.0).any():
-            image = np.asarray(cv2.LUT(image, relit_bytes(gains_bgr).T[None]), dtype=np.uint8)
+            image = np.asarray(cv2.LUT(image, gain_tables(gains_bgr).T[None]), dtype=np.uint8)
         self._noise.add_to(image, round(t_s * 1e6))
         return image, painted
 
@@ -125,9 +125,9 @@ class Renderer:
         phalanges = depth[CAPSULES].mean(axis=1).tolist()
         for part in _finger_parts(snapshot):
             # A part that grows out of the palm goes under its edge, wherever the rest of it is.
-            grown = part[0] in ROOTS
+            margin = part[0] in ROOTS
             far = sum(phalanges[k] for k in part) / len(part)
-            parts.append((max(far, palm_depth + 1e-6) if grown else far, part))
+            parts.append((max(far, palm_depth + 1e-6) if margin else far, part))
         palm = list(zip(raster.fixed_each(snapshot.web), raster.fixed_each(snapshot.palm), strict=True))
         behind = snapshot.into_sleeve
         if behind:

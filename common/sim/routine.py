@@ -11,8 +11,8 @@ from common.hand_model import HandModel
 from common.hand_routine import MOVES, ROUTINE_S, STEPS, posture_at
 from common.sim.motion import Drift, HandState, angles_of
 
-LEAD_S, TAIL_S = 1.0, 0.8
-PERIOD_S = LEAD_S + ROUTINE_S + TAIL_S
+REACTION_S, TAIL_S = 1.0, 0.8
+PERIOD_S = REACTION_S + ROUTINE_S + TAIL_S
 LATE_S = (0.05, 0.45)  # by how much a step is begun late, least and most
 REST = 0.1  # share of the drift of a hand in the air that is left when the palm rests on something
 TILT_DEG = 15.0  # of the fingers towards the cameras
@@ -36,7 +36,7 @@ class HandRoutine:
         starts = [next(m.start_s for m in MOVES if m.step == k) for k in range(len(STEPS))]
         late = rng.uniform(*LATE_S, len(STEPS))
         self._script_s = np.array([*starts, ROUTINE_S])
-        self._done_s = LEAD_S + np.array([*(starts + late), ROUTINE_S + LATE_S[1]])
+        self._done_s = REACTION_S + np.array([*(starts + late), ROUTINE_S + LATE_S[1]])
 
     @property
     def period_s(self) -> float:
@@ -50,13 +50,15 @@ class HandRoutine:
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
         t = max(t_s, 0.0) % PERIOD_S
-        wobble, shift, turn = self._drift.at(t)
+        wobble, shift, rotation = self._drift.at(t)
         angles = angles_of(self._model, posture_at(self.script_s(t)), wobble)
-        return HandState(self._pose(self._rest * shift, self._rest * turn), angles)
+        return HandState(self._pose(self._rest * shift, self._rest * rotation), angles)
 
-    def _pose(self, shift_m: Float, turn_rad: Float) -> Float:
+    def _pose(self, shift_m: Float, rotation_rad: Float) -> Float:
         """`T_rig_palm` (4, 4): palm to the cameras, fingers up in the image."""
         to_cameras = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-        rotation = rotation_vector_to_matrix(turn_rad) @ axis_rotation(0, np.radians(TILT_DEG)) @ to_cameras
+        rotation = (
+            rotation_vector_to_matrix(rotation_rad) @ axis_rotation(0, np.radians(TILT_DEG)) @ to_cameras
+        )
         middle = np.array([0.0, 0.0, 0.5 * float(self._model.rest_position_m[:, 2].max())])
         return rigid(rotation, self._centre + shift_m - rotation @ middle)

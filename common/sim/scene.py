@@ -16,7 +16,7 @@ from common.geometry import transform
 from common.hand_model import HandJoints, HandModel
 from common.object_profile import ObjectProfile
 from common.sim.held import Cylinder
-from common.sim.illuminant import LightCourse
+from common.sim.illuminant import LightSchedule
 from common.sim.motion import HandMotion, HandState, ScriptedMotion
 from common.sim.tracked import TrackedObjects
 
@@ -37,7 +37,7 @@ class SceneTruth:
         angles_rad: (5, 4).
         joints: Positions (26, 3) [m] and rotations of all joints, rig frame.
         markers_m: (M, 3) centroids of the painted surfaces [m], rig frame; middles of the beads of objects.
-        bend_rad: (2,) how the wrist is bent between forearm and palm (`common.wrist_bend`).
+        wrist_angles_rad: (2,) how the wrist is bent between forearm and palm (`common.wrist_joint`).
         things: What stands about, or is held, and is not tracked.
         objects: Tracked object -> `T_rig_object` (4, 4) [m].
     """
@@ -47,7 +47,7 @@ class SceneTruth:
     angles_rad: Float
     joints: HandJoints
     markers_m: Float
-    bend_rad: Float
+    wrist_angles_rad: Float
     things: tuple[Cylinder, ...]
     objects: Mapping[str, Float] = field(default_factory=dict[str, Float])
 
@@ -127,7 +127,7 @@ class Scene:
     centre_m: Float
     cards: tuple[Card, ...] = ()
     seed: int = STANDARD_SEED
-    light: LightCourse | None = None
+    light: LightSchedule | None = None
     objects: Mapping[str, ObjectProfile] = field(default_factory=dict[str, ObjectProfile])
     optics: Mapping[str, CameraModel] = field(default_factory=dict[str, CameraModel])
     tracked: TrackedObjects = field(init=False)
@@ -192,7 +192,7 @@ class Scene:
             state.angles_rad,
             joints,
             self._marker_points(joints, poses),
-            state.bend_rad,
+            state.wrist_angles_rad,
             self.untracked(state),
             dict(zip(self.rig.objects, poses, strict=True)),
         )

@@ -19,7 +19,7 @@ from common.sim.routine import HandRoutine
 from common.sim.scene import Scene, view_centre
 from common.sim.together import TOGETHER, together_motion
 from common.sim.travel import CARDS, ObjectTravel
-from common.sim.wrist.render import LIVE_BEND_RAD, LIVE_STEP, WristRenderer
+from common.sim.wrist.render import LIVE_STEP, LIVE_WRIST_RAD, WristRenderer
 from common.sim.wrist.scene import WRIST_NAMES, WristScene
 
 NAMES = f"standard | lights | poses | hand-routine | object | leap:FILE.npz | {' | '.join(TOGETHER)}"
@@ -115,6 +115,6 @@ def renderer_of(
     """
     if isinstance(scene, WristScene):
         return (
-            WristRenderer(scene, camera, LIVE_STEP, LIVE_BEND_RAD) if live else WristRenderer(scene, camera)
+            WristRenderer(scene, camera, LIVE_STEP, LIVE_WRIST_RAD) if live else WristRenderer(scene, camera)
         )
     return BoardRenderer(scene, camera) if isinstance(scene, BoardScene) else Renderer(scene, camera)

@@ -21,7 +21,7 @@ from common.hand_model import CHAINS, METACARPALS, Chains, HandModel
 CYLINDER_SHARE = 0.7
 BOX_M = (0.025, 0.003, 0.020)  # along the palm's x, y (thickness), z
 # The skin below the paint is a little smaller and shorter, so that it does not shine out around it.
-SKIN_UNDER_PAINT = 0.86
+SKIN_UNDER_CAP = 0.86
 SKIN_BACK_SHARE = 0.4
 
 # Sphere indices: 4 f + k is joint k of finger f; then the rest of palm, web and sleeve.
@@ -106,7 +106,7 @@ class HandSurface:
             elif finger is not None and mount.joint == CHAINS[finger, 3]:
                 cap = Cap(m, finger, float(model.radius_m[mount.joint]), count, count + 1)
                 caps.append(cap)
-                radius[4 * finger + 3] *= SKIN_UNDER_PAINT
+                radius[4 * finger + 3] *= SKIN_UNDER_CAP
                 ahead = -cap.radius_m * _AXES[4 * finger + 3, 2]
                 centroid = _JOINTS[4 * finger + 3] + mount.offset_m @ _AXES[4 * finger + 3]
                 centre = centroid - cap_centroid_ahead(1.0) * ahead
@@ -131,9 +131,9 @@ class HandSurface:
 
 def _chain_rows(chains: Chains) -> Float:
     """Positions [m], then axes, of the joints of all chains, finger by finger (..., 80, 3), palm frame."""
-    lead = chains.position_m.shape[:-3]
+    batch = chains.position_m.shape[:-3]
     axes = np.swapaxes(chains.rotation, -1, -2)
-    return np.concatenate([chains.position_m.reshape(*lead, 20, 3), axes.reshape(*lead, 60, 3)], axis=-2)
+    return np.concatenate([chains.position_m.reshape(*batch, 20, 3), axes.reshape(*batch, 60, 3)], axis=-2)
 
 
 def _spheres(model: HandModel) -> list[Float]:

@@ -1,7 +1,7 @@
 """Motions that a marker rig and a wrist device see alike: what fusion is measured on, and mounting calibrated from.
 
 All of them are pure in time, smooth (C2) and closed over their period, and the wrist bends in all of them, since the
-device sits on the forearm (`common.wrist_bend`; limits of the bend as flexion / deviation):
+device sits on the forearm (`common.wrist_joint`; limits of the bend as flexion / deviation):
 
     grasp         closes round a bar, lifts, turns and puts it back (`grasp`); 3 degrees flexed, +-7 / +-8 about that
     both-poses    the six study poses, the palm in a new place and turned another way each (`poses`); +-8 / +-5
@@ -35,17 +35,17 @@ from common.sim.motion import (
 from common.sim.poses import StudyPoses
 
 TOGETHER = ("grasp", "both-poses", "both-curl", "both-travel", "both-moves", "gestures")
-USUAL_BEND_DEG = np.array([8.0, 5.0])
+TYPICAL_FLEXION_DEG = np.array([8.0, 5.0])
 CURL_S, STRAIGHT_DEG, CURL_PIP_DEG, MCP_PER_PIP = 10.0, 4.0, 101.0, 0.54  # Kamper's ratio, row D8
 _CURL_LAG_RAD = np.array([0.3, 0.0, 0.1, 0.2, 0.3])  # no finger follows another at once
 _CURL_SPREAD_DEG = np.array([8.0, 4.0, 0.0, -4.0, -8.0])
 _THUMB_DEG = np.array([[14.0, -6.0, 0.0], [6.0, 26.0, 26.0]])  # open, closed
-CURL_TURN_DEG = 14.0
+CURL_ROTATION_DEG = 14.0
 TRAVEL_S, TRAVEL_FADE_S = 6.0, 0.6
 TRAVEL_HZ = (1.3, 1.8)
 MOVES_S = 10.0
-MOVES_TURN_DEG = np.array([26.0, 24.0, 30.0])
-MOVES_BEND_DEG = np.array([25.0, 12.0])
+MOVES_ROTATION_DEG = np.array([26.0, 24.0, 30.0])
+MOVES_WRIST_DEG = np.array([25.0, 12.0])
 MOVES_SHIFT_M = np.array([0.05, 0.03, 0.04])
 
 
@@ -60,17 +60,17 @@ def together_motion(name: str, model: HandModel, centre_m: Float, seed: int) -> 
     if name == "grasp":
         return Grasp(model, centre_m, seed)
     if name == "both-poses":
-        return Bent(StudyPoses(model, centre_m, seed), seed)
+        return FlexedWrist(StudyPoses(model, centre_m, seed), seed)
     if name == "both-curl":
-        return Bent(Curls(model, centre_m, seed), seed)
+        return FlexedWrist(Curls(model, centre_m, seed), seed)
     if name == "both-travel":
-        return Bent(Travel(model, centre_m, seed), seed)
+        return FlexedWrist(Travel(model, centre_m, seed), seed)
     if name == "both-moves":
         return Moves(model, centre_m, seed)
     return None
 
 
-class Bent:
+class FlexedWrist:
     """A motion, and a wrist that bends as in normal use while it goes on. It holds which way, from its seed."""
 
     def __init__(self, motion: HandMotion, seed: int) -> None:
@@ -85,8 +85,8 @@ class Bent:
 
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
-        bend = np.radians(USUAL_BEND_DEG) * self._waves.at(max(t_s, 0.0))
-        return replace(self._motion.at(t_s), bend_rad=bend)
+        wrist_angles = np.radians(TYPICAL_FLEXION_DEG) * self._waves.at(max(t_s, 0.0))
+        return replace(self._motion.at(t_s), wrist_angles_rad=wrist_angles)
 
 
 class Curls:
@@ -96,7 +96,7 @@ class Curls:
         """Of a hand about a place (3,) [m]; the same seed, the same motion."""
         rng = np.random.default_rng([seed, 23])
         self._model, self._centre = model, np.asarray(centre_m, dtype=np.float64)
-        self._drift, self._turn = Drift(rng), Waves(rng, 3)
+        self._drift, self._rotations = Drift(rng), Waves(rng, 3)
         self._most = CURL_PIP_DEG * (1.0 - rng.uniform(0.0, 0.06, 4))
         self._ratio = MCP_PER_PIP * (1.0 + rng.normal(0.0, 0.06, 4))
 
@@ -114,10 +114,10 @@ class Curls:
         posture[0] = _THUMB_DEG[0] + share[0] * (_THUMB_DEG[1] - _THUMB_DEG[0])
         posture[1:, 0] = _CURL_SPREAD_DEG[1:] * (1.0 - share[1:])
         posture[1:, 1], posture[1:, 2] = STRAIGHT_DEG + self._ratio * pip, STRAIGHT_DEG + pip
-        wobble, shift, turn = self._drift.at(t)
-        turn = turn + np.radians(CURL_TURN_DEG) * self._turn.at(t)
+        wobble, shift, rotation = self._drift.at(t)
+        rotation = rotation + np.radians(CURL_ROTATION_DEG) * self._rotations.at(t)
         return HandState(
-            base_pose(self._model, self._centre, shift, turn), angles_of(self._model, posture, wobble)
+            base_pose(self._model, self._centre, shift, rotation), angles_of(self._model, posture, wobble)
         )
 
 
@@ -128,7 +128,7 @@ class Travel:
         """Of a hand about a place (3,) [m]; the same seed, the same motion."""
         rng = np.random.default_rng([seed, 29])
         self._model, self._centre = model, np.asarray(centre_m, dtype=np.float64)
-        self._drift, self._bend = Drift(rng), Waves(rng, 5)
+        self._drift, self._wrist = Drift(rng), Waves(rng, 5)
         count = round(PERIOD_S / TRAVEL_S)
         way = np.array([1.0, 0.0, 0.0]) + rng.uniform(-1.0, 1.0, (count, 3)) * np.array([0.2, 0.4, 0.6])
         self._way = way / np.linalg.norm(way, axis=1, keepdims=True)
@@ -145,13 +145,13 @@ class Travel:
         k = min(int(t / TRAVEL_S), len(self._way) - 1)
         s, rate = t - k * TRAVEL_S, 2.0 * np.pi * float(self._rate_hz[k])
         size = window(s, 0.0, TRAVEL_S, TRAVEL_FADE_S) * 0.98 * PEAK_SPEED_M_S / rate
-        wobble, shift, turn = self._drift.at(t)
-        share = 0.35 + 0.35 * self._bend.at(t)
+        wobble, shift, rotation = self._drift.at(t)
+        share = 0.35 + 0.35 * self._wrist.at(t)
         rest, fist = np.array(REST, dtype=np.float64), np.array(FIST, dtype=np.float64)
         posture = rest + share[:, None] * (fist - rest)
         shift = shift + size * np.sin(rate * s) * self._way[k]
         return HandState(
-            base_pose(self._model, self._centre, shift, turn), angles_of(self._model, posture, wobble)
+            base_pose(self._model, self._centre, shift, rotation), angles_of(self._model, posture, wobble)
         )
 
 
@@ -188,11 +188,13 @@ class Moves:
         wave = np.sin(2.0 * np.pi * self._cycles * t / MOVES_S + self._phase)
         rest, fist = np.array(REST, dtype=np.float64), np.array(FIST, dtype=np.float64)
         posture = rest + share[:, None] * (fist - rest)
-        wobble, shift, turn = self._drift.at(t)
+        wobble, shift, rotation = self._drift.at(t)
         pose = base_pose(
             self._model,
             self._centre,
             shift + MOVES_SHIFT_M * wave[3:6],
-            turn + np.radians(MOVES_TURN_DEG) * wave[:3],
+            rotation + np.radians(MOVES_ROTATION_DEG) * wave[:3],
         )
-        return HandState(pose, angles_of(self._model, posture, wobble), np.radians(MOVES_BEND_DEG) * wave[6:])
+        return HandState(
+            pose, angles_of(self._model, posture, wobble), np.radians(MOVES_WRIST_DEG) * wave[6:]
+        )

@@ -16,7 +16,7 @@ from common.geometry import axis_rotation, rigid
 from common.object_profile import ObjectProfile
 from common.sim.motion import HandState
 
-BESIDE_M = np.array([0.19, 0.13, 0.12])  # of an object that nothing moves, against the middle of the view
+RESTING_M = np.array([0.19, 0.13, 0.12])  # of an object that nothing moves, against the middle of the view
 TILT_RAD = np.radians(20.0)
 _FACING = np.array(
     [[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
@@ -64,7 +64,9 @@ class TrackedObjects:
     def poses(self, state: HandState, centre_m: Float) -> tuple[Float, ...]:
         """`T_rig_object` (4, 4) [m] of each, of a scene whose middle is at (3,) [m], rig frame."""
         moved = state.objects or tuple(thing.T_rig_object for thing in state.things)
-        return tuple(moved[k] if k < len(moved) else beside(k, centre_m) for k in range(len(self.profiles)))
+        return tuple(
+            moved[k] if k < len(moved) else resting_pose(k, centre_m) for k in range(len(self.profiles))
+        )
 
     def features(self, which: int) -> tuple[str, ...]:
         """What can be found of one object: its beads by name, then its tags by number."""
@@ -73,7 +75,7 @@ class TrackedObjects:
         return (*profile.markers, *(f"tag {tag.id}" for tag in tags))
 
 
-def beside(which: int, centre_m: Float) -> Float:
+def resting_pose(which: int, centre_m: Float) -> Float:
     """Pose (4, 4) [m], rig frame, of the object of that number where nothing moves it."""
     side = np.array([-1.0 if which % 2 == 0 else 1.0, 1.0 if which % 4 < 2 else -1.0, 1.0])
-    return rigid(facing(TILT_RAD), centre_m + side * BESIDE_M)
+    return rigid(facing(TILT_RAD), centre_m + side * RESTING_M)

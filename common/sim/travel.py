@@ -53,7 +53,7 @@ class ObjectTravel:
         """Of a hand and an object about a place (3,) [m]; the same seed, the same motion."""
         rng = np.random.default_rng([seed, 37])
         self._model, self._centre = model, np.asarray(centre_m, dtype=np.float64)
-        self._wander, self._drift, self._bend = Waves(rng, 6), Drift(rng), Waves(rng, 5)
+        self._wander, self._drift, self._wrist = Waves(rng, 6), Drift(rng), Waves(rng, 5)
         self._place = self._centre + AT_M + rng.uniform(-0.01, 0.01, 3)
         self._facing = rotation_vector_to_matrix(np.radians(rng.uniform(-20.0, 20.0, 3))) @ facing(
             np.radians(25.0)
@@ -74,15 +74,15 @@ class ObjectTravel:
     def at(self, t_s: float) -> HandState:
         """Hand and object at time `t_s` [s]; before 0 those of 0."""
         t = max(t_s, 0.0) % PERIOD_S
-        wobble, shift, turn = self._drift.at(t)
+        wobble, shift, rotation = self._drift.at(t)
         come, there, leave, gone = COMES_S
         before = smooth_step((t - come) / (there - come)) * smooth_step((gone - t) / (gone - leave))
         aside = self._centre + ASIDE_M
         shift = shift + (1.0 - before) * ASIDE_M + before * (self._place - self._centre + self._before)
-        share = (1.0 - before) * (0.25 + 0.25 * self._bend.at(t))
+        share = (1.0 - before) * (0.25 + 0.25 * self._wrist.at(t))
         rest, fist = np.array(REST, dtype=np.float64), np.array(FIST, dtype=np.float64)
         posture = rest + share[:, None] * (fist - rest)
-        palm = base_pose(self._model, aside - ASIDE_M, shift, turn)
+        palm = base_pose(self._model, aside - ASIDE_M, shift, rotation)
         return HandState(palm, angles_of(self._model, posture, wobble), objects=(self.object_at(t),))
 
     def object_at(self, t_s: float) -> Float:
@@ -93,8 +93,8 @@ class ObjectTravel:
         start, stop = SHUTTLE_S
         size = window(t_s, start, stop, FADE_S) * SHUTTLE_M_S / self._rate
         place = place + size * np.sin(self._rate * (t_s - start)) * self._way
-        turned = rotation_vector_to_matrix(np.radians(WANDER_DEG) * waves[3:])
+        rotation = rotation_vector_to_matrix(np.radians(WANDER_DEG) * waves[3:])
         for axis, (start, stop) in zip(self._spins, SPINS_S, strict=True):
             spun = 2.0 * np.pi * smooth_step((t_s - start) / (stop - start))
-            turned = turned @ rotation_vector_to_matrix(spun * axis)
-        return rigid(turned @ self._facing, place)
+            rotation = rotation @ rotation_vector_to_matrix(spun * axis)
+        return rigid(rotation @ self._facing, place)

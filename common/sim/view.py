@@ -18,7 +18,7 @@ from common.sim import raster
 from common.sim.held import Cylinder
 from common.sim.light import LAYER_COSINES, TO_LIGHT_RIG
 from common.sim.motion import HandState
-from common.sim.object_looks import Looks, Points
+from common.sim.object_appearance import Appearances, Points
 from common.sim.object_surface import ObjectSurface
 from common.sim.objects_seen import SeenObjects
 from common.sim.raster import Int32, Shape
@@ -126,7 +126,7 @@ class View:
         self._to_lit = (self._radius[:, None] * LAYER_COSINES)[..., None] * self.to_light
         self._fine_circle = unit_circle(32)
         self.objects = ObjectSurface.of(scene.tracked, scene.rig.markers)
-        self._looks = Looks(self.to_light, self.circle, self.focal_px, self.project)
+        self._appearances = Appearances(self.to_light, self.circle, self.focal_px, self.project)
         count = self.surface.count + len(self.objects.local)
         # Points of one marker share the moment of the marker's centroid: row k weighs the rows for point k.
         together = np.eye(count)
@@ -192,7 +192,9 @@ class View:
             sleeve=tuple(raster.hull(layer) for layer in sleeve),
             into_sleeve=_looks_into(*points[[_CUFF, _ELBOW]]),
             things=self._things(t_s, things),
-            tracked=self._looks.seen(self.objects, Points(points[own], uv[own], speed_uv[own], when[own])),
+            tracked=self._appearances.seen(
+                self.objects, Points(points[own], uv[own], speed_uv[own], when[own])
+            ),
         )
 
     def own_finger(self, snapshot: Snapshot, cap: int) -> Shape | None:
@@ -229,14 +231,14 @@ class View:
         h = max(0.5 * readout_s, 0.5 * self.exposure_s, 1e-4)
         states = tuple(self.scene.motion.at(t) for t in (t_middle - h, t_middle, t_middle + h))
         before, now, after = transform(self.T_camera_rig, self._key_points(states))
-        slope, bend = (after - before) / (2.0 * h), (after - 2.0 * now + before) / (h * h)
+        slope, curvature = (after - before) / (2.0 * h), (after - 2.0 * now + before) / (h * h)
         when = np.full(len(now), t_middle)
         points = now
         for _ in range(2):
             when = t_s + (self._together @ self.project(points)[:, 1]) * self.row_s
             ahead = (when - t_middle)[:, None]
-            points = now + ahead * slope + 0.5 * ahead * ahead * bend
-        speed = slope + (when - t_middle)[:, None] * bend
+            points = now + ahead * slope + 0.5 * ahead * ahead * curvature
+        speed = slope + (when - t_middle)[:, None] * curvature
         z = np.maximum(points[:, 2:], NEAREST_M)
         speed_uv = self.focal_px * (speed[:, :2] / z - points[:, :2] * speed[:, 2:] / z**2)
         return points, self.project(points), speed_uv, when, self.scene.untracked(states[1])

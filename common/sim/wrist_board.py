@@ -24,7 +24,7 @@ from common.wrist_calibration import Laser, LaserPlane
 Float32 = npt.NDArray[np.float32]
 
 TRUTH = "truth.npz"
-KINDS = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
+ILLUMINATIONS = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
 FIRST_NS, PERIOD_NS, HELD_NS = 10**9, 11_111_111, 500_000_000
 FINE = 3  # rays per pixel and axis
 WHITE, BLACK, WALL = 0.75, 0.06, 0.35  # reflectance at 850 nm
@@ -222,7 +222,7 @@ class WristBoardRenderer:
         import cv2
 
         blurred = np.asarray(cv2.GaussianBlur(light, (5, 5), LENS_SIGMA_PX), np.float64)
-        rng = np.random.default_rng([self._scene.seed, pose, KINDS.index(lit)])
+        rng = np.random.default_rng([self._scene.seed, pose, ILLUMINATIONS.index(lit)])
         level = BLACK_LEVEL + (FULL - BLACK_LEVEL) * blurred
         sigma = np.sqrt(READ_SIGMA**2 + np.maximum(level - BLACK_LEVEL, 0.0) / ELECTRONS)
         return np.clip(np.rint(level + sigma * rng.standard_normal(level.shape)), 0.0, FULL).astype(np.uint8)
@@ -232,7 +232,7 @@ def record_wrist_board(
     folder: Path,
     scene: WristBoardScene,
     rig: RigCalibration | None = None,
-    kinds: tuple[Illumination, ...] = KINDS,
+    illuminations: tuple[Illumination, ...] = ILLUMINATIONS,
 ) -> int:
     """Render every pose as one strobed triple; return the number of poses.
 
@@ -240,7 +240,7 @@ def record_wrist_board(
         folder: New or empty. Gets a recording of raw frames of kind "wrist", and truth.npz with T_camera_board.
         scene: What to render.
         rig: What the manifest says of the device; None: the truth.
-        kinds: Frames of a triple that are kept; the others were lost.
+        illuminations: Frames of a triple that are kept; the others were lost.
 
     Raises:
         RecordingError: The folder holds something already, or cannot be written.
@@ -257,8 +257,8 @@ def record_wrist_board(
     writer = RecordingWriter(folder, manifest)
     try:
         for pose in range(len(scene.poses)):
-            for k, lit in enumerate(KINDS):
-                if lit not in kinds:
+            for k, lit in enumerate(ILLUMINATIONS):
+                if lit not in illuminations:
                     continue
                 t_ns = FIRST_NS + pose * HELD_NS + k * PERIOD_NS
                 writer.add(scene.camera.name, 3 * pose + k, t_ns, lit, encode_png(renderer.render(pose, lit)))

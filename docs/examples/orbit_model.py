@@ -71,8 +71,8 @@ class Orbit:
         if self.mode == "taken" and max(far) > 1.0:  # it begins here: what decided is no leap
             self.mode, self._from = ("orbit" if far[0] > far[1] else "zoom"), (at, self._goal)
         elif self.mode != "taken":
-            turned = moved[[0, 1, 3]] * ([1, 1, 0] if self.mode == "orbit" else [0, 0, 1])
-            self._goal = np.clip(goal + self._gain * turned, -MOST, MOST)
+            rotated = moved[[0, 1, 3]] * ([1, 1, 0] if self.mode == "orbit" else [0, 0, 1])
+            self._goal = np.clip(goal + self._gain * rotated, -MOST, MOST)
         self._past.append((self._t_ns, self._goal))
 
     def glide(self, seconds: float) -> None:
@@ -99,7 +99,7 @@ def show_model(show: rr.RecordingStream, model: rr.Boxes3D | rr.Asset3D, radius:
 
 def run(bus: Bus, orbit: Orbit, show: rr.RecordingStream, go_on: Callable[[], bool]) -> None:
     """Follow the gestures while `go_on`; the screen says what is waited for."""
-    feed, said, drawn = bus.subscribe("gesture", depth=256), "", np.full(3, np.nan)
+    feed, shown, drawn = bus.subscribe("gesture", depth=256), "", np.full(3, np.nan)
     there, last_s, asked_s = False, time.monotonic(), -ASK_S
     while go_on():
         message = feed.get(FRAME_S)
@@ -111,13 +111,13 @@ def run(bus: Bus, orbit: Orbit, show: rr.RecordingStream, go_on: Callable[[], bo
         orbit.glide(now_s - last_s)
         if not np.abs(orbit.shown - drawn).max() < 1e-4:
             drawn = orbit.shown
-            turn = axis_rotation(0, drawn[1]) @ axis_rotation(1, drawn[0])
-            show.log("model", rr.Transform3D(mat3x3=turn * math.exp(drawn[2])))
+            rotation = axis_rotation(0, drawn[1]) @ axis_rotation(1, drawn[0])
+            show.log("model", rr.Transform3D(mat3x3=rotation * math.exp(drawn[2])))
         text = HELP.get(orbit.mode, orbit.mode) if there else "waiting for a master ..."
-        if text != said:
+        if text != shown:
             show.log("said", rr.TextDocument(text))
             sys.stderr.write(f"{text}\n")
-        said, last_s = text, now_s
+        shown, last_s = text, now_s
 
 
 def main() -> None:

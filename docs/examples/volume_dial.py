@@ -113,11 +113,11 @@ def click(hertz: float, seconds: float = 0.03) -> bytes:
 
 def run(bus: Bus, dial: Dial, output: Printed | Program, percent: int, stop: threading.Event) -> None:
     """Follow the gestures, `percent` a detent, until `stop`; say what is waited for."""
-    feed, said = bus.subscribe("gesture", depth=256), ""
+    feed, text = bus.subscribe("gesture", depth=256), ""
     while not stop.is_set():
         message, detents = feed.get(0.3), 0
-        if message is None and (state := "a dial grip" if MASTER in bus.alive() else "a master") != said:
-            said = state
+        if message is None and (state := "a dial grip" if MASTER in bus.alive() else "a master") != text:
+            text = state
             sys.stderr.write(f"waiting for {state} ...\n")
         while isinstance(message, Gesture):  # what came while the volume was set is one turn
             detents += dial.push(message)

@@ -9,8 +9,8 @@ from master.calibrate.cameras.capture_command import capture_views
 from master.calibrate.cameras.commands import intrinsics, stereo
 from master.calibrate.depth.commands import depth
 from master.calibrate.depth.verify_command import verify_command
+from master.calibrate.extrinsics.command import extrinsics
 from master.calibrate.hand.commands import hand_command
-from master.calibrate.mounting.command import mounting
 from master.calibrate.object.command import object_command
 from master.calibrate.object.cube_command import cube
 from master.calibrate.time.commands import time_command
@@ -19,7 +19,7 @@ from master.calibrate.wrist.curl_command import curl
 from master.calibrate.wrist.flat_command import flat_field
 from master.calibrate.wrist.laser_command import laser_plane
 from master.calibrate.wrist.palm_command import palm
-from master.calibrate.wrist.wearer_command import wearer
+from master.calibrate.wrist.subject_command import subject
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "board": board,
@@ -34,8 +34,8 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "flat-field": flat_field,
     "curl": curl,
     "palm": palm,
-    "wearer": wearer,
-    "mounting": mounting,
+    "subject": subject,
+    "extrinsics": extrinsics,
     "tracker": tracker,
     "cube": cube,
     "object": object_command,

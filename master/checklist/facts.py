@@ -4,8 +4,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from common.messages import CheckCode, CheckItem
+from master.rejected_peers import MarkerCounts, RejectedPeer
 from master.rig_setup import RigSetup
-from master.turned_away import Away, MarkerCounts
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class SenderNow:
     """One camera or IMU, as the master hears it.
 
     Attributes:
-        connected: Heard within the last second.
+        connected: Received within the last second.
         received, missed: Messages that were taken, and that were sent and could not be (lost, or too late), so far.
         clock_sigma_ns: Standard deviation of its clock's offset now [ns]; None: not known.
         twin: Where a second process under its name was turned away lately; None: there was none.
@@ -62,9 +62,9 @@ class SenderNow:
     received: int
     missed: int
     clock_sigma_ns: float | None
-    twin: Away | None = None
-    stranger: Away | None = None
-    unproven: Away | None = None
+    duplicate: RejectedPeer | None = None
+    unknown_peer: RejectedPeer | None = None
+    unproven: RejectedPeer | None = None
     markers: MarkerCounts | None = None
 
 

@@ -10,21 +10,21 @@ from msgspec import Struct
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.calibration_parts import Provenance
 from common.errors import CalibrationError
+from common.file_monitor import MonitoredFiles
 from common.messages import CheckItem
-from common.watching import WatchedFiles
 from master.checklist.facts import CameraPlan, Plan
 
 TOGETHER = timedelta(minutes=1)  # one calibration writes several parts, one after the other
 PartT = TypeVar("PartT", bound=Struct)
 
 
-class FileWatch:
+class FileMonitor:
     """Looks at the files of the rigs that run. Holds how they were, and what was wrong with them."""
 
     def __init__(self, calibration: Path, rigs: tuple[str, ...]) -> None:
         """Watch these rigs of a calib_json tree, and what they name."""
         self._calibration, self._rigs = calibration, rigs
-        self._watched = WatchedFiles()
+        self._monitored = MonitoredFiles()
         self._hands: dict[Path, None] = {}  # that ever were: one that is gone has changed, too
         self._plan: Plan | None = None
         self._found: tuple[CheckItem, ...] = ()
@@ -34,7 +34,7 @@ class FileWatch:
         cameras = [self._calibration / "cameras" / f"{one.name}.json" for one in plan.cameras]
         rigs = [self._calibration / "rigs" / f"{name}.json" for name in self._rigs]
         self._hands |= dict.fromkeys(sorted((self._calibration / "hands").glob("*.json")))
-        if self._watched.changed([*rigs, *cameras, *self._hands]) or plan != self._plan:
+        if self._monitored.changed([*rigs, *cameras, *self._hands]) or plan != self._plan:
             self._plan = plan
             self._found = judge(self._calibration, self._rigs, plan)
         return self._found
@@ -78,7 +78,7 @@ def _judge_rig(calibration: Path, name: str, used: Mapping[str, CameraPlan]) -> 
         yield _absent(
             rig.imu.name,
             f"IMU {rig.imu.name}: how it is mounted is not known; its orientation is not used.",
-            "`phalanx-master calibrate mounting`.",
+            "`phalanx-master calibrate extrinsics`.",
         )
     for camera in rig.cameras:
         yield from _judge_camera(calibration, rig, camera, used.get(camera))
@@ -103,7 +103,7 @@ def _judge_camera(
             "Measure the lens with the size that is used, or start master and slave anew.",
         )
     lens = file.provenance.get("intrinsics")
-    for key, part in (("T_rig_camera", "the places of the cameras"), *_RESTS_ON_LENS[rig.kind]):
+    for key, part in (("T_rig_camera", "the places of the cameras"), *_NEEDS_LENS[rig.kind]):
         if _older(rig.provenance.get(key), lens):
             yield _stale(
                 name,
@@ -120,7 +120,7 @@ def _judge_camera(
 
 
 _MEND = "Mend it, or take the copy that was in use; meanwhile everything goes on with what was read before."
-_RESTS_ON_LENS = {
+_NEEDS_LENS = {
     "markers": (),
     "wrist": (("laser_plane", "the plane of the laser"), ("T_camera_palm", "the palm")),
 }

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from common.messages import WIRE_VERSION
 from master.checklist.facts import CameraPlan, MasterNow, Plan, SenderNow, Verdict, beyond
-from master.checklist.said import Said
+from master.checklist.slave_reports import SlaveReports
 from master.checklist.window import Window
 
 GRACE_NS = 5_000_000_000  # from the first look: processes come up one after another
@@ -22,7 +22,7 @@ CLOCK_NS, CLOCK_WELL_NS = 1.0e6, 0.7e6  # 1.5 ms between two cameras cost 2 % of
 RESERVE_MB, RESERVE_WELL_MB = 200.0, 250.0  # as much as a recording leaves free
 
 
-class _Heard:
+class _Received:
     """How one sender was heard so far."""
 
     def __init__(self) -> None:
@@ -59,52 +59,54 @@ class LinkRules:
         """Nobody was heard yet."""
         self._first_ns: int | None = None
         self._started_ns: int | None = None
-        self._heard: dict[str, _Heard] = {}
+        self._received: dict[str, _Received] = {}
 
     def present(self, name: str) -> bool:
         """Whether a sender is there, as of the last look."""
-        heard = self._heard.get(name)
-        return heard is not None and heard.since_ns is not None
+        received = self._received.get(name)
+        return received is not None and received.since_ns is not None
 
-    def look(self, plan: Plan, now: MasterNow, said: dict[str, Said], t_ns: int) -> Iterator[Verdict]:
+    def look(
+        self, plan: Plan, now: MasterNow, reports: dict[str, SlaveReports], t_ns: int
+    ) -> Iterator[Verdict]:
         """What the links of all senders are like."""
         self._first_ns = t_ns if self._first_ns is None else self._first_ns
         if now.started and self._started_ns is None:
             self._started_ns = t_ns
         for name, sender in now.senders.items():
-            self._heard.setdefault(name, _Heard()).push(t_ns, sender)
+            self._received.setdefault(name, _Received()).push(t_ns, sender)
         for camera in plan.cameras:
             sender = now.senders.get(camera.name)
             if sender is not None:
-                yield self._camera_absent(camera, sender, said.get(camera.name), t_ns)
-                yield self._slow(camera, said.get(camera.name), t_ns)
+                yield self._camera_absent(camera, sender, reports.get(camera.name), t_ns)
+                yield self._slow(camera, reports.get(camera.name), t_ns)
                 yield from self._way(camera.name, sender, t_ns)
-                yield from self._turned_away(camera.name, sender)
+                yield from self._rejected_peers(camera.name, sender)
         for name in plan.imus:
             sender = now.senders.get(name)
             if sender is not None:
                 yield self._imu_silent(name, sender, t_ns)
                 yield from self._way(name, sender, t_ns)
-                yield from self._turned_away(name, sender)
+                yield from self._rejected_peers(name, sender)
         if now.disk_free_mb is not None:
             yield disk_verdict("master", now.disk_free_mb)
 
-    def _turned_away(self, name: str, sender: SenderNow) -> Iterator[Verdict]:
+    def _rejected_peers(self, name: str, sender: SenderNow) -> Iterator[Verdict]:
         """Who says that it is `name` and is not taken."""
-        twin, stranger = sender.twin, sender.stranger
-        host = None if twin is None else twin.host
+        duplicate, unknown_peer = sender.duplicate, sender.unknown_peer
+        host = None if duplicate is None else duplicate.host
         yield Verdict(
             "twin_sender",
             name,
-            twin is not None,
+            duplicate is not None,
             f"Two processes say that they are {name}; the one at {host} is not taken while the other is well.",
             "End one of them, or give it its own name (--name) and files.",
         )
-        host, version = (None, None) if stranger is None else stranger
+        host, version = (None, None) if unknown_peer is None else unknown_peer
         yield Verdict(
             "version_mismatch",
             name,
-            stranger is not None,
+            unknown_peer is not None,
             f"{name} at {host} speaks wire version {version}, this master {WIRE_VERSION}: neither takes the other.",
             "Install the same version of Phalanx on both, for example by phalanx deploy.",
         )
@@ -128,32 +130,34 @@ class LinkRules:
             " file here has changed since it began.",
         )
 
-    def _away(self, name: str, sender: SenderNow, t_ns: int) -> bool | None:
+    def _is_silent(self, name: str, sender: SenderNow, t_ns: int) -> bool | None:
         """Whether it is not heard: at once where it was there, after a grace where it never was."""
         assert self._first_ns is not None
         if sender.connected:
             return False
-        return self._heard[name].ever or t_ns - self._first_ns >= GRACE_NS or None
+        return self._received[name].ever or t_ns - self._first_ns >= GRACE_NS or None
 
     def _mute(self, name: str, t_ns: int) -> bool:
         """Whether it is heard, and sends nothing though it should."""
-        heard = self._heard[name]
+        received = self._received[name]
         started = self._started_ns is not None and t_ns - self._started_ns >= SETTLED_NS
-        return started and heard.settled(t_ns) and t_ns - heard.came_ns >= MUTE_NS
+        return started and received.settled(t_ns) and t_ns - received.came_ns >= MUTE_NS
 
-    def _camera_absent(self, camera: CameraPlan, sender: SenderNow, said: Said | None, t_ns: int) -> Verdict:
-        name, away = camera.name, self._away(camera.name, sender, t_ns)
-        if away or away is None:
-            never = not self._heard[name].ever
+    def _camera_absent(
+        self, camera: CameraPlan, sender: SenderNow, reports: SlaveReports | None, t_ns: int
+    ) -> Verdict:
+        name, silent = camera.name, self._is_silent(camera.name, sender, t_ns)
+        if silent or silent is None:
+            never = not self._received[name].ever
             return Verdict(
                 "camera_absent",
                 name,
-                away,
-                f"Camera {name} {'was never heard' if never else 'is not heard any more'}.",
+                silent,
+                f"Camera {name} {'was never received' if never else 'is not received any more'}.",
                 f"Is its slave running (phalanx-slave run --name {name}), on this network, with the same rig key?",
             )
         if camera.wrist:  # without a hand there are no triples: it is the frames that count
-            frames = None if said is None or not said.fresh(t_ns) else said.grown("frames")
+            frames = None if reports is None or not reports.is_recent(t_ns) else reports.increase("frames")
             mute = frames == 0 and self._mute(name, t_ns)
         else:
             mute = self._mute(name, t_ns)
@@ -166,8 +170,8 @@ class LinkRules:
         )
 
     def _imu_silent(self, name: str, sender: SenderNow, t_ns: int) -> Verdict:
-        away, never = self._away(name, sender, t_ns), not self._heard[name].ever
-        if away is False and self._mute(name, t_ns):
+        silent, never = self._is_silent(name, sender, t_ns), not self._received[name].ever
+        if silent is False and self._mute(name, t_ns):
             return Verdict(
                 "imu_silent",
                 name,
@@ -178,22 +182,22 @@ class LinkRules:
         return Verdict(
             "imu_silent",
             name,
-            away,
-            f"IMU {name} {'was never heard' if never else 'is not heard any more'}.",
+            silent,
+            f"IMU {name} {'was never received' if never else 'is not received any more'}.",
             f"Is its slave running (phalanx-slave imu --name {name}), and the IMU plugged in?",
         )
 
-    def _slow(self, camera: CameraPlan, said: Said | None, t_ns: int) -> Verdict:
+    def _slow(self, camera: CameraPlan, reports: SlaveReports | None, t_ns: int) -> Verdict:
         """Of what is sent, not of what comes: loss has a code of its own."""
-        heard, rate_hz = self._heard[camera.name], float("nan")
+        received, rate_hz = self._received[camera.name], float("nan")
         if camera.wrist:
-            if said is not None and said.fresh(t_ns) and said.number != heard.report:
-                heard.report = said.number
-                heard.frames.push(said.t_ns, said.counts.get("frames", 0))
-                if heard.settled(t_ns) and heard.frames.full and heard.frames.moved:
-                    rate_hz = heard.frames.grown()[0] / heard.frames.seconds
-        elif heard.settled(t_ns) and heard.messages.full and heard.messages.moved:
-            rate_hz = sum(heard.messages.grown()) / heard.messages.seconds
+            if reports is not None and reports.is_recent(t_ns) and reports.number != received.report:
+                received.report = reports.number
+                received.frames.push(reports.t_ns, reports.counts.get("frames", 0))
+                if received.settled(t_ns) and received.frames.full and received.frames.moved:
+                    rate_hz = received.frames.increase()[0] / received.frames.seconds
+        elif received.settled(t_ns) and received.messages.full and received.messages.moved:
+            rate_hz = sum(received.messages.increase()) / received.messages.seconds
         share = rate_hz / camera.rate_hz
         wrong = beyond(-share, -SLOW, -SLOW_WELL) if share == share else None
         return Verdict(
@@ -207,12 +211,12 @@ class LinkRules:
 
     def _way(self, name: str, sender: SenderNow, t_ns: int) -> Iterator[Verdict]:
         """Loss, and the clock."""
-        heard = self._heard[name]
-        settled = heard.settled(t_ns)
-        clocked = heard.settled(t_ns, CLOCK_SETTLED_NS)
-        came, missed = heard.messages.grown() or (0, 0)
+        received = self._received[name]
+        settled = received.settled(t_ns)
+        clocked = received.settled(t_ns, CLOCK_SETTLED_NS)
+        came, missed = received.messages.increase() or (0, 0)
         share = missed / max(came + missed, 1)
-        lossy = beyond(share, LOSS, LOSS_WELL) if settled and heard.messages.full else None
+        lossy = beyond(share, LOSS, LOSS_WELL) if settled and received.messages.full else None
         if lossy and missed < LOSS_LEAST:
             lossy = None
         yield Verdict(
@@ -224,15 +228,15 @@ class LinkRules:
         )
         sigma = sender.clock_sigma_ns
         if sigma is None:
-            said, wrong = "is not known", clocked or None
+            reports, wrong = "is not known", clocked or None
         else:
-            said = f"is known to {1e-6 * sigma:.1f} ms only"
+            reports = f"is known to {1e-6 * sigma:.1f} ms only"
             wrong = beyond(sigma, CLOCK_NS, CLOCK_WELL_NS) if clocked else None
         yield Verdict(
             "clock_unsynchronised",
             name,
             wrong,
-            f"The clock of {name} against the master's {said}: its times are worth nothing for moving hands.",
+            f"The clock of {name} against the master's {reports}: its times are worth nothing for moving hands.",
             "The network is slow or uneven: use a cable; wait half a minute after it was mended.",
         )
 

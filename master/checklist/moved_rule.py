@@ -33,10 +33,10 @@ class MovedRule:
             self._window.clear()
         out = [counts.get(f"mostly_left_out.{name}"[:_NAME], 0) for name in cameras]
         self._window.push(t_ns, counts.get("poses", 0), counts.get("epipolar_misfits", 0), *out)
-        poses, apart, *left_out = self._window.grown()
+        poses, outliers, *rejected = self._window.increase()
         enough = self._window.full and poses >= LEAST_POSES
         if len(cameras) == 2:
-            share = apart / max(poses * markers, 1)
+            share = outliers / max(poses * markers, 1)
             yield _verdict(
                 cameras,
                 beyond(share, APART, APART_WELL) if enough else None,
@@ -44,7 +44,7 @@ class MovedRule:
                 f" {100.0 * share:.0f} % of the markers miss each other.",
             )
             return
-        for name, number in zip(cameras, left_out, strict=True):
+        for name, number in zip(cameras, rejected, strict=True):
             yield _verdict(
                 (name,),
                 beyond(number / max(poses, 1), MOSTLY, MOSTLY_WELL) if enough else None,

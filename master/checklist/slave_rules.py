@@ -6,7 +6,7 @@ from math import log
 from common.camera_settings import WANTED
 from master.checklist.facts import CameraPlan, Verdict, beyond
 from master.checklist.link_rules import disk_verdict
-from master.checklist.said import Said
+from master.checklist.slave_reports import SlaveReports
 from master.checklist.unseen import UnseenMarkers
 
 # Setting -> relative and absolute distance from which what is read back is another setting. Cameras round exposure to
@@ -22,12 +22,12 @@ BRIGHT, BRIGHT_WELL = (
     1.5,
     1.35,
 )  # against calibration, either way; the slave follows up to 2.5 (docs/light.md)
-TWIN = "twins."  # gauges of the slave: hues between two markers as they are seen,
+DUPLICATE_SENDER = "twins."  # gauges of the slave: hues between two markers as they are seen,
 OVERLAP = "overlap."  # and by which the ranges in use of two markers overlap
 BETWEEN = ".."  # the names of the two
-BESIDE = "beside."  # count: frames in which something beside the hand had the colour of a marker
+AMBIGUOUS = "ambiguous."  # count: frames in which something beside the hand had the colour of a marker
 UNCOLOURED = "uncalibrated."  # count: 1 of a marker without a colour
-BESIDE_SHARE, BESIDE_WELL = 0.5, 0.1  # of the frames
+AMBIGUOUS_SHARE, AMBIGUOUS_WELL = 0.5, 0.1  # of the frames
 HOT_WELL_C = 5.0
 FLAGS = {1: "the supply is too weak", 2: "the clock is capped", 4: "it is throttled", 8: "it is too warm"}
 CYCLE = 3  # frames: ambient, laser, LEDs
@@ -44,44 +44,44 @@ class SlaveRules:
         self._judged = -1
         self._kept: list[Verdict] = []
 
-    def look(self, name: str, said: Said, t_ns: int) -> Iterator[Verdict]:
+    def look(self, name: str, reports: SlaveReports, t_ns: int) -> Iterator[Verdict]:
         """All that its last reports tell; nothing where they are old."""
-        if not said.fresh(t_ns):
+        if not reports.is_recent(t_ns):
             return
-        if said.number != self._judged:
-            self._judged = said.number
-            self._kept = [] if self._camera is None else list(self._of_two(self._camera, said))
+        if reports.number != self._judged:
+            self._judged = reports.number
+            self._kept = [] if self._camera is None else list(self._of_two(self._camera, reports))
         yield from self._kept
         if self._camera is not None:
-            yield from _settings(name, said)
-            yield from _light(name, said)
-            yield from _collisions(self._camera, said)
-            yield from _file(self._camera, said)
-        yield from _machine(name, said)
+            yield from _settings(name, reports)
+            yield from _light(name, reports)
+            yield from _collisions(self._camera, reports)
+            yield from _file(self._camera, reports)
+        yield from _machine(name, reports)
 
-    def _of_two(self, camera: CameraPlan, said: Said) -> Iterator[Verdict]:
+    def _of_two(self, camera: CameraPlan, reports: SlaveReports) -> Iterator[Verdict]:
         """What happened between two reports."""
         for unseen in self._unseen:
-            yield from unseen.push(said)
-        yield from _background(camera, said)
+            yield from unseen.push(reports)
+        yield from _background(camera, reports)
         if camera.wrist:
-            yield from _strobe(camera.name, said)
+            yield from _strobe(camera.name, reports)
 
 
-def _settings(name: str, said: Said) -> Iterator[Verdict]:
+def _settings(name: str, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether the camera has what it was told."""
-    gauges = said.gauges
+    metrics = reports.metrics
     wrong: list[str] = []
     for setting, (share, least) in OFF.items():
-        want, got = gauges.get(WANTED + setting), gauges.get(setting)
+        want, got = metrics.get(WANTED + setting), metrics.get(setting)
         if want is not None and got is not None and abs(got - want) > max(share * want, least):
             wrong.append(f"{setting} is {got:.4g}, not {want:.4g}")
-    if (digital := gauges.get("digital_gain", 1.0)) > DIGITAL:
+    if (digital := metrics.get("digital_gain", 1.0)) > DIGITAL:
         wrong.append(f"digital_gain is {digital:.3g}")
     wrong += [
         f"{auto.removeprefix('auto.')} is on"
-        for auto in sorted(gauges)
-        if auto.startswith("auto.") and gauges[auto]
+        for auto in sorted(metrics)
+        if auto.startswith("auto.") and metrics[auto]
     ]
     yield Verdict(
         "auto_mode",
@@ -93,9 +93,9 @@ def _settings(name: str, said: Said) -> Iterator[Verdict]:
     )
 
 
-def _light(name: str, said: Said) -> Iterator[Verdict]:
+def _light(name: str, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether the picture is as bright as at calibration."""
-    exposure = said.gauges.get("light_exposure")
+    exposure = reports.metrics.get("light_exposure")
     if exposure is None or exposure <= 0.0:
         return
     yield Verdict(
@@ -107,15 +107,15 @@ def _light(name: str, said: Said) -> Iterator[Verdict]:
     )
 
 
-def _collisions(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
+def _collisions(camera: CameraPlan, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether two markers share colours, by their ranges or by their looks."""
     name = camera.name
-    for gauge, hues in said.gauges.items():
-        if gauge.startswith(OVERLAP):
-            pair = tuple(gauge.removeprefix(OVERLAP).split(BETWEEN))
+    for metric, hues in reports.metrics.items():
+        if metric.startswith(OVERLAP):
+            pair = tuple(metric.removeprefix(OVERLAP).split(BETWEEN))
             what = f"the colour ranges of {' and '.join(pair)} overlap by {hues:.0f} hues"
-        elif gauge.startswith(TWIN):
-            pair = tuple(gauge.removeprefix(TWIN).split(BETWEEN))
+        elif metric.startswith(DUPLICATE_SENDER):
+            pair = tuple(metric.removeprefix(DUPLICATE_SENDER).split(BETWEEN))
             what = f"{' and '.join(pair)} look alike, {hues:.0f} hues apart"
         else:
             continue
@@ -132,10 +132,10 @@ def _collisions(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
         )
 
 
-def _file(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
+def _file(camera: CameraPlan, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether the slave has colours, and a file of the same camera as the master's."""
     name = camera.name
-    bare = tuple(marker for marker in camera.markers if UNCOLOURED + marker in said.counts)
+    bare = tuple(marker for marker in camera.markers if UNCOLOURED + marker in reports.counts)
     yield Verdict(
         "calibration_absent",
         name,
@@ -145,7 +145,7 @@ def _file(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
         (name,),
         bare,
     )
-    width, height = said.gauges.get("width_px"), said.gauges.get("height_px")
+    width, height = reports.metrics.get("width_px"), reports.metrics.get("height_px")
     if width is None or height is None:
         return
     yield Verdict(
@@ -158,22 +158,22 @@ def _file(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
     )
 
 
-def _background(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
+def _background(camera: CameraPlan, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether things beside the hand have the colour of a marker."""
-    frames = said.grown("frames")
+    frames = reports.increase("frames")
     if not frames:
         return
     for marker in camera.markers:
-        event = BESIDE + marker
-        if event not in said.counts:
+        event = AMBIGUOUS + marker
+        if event not in reports.counts:
             continue
-        share = (said.grown(event) or 0) / frames
-        u, v = said.gauges.get(f"{event}.u"), said.gauges.get(f"{event}.v")
+        share = (reports.increase(event) or 0) / frames
+        u, v = reports.metrics.get(f"{event}.u"), reports.metrics.get(f"{event}.v")
         where = "" if u is None or v is None else f", near pixel {u:.0f}, {v:.0f}"
         yield Verdict(
             "background_in_range",
             f"{camera.name}.{marker}",
-            beyond(share, BESIDE_SHARE, BESIDE_WELL),
+            beyond(share, AMBIGUOUS_SHARE, AMBIGUOUS_WELL),
             f"Camera {camera.name} sees something else in the colour of marker {marker}{where}.",
             "Take it away or cover it; or paint the marker in another colour.",
             (camera.name,),
@@ -181,9 +181,11 @@ def _background(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
         )
 
 
-def _strobe(name: str, said: Said) -> Iterator[Verdict]:
+def _strobe(name: str, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether laser and LEDs are on in the frames in which they should be."""
-    frames, out, unlit = (said.grown(event) for event in ("frames", "strobe.out_of_step", "strobe.unlit"))
+    frames, out, unlit = (
+        reports.increase(event) for event in ("frames", "strobe.out_of_step", "strobe.unlit")
+    )
     if not frames or out is None:
         return
     cycles = frames / CYCLE
@@ -199,18 +201,18 @@ def _strobe(name: str, said: Said) -> Iterator[Verdict]:
     )
 
 
-def _machine(name: str, said: Said) -> Iterator[Verdict]:
+def _machine(name: str, reports: SlaveReports) -> Iterator[Verdict]:
     """Whether the slave's computer is hot, throttled, or its disk full."""
-    gauges = said.gauges
-    now, limit = gauges.get("temperature_c"), gauges.get("temperature_limit_c")
+    metrics = reports.metrics
+    now, limit = metrics.get("temperature_c"), metrics.get("temperature_limit_c")
     hot: bool | None = False
     why: list[str] = []
     if now is not None and limit is not None:
         hot = beyond(now, limit, limit - HOT_WELL_C)
         why = [f"{now:.0f} °C, {limit:.0f} are its limit"] if now >= limit else []
-    flags = int(gauges.get("throttled", 0.0))
+    flags = int(metrics.get("throttled", 0.0))
     held = [text for bit, text in FLAGS.items() if flags & bit]
-    if now is not None or "throttled" in gauges:
+    if now is not None or "throttled" in metrics:
         yield Verdict(
             "too_hot",
             name,
@@ -218,5 +220,5 @@ def _machine(name: str, said: Said) -> Iterator[Verdict]:
             f"The computer of {name}: {'; '.join(why + held) or 'still warm'}.",
             "Give it air, a heat sink or a fan, and a supply of its own that is strong enough (Pi 5: 5 A).",
         )
-    if (free := gauges.get("disk_free_mb")) is not None:
+    if (free := metrics.get("disk_free_mb")) is not None:
         yield disk_verdict(name, free)

@@ -13,7 +13,7 @@ Only time counts in which at least three others (all, of a hand with fewer) are 
 from collections.abc import Iterator
 
 from master.checklist.facts import Verdict
-from master.checklist.said import Said
+from master.checklist.slave_reports import SlaveReports
 
 CHANGED_S, NEVER_S, GONE_S = 0.9, 5.0, 30.0
 OTHERS = 3
@@ -45,23 +45,23 @@ class UnseenMarkers:
         self._markers = {name: _Marker() for name in markers}
         self._session: int | None = None
 
-    def push(self, said: Said) -> Iterator[Verdict]:
+    def push(self, reports: SlaveReports) -> Iterator[Verdict]:
         """Take the newest report."""
-        if said.session != self._session:
-            self._session = said.session
+        if reports.session != self._session:
+            self._session = reports.session
             self._markers = {name: _Marker() for name in self._markers}
-        frames = said.grown("frames")
+        frames = reports.increase("frames")
         if not frames:
             return
-        share = {name: (said.grown(SEEN + name) or 0) / frames for name in self._markers}
+        share = {name: (reports.increase(SEEN + name) or 0) / frames for name in self._markers}
         needed = min(OTHERS, len(share) - 1)
         for name, one in self._markers.items():
-            if self._recoloured(one, said.gauges.get(COLOUR + name)):
+            if self._recoloured(one, reports.metrics.get(COLOUR + name)):
                 pass  # of the frames of this report some were looked at with the colours of before
             elif share[name]:
                 one.ever, one.without_s = True, 0.0
             elif needed and sum(other >= HALF for key, other in share.items() if key != name) >= needed:
-                one.without_s += said.seconds
+                one.without_s += reports.seconds
             yield Verdict(
                 "marker_unseen",
                 f"{self._camera}.{name}",

@@ -33,7 +33,7 @@ class Window:
         """How far it reaches back [s]."""
         return 1e-9 * (self._looks[-1][0] - self._looks[0][0]) if self._looks else 0.0
 
-    def grown(self) -> tuple[int, ...]:
+    def increase(self) -> tuple[int, ...]:
         """By how much each counter rose in it; () before the first look."""
         if not self._looks:
             return ()

@@ -13,11 +13,11 @@ from fastapi import FastAPI
 from nicegui import ui
 
 from common.errors import PhalanxError
-from master.console.guard import OwnPagesOnly, names_of
 from master.console.login import PasswordHash, kept_password, password_from
 from master.console.login_page import LoginRequired
 from master.console.neighbours import same_user
 from master.console.pages import checklist, gestures, live, outputs, plots, tune
+from master.console.request_filter import OwnPagesOnly, names_of
 from master.console.serving import console_server
 from master.console.setup import page as setup_page
 from master.console.shell import Entry, shell
@@ -75,7 +75,7 @@ def register(state: ConsoleState, logout: bool = False) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Door:
+class LoginPage:
     """What stands before the pages.
 
     Attributes:
@@ -87,7 +87,7 @@ class Door:
     tls: ssl.SSLContext | None = None
 
 
-def door_of(settings: ConsoleSettings, folder: Path, say: Callable[[str], None]) -> Door:
+def login_of(settings: ConsoleSettings, folder: Path, notify: Callable[[str], None]) -> LoginPage:
     """The door of a console: none on this machine alone; elsewhere a password, and TLS unless it is to be open.
 
     Args:
@@ -102,38 +102,38 @@ def door_of(settings: ConsoleSettings, folder: Path, say: Callable[[str], None])
     if settings.password_file is not None:
         password = password_from(settings.password_file)
     else:
-        password = None if here else kept_password(folder, say)
+        password = None if here else kept_password(folder, notify)
     if here:
-        return Door(password)
+        return LoginPage(password)
     if settings.open_links:
-        say(
+        notify(
             "console: WARNING: --open: the page is not encrypted; whoever listens to the network reads the password"
         )
-        return Door(password)
+        return LoginPage(password)
     certificate = page_certificate(folder, settings.host)
-    say(
+    notify(
         "console: the browser asks once whether to trust this page: compare what it shows with SHA-256"
         f" {certificate.fingerprint}"
     )
-    return Door(password, certificate.context)
+    return LoginPage(password, certificate.context)
 
 
-def run_console(settings: ConsoleSettings, stop: threading.Event, say: Callable[[str], None]) -> None:
+def run_console(settings: ConsoleSettings, stop: threading.Event, notify: Callable[[str], None]) -> None:
     """Serve the console until `stop` is set.
 
     Raises:
         PhalanxError: The address cannot be bound, or its password or certificate cannot be used.
     """
-    door = door_of(settings, private_folder(os.environ), say)
+    login = login_of(settings, private_folder(os.environ), notify)
     listening = _listen(settings.host, settings.port)
     host, port = listening.getsockname()[:2]
     state = ConsoleState(settings)
     try:
-        register(state, logout=door.password is not None)
-        server = console_server(console_app(state, settings.host, port, door), door.tls)
+        register(state, logout=login.password is not None)
+        server = console_server(console_app(state, settings.host, port, login), login.tls)
         threading.Thread(target=_end_with, args=(stop, server), name="console stop", daemon=True).start()
-        scheme = "http" if door.tls is None else "https"
-        say("console: " + " ".join(f"{scheme}://{place}:{port}/" for place in places_of(host)))
+        scheme = "http" if login.tls is None else "https"
+        notify("console: " + " ".join(f"{scheme}://{place}:{port}/" for place in places_of(host)))
         server.run(sockets=[listening])
     finally:
         stop.set()
@@ -141,7 +141,7 @@ def run_console(settings: ConsoleSettings, stop: threading.Event, say: Callable[
         listening.close()
 
 
-def console_app(state: ConsoleState, host: str, port: int, door: Door) -> FastAPI:
+def console_app(state: ConsoleState, host: str, port: int, login: LoginPage) -> FastAPI:
     """All that the console serves, behind its guards: own pages only, then the login (or: the same user)."""
     app = FastAPI(openapi_url=None)
     serve_sockets(app, state)
@@ -154,15 +154,15 @@ def console_app(state: ConsoleState, host: str, port: int, door: Door) -> FastAP
         show_welcome_message=False,
         reconnect_timeout=_AWAY_S,
     )
-    if door.password is not None:
+    if login.password is not None:
         app.add_middleware(
             LoginRequired,
-            password=door.password,
+            password=login.password,
             cookie=f"phalanx-{port}",
-            secure=door.tls is not None,
+            secure=login.tls is not None,
             pages=[page.route for page in PAGES],
         )
-    neighbours = same_user if door.password is None else None
+    neighbours = same_user if login.password is None else None
     app.add_middleware(OwnPagesOnly, allowed=names_of(host), same_user=neighbours)  # the outermost
     return app
 

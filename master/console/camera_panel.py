@@ -9,11 +9,11 @@ from nicegui.client import Client
 from common.camera_settings import ROI_LEAST, ROI_MOST
 from common.errors import CalibrationError, PhalanxError
 from master.console.colour_panel import ColourPanel
+from master.console.command_queue import CommandQueue
 from master.console.controls import Setting
 from master.console.elements import CameraView, full_frame_uv
-from master.console.own_copy import update_copy
+from master.console.local_mirror import update_copy
 from master.console.state import ConsoleState
-from master.console.telling import Telling
 from master.console.tuner import GAINS, InUse, Range, colour_body
 
 # Name of the gauge, title, unit, slider from, to, decimals, logarithmic.
@@ -42,7 +42,7 @@ class CameraPanel:
         self._tuner = state.tuner(camera)
         self._client: Client = ui.context.client
         self._now: InUse | None = None
-        self._telling = Telling(self._tuner.set, self._show, self._fail)
+        self._command_queue = CommandQueue(self._tuner.set, self._show, self._fail)
         self._settings: dict[str, Setting] = {}
         with ui.element("div").classes("tune-grid"):
             with (
@@ -84,15 +84,15 @@ class CameraPanel:
         def change(value: float) -> None:
             if name in GAINS:
                 pair = [self._settings[gain].value or 1.0 for gain in GAINS]
-                self._telling.change("colour_gains", pair)
+                self._command_queue.change("colour_gains", pair)
             else:
-                self._telling.change(name, value)
+                self._command_queue.change(name, value)
             self._state_of_file.set_text("not saved")
 
         return change
 
     def _coloured(self, marker: str, colour: Range) -> None:
-        self._telling.change("markers", colour_body(colour), part=marker)
+        self._command_queue.change("markers", colour_body(colour), part=marker)
         self._state_of_file.set_text("not saved")
 
     def _forget(self, marker: str) -> None:

@@ -8,10 +8,10 @@ from nicegui import background_tasks, ui
 
 from common.calibration import FilterCalibration
 from common.errors import PhalanxError
+from master.console.command_queue import CommandQueue
 from master.console.controls import Setting
 from master.console.filter_trial import save_filter, saved_filter, try_filter
 from master.console.state import ConsoleState
-from master.console.telling import Telling
 
 # Name of the key, title, unit, factor to the key's unit, slider from, to, decimals, logarithmic, what it does.
 _PARAMETERS: tuple[tuple[str, str, str, float, float, float, int, bool, str], ...] = (
@@ -74,13 +74,13 @@ def filter_panel(state: ConsoleState, rig: str) -> None:
     def tell(change: Mapping[str, object]) -> None:
         try_filter(state.link.ask, rig, values())
 
-    telling: Telling[None] = Telling(tell, tried, fail)
+    command_queue: CommandQueue[None] = CommandQueue(tell, tried, fail)
 
     def show(now: FilterCalibration) -> None:
         for name, _, _, factor, *_ in _PARAMETERS:
             settings[name].show(float(msgspec.structs.asdict(now)[name]) / factor)
 
-    def do(step: Callable[[], None], said: str) -> None:
+    def do(step: Callable[[], None], text: str) -> None:
         async def work() -> None:
             try:
                 await asyncio.to_thread(step)
@@ -90,7 +90,7 @@ def filter_panel(state: ConsoleState, rig: str) -> None:
                 return
             show(now)
             error.set_visibility(False)
-            status.set_text(said)
+            status.set_text(text)
 
         background_tasks.create(work(), name=f"filter {rig}")
 
@@ -101,7 +101,13 @@ def filter_panel(state: ConsoleState, rig: str) -> None:
         ).classes("soft")
         for name, title, unit, _, low, high, digits, log, does in _PARAMETERS:
             settings[name] = Setting(
-                title, unit, low, high, lambda _value: telling.change("filter", True), digits=digits, log=log
+                title,
+                unit,
+                low,
+                high,
+                lambda _value: command_queue.change("filter", True),
+                digits=digits,
+                log=log,
             )
             ui.label(does).classes("soft setting-hint")
         error = ui.label("").classes("problem").props('role="alert"')

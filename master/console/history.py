@@ -74,12 +74,12 @@ class History:
             name = count.removesuffix(_RECEIVED)
             if name == count:
                 continue
-            out[f"lost_per_s.{name}"] = self._grown(report, f"{name}.lost")
-            if _CAMERA_HZ + name in report.gauges:
-                out[f"rate_hz.{name}"] = self._grown(report, count)
+            out[f"lost_per_s.{name}"] = self._increase(report, f"{name}.lost")
+            if _CAMERA_HZ + name in report.metrics:
+                out[f"rate_hz.{name}"] = self._increase(report, count)
         return {name: rate for name, rate in out.items() if not math.isnan(rate)}
 
-    def _grown(self, report: Health, name: str) -> float:
+    def _increase(self, report: Health, name: str) -> float:
         """What a count grew by per second, between two reports; NaN: not known yet."""
         now = report.counts.get(name, 0)
         then_ns, then, rate = self._counts.get(name, (report.t_ns, now, math.nan))
@@ -95,7 +95,7 @@ class History:
 
 def _of_master(report: Health) -> dict[str, float]:
     out: dict[str, float] = {}
-    for name, value in report.gauges.items():
+    for name, value in report.metrics.items():
         for suffix, (quantity, factor) in _CLOCK.items():
             if name.endswith(suffix):
                 out[f"{quantity}.{name.removesuffix(suffix)}"] = factor * value
@@ -103,5 +103,5 @@ def _of_master(report: Health) -> dict[str, float]:
 
 
 def _of_sender(source: str, report: Health) -> dict[str, float]:
-    hot = [value for name, value in report.gauges.items() if "celsius" in name]
+    hot = [value for name, value in report.metrics.items() if "celsius" in name]
     return {f"celsius.{source}": max(hot)} if hot else {}

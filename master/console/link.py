@@ -8,8 +8,8 @@ from common.bus import Bus, Subscription
 from common.errors import BusError
 from common.messages import Command, Health, Message
 
-LOOK_S = 0.5  # between two looks at who is alive
-GONE_LOOKS = 4  # so often nobody was alive: the connection is made anew
+POLL_S = 0.5  # between two looks at who is alive
+MISSED_POLLS = 4  # so often nobody was alive: the connection is made anew
 ANSWER_S = 20.0  # a slow camera shows its new settings after some seconds
 _DEPTH = 64
 _READ_S = 0.2
@@ -73,15 +73,15 @@ class Link:
                 bus = self._open_bus()
             except BusError as error:
                 self._reason = str(error)
-                self._closing.wait(LOOK_S)
+                self._closing.wait(POLL_S)
                 continue
             try:
-                self._stay(bus)
+                self._wait(bus)
             finally:
                 self._bus, self._alive = None, frozenset()
                 bus.close()
 
-    def _stay(self, bus: Bus) -> None:
+    def _wait(self, bus: Bus) -> None:
         """Read and look around until the others are gone or the console ends."""
         ended = threading.Event()
         inboxes = {stream: bus.subscribe(stream, depth=_DEPTH) for stream in self._take}
@@ -95,10 +95,10 @@ class Link:
         self._bus = bus
         empty = 0
         try:
-            while empty < GONE_LOOKS and not self._closing.is_set():
+            while empty < MISSED_POLLS and not self._closing.is_set():
                 self._alive = bus.alive()
                 empty = 0 if self._alive else empty + 1
-                self._closing.wait(LOOK_S)
+                self._closing.wait(POLL_S)
             self._reason = "the master is gone"
         except BusError as error:
             self._reason = str(error)

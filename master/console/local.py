@@ -1,6 +1,6 @@
 """Processes of this machine that the console starts by command line: cameras, a master, calibrations. They end with it.
 
-Each runs in a process group of its own; its lines are read on a thread. A `warden` process holds the list of groups and
+Each runs in a process group of its own; a thread reads its lines. A `supervisor` process holds the groups and
 ends them when the console is gone, so that a console that was killed leaves no camera busy.
 """
 
@@ -16,7 +16,7 @@ from contextlib import suppress
 from typing import IO, TypeVar
 
 from common.errors import PhalanxError
-from master.console.warden import ENDS_S
+from master.console.process_supervisor import ENDS_S
 
 TAIL = 200
 T = TypeVar("T")
@@ -138,8 +138,8 @@ class LocalProcesses:
         self._all: dict[str, LocalProcess] = {}
         self._shared: dict[type, object] = {}
         try:
-            self._warden = subprocess.Popen(
-                [sys.executable, "-m", "master.console.warden"],
+            self._supervisor = subprocess.Popen(
+                [sys.executable, "-m", "master.console.process_supervisor"],
                 stdin=subprocess.PIPE,
                 text=True,
                 start_new_session=True,
@@ -196,16 +196,16 @@ class LocalProcesses:
             thread.join(ENDS_S + _KILLED_S)
         for one in running:
             self._tell(f"-{one.pid}")
-        if self._warden.stdin is not None and not self._warden.stdin.closed:
-            self._warden.stdin.close()
+        if self._supervisor.stdin is not None and not self._supervisor.stdin.closed:
+            self._supervisor.stdin.close()
         try:
-            self._warden.wait(ENDS_S + _KILLED_S)
+            self._supervisor.wait(ENDS_S + _KILLED_S)
         except subprocess.TimeoutExpired:
-            self._warden.kill()
-            self._warden.wait(_KILLED_S)
+            self._supervisor.kill()
+            self._supervisor.wait(_KILLED_S)
 
     def _tell(self, line: str) -> None:
-        pipe = self._warden.stdin
+        pipe = self._supervisor.stdin
         if pipe is None or pipe.closed:
             return
         try:

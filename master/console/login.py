@@ -86,7 +86,7 @@ def password_from(file: Path) -> PasswordHash:
     return PasswordHash.of(password)
 
 
-def kept_password(folder: Path, say: Callable[[str], None]) -> PasswordHash:
+def kept_password(folder: Path, notify: Callable[[str], None]) -> PasswordHash:
     """Of the password whose hash is kept in a folder; at the first start it is made, and said this once.
 
     Raises:
@@ -94,14 +94,14 @@ def kept_password(folder: Path, say: Callable[[str], None]) -> PasswordHash:
     """
     path = folder / HASH_FILE
     if path.exists():
-        say(
+        notify(
             f"console: the password is the one that was said when {path} was made; forgotten: delete that file"
         )
         return PasswordHash.parse(_text(path), str(path))
     password = new_password()
     kept = PasswordHash.of(password)
     write_private(path, kept.text().encode())
-    say(f"console: the password is {password}   (said only now; its hash is kept in {path})")
+    notify(f"console: the password is {password}   (said only now; its hash is kept in {path})")
     return kept
 
 

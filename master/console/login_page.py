@@ -74,12 +74,12 @@ class LoginRequired:
             else:
                 await self._socket(session, scope, receive, send)
         elif scope["path"] in (LOGIN, LOGOUT) or session is None:
-            answer = await self._door(Request(scope, receive), token, session)
+            answer = await self._login(Request(scope, receive), token, session)
             await answer(scope, receive, send)
         else:
             await self._app(scope, receive, send)
 
-    async def _door(self, request: Request, token: str, session: Session | None) -> Response:
+    async def _login(self, request: Request, token: str, session: Session | None) -> Response:
         path, method = request.url.path, request.method
         if path == LOGIN and method == "POST":
             return await self._try(request)
@@ -135,14 +135,14 @@ class LoginRequired:
         ended = asyncio.ensure_future(_end(session, self._clock()))
 
         async def receive_or_end() -> Message:
-            hearing = asyncio.ensure_future(receive())
+            receiving = asyncio.ensure_future(receive())
             try:
-                await asyncio.wait((hearing, ended), return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait((receiving, ended), return_when=asyncio.FIRST_COMPLETED)
                 if ended.done():
                     return {"type": "websocket.disconnect", "code": 1008}
-                return hearing.result()
+                return receiving.result()
             finally:
-                hearing.cancel()
+                receiving.cancel()
 
         try:
             await self._app(scope, receive_or_end, send)

@@ -65,7 +65,7 @@ def output_panel(state: ConsoleState) -> None:
         rows = {name: _row(name, settings, change) for name in OUTPUTS}
         start = ui.button("Start sending", icon="play_arrow").props("outline").classes("q-mt-sm")
         start.on_click(begin)
-        said = ui.label("").classes("mono").props('role="log" aria-label="What the sending process says"')
+        log = ui.label("").classes("mono").props('role="log" aria-label="What the sending process says"')
 
     def update() -> None:
         report = state.health.get(NAME)
@@ -77,7 +77,7 @@ def output_panel(state: ConsoleState) -> None:
         start.set_visibility(idle)
         process = state.local.get(PROCESS)
         if process is not None:
-            said.set_text("\n".join(process.tail(4)))
+            log.set_text("\n".join(process.tail(4)))
 
     update()
     ui.timer(_UPDATE_S, update)
@@ -85,10 +85,10 @@ def output_panel(state: ConsoleState) -> None:
 
 def status_words(name: str, report: Health | None) -> str:
     """How an output does, by the report of the sending process."""
-    if report is None or not report.gauges.get(f"on.{name}"):
+    if report is None or not report.metrics.get(f"on.{name}"):
         return ""
     sent, failed, dropped = (report.counts.get(f"{what}.{name}", 0) for what in ("sent", "failed", "dropped"))
-    words = f"{'open' if report.gauges.get(f'open.{name}') else 'not open'}, {sent} sent"
+    words = f"{'open' if report.metrics.get(f'open.{name}') else 'not open'}, {sent} sent"
     return words + (f", {failed} failed" if failed else "") + (f", {dropped} dropped" if dropped else "")
 
 

@@ -11,7 +11,7 @@ from common.errors import CalibrationError
 from common.messages import Preview
 from common.picture_size import Size, jpeg_size
 
-_LOOK_S = 2.0  # a camera file is not read more often
+_POLL_S = 2.0  # a camera file is not read more often
 _MOST = 64  # cameras: a bus on which names are invented costs no memory
 
 
@@ -51,8 +51,8 @@ class PictureSizes:
         return self._refused.get(camera, "")
 
     def _size(self, name: str) -> Size | None:
-        read_s, size = self._known.get(name, (-_LOOK_S, None))
-        if time.monotonic() - read_s < _LOOK_S:
+        read_s, size = self._known.get(name, (-_POLL_S, None))
+        if time.monotonic() - read_s < _POLL_S:
             return size
         try:
             file = self._camera(name)

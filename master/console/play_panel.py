@@ -13,9 +13,9 @@ from nicegui.events import GenericEventArguments
 from common.errors import PhalanxError
 from common.messages import Command, Health
 from common.streams import MASTER
+from master.console.command_queue import CommandQueue
 from master.console.recording_panel import recordings_folder
 from master.console.state import ConsoleState
-from master.console.telling import Telling
 
 PROCESS = "play"
 _UPDATE_S = 0.5
@@ -55,9 +55,9 @@ def start_playing(state: ConsoleState, name: str) -> None:
 class Controls:
     """Pause, position and speed of whichever player is on the bus. Holds what the page shows of it."""
 
-    def __init__(self, state: ConsoleState, say: Callable[[str], object]) -> None:
-        """Build them in the present slot; `say` is told why a command was refused, or nothing."""
-        self._state, self._say = state, say
+    def __init__(self, state: ConsoleState, notify: Callable[[str], object]) -> None:
+        """Build them in the present slot; `notify` is told why a command was refused, or nothing."""
+        self._state, self._notify = state, notify
         self._answer: Health | None = None
         self._at, self._speed, self._paused = 0.0, 1.0, False
         self._wanted_s: float | None = None
@@ -70,8 +70,8 @@ class Controls:
                 self._words = ui.label("").classes("mono play-at")
             self._speeds = ui.select(_SPEEDS, value=1.0, label="Speed").props("dense outlined")
             self._speeds.classes("known-poses")
-        self._telling = Telling(self._tell, self._told, say)
-        self._pause.on_click(lambda: self._telling.change("resume" if self._paused else "pause", None))
+        self._command_queue = CommandQueue(self._tell, self._told, notify)
+        self._pause.on_click(lambda: self._command_queue.change("resume" if self._paused else "pause", None))
         self._slider.on_value_change(self._dragged)
         self._slider.on("change", self._sought)  # when it is let go, or its key
         self._speeds.on_value_change(self._sped)
@@ -79,9 +79,9 @@ class Controls:
     def update(self) -> None:
         """Show what the player said last."""
         now = self._newest()
-        position = None if now is None else now.gauges.get("play.position_s")
+        position = None if now is None else now.metrics.get("play.position_s")
         self._all.set_visibility(position is not None)
-        if now is None or position is None or self._telling.busy:
+        if now is None or position is None or self._command_queue.busy:
             return
         if self._wanted_s is not None:
             there = abs(position - self._wanted_s) < _NEAR_S
@@ -89,9 +89,9 @@ class Controls:
             if left_s > (_JUMP_S - _REST_S if there else 0.0):
                 return  # still being moved by hand, or on its way
             self._wanted_s = None
-        length = now.gauges.get("play.length_s", 0.0)
-        self._paused, self._at = bool(now.gauges.get("play.paused")), round(position, 1)
-        self._speed = now.gauges.get("play.speed", 1.0)
+        length = now.metrics.get("play.length_s", 0.0)
+        self._paused, self._at = bool(now.metrics.get("play.paused")), round(position, 1)
+        self._speed = now.metrics.get("play.speed", 1.0)
         self._slider.props(f"max={max(length, 0.1):.1f}")
         self._slider.set_value(self._at)
         self._words.set_text(f"{position:.1f} of {length:.1f} s")
@@ -115,7 +115,7 @@ class Controls:
 
     def _told(self, answer: Health | None) -> None:
         self._answer = answer
-        self._say("")
+        self._notify("")
 
     def _dragged(self) -> None:
         value = self._slider.value
@@ -126,13 +126,13 @@ class Controls:
     def _sought(self, event: GenericEventArguments) -> None:
         """The event has the value: `value` follows a moment later while a hand is quick."""
         self._wanted_s, self._until_s = float(cast(float, event.args)), time.monotonic() + _JUMP_S
-        self._telling.change("seek", {"t_s": round(self._wanted_s, 1)})
+        self._command_queue.change("seek", {"t_s": round(self._wanted_s, 1)})
 
     def _sped(self) -> None:
         factor = float(self._speeds.value or 0.0)
         if factor != self._speed:
             self._speed = factor
-            self._telling.change("speed", {"factor": factor})
+            self._command_queue.change("speed", {"factor": factor})
 
 
 def play_panel(state: ConsoleState) -> None:
@@ -145,7 +145,7 @@ def play_panel(state: ConsoleState) -> None:
             play = ui.button("Play", icon="play_circle").props("unelevated")
         error = ui.label("").classes("problem").props('role="alert"')
         controls = Controls(state, error.set_text)
-        said = ui.label("").classes("mono").props('role="log" aria-label="What the player says"')
+        log = ui.label("").classes("mono").props('role="log" aria-label="What the player says"')
 
     async def toggle() -> None:
         error.set_text("")
@@ -171,7 +171,7 @@ def play_panel(state: ConsoleState) -> None:
             which.set_options(names, value=which.value if which.value in names else None)
         controls.update()
         process = state.local.get(PROCESS)
-        said.set_text("" if process is None else "\n".join(process.tail(3)) or "starting …" * running)
+        log.set_text("" if process is None else "\n".join(process.tail(3)) or "starting …" * running)
 
     update()
     ui.timer(_UPDATE_S, update)

@@ -58,9 +58,9 @@ def progress_words(report: Health | None) -> str:
     """How far the recorder is, by its report."""
     if report is None:
         return ""
-    gauges = report.gauges
-    seconds, size = gauges.get("recorder.seconds", 0.0), gauges.get("recorder.megabytes", 0.0)
-    words = f"{seconds:.0f} s, {size:.1f} MB, {gauges.get('recorder.free_gb', 0.0):.0f} GB free"
+    metrics = report.metrics
+    seconds, size = metrics.get("recorder.seconds", 0.0), metrics.get("recorder.megabytes", 0.0)
+    words = f"{seconds:.0f} s, {size:.1f} MB, {metrics.get('recorder.free_gb', 0.0):.0f} GB free"
     lost = report.counts.get("lost", 0) + report.counts.get("dropped", 0)
     return words + (f", {lost} lost" if lost else ", nothing lost")
 

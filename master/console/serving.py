@@ -47,8 +47,8 @@ class BoundedHttp(HttpToolsProtocol):
         if not self._in_head and getattr(self.cycle, "response_complete", True):
             self._await_head()
         if self._in_head:  # what comes behind the head, together with it, counts as none of it
-            room = MOST_HEAD_BYTES - self._head_bytes
-            head, data = data[:room], data[room:]
+            capacity = MOST_HEAD_BYTES - self._head_bytes
+            head, data = data[:capacity], data[capacity:]
             self._head_bytes += len(head)
             super().data_received(head)
             if not data or self.transport.is_closing():

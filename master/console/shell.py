@@ -118,14 +118,14 @@ def _theme() -> None:
     dark = ui.dark_mode(_THEMES[now])
     names = list(_THEMES)
 
-    def turn() -> None:
+    def next_theme() -> None:
         nonlocal now
         now = names[(names.index(now) + 1) % len(names)]
         dark.set_value(_THEMES[now])
         ui.run_javascript(f'document.cookie = "theme={now}; path=/; max-age=31536000; samesite=strict"')
         show()
 
-    button = ui.button(on_click=turn).props("flat round dense color=inherit").classes("console-theme")
+    button = ui.button(on_click=next_theme).props("flat round dense color=inherit").classes("console-theme")
     with button:
         hint = ui.tooltip("")
 

@@ -19,7 +19,7 @@ from master.console.state import ConsoleState
 from master.web import object_json, static_dir, three_js_path, webxr_json
 
 _POLL_S = 0.03
-_LOOK_S = 1.0
+_RENEW_S = 1.0
 _MOST_CHARACTERS = 8192
 _NOT_OURS = 4004
 _TIME = struct.Struct(">q")  # before each picture: when it was taken [ns]
@@ -39,7 +39,7 @@ class Shown:
         self.ready = True
         self.mask: tuple[str, ...] = ()
 
-    def hear(self, text: str) -> None:
+    def on_text(self, text: str) -> None:
         """Take one message of the page; what is none of ours is left alone."""
         if text == "next":
             self.ready = True
@@ -84,7 +84,7 @@ async def _page(socket: WebSocket) -> AsyncGenerator[Shown]:
     async def listen() -> None:
         try:
             while True:
-                shown.hear(await socket.receive_text())
+                shown.on_text(await socket.receive_text())
         except (WebSocketDisconnect, RuntimeError, KeyError):
             if sending is not None:
                 sending.cancel()
@@ -104,7 +104,7 @@ async def _send_pictures(socket: WebSocket, state: ConsoleState, camera: str, sh
     asked = shown.mask
     while True:
         if loop.time() >= look_at or shown.mask != asked:
-            asked, look_at = shown.mask, loop.time() + _LOOK_S
+            asked, look_at = shown.mask, loop.time() + _RENEW_S
             state.look(camera, shown.mask)
         picture = state.preview(camera)
         if picture is None:

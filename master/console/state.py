@@ -22,12 +22,12 @@ from common.messages import (
     Preview,
 )
 from common.streams import MASTER
-from master.console.gestures_heard import GesturesHeard
 from master.console.history import STEP_S, History
 from master.console.link import Link
 from master.console.local import LocalProcesses
-from master.console.looking import Looking
 from master.console.picture_sizes import PictureSizes
+from master.console.preview_leases import PreviewLeases
+from master.console.received_gestures import ReceivedGestures
 from master.console.tuner import Tuner
 from master.master_bus import join_bus
 from master.options import HERE_BEACON, HERE_BIND, HERE_BUS
@@ -71,22 +71,26 @@ class Newest(Generic[MessageT]):
 
     def __init__(self) -> None:
         """Nothing was heard."""
-        self._heard: dict[str, tuple[float, MessageT]] = {}
+        self._received: dict[str, tuple[float, MessageT]] = {}
 
     def put(self, name: str, message: MessageT) -> None:
         """Hear one."""
-        if name in self._heard or len(self._heard) < MAX_NAMES:
-            self._heard[name] = (time.monotonic(), message)
+        if name in self._received or len(self._received) < MAX_NAMES:
+            self._received[name] = (time.monotonic(), message)
 
     def get(self, name: str, within_s: float = STALE_S) -> MessageT | None:
         """The newest of one sender, unless it is older than `within_s`."""
-        heard_s, message = self._heard.get(name, (-within_s, None))
-        return message if time.monotonic() - heard_s < within_s else None
+        received_s, message = self._received.get(name, (-within_s, None))
+        return message if time.monotonic() - received_s < within_s else None
 
     def present(self, within_s: float = STALE_S) -> dict[str, MessageT]:
         """The newest of all that were heard of late."""
         now_s = time.monotonic()
-        return {name: one for name, (heard_s, one) in list(self._heard.items()) if now_s - heard_s < within_s}
+        return {
+            name: one
+            for name, (received_s, one) in list(self._received.items())
+            if now_s - received_s < within_s
+        }
 
 
 class ConsoleState:
@@ -101,7 +105,7 @@ class ConsoleState:
         """
         self.settings = settings
         self.history = History()
-        self.gestures_heard = GesturesHeard()
+        self.received_gestures = ReceivedGestures()
         self.local = LocalProcesses()
         self._poses, self._health = Newest[HandPose](), Newest[Health]()
         self._objects, self._contacts = Newest[ObjectPose](), Newest[Contact]()
@@ -110,7 +114,7 @@ class ConsoleState:
         self._closing = threading.Event()
         self._sizes = PictureSizes(self.camera)
         self.link = Link(open_bus or (lambda: join_bus(settings.bus)), _takers(self))
-        self._looking = Looking(self.link.ask)
+        self._preview_leases = PreviewLeases(self.link.ask)
         self._tuners: dict[str, Tuner] = {}
         self._sampler = threading.Thread(target=self._sample, name="console history", daemon=True)
         self._sampler.start()
@@ -148,7 +152,7 @@ class ConsoleState:
     @property
     def gestures(self) -> dict[tuple[str, str], Gesture]:
         """(hand, kind) -> the gesture that lasts now."""
-        return self.gestures_heard.lasting()
+        return self.received_gestures.held()
 
     def preview(self, camera: str) -> Preview | None:
         """The newest picture of a camera, unless it is older than 3 s."""
@@ -156,11 +160,11 @@ class ConsoleState:
 
     def look(self, camera: str, mask: tuple[str, ...] = ()) -> None:
         """A page shows this camera for the next 3 s, with the pixels of these markers tinted. Never waits."""
-        self._looking.look(camera, mask)
+        self._preview_leases.look(camera, mask)
 
     def preview_error(self, camera: str) -> str:
         """Why there is no picture of a camera that somebody looks at; empty while it answers."""
-        return self._sizes.error(camera) or self._looking.error(camera)
+        return self._sizes.error(camera) or self._preview_leases.error(camera)
 
     def tuner(self, camera: str) -> Tuner:
         """What tunes a camera, the same for every page: all revert to what it was before the first change."""
@@ -211,7 +215,7 @@ class ConsoleState:
         self.link.close()
         self._sampler.join()
 
-    def hear(self, message: Message) -> None:
+    def on_message(self, message: Message) -> None:
         """Take one message from the bus; from any thread."""
         match message:
             case HandPose():
@@ -224,7 +228,7 @@ class ConsoleState:
             case Contact():
                 self._contacts.put(f"{message.hand}/{message.object}", message)
             case Gesture():
-                self.gestures_heard.push(message, time.monotonic())
+                self.received_gestures.push(message, time.monotonic())
             case Preview():
                 if self._sizes.fits(message):
                     self._previews.put(message.camera, message)
@@ -243,4 +247,4 @@ _STREAMS = ("hand", "object", "contact", "gesture", "health", "checklist", "prev
 
 
 def _takers(state: ConsoleState) -> dict[str, Callable[[Message], None]]:
-    return dict.fromkeys(_STREAMS, state.hear)
+    return dict.fromkeys(_STREAMS, state.on_message)

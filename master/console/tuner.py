@@ -46,14 +46,14 @@ class InUse:
     def of(cls, health: Health) -> "InUse":
         """Read an answer."""
         names = (*PLAIN, *GAINS)
-        gauges = health.gauges
-        read = {name: gauges[name] for name in names if name in gauges}
-        wanted = {name: gauges.get(WANTED + name, gauges.get(name, nan)) for name in names}
+        metrics = health.metrics
+        read = {name: metrics[name] for name in names if name in metrics}
+        wanted = {name: metrics.get(WANTED + name, metrics.get(name, nan)) for name in names}
         markers: dict[str, Range] = {}
-        for gauge in gauges:
-            name = gauge.removeprefix(MARKER).removesuffix(".h_low")
-            if gauge == f"{MARKER}{name}.h_low":
-                markers[name] = _range(gauges, name)
+        for metric in metrics:
+            name = metric.removeprefix(MARKER).removesuffix(".h_low")
+            if metric == f"{MARKER}{name}.h_low":
+                markers[name] = _range(metrics, name)
         known = {name: value for name, value in wanted.items() if value == value}
         return cls(known, read, markers)
 
@@ -140,9 +140,9 @@ class Tuner:
         return InUse.of(self._ask(Command(self.camera, verb, body)))
 
 
-def _range(gauges: Mapping[str, float], name: str) -> Range:
+def _range(metrics: Mapping[str, float], name: str) -> Range:
     low, high = (
-        tuple(round(gauges.get(f"{MARKER}{name}.{channel}_{end}", 0.0)) for channel in _CHANNELS)
+        tuple(round(metrics.get(f"{MARKER}{name}.{channel}_{end}", 0.0)) for channel in _CHANNELS)
         for end in ("low", "high")
     )
     return Range((low[0], low[1], low[2]), (high[0], high[1], high[2]))

@@ -23,7 +23,7 @@ from math import sqrt
 
 from common.arrays import Bool, Float
 from common.kernels import constant, inlined, inner
-from master.estimator.certainty import MOST_TURNS, Certainty, joint_slopes
+from master.estimator.certainty import MOST_ROTATIONS, Certainty, joint_slopes
 from master.estimator.hand_tables import HandTables
 from master.estimator.kinematics import PLACE, Scratch, finger_slopes, marker_point, palm_slopes
 from master.estimator.matrices import cholesky, eigen
@@ -34,16 +34,16 @@ _NONE = constant(0)
 
 
 @inner
-def _turns(settings: Settings, cov: Float, room: Certainty) -> int:
+def _rotation_columns(settings: Settings, cov: Float, scratch: Certainty) -> int:
     """Write the turns that are not straight, as columns of a pivoted Cholesky factor; return how many.
 
-    One that is less sure than `turns_most_rad` leads nowhere farther.
+    One that is less sure than `rotation_most_rad` leads nowhere farther.
     """
-    N, left = cov.shape[0], room.left
+    N, left = cov.shape[0], scratch.left
     for i in range(N):
         left[i] = 0.0 if 3 <= i < 6 else cov[i, i]
     count = 0
-    while count < MOST_TURNS:
+    while count < MOST_ROTATIONS:
         pivot = 0
         for i in range(3):
             if left[i] > left[pivot]:
@@ -58,27 +58,27 @@ def _turns(settings: Settings, cov: Float, room: Certainty) -> int:
         for i in range(N):
             value = 0.0 if 3 <= i < 6 else cov[i, pivot]
             for k in range(count):
-                value -= room.turns[k, i] * room.turns[k, pivot]
+                value -= scratch.rotations[k, i] * scratch.rotations[k, pivot]
             value = 0.0 if 3 <= i < 6 else value / root
-            room.turns[count, i] = value
+            scratch.rotations[count, i] = value
             squared += value * value
             left[i] = max(left[i] - value * value, 0.0)
         left[pivot] = 0.0
-        most = settings.turns_most_rad
-        room.values[count] = min(most / sqrt(squared), 1.0)
+        most = settings.rotation_most_rad
+        scratch.values[count] = min(most / sqrt(squared), 1.0)
         count += 1
     return count
 
 
 @inner
-def _bone_turns(hand: HandTables, T: Float, count: int, work: Scratch, room: Certainty) -> None:
+def _bone_rotations(hand: HandTables, T: Float, count: int, work: Scratch, scratch: Certainty) -> None:
     """Write how each turn turns each bone (5, 4, K, 3): the palm, and the axes of the joints before it."""
     for f in range(5):
         columns = hand.first[f + 1] - hand.first[f]
         for k in range(count):
-            scale = room.values[k]
+            scale = scratch.values[k]
             for i in range(3):
-                room.w[f, 0, k, i] = scale * room.turns[k, i]
+                scratch.w[f, 0, k, i] = scale * scratch.rotations[k, i]
         for axis in range(4):
             ax, ay, az = -work.R[f, max(axis - 1, 0), 0, 0], -work.R[f, max(axis - 1, 0), 1, 0], 0.0
             az = -work.R[f, max(axis - 1, 0), 2, 0]
@@ -93,14 +93,14 @@ def _bone_turns(hand: HandTables, T: Float, count: int, work: Scratch, room: Cer
             for k in range(count):
                 rate = 0.0
                 for c in range(columns):
-                    rate += work.by[4 * f + axis, c] * room.turns[k, 6 + hand.first[f] + c]
-                rate *= room.values[k]
+                    rate += work.by[4 * f + axis, c] * scratch.rotations[k, 6 + hand.first[f] + c]
+                rate *= scratch.values[k]
                 for i in range(3):
                     if axis != 1:
-                        room.w[f, bone, k, i] = room.w[f, before, k, i]
-                room.w[f, bone, k, 0] += rate * ax
-                room.w[f, bone, k, 1] += rate * ay
-                room.w[f, bone, k, 2] += rate * az
+                        scratch.w[f, bone, k, i] = scratch.w[f, before, k, i]
+                scratch.w[f, bone, k, 0] += rate * ax
+                scratch.w[f, bone, k, 1] += rate * ay
+                scratch.w[f, bone, k, 2] += rate * az
 
 
 @inlined
@@ -114,9 +114,11 @@ def _arc(one: Float, other: Float, bx: float, by: float, bz: float, i: int) -> f
 
 
 @inner
-def _arcs(rig: Rig, T: Float, seen: Bool, k: int, m: int, pair: int, work: Scratch, room: Certainty) -> None:
+def _arcs(
+    rig: Rig, T: Float, seen: Bool, k: int, m: int, pair: int, work: Scratch, scratch: Certainty
+) -> None:
     """Write the arcs of joints and markers by turns k and m: room.joint, room.marker (not yet whitened)."""
-    hand, mounts, w = rig.hand, rig.mounts, room.w
+    hand, mounts, w = rig.hand, rig.mounts, scratch.w
     for joint in range(26):
         if hand.finger[joint] >= 0:
             continue
@@ -126,7 +128,7 @@ def _arcs(rig: Rig, T: Float, seen: Bool, k: int, m: int, pair: int, work: Scrat
             by += T[1, j] * hand.rest_m[joint, j]
             bz += T[2, j] * hand.rest_m[joint, j]
         for i in range(3):
-            room.joint[pair, joint, i] = _arc(w[0, 0, k], w[0, 0, m], bx, by, bz, i)
+            scratch.joint[pair, joint, i] = _arc(w[0, 0, k], w[0, 0, m], bx, by, bz, i)
     for joint in range(26):
         f, level = hand.finger[joint], hand.level[joint]
         if f < 0:
@@ -141,8 +143,10 @@ def _arcs(rig: Rig, T: Float, seen: Bool, k: int, m: int, pair: int, work: Scrat
         else:
             bx, by, bz = bx - T[0, 3], by - T[1, 3], bz - T[2, 3]
         for i in range(3):
-            bent = _arc(w[f, level, k], w[f, level, m], bx, by, bz, i)
-            room.joint[pair, joint, i] = bent + (room.joint[pair, joint - 1, i] if level > 0 else 0.0)
+            second_derivative = _arc(w[f, level, k], w[f, level, m], bx, by, bz, i)
+            scratch.joint[pair, joint, i] = second_derivative + (
+                scratch.joint[pair, joint - 1, i] if level > 0 else 0.0
+            )
     for marker in range(mounts.finger.shape[0]):
         if not seen[marker]:
             continue
@@ -158,11 +162,11 @@ def _arcs(rig: Rig, T: Float, seen: Bool, k: int, m: int, pair: int, work: Scrat
             )
         for i in range(3):
             if f < 0:
-                room.marker[pair, 3 * marker + i] = _arc(w[0, 0, k], w[0, 0, m], bx, by, bz, i)
+                scratch.marker[pair, 3 * marker + i] = _arc(w[0, 0, k], w[0, 0, m], bx, by, bz, i)
             else:
-                carried = room.joint[pair, room.joint_of[f, level], i]
-                bent = _arc(w[f, bone, k], w[f, bone, m], bx, by, bz, i)
-                room.marker[pair, 3 * marker + i] = carried + bent
+                carried = scratch.joint[pair, scratch.joint_of[f, level], i]
+                second_derivative = _arc(w[f, bone, k], w[f, bone, m], bx, by, bz, i)
+                scratch.marker[pair, 3 * marker + i] = carried + second_derivative
 
 
 @inner
@@ -184,7 +188,14 @@ def _whiten(information: Float, white: Float) -> None:
 
 @inner
 def _gain(
-    rig: Rig, T: Float, cov: Float, seen: Bool, information: Float, pairs: int, work: Scratch, room: Certainty
+    rig: Rig,
+    T: Float,
+    cov: Float,
+    seen: Bool,
+    information: Float,
+    pairs: int,
+    work: Scratch,
+    scratch: Certainty,
 ) -> int:
     """Write the answer of the fit to moved markers (N, K), and whiten the markers' arcs; return K."""
     hand, mounts, N, K = rig.hand, rig.mounts, cov.shape[0], 0
@@ -195,64 +206,64 @@ def _gain(
         marker_point(mounts, m, T, work.R, work.P, work.point)
         for i in range(3):
             work.arm[i] = work.point[i] - T[i, 3]
-        palm_slopes(work.arm, room.J)
+        palm_slopes(work.arm, scratch.J)
         size, start = 6, 0
         if f >= 0:
             start, size = hand.first[f], 6 + hand.first[f + 1] - hand.first[f]
-            finger_slopes(hand, work.by, T, work.R, work.P, f, mounts.level[m], work.point, PLACE, room.J)
-        _whiten(information[m], room.white)
+            finger_slopes(hand, work.by, T, work.R, work.P, f, mounts.level[m], work.point, PLACE, scratch.J)
+        _whiten(information[m], scratch.white)
         for i in range(3):
             for c in range(N):
-                room.Jm[K + i, c] = 0.0
+                scratch.Jm[K + i, c] = 0.0
             for a in range(size):
                 total = 0.0
                 for j in range(3):
-                    total += room.white[i, j] * room.J[a, j]
-                room.Jm[K + i, a if a < 6 else start + a] = total
+                    total += scratch.white[i, j] * scratch.J[a, j]
+                scratch.Jm[K + i, a if a < 6 else start + a] = total
         for p in range(pairs):
-            hx, hy, hz = room.marker[p, 3 * m], room.marker[p, 3 * m + 1], room.marker[p, 3 * m + 2]
+            hx, hy, hz = scratch.marker[p, 3 * m], scratch.marker[p, 3 * m + 1], scratch.marker[p, 3 * m + 2]
             for i in range(3):
-                whitened = room.white[i, 0] * hx + room.white[i, 1] * hy + room.white[i, 2] * hz
-                room.marker[p, K + i] = whitened  # K <= 3 m: nothing that is still needed
+                whitened = scratch.white[i, 0] * hx + scratch.white[i, 1] * hy + scratch.white[i, 2] * hz
+                scratch.marker[p, K + i] = whitened  # K <= 3 m: nothing that is still needed
         K += 3
     for c in range(N):
         for r in range(K):
             total = 0.0
             for d in range(N):
-                total += cov[c, d] * room.Jm[r, d]
-            room.gain[c, r] = total
+                total += cov[c, d] * scratch.Jm[r, d]
+            scratch.gain[c, r] = total
     for r in range(K):
         for q in range(r + 1):
             total = 0.0
             for d in range(N):
-                total += room.Jm[r, d] * room.gain[d, q]
-            room.B[r, q] = room.B[q, r] = total
+                total += scratch.Jm[r, d] * scratch.gain[d, q]
+            scratch.B[r, q] = scratch.B[q, r] = total
     return K
 
 
 @inner
-def _at_most_one(N: int, K: int, room: Certainty) -> None:
+def _at_most_one(N: int, K: int, scratch: Certainty) -> None:
     """Divide the gain by what is wider than its markers, because misfit or two hypotheses made it so."""
     for r in range(K):
         for q in range(K):
-            room.BL[r, q] = (1.0 if r == q else 0.0) - room.B[r, q]
-    if cholesky(room.BL, K, room.BV):
+            scratch.BL[r, q] = (1.0 if r == q else 0.0) - scratch.B[r, q]
+    if cholesky(scratch.BL, K, scratch.BV):
         return
-    eigen(room.B, K, room.B_values, room.BV)
+    eigen(scratch.B, K, scratch.B_values, scratch.BV)
     for r in range(K):
         for q in range(K):
             total = 0.0
             for d in range(K):
-                total += room.BV[r, d] * room.BV[q, d] / max(room.B_values[d], 1.0)
-            room.BL[r, q] = total
+                total += scratch.BV[r, d] * scratch.BV[q, d] / max(scratch.B_values[d], 1.0)
+            scratch.BL[r, q] = total
     for c in range(N):
         for r in range(K):
             total = 0.0
             for q in range(K):
-                total += room.gain[c, q] * room.BL[q, r]
-            room.row[r] = total
+                total += scratch.gain[c, q] * scratch.BL[q, r]
+            scratch.row[r] = total
         for r in range(K):
-            room.gain[c, r] = room.row[r]
+            scratch.gain[c, r] = scratch.row[r]
 
 
 @inner
@@ -264,7 +275,7 @@ def add_arcs(
     seen: Bool,
     information: Float,
     work: Scratch,
-    room: Certainty,
+    scratch: Certainty,
     joint_cov: Float,
 ) -> None:
     """Add to covariances of the joints what the linear ones leave out.
@@ -274,42 +285,42 @@ def add_arcs(
         T: (4, 4) palm; chains and derivatives of its angles are in `work`.
         cov: (N, N) of the unknowns.
         seen: (M,) markers that are measured, and `information` (M, 3, 3) [1/m^2] of their places.
-        work, room: Room.
+        work, room: Scratch.
         joint_cov: (26, 3, 3) [m^2], changed.
     """
-    count, N = _turns(settings, cov, room), cov.shape[0]
+    count, N = _rotation_columns(settings, cov, scratch), cov.shape[0]
     if count == 0:
         return
-    _bone_turns(rig.hand, T, count, work, room)
+    _bone_rotations(rig.hand, T, count, work, scratch)
     pairs = _NONE
     for k in range(count):
         for m in range(k + 1):
-            _arcs(rig, T, seen, k, m, pairs, work, room)
+            _arcs(rig, T, seen, k, m, pairs, work, scratch)
             pairs += 1
-    K = _gain(rig, T, cov, seen, information, pairs, work, room)
-    _at_most_one(N, K, room)
+    K = _gain(rig, T, cov, seen, information, pairs, work, scratch)
+    _at_most_one(N, K, scratch)
     for joint in range(26):
-        size = joint_slopes(rig.hand, joint, T, work, room)
+        size = joint_slopes(rig.hand, joint, T, work, scratch)
         mx = my = mz = 0.0
         out = joint_cov[joint]
         for i in range(3):
             for r in range(K):  # how the joint answers to the markers
                 total = 0.0
                 for a in range(size):
-                    total += room.J[a, i] * room.gain[room.at[a], r]
-                room.BL[i, r] = total
+                    total += scratch.J[a, i] * scratch.gain[scratch.at[a], r]
+                scratch.BL[i, r] = total
         pair = 0
         for k in range(count):
             for m in range(k + 1):
                 hx, hy, hz = (
-                    room.joint[pair, joint, 0],
-                    room.joint[pair, joint, 1],
-                    room.joint[pair, joint, 2],
+                    scratch.joint[pair, joint, 0],
+                    scratch.joint[pair, joint, 1],
+                    scratch.joint[pair, joint, 2],
                 )
                 for r in range(K):
-                    hx -= room.BL[0, r] * room.marker[pair, r]
-                    hy -= room.BL[1, r] * room.marker[pair, r]
-                    hz -= room.BL[2, r] * room.marker[pair, r]
+                    hx -= scratch.BL[0, r] * scratch.marker[pair, r]
+                    hy -= scratch.BL[1, r] * scratch.marker[pair, r]
+                    hz -= scratch.BL[2, r] * scratch.marker[pair, r]
                 share = 0.5 if k == m else 1.0  # those of two turns count twice
                 if k == m:
                     mx, my, mz = mx + hx, my + hy, mz + hz

@@ -21,18 +21,18 @@ from master.estimator.state import Hidden
 
 _QUANTILE_95 = 7.815  # chi square of three numbers
 _LAST = constant(3)  # joint of a finger: its tip
-MOST_TURNS = 12  # turns that count in arcs: those of the palm, which moves all joints, then the largest
+MOST_ROTATIONS = 12  # turns that count in arcs: those of the palm, which moves all joints, then the largest
 
 
 class Certainty:
-    """Room for N unknowns and M markers."""
+    """Scratch for N unknowns and M markers."""
 
     A: Float  # (N, N)
     L: Float  # (N, N)
     V: Float  # (N, N)
     work: Float  # (N, N)
     values: Float  # (N,)
-    turns: Float  # (12, N) columns of the factor, as rows
+    rotations: Float  # (12, N) columns of the factor, as rows
     left: Float  # (N,)
     w: Float  # (5, 4, 12, 3)
     joint: Float  # (78, 26, 3) arcs of joints, by pair
@@ -53,17 +53,17 @@ class Certainty:
     @classmethod
     def empty(cls, N: int, markers: int) -> "Certainty":
         """Allocate it."""
-        K, pairs = 3 * markers, MOST_TURNS * (MOST_TURNS + 1) // 2
-        room = record(
+        K, pairs = 3 * markers, MOST_ROTATIONS * (MOST_ROTATIONS + 1) // 2
+        scratch = record(
             cls,
             A=(N, N),
             L=(N, N),
             V=(N, N),
             work=(N, N),
             values=N,
-            turns=(MOST_TURNS, N),
+            rotations=(MOST_ROTATIONS, N),
             left=N,
-            w=(5, 4, MOST_TURNS, 3),
+            w=(5, 4, MOST_ROTATIONS, 3),
             joint=(pairs, 26, 3),
             marker=(pairs, K),
             Jm=(K, N),
@@ -79,14 +79,14 @@ class Certainty:
             at=("i8", 10),
             joint_of=("i8", (5, 4)),
         )
-        room.joint_of[:] = CHAINS
-        return room
+        scratch.joint_of[:] = CHAINS
+        return scratch
 
 
 @inner
-def surer(now: Float, past: Float, room: Certainty, out: Float) -> None:
+def surer(now: Float, past: Float, scratch: Certainty, out: Float) -> None:
     """Write the covariance (N, N) that is in each direction that of the surer of two, both positive definite."""
-    N, L, A, V = now.shape[0], room.L, room.A, room.V
+    N, L, A, V = now.shape[0], scratch.L, scratch.A, scratch.V
     if not cholesky(now, N, L):
         for i in range(N):
             for j in range(N):
@@ -102,23 +102,23 @@ def surer(now: Float, past: Float, room: Certainty, out: Float) -> None:
         for j in range(N):
             total = A[i, j]
             for k in range(j):
-                total -= room.work[i, k] * L[j, k]
-            room.work[i, j] = total / L[j, j]
+                total -= scratch.work[i, k] * L[j, k]
+            scratch.work[i, j] = total / L[j, j]
     for i in range(N):
         for j in range(N):
-            A[i, j] = 0.5 * (room.work[i, j] + room.work[j, i])
-    eigen(A, N, room.values, V)
+            A[i, j] = 0.5 * (scratch.work[i, j] + scratch.work[j, i])
+    eigen(A, N, scratch.values, V)
     for i in range(N):
         for j in range(N):
             total = 0.0
             for k in range(i + 1):
                 total += L[i, k] * V[k, j]
-            room.work[i, j] = total
+            scratch.work[i, j] = total
     for i in range(N):
         for j in range(i + 1):
             total = 0.0
             for k in range(N):
-                total += room.work[i, k] * min(room.values[k], 1.0) * room.work[j, k]
+                total += scratch.work[i, k] * min(scratch.values[k], 1.0) * scratch.work[j, k]
             out[i, j] = out[j, i] = total
 
 
@@ -137,7 +137,7 @@ def only_limits(hand: HandTables, x: Float, hidden: Hidden, cov: Float) -> None:
 
 
 @inner
-def joint_slopes(hand: HandTables, joint: int, T: Float, work: Scratch, room: Certainty) -> int:
+def joint_slopes(hand: HandTables, joint: int, T: Float, work: Scratch, scratch: Certainty) -> int:
     """Write derivatives of a joint (10, 3) and which unknowns they belong to; return how many."""
     f, level = hand.finger[joint], hand.level[joint]
     for i in range(3):
@@ -145,41 +145,43 @@ def joint_slopes(hand: HandTables, joint: int, T: Float, work: Scratch, room: Ce
         for j in range(3):
             work.point[i] += 0.0 if f >= 0 else T[i, j] * hand.rest_m[joint, j]
         work.arm[i] = work.point[i] - T[i, 3]
-    palm_slopes(work.arm, room.J)
+    palm_slopes(work.arm, scratch.J)
     for a in range(6):
-        room.at[a] = a
+        scratch.at[a] = a
     if f < 0:
         return 6
     count = int(hand.first[f + 1] - hand.first[f])
-    finger_slopes(hand, work.by, T, work.R, work.P, f, level, work.point, PLACE, room.J)
+    finger_slopes(hand, work.by, T, work.R, work.P, f, level, work.point, PLACE, scratch.J)
     for c in range(count):
-        room.at[6 + c] = 6 + hand.first[f] + c
+        scratch.at[6 + c] = 6 + hand.first[f] + c
     return 6 + count
 
 
 @inlined
-def _project(cov: Float, count: int, room: Certainty, out: Float) -> None:
+def _project(cov: Float, count: int, scratch: Certainty, out: Float) -> None:
     """Write J' cov J (3, 3) of the rows in use."""
     for a in range(count):
         for i in range(3):
             total = 0.0
             for b in range(count):
-                total += cov[room.at[a], room.at[b]] * room.J[b, i]
-            room.C[a, i] = total
+                total += cov[scratch.at[a], scratch.at[b]] * scratch.J[b, i]
+            scratch.C[a, i] = total
     for i in range(3):
         for j in range(3):
             total = 0.0
             for a in range(count):
-                total += room.J[a, i] * room.C[a, j]
+                total += scratch.J[a, i] * scratch.C[a, j]
             out[i, j] = total
 
 
 @inner
-def linear(hand: HandTables, T: Float, cov: Float, work: Scratch, room: Certainty, joint_cov: Float) -> None:
+def linear(
+    hand: HandTables, T: Float, cov: Float, work: Scratch, scratch: Certainty, joint_cov: Float
+) -> None:
     """Write the covariances of the joints (26, 3, 3) [m^2], by their derivatives; `work` as `chains` left it."""
     for joint in range(26):
-        count = joint_slopes(hand, joint, T, work, room)
-        _project(cov, count, room, joint_cov[joint])
+        count = joint_slopes(hand, joint, T, work, scratch)
+        _project(cov, count, scratch, joint_cov[joint])
 
 
 @inner
@@ -189,9 +191,9 @@ def tilts(
     T: Float,
     cov: Float,
     work: Scratch,
-    room: Certainty,
+    scratch: Certainty,
     tilt: Float,
-    walk: Float,
+    process_noise: Float,
 ) -> None:
     """Write the covariances of the last phalanges' directions (5, 3, 3) [rad^2], and how fast they walk (5,).
 
@@ -204,19 +206,19 @@ def tilts(
             squared += work.ahead[i] ** 2
         for i in range(3):
             work.ahead[i] /= sqrt(squared)
-        palm_slopes(work.ahead, room.J)
-        finger_slopes(hand, work.by, T, work.R, work.P, f, _LAST, work.ahead, DIRECTION, room.J)
+        palm_slopes(work.ahead, scratch.J)
+        finger_slopes(hand, work.by, T, work.R, work.P, f, _LAST, work.ahead, DIRECTION, scratch.J)
         count = hand.first[f + 1] - hand.first[f]
         for a in range(6 + count):
-            room.at[a] = a if a < 6 else hand.first[f] + a
+            scratch.at[a] = a if a < 6 else hand.first[f] + a
             for i in range(3):
-                room.J[a, i] = 0.0 if 3 <= a < 6 else room.J[a, i]
-        walk[f] = 0.0
+                scratch.J[a, i] = 0.0 if 3 <= a < 6 else scratch.J[a, i]
+        process_noise[f] = 0.0
         for a in range(6 + count):
-            rate = settings.palm_walk_rad_s if a < 3 else settings.walk_rad_s
+            rate = settings.palm_process_noise_rad_s if a < 3 else settings.process_noise_rad_s
             for i in range(3):
-                walk[f] += (rate * room.J[a, i]) ** 2
-        _project(cov, 6 + count, room, tilt[f])
+                process_noise[f] += (rate * scratch.J[a, i]) ** 2
+        _project(cov, 6 + count, scratch, tilt[f])
 
 
 @inlined

@@ -17,16 +17,16 @@ from common.kernels import kernel
 from common.records import boxed
 from common.wrist_calibration import FingerLine
 from master.estimator.finger_lines import on_line, principal_line
-from master.estimator.finger_surface import OWN_MOVES, Surface, cut, look
+from master.estimator.finger_surface import OWN_MOVES, Surface, laser_centroid, look
+from master.estimator.flexion_synergy import FlexionSynergy
 from master.estimator.hand_tables import HandTables
-from master.estimator.natural_curve import NaturalCurve
 from master.estimator.parameters import HandParameters
-from master.estimator.wrist_device import Device, bent_palm
+from master.estimator.wrist_device import Device, flexed_palm
 from master.wrist_setup import WristSetup
 
 ROOT_MM = 102.06
 _POLYNOMIAL = (-0.0003, 0.059, -4.07, 119.75)
-_CLOSINGS = 31
+_CURLS = 31
 _BRANCH = 0.75  # of a curl: after that the last phalanx folds into the light, and the line jumps to it
 
 
@@ -43,33 +43,33 @@ def _laser_points(
     """Write laser points (C, 5, 3) [m] of hands of angles (C, 20); NaN where the laser misses a finger."""
     palm, axes = np.zeros((4, 4)), np.zeros((2, 3))
     hand, device, work = boxed_hand[0], boxed_device[0], boxed_work[0]
-    bent_palm(device.palm, 0.0, 0.0, palm, axes)
+    flexed_palm(device.palm, 0.0, 0.0, palm, axes)
     for c in range(angles.shape[0]):
         for f in range(5):
             look(hand, device, palm, axes, angles[c], f, OWN_MOVES, work)
-            lit = cut(device, f, work) > 0.0
+            lit = laser_centroid(device, f, work) > 0.0
             for i in range(3):
-                out[c, f, i] = work.cut[i] if lit else np.nan
+                out[c, f, i] = work.laser_centroid[i] if lit else np.nan
 
 
-def lit(setup: WristSetup, curve: NaturalCurve) -> bool:
+def lit(setup: WristSetup, synergy: FlexionSynergy) -> bool:
     """Tell whether the laser meets a finger that closes naturally."""
-    return bool(np.isfinite(_curl(setup, curve)[:, 1:, 0]).any())
+    return bool(np.isfinite(_curl(setup, synergy)[:, 1:, 0]).any())
 
 
 def simulated_lines(setup: WristSetup) -> tuple[FingerLine, ...]:
     """The lines (5) of a whole curl of the simulated hand, fingers neither spread nor crossed."""
-    points = _curl(setup, NaturalCurve.of(setup.model))
+    points = _curl(setup, FlexionSynergy.of(setup.model))
     return tuple(principal_line(points[np.isfinite(points[:, f, 0]), f]) for f in range(5))
 
 
-def _curl(setup: WristSetup, curve: NaturalCurve) -> Float:
+def _curl(setup: WristSetup, synergy: FlexionSynergy) -> Float:
     """Laser points (C, 5, 3) [m] of a hand that closes; NaN where the laser misses a finger."""
     model = setup.model
-    share = np.linspace(0.0, _BRANCH, _CLOSINGS)[:, None]
-    closing = curve.range_rad[:, 0] + share * (curve.range_rad[:, 1] - curve.range_rad[:, 0])
-    angles = curve.angles(closing, np.zeros_like(closing)).reshape(_CLOSINGS, 20)
-    points = np.empty((_CLOSINGS, 5, 3))
+    share = np.linspace(0.0, _BRANCH, _CURLS)[:, None]
+    curl = synergy.range_rad[:, 0] + share * (synergy.range_rad[:, 1] - synergy.range_rad[:, 0])
+    angles = synergy.angles(curl, np.zeros_like(curl)).reshape(_CURLS, 20)
+    points = np.empty((_CURLS, 5, 3))
     tables = HandTables.of(model, HandParameters.of(model))
     _laser_points(boxed(tables), boxed(Device.of(setup)), angles, boxed(Surface.empty()), points)
     return points

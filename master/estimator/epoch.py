@@ -19,8 +19,8 @@ class Epoch:
         uv: (C, A, 2) [px] centroids of all markers of the rig; NaN: not seen, or gated out.
         variance_px2: (C, A) of each camera's own errors; NaN: not to be used.
         own_m2: (A, 3, 3) covariance of what is wrong with each marker itself, beside bones.
-        facing: (3,) unit vector from the hand to the cameras that see its back.
-        turn: How other sensors have the palm turned; None: they do not say.
+        back_normal: (3,) unit vector from the hand to the cameras that see its back.
+        orientation: How other sensors have the palm turned; None: they do not say.
         wrist: What a wrist device sees of the fingers; None: nothing.
         place: (3,) [m] where the palm is, of a wrist device alone; None: not known.
         start: Another hand of this epoch; None: there is none.
@@ -29,12 +29,12 @@ class Epoch:
 
     t_ns: int
     points_m: Float
-    facing: Float
+    back_normal: Float
     cov_m2: Float | None = None
     uv: Float | None = None
     variance_px2: Float | None = None
     own_m2: Float | None = None
-    turn: "Turn | None" = None
+    orientation: "OrientationMeasurement | None" = None
     wrist: "WristRows | None" = None
     place: Float | None = None
     start: SolvedHand | None = None
@@ -42,7 +42,7 @@ class Epoch:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Turn:
+class OrientationMeasurement:
     """How other sensors have the palm turned.
 
     Attributes:
@@ -50,14 +50,14 @@ class Turn:
         information: (3, 3) [1/rad^2] about its turn, rig axes.
         sure: Whether it is known about every axis how the palm lies.
         axes: (3, 3) as rows, rig axes: about which tilt 2 and heading turn the forearm; None: the IMU is on the palm.
-        walked_rad2: Variance of what the heading has drifted since the epoch before.
+        process_noise_rad2: Variance of what the heading has drifted since the epoch before.
     """
 
     rotation: Float
     information: Float
     sure: bool
     axes: Float | None = None
-    walked_rad2: float = 0.0
+    process_noise_rad2: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,9 +119,9 @@ class Fitted:
             a finger the sum of `ON_MARKERS`, `BY_MARKERS` where its own is placed, and `ON_OTHERS` by its level; for
             the palm one of the former and which markers are seen.
         anew: The hand of a moment ago was wrong: nothing of it is in this one.
-        level: (5,) `Level` codes of what a wrist device tells the fingers from, now.
+        solver_mode: (5,) `SolverMode` codes of what a wrist device tells the fingers from, now.
         ambiguous: (5,) whether another pose of the finger explains that as well.
-        turn_left_out: Whether the palm by markers contradicts how other sensors have it turned, which was left out.
+        rotation_rejected: Whether the palm by markers contradicts the measured orientation, which was left out.
         refused, off: (5,) fingertips and laser points that no pose explains.
     """
 
@@ -129,10 +129,10 @@ class Fitted:
     valid: Bool
     tracked: Bool
     source: Code
-    rests: Int
-    anew: bool = False
-    level: Code = field(default_factory=lambda: np.zeros(5, np.uint8))
+    sources: Int
+    reinitialised: bool = False
+    solver_mode: Code = field(default_factory=lambda: np.zeros(5, np.uint8))
     ambiguous: Bool = field(default_factory=lambda: np.zeros(5, np.bool_))
-    turn_left_out: bool = False
+    rotation_rejected: bool = False
     refused: Bool = field(default_factory=lambda: np.zeros(5, np.bool_))
     off: Bool = field(default_factory=lambda: np.zeros(5, np.bool_))

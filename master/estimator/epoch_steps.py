@@ -11,11 +11,11 @@ from common.kernels import bound
 from common.records import boxed, fields
 from master.estimator.cameras import CameraArrays
 from master.estimator.epoch import Epoch
-from master.estimator.extras import usual_of
-from master.estimator.ground import count_rows
+from master.estimator.extras import stationary_of
 from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.hypotheses import Blank
 from master.estimator.kinematics import Scratch, pose
+from master.estimator.observation_sources import count_rows
 from master.estimator.parameters import HandParameters
 from master.estimator.priors import Habits
 from master.estimator.problem import Rig
@@ -68,30 +68,33 @@ class EpochSteps:
         self._rig = Rig(HandTables.of(model, parameters), mounts, CameraArrays.of(cameras), device)
         n = len(parameters.free)
         self.observed = observed = Observations.empty(len(cameras), count)
-        self.placed: Bool = np.zeros(count, np.bool_)
+        self.triangulated: Bool = np.zeros(count, np.bool_)
         self._blank = Blank.of(n, extras, len(cameras), count)
         # Records are used by their fields here, and handed to kernels in the arrays that they lie in.
         self.state = state = HandState.unknown(n, extras)
         space = Workspace.empty(n, extras, _capacity(count))
         self.now, self.at = fields(state), fields(space)
         self._state, self._space, self._work = boxed(state), boxed(space), boxed(Scratch.empty())
-        self._ground, self._sights = self._space["ground"], self._space["belief"]["sights"]
+        self._ground, self._lines_of_sight = self._space["ground"], self._space["belief"]["lines_of_sight"]
         hand, device = boxed(self._rig.hand), boxed(device)
         self._model = Model(hand, boxed(settings.record()), mounts, self._rig.cameras, device)
-        self.at.room.search.bend_share[0] = settings.bend_share
+        self.at.scratch.search.wrist_share[0] = settings.wrist_share
         self.at.belief.z_info[0, 0] = 1.0  # of a rig without wrist device: one extra that means nothing
         if wrist is not None:
             self._lay_out(wrist)
         nothing, own = np.full((len(cameras), len(markers), 2), np.nan), np.zeros((len(markers), 3, 3))
-        room, none = (np.empty((26, 3)), np.empty((26, 3, 3)), np.empty((count, 3))), np.full((5, 2), np.nan)
+        scratch, none = (
+            (np.empty((26, 3)), np.empty((26, 3, 3)), np.empty((count, 3))),
+            np.full((5, 2), np.nan),
+        )
         each = none[:, 0].copy()
         self._rays = bound(observe_rays, nothing, nothing[..., 0].copy(), own, self.on_hand, observed)
-        self._points = bound(observe_points, room[2], own[self.on_hand], 0.0, observed)
+        self._points = bound(observe_points, scratch[2], own[self.on_hand], 0.0, observed)
         self._count = bound(count_rows, mounts, observed, self._ground)
-        self._triple = bound(
-            observe_wrist, device, none, each, each, none, each, each, 0.0, 0.0, 0.0, self._sights
+        self._cycle = bound(
+            observe_wrist, device, none, each, each, none, each, each, 0.0, 0.0, 0.0, self._lines_of_sight
         )
-        self._pose = bound(pose, hand, mounts, _AT_ORIGIN, np.zeros(20), self._work, *room)
+        self._pose = bound(pose, hand, mounts, _AT_ORIGIN, np.zeros(20), self._work, *scratch)
         rig, state, space = self._model, self._state, self._space
         self._prepare = bound(prepare_epoch, rig, state, space)
         self._predict = bound(predict_epoch, rig, state, observed, space)
@@ -110,15 +113,15 @@ class EpochSteps:
 
     def observe(self, at: Epoch, *, continuous: bool) -> None:
         """Write the rows of an epoch, and count them."""
-        task, sights = self.at.task, self.at.belief.sights
+        task, lines_of_sight = self.at.task, self.at.belief.lines_of_sight
         task.t_ns[0], task.second_order[0], task.continuous[0] = at.t_ns, at.second_order, continuous
-        task.walked_rad2[0] = 0.0 if at.turn is None else at.turn.walked_rad2
+        task.process_noise_rad2[0] = 0.0 if at.orientation is None else at.orientation.process_noise_rad2
         if at.wrist is None:
-            sights.rows[0] = 0.0
-            sights.lit[:] = sights.shown[:] = 0.0
+            lines_of_sight.rows[0] = 0.0
+            lines_of_sight.lit[:] = lines_of_sight.shown[:] = 0.0
         else:
             self.at.prior.law[:] = at.wrist.law
-            self._triple(
+            self._cycle(
                 self._model.device,
                 at.wrist.laser,
                 at.wrist.laser_sigma_px,
@@ -129,7 +132,7 @@ class EpochSteps:
                 self._settings.light_rad,
                 at.wrist.laser_s,
                 at.wrist.tip_s,
-                self._sights,
+                self._lines_of_sight,
             )
         if at.uv is None and at.cov_m2 is None:
             self.observed.seen[:] = False
@@ -145,7 +148,9 @@ class EpochSteps:
             uv, variance = np.ascontiguousarray(at.uv), np.ascontiguousarray(at.variance_px2)
             self._rays(uv, variance, own, self.on_hand, self.observed)
         measured = at.cov_m2 is not None
-        self.placed = self.observed.placed if measured else np.isfinite(at.points_m[self.on_hand].sum(axis=1))
+        self.triangulated = (
+            self.observed.triangulated if measured else np.isfinite(at.points_m[self.on_hand].sum(axis=1))
+        )
         self._count(self._model.mounts, self.observed, self._ground)
 
     def prepare(self) -> None:
@@ -154,20 +159,20 @@ class EpochSteps:
 
     def believe(self, at: Epoch, *, known: bool) -> None:
         """Write what is believed beside the past and habits; `known`: whether the past still says anything."""
-        belief, ground, turn = self.at.belief, self.at.ground, at.turn
-        belief.facing[:] = at.facing
-        belief.facing_w2[0] = self._settings.facing_rad**-2.0 if ground.back[0] else 0.0
+        belief, ground, orientation = self.at.belief, self.at.ground, at.orientation
+        belief.back_normal[:] = at.back_normal
+        belief.back_normal_w2[0] = self._settings.back_normal_rad**-2.0 if ground.back[0] else 0.0
         belief.depth_w2[0] = 0.0
         if known and ground.most[0] == 1:
             alone = self._rig.cameras.centre[(self.observed.weight > 0.0).sum(axis=1).argmax()]
-            sight = self.now.palm[:3, 3] - alone
-            belief.sight[:] = sight / np.sqrt(sight @ sight)
+            line_of_sight = self.now.palm[:3, 3] - alone
+            belief.line_of_sight[:] = line_of_sight / np.sqrt(line_of_sight @ line_of_sight)
             belief.depth_w2[0] = self._settings.held_depth_m**-2.0
-        belief.turned[0] = turn is not None
-        if turn is not None:
-            belief.forearm[:3, :3], belief.turn_info[:] = turn.rotation, turn.information
-            belief.on_forearm[0] = turn.axes is not None
-            belief.axes[:] = 0.0 if turn.axes is None else turn.axes
+        belief.oriented[0] = orientation is not None
+        if orientation is not None:
+            belief.forearm[:3, :3], belief.orientation_info[:] = orientation.rotation, orientation.information
+            belief.on_forearm[0] = orientation.axes is not None
+            belief.axes[:] = 0.0 if orientation.axes is None else orientation.axes
         belief.place_w2[0] = 0.0
         if at.place is not None:
             belief.place[:], belief.place_w2[0] = at.place, _STANDS_M**-2.0
@@ -196,15 +201,15 @@ class EpochSteps:
         self._state[:] = state
 
     def enough(self, at: Epoch) -> bool:
-        """Tell whether the markers fix a hand: not in one line, or across `facing`.
+        """Tell whether the markers fix a hand: not in one line, or across `back_normal`.
 
         What faces the cameras turns the hand about a line of markers, but not about one that points at them. With an
         orientation that is known any one marker is enough.
         """
         if at.place is not None:
             return True
-        points = at.points_m[self.on_hand][self.placed]
-        if at.turn is not None and at.turn.sure:
+        points = at.points_m[self.on_hand][self.triangulated]
+        if at.orientation is not None and at.orientation.sure:
             return len(points) > 0
         if len(points) < 2:
             return False
@@ -218,7 +223,7 @@ class EpochSteps:
         if len(points) > 2 and extent[1] > _SPREAD_M:
             return True
         back = self.at.ground.back[0]
-        return bool(back and extent[0] > _LENGTH_M and abs(axes[0] @ at.facing) < _ACROSS)
+        return bool(back and extent[0] > _LENGTH_M and abs(axes[0] @ at.back_normal) < _ACROSS)
 
     def unexplained(self) -> bool:
         """Tell whether a marker is too far from what was found."""
@@ -233,8 +238,8 @@ class EpochSteps:
         prior.abduction[0] = prior.flexion[0] = 0.5 * s.thumb_rad
         if wrist.only_natural:
             prior.only_natural[0], prior.flexion[:] = 1.0, _STIFF_RAD
-        state.usual[:] = usual_of(s, loose=wrist.loose, tilt_rad=wrist.tilt_rad)
-        state.z_cov[:] = np.diag(state.usual)
+        state.stationary[:] = stationary_of(s, loose=wrist.loose, tilt_rad=wrist.tilt_rad)
+        state.z_cov[:] = np.diag(state.stationary)
         if wrist.heading_rad is not None:
             state.z_cov[HEADING, HEADING] = wrist.heading_rad**2
 

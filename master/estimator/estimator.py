@@ -8,14 +8,14 @@ import numpy as np
 from common.arrays import Float, Int
 from common.camera_model import CameraModel
 from common.hand_model import HandJoints, HandModel
-from master.estimator.afresh import NONE, Afresh, HabitTables
 from master.estimator.epoch import Epoch, Fitted, FittedHand
 from master.estimator.epoch_steps import EpochSteps
-from master.estimator.ground import ON_OTHERS
+from master.estimator.observation_sources import ON_OTHERS
 from master.estimator.parameters import HandParameters
+from master.estimator.reinitialise import NONE, HabitTables, Reinitialiser
 from master.estimator.settings import DEFAULT, Settings
 from master.estimator.update import Estimate
-from master.estimator.wrist_device import BEND, HEADING, LIGHT
+from master.estimator.wrist_device import HEADING, LED_SCALE, WRIST_ANGLES
 from master.estimator.wrist_model import WristModel
 
 _SOMEWHERE_M = 0.1  # about each axis: a hand that is known no better than this is lost
@@ -62,7 +62,7 @@ class Estimator:
         self._steps = EpochSteps(
             cameras, model, self.parameters, markers, hand_markers, self._habits, settings, wrist
         )
-        self._afresh = Afresh(self._steps, self.parameters, habits, settings)
+        self._reinitialiser = Reinitialiser(self._steps, self.parameters, habits, settings)
         self.state, self._now, self._at = self._steps.state, self._steps.now, self._steps.at
 
     @property
@@ -75,7 +75,7 @@ class Estimator:
         """The last epoch that had a hand."""
         return int(self._now.t_ns[0])
 
-    def recent(self, t_ns: int) -> bool:
+    def has_previous(self, t_ns: int) -> bool:
         """Whether the state still says anything at `t_ns`."""
         age_s = (t_ns - int(self._now.t_ns[0])) * 1e-9
         return self._continuous and bool(self._now.known[0]) and 0.0 < age_s <= self.settings.forget_s
@@ -92,15 +92,17 @@ class Estimator:
 
     def forget_heading(self) -> None:
         """Let the heading of an IMU be any, and what was learnt with it."""
-        self._now.z_cov[BEND:LIGHT] = self._now.z_cov[:, BEND:LIGHT] = 0.0
-        self._now.z_cov[range(BEND, LIGHT), range(BEND, LIGHT)] = self._now.usual[BEND:LIGHT]
+        self._now.z_cov[WRIST_ANGLES:LED_SCALE] = self._now.z_cov[:, WRIST_ANGLES:LED_SCALE] = 0.0
+        self._now.z_cov[range(WRIST_ANGLES, LED_SCALE), range(WRIST_ANGLES, LED_SCALE)] = (
+            self._now.stationary[WRIST_ANGLES:LED_SCALE]
+        )
 
     def begin_heading(self, heading_rad: float, variance_rad2: float) -> None:
         """Take the heading of an IMU from a palm that was solved without it."""
         self._now.z[HEADING] = heading_rad
         self._now.z_cov[HEADING] = self._now.z_cov[:, HEADING] = 0.0
         self._now.z_cov[HEADING, HEADING] = variance_rad2
-        self._now.turn_known[0] = False
+        self._now.measured_rotation_known[0] = False
 
     def pose(self, T: Float, angles_rad: Float) -> tuple[HandJoints, Float]:
         """Place joints and markers (M, 3) [m], rig frame.
@@ -115,28 +117,32 @@ class Estimator:
         steps.observe(at, continuous=self._continuous)
         if self.wrist:
             steps.prepare()
-        sure = at.turn is not None and at.turn.sure
+        sure = at.orientation is not None and at.orientation.sure
         palm_shown = bool(ground.by_markers[0]) or (sure and ground.seen[0] > 0) or at.place is not None
         task.palm_shown[0] = palm_shown
-        known = self.recent(at.t_ns)
+        known = self.has_previous(at.t_ns)
         steps.believe(at, known=known)
-        doubtful = self.wrist and at.turn is not None and bool(ground.by_markers[0])
-        before, left_out = steps.kept() if doubtful else None, False
-        out, anew = self._solve(at, known=known)
+        doubtful = self.wrist and at.orientation is not None and bool(ground.by_markers[0])
+        before, rejected = steps.kept() if doubtful else None, False
+        out, reinitialised = self._solve(at, known=known)
         if out is not None and before is not None and self._at.found.contrary[0] > self.settings.contrary:
             # What the IMU says is left out: it began anew, or the wrist was flicked. But not where it alone tells.
-            for turn in (None, at.turn):
+            for orientation in (None, at.orientation):
                 steps.put_back(before)
-                steps.believe(replace(at, turn=turn), known=known)
-                out, anew = self._solve(replace(at, turn=turn), known=known)
-                left_out = turn is None
-                if left_out and np.trace(self._at.found.cov[:3, :3]) < _SURE_RAD2:
+                steps.believe(replace(at, orientation=orientation), known=known)
+                out, reinitialised = self._solve(replace(at, orientation=orientation), known=known)
+                rejected = orientation is None
+                if rejected and np.trace(self._at.found.cov[:3, :3]) < _SURE_RAD2:
                     break
-        told = self.wrist and bool(task.level.any())
+        told = self.wrist and bool(task.solver_mode.any())
         if ground.seen[0] > 0 or (told and (at.place is not None or self._knows_place())):
             self._now.seen_ns[0] = at.t_ns
-        rests = self._rests(at, palm_shown=palm_shown)
-        return _unknown(rests) if out is None else self._fitted(at, out, rests, anew=anew, left_out=left_out)
+        sources = self._sources(at, palm_shown=palm_shown)
+        return (
+            _unknown(sources)
+            if out is None
+            else self._fitted(at, out, sources, reinitialised=reinitialised, rejected=rejected)
+        )
 
     def _solve(self, at: Epoch, *, known: bool) -> tuple[Estimate | None, bool]:
         """Fit an epoch and take it over.
@@ -147,16 +153,16 @@ class Estimator:
         if known:
             wrong, explained = self._go_on(at, may_leave=True)
             # Where nothing is better, what goes on is kept.
-            goes_on = explained or wrong <= self.settings.misled + self._afresh.begin(at)
+            goes_on = explained or wrong <= self.settings.misled + self._reinitialiser.begin(at)
             if goes_on and not explained:
                 self._go_on(at, may_leave=False)
         elif self._steps.enough(at):
             goes_on = False
-            self._afresh.begin(at)
+            self._reinitialiser.begin(at)
         else:
             return None, False
-        anew = known and not goes_on and not self._only_natural
-        return self._steps.take_over(goes_on=goes_on), anew
+        reinitialised = known and not goes_on and not self._only_natural
+        return self._steps.take_over(goes_on=goes_on), reinitialised
 
     def _go_on(self, at: Epoch, *, may_leave: bool) -> tuple[float, bool]:
         """Fit from the state.
@@ -182,27 +188,31 @@ class Estimator:
         """Tell whether the place of a hand is known of which only fingers are told."""
         return self.known and float(np.trace(self._now.cov[3:6, 3:6])) < 3.0 * _SOMEWHERE_M**2
 
-    def _rests(self, at: Epoch, *, palm_shown: bool) -> Int:
+    def _sources(self, at: Epoch, *, palm_shown: bool) -> Int:
         """What thumb ... little and the palm rest on now (6,), as of `Fitted`.
 
         Of what a wrist device tells the level counts, that of now or of the triple before.
         """
         ground = self._at.ground
-        rests: list[int] = ground.rests.tolist()
+        sources: list[int] = ground.sources.tolist()
         if self.wrist:
-            told = zip(self._now.level.tolist(), self._now.told_ns.tolist(), strict=False)  # of fingers alone
-            for f, (level, told_ns) in enumerate(told):
-                if (at.t_ns - told_ns) * 1e-9 <= self.settings.tracked_triple_s:
-                    rests[f] += ON_OTHERS * level
+            told = zip(
+                self._now.solver_mode.tolist(), self._now.told_ns.tolist(), strict=False
+            )  # of fingers alone
+            for f, (solver_mode, told_ns) in enumerate(told):
+                if (at.t_ns - told_ns) * 1e-9 <= self.settings.tracked_cycle_s:
+                    sources[f] += ON_OTHERS * solver_mode
         if not palm_shown:
-            rests[5] = 0
+            sources[5] = 0
         elif not ground.by_markers[0]:
-            rests[5] += ON_OTHERS
-        return np.array(rests)
+            sources[5] += ON_OTHERS
+        return np.array(sources)
 
-    def _fitted(self, at: Epoch, out: Estimate, rests: Int, *, anew: bool, left_out: bool) -> Fitted:
+    def _fitted(
+        self, at: Epoch, out: Estimate, sources: Int, *, reinitialised: bool, rejected: bool
+    ) -> Fitted:
         found, task = self._at.found, self._at.task
-        recent = (at.t_ns - int(self._now.seen_ns[0])) * 1e-9 <= self.settings.forget_s
+        has_previous = (at.t_ns - int(self._now.seen_ns[0])) * 1e-9 <= self.settings.forget_s
         known = 6 + len(found.x)
         hand = FittedHand(
             T_rig_palm=out.palm,
@@ -210,7 +220,7 @@ class Estimator:
             joints=HandJoints(out.position, out.rotation, out.palm),
             cov_m2=out.cov,
             tilt_cov_rad2=out.tilt,
-            tilt_walk_rad2_s2=out.tilt_walk,
+            tilt_process_noise_rad2_s2=out.tilt_process_noise,
             alone=found.cov[:known, :known].copy(),
             x=found.x.copy(),
             scale=float(found.scale[0]),
@@ -221,20 +231,20 @@ class Estimator:
         )
         return Fitted(
             hand,
-            np.full(26, recent),
-            out.tracked if recent else np.zeros(26, np.bool_),
+            np.full(26, has_previous),
+            out.tracked if has_previous else np.zeros(26, np.bool_),
             out.source,
-            rests,
-            anew,
-            level=task.level.copy(),
+            sources,
+            reinitialised,
+            solver_mode=task.solver_mode.copy(),
             ambiguous=task.ambiguous.astype(np.bool_),
-            turn_left_out=left_out,
+            rotation_rejected=rejected,
             refused=task.refused.astype(np.bool_),
             off=task.off.astype(np.bool_),
         )
 
 
-def _unknown(rests: Int) -> Fitted:
+def _unknown(sources: Int) -> Fitted:
     """No hand."""
     none = np.zeros(26, np.bool_)
-    return Fitted(None, none, none.copy(), np.zeros(26, np.uint8), rests, False)
+    return Fitted(None, none, none.copy(), np.zeros(26, np.uint8), sources, False)

@@ -6,7 +6,7 @@
              "Kalman filtering and smoothing solutions to temporal Gaussian process regression models")
     tilt     what the IMU has the vertical off by, for seconds
     heading  walks as far as the IMU is told to
-    light    logarithm of the unit of distances by light: of the device and its wearer, all but constant
+    light    logarithm of the unit of distances by light: of the device and its subject, all but constant
 
 Wrists at work flex by a median of 1.4...54 deg/s about a median posture of -30...3 deg (43 types of work; Hansson et
 al. 2009, Int. J. Ind. Ergonomics 39, 221); most of what hands do daily takes 5 deg of flexion, 30 of extension, 10 and
@@ -27,13 +27,13 @@ from master.estimator.matrices import cholesky, inverse
 from master.estimator.problem import Belief
 from master.estimator.settings import Settings
 from master.estimator.state import HandState
-from master.estimator.wrist_device import BEND, EXTRAS, HEADING, LIGHT, RATE, TILT
+from master.estimator.wrist_device import EXTRAS, HEADING, LED_SCALE, RATE, TILT, WRIST_ANGLES
 
 _CONSTANT_S = 1e4
 
 
-class ExtrasRoom:
-    """Room for the extras' steps."""
+class ExtrasScratch:
+    """Scratch for the extras' steps."""
 
     M: Float  # (K, K)
     A: Float  # (K, K)
@@ -41,13 +41,13 @@ class ExtrasRoom:
     L: Float  # (K, K)
 
     @classmethod
-    def empty(cls, extras: int) -> "ExtrasRoom":
+    def empty(cls, extras: int) -> "ExtrasScratch":
         """Allocate it."""
         K = extras
         return record(cls, M=(K, K), A=(K, K), B=(K, K), L=(K, K))
 
 
-def usual_of(settings: Settings, *, loose: bool, tilt_rad: float) -> Float:
+def stationary_of(settings: Settings, *, loose: bool, tilt_rad: float) -> Float:
     """Variances (K,) that doubt grows to; the heading's is that at the beginning.
 
     Args:
@@ -55,26 +55,33 @@ def usual_of(settings: Settings, *, loose: bool, tilt_rad: float) -> Float:
         loose: Whether the wrist may bend; False: the palm was calibrated and stands still.
         tilt_rad: Of the IMU's vertical.
     """
-    usual = np.zeros(EXTRAS)
-    usual[:BEND] = settings.hinge_rad**2
-    usual[:1] = 1e-6  # a thumb's hinges are no parallel ones
-    bend = np.array([settings.flexion_rad, settings.deviation_rad] if loose else 2 * [settings.worn_rad])
-    usual[BEND : BEND + 2] = bend**2
-    usual[RATE : RATE + 2] = (settings.pace_1_s * bend) ** 2
-    usual[TILT : TILT + 2] = max(tilt_rad, 1e-3) ** 2
-    usual[HEADING] = np.pi**2 / 3.0
-    usual[LIGHT] = settings.light_unit**2
-    return usual
+    stationary = np.zeros(EXTRAS)
+    stationary[:WRIST_ANGLES] = settings.hinge_rad**2
+    stationary[:1] = 1e-6  # a thumb's hinges are no parallel ones
+    wrist_angles = np.array(
+        [settings.flexion_rad, settings.deviation_rad] if loose else 2 * [settings.calibrated_palm_rad]
+    )
+    stationary[WRIST_ANGLES : WRIST_ANGLES + 2] = wrist_angles**2
+    stationary[RATE : RATE + 2] = (settings.pace_1_s * wrist_angles) ** 2
+    stationary[TILT : TILT + 2] = max(tilt_rad, 1e-3) ** 2
+    stationary[HEADING] = np.pi**2 / 3.0
+    stationary[LED_SCALE] = settings.led_scale**2
+    return stationary
 
 
 @inlined
-def _lasts(settings: Settings, i: int) -> float:
+def _correlation_time(settings: Settings, i: int) -> float:
     return settings.tilt_s if TILT <= i < TILT + 2 else _CONSTANT_S
 
 
 @inner
 def predict_extras(
-    settings: Settings, state: HandState, dt_s: float, walked_rad2: float, belief: Belief, room: ExtrasRoom
+    settings: Settings,
+    state: HandState,
+    dt_s: float,
+    process_noise_rad2: float,
+    belief: Belief,
+    scratch: ExtrasScratch,
 ) -> None:
     """Step the extras to an epoch, in the state, and write `Belief.z` and `z_info`.
 
@@ -82,10 +89,10 @@ def predict_extras(
         settings: Paces.
         state: Changed.
         dt_s: Since they were stepped last.
-        walked_rad2: Variance of what the heading has drifted in that time.
+        process_noise_rad2: Variance of what the heading has drifted in that time.
         belief, room: Written.
     """
-    K, z, P, M = state.z.shape[0], state.z, state.z_cov, room.M
+    K, z, P, M = state.z.shape[0], state.z, state.z_cov, scratch.M
     if K < EXTRAS:
         belief.z[0], belief.z_info[0, 0] = 0.0, 1.0
         return
@@ -93,11 +100,11 @@ def predict_extras(
     for i in range(K):
         for j in range(K):
             M[i, j] = 0.0
-        M[i, i] = 1.0 if i == HEADING else exp(-away / _lasts(settings, i))
+        M[i, i] = 1.0 if i == HEADING else exp(-away / _correlation_time(settings, i))
     paced = settings.pace_1_s * away
     decay = exp(-paced)
     for b in range(2):
-        at, rate = BEND + b, RATE + b
+        at, rate = WRIST_ANGLES + b, RATE + b
         M[at, at], M[at, rate] = (1.0 + paced) * decay, away * decay
         M[rate, at], M[rate, rate] = -(settings.pace_1_s**2) * away * decay, (1.0 - paced) * decay
         z[at] -= state.habit[b]
@@ -107,35 +114,35 @@ def predict_extras(
             total += M[i, j] * z[j]
             inside = 0.0
             for k in range(K):
-                usual = state.usual[k] if k == j and k != HEADING else 0.0
-                inside += M[i, k] * (P[k, j] - usual)
-            room.A[i, j] = inside
-        room.B[0, i] = total
+                stationary = state.stationary[k] if k == j and k != HEADING else 0.0
+                inside += M[i, k] * (P[k, j] - stationary)
+            scratch.A[i, j] = inside
+        scratch.B[0, i] = total
     for i in range(K):
-        z[i] = room.B[0, i]
+        z[i] = scratch.B[0, i]
     for i in range(K):
         for j in range(K):
             total = 0.0
             for k in range(K):
-                total += room.A[i, k] * M[j, k]
+                total += scratch.A[i, k] * M[j, k]
             P[i, j] = total
     for i in range(K):
         if i != HEADING:
-            P[i, i] += state.usual[i]
-    P[HEADING, HEADING] += walked_rad2
+            P[i, i] += state.stationary[i]
+    P[HEADING, HEADING] += process_noise_rad2
     for b in range(2):
-        z[BEND + b] += state.habit[b]
+        z[WRIST_ANGLES + b] += state.habit[b]
     for i in range(K):
         belief.z[i] = z[i]
         for j in range(i + 1):
-            room.A[i, j] = 0.5 * (P[i, j] + P[j, i])
-    if cholesky(room.A, K, room.L):
-        inverse(room.L, K, room.B, belief.z_info)
+            scratch.A[i, j] = 0.5 * (P[i, j] + P[j, i])
+    if cholesky(scratch.A, K, scratch.L):
+        inverse(scratch.L, K, scratch.B, belief.z_info)
         return
     for i in range(K):  # by rounding: nothing is known
         for j in range(K):
-            P[i, j] = state.usual[i] if i == j else 0.0
-            belief.z_info[i, j] = 1.0 / state.usual[i] if i == j else 0.0
+            P[i, j] = state.stationary[i] if i == j else 0.0
+            belief.z_info[i, j] = 1.0 / state.stationary[i] if i == j else 0.0
 
 
 @inner
@@ -147,7 +154,7 @@ def keep_extras(
     z: Float,
     cov: Float,
     scale: float,
-    room: ExtrasRoom,
+    scratch: ExtrasScratch,
 ) -> None:
     """Take over what an epoch leaves of the extras.
 
@@ -160,37 +167,37 @@ def keep_extras(
         belief: What was believed before.
         z: (K,) their mean.
         cov: (N, N) covariance, with theirs last, and `scale` by how much the misfit has scaled it.
-        room: Room.
+        room: Scratch.
     """
-    K, P, A, B, new = state.z.shape[0], state.z_cov, room.A, room.B, room.M[0]
+    K, P, A, B, new = state.z.shape[0], state.z_cov, scratch.A, scratch.B, scratch.M[0]
     if K < EXTRAS:
         return
     first = cov.shape[0] - K
     for i in range(K):
         # What the palm tells and what fingers tell are two blocks: within one, as much is new of everything.
-        errs_s = settings.turn_errs_s if BEND <= i < LIGHT else settings.errs_s
+        errs_s = settings.wrist_errs_s if WRIST_ANGLES <= i < LED_SCALE else settings.errs_s
         new[i] = 1.0 - exp(-min(dt_s, 10.0) / errs_s)
         for j in range(K):
             A[i, j] = cov[first + i, first + j] / scale
-    if not cholesky(A, K, room.L):
+    if not cholesky(A, K, scratch.L):
         return
-    inverse(room.L, K, B, A)  # the posterior's information
+    inverse(scratch.L, K, B, A)  # the posterior's information
     for i in range(K):
         pull = 0.0
         for j in range(K):
             pull += A[i, j] * (z[j] - belief.z[j])
-        room.M[1, i] = new[i] * pull
+        scratch.M[1, i] = new[i] * pull
     for i in range(K):
         for j in range(K):
             gained = A[i, j] - belief.z_info[i, j]
             B[i, j] = belief.z_info[i, j] + sqrt(new[i] * new[j]) * gained
-    if not cholesky(B, K, room.L):
+    if not cholesky(B, K, scratch.L):
         return
-    inverse(room.L, K, A, P)
+    inverse(scratch.L, K, A, P)
     for i in range(K):
         state.z[i] = belief.z[i]
         for j in range(K):
-            state.z[i] += P[i, j] * room.M[1, j]
+            state.z[i] += P[i, j] * scratch.M[1, j]
     share = 1.0 - exp(-min(dt_s, 10.0) / settings.habit_s)
     for b in range(2):
-        state.habit[b] += share * (state.z[BEND + b] - state.habit[b])
+        state.habit[b] += share * (state.z[WRIST_ANGLES + b] - state.habit[b])

@@ -1,6 +1,6 @@
 """Kernels of how the MCP of a hand goes with its PIP, learnt from the fingers whose tips are seen.
 
-A natural MCP is a share of the PIP (`master.estimator.natural_curve`). But each hand has a share of its own, and keeps
+A natural MCP is a share of the PIP (`master.estimator.flexion_synergy`). But each hand has its own share, and keeps
 to it more closely or less. Both are those of a regression through the origin,
 
     e = MCP - natural MCP,   share = sum(PIP e) / sum(PIP^2),   spread^2 = sum(e^2) / sum(PIP^2) - share^2,
@@ -25,10 +25,10 @@ def expect_coupling(settings: Settings, state: HandState, dt_s: float, prior: Pr
     kept, sums = exp(-dt_s / settings.coupled_s), state.coupling
     for i in range(3):
         sums[i] *= kept
-    usual = settings.coupled_fingers * _BENT_RAD2
-    squared = usual + sums[0]
+    stationary = settings.coupled_fingers * _BENT_RAD2
+    squared = stationary + sums[0]
     share = sums[1] / squared
-    spread2 = (usual * settings.coupled_spread**2 + sums[2]) / squared - share * share
+    spread2 = (stationary * settings.coupled_spread**2 + sums[2]) / squared - share * share
     prior.coupled_share[0], prior.coupled_spread[0] = share, sqrt(max(spread2, 0.0))
 
 

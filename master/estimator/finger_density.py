@@ -12,7 +12,7 @@ from common.kernels import inlined, inner
 from master.estimator.finger_scan import FINE, HANDS, NODES, ROWS, Prior, Scan
 from master.estimator.hand_tables import HandTables
 from master.estimator.settings import Settings
-from master.estimator.wrist_device import Sights
+from master.estimator.wrist_device import LinesOfSight
 
 _NATURAL, _STRAIGHT, _FREE = 0, 1, 2
 _FAR = 1e9  # logarithm of what is not searched
@@ -54,7 +54,7 @@ def _densities(hand: HandTables, settings: Settings, prior: Prior, f: int, unsee
         flexion2 = (1.0 - share) * scan.flexion2[f, node] + share * scan.flexion2[f, node + 1]
         if unseen:
             shows = (1.0 - share) * scan.showing[f, node] + share * scan.showing[f, node + 1]
-            base -= (settings.unseen_again if prior.recent[f] > 0.0 else settings.unseen) * shows
+            base -= (settings.unseen_again if prior.had_previous[f] > 0.0 else settings.unseen) * shows
         off = flexion - prior.natural[f, 1] - prior.slope[f, 1] * pip
         variance = prior.flexion[f] ** 2 + flexion2
         if f > 0 and prior.only_natural[0] == 0.0:
@@ -69,20 +69,22 @@ def _densities(hand: HandTables, settings: Settings, prior: Prior, f: int, unsee
 
 
 @inner
-def weigh_hands(hand: HandTables, settings: Settings, sights: Sights, prior: Prior, scan: Scan) -> None:
+def weigh_hands(
+    hand: HandTables, settings: Settings, lines_of_sight: LinesOfSight, prior: Prior, scan: Scan
+) -> None:
     """Write the evidence of each hand by each finger, and the probabilities of the hands.
 
     A finger of which the laser alone tells has no say: it is explained by any.
     """
     others = 0
     for f in range(1, 5):
-        others += 1 if sights.shown[f] > 0.0 else 0
+        others += 1 if lines_of_sight.shown[f] > 0.0 else 0
     scan.share[_NATURAL] = log(settings.mostly_natural)
     scan.share[_STRAIGHT] = scan.share[_FREE] = log(0.5 * (1.0 - settings.mostly_natural))
     for f in range(5):
         if scan.known[f] == 0.0:
             continue
-        _densities(hand, settings, prior, f, others > 0 and sights.shown[f] == 0.0, scan)
+        _densities(hand, settings, prior, f, others > 0 and lines_of_sight.shown[f] == 0.0, scan)
         for h in range(HANDS):
             top = -inf
             for k in range(FINE * (NODES - 1) + 1):
@@ -91,7 +93,7 @@ def weigh_hands(hand: HandTables, settings: Settings, sights: Sights, prior: Pri
             for k in range(FINE * (NODES - 1) + 1):
                 total += exp(scan.log_p[f, h, k] - top)
             scan.hand[f, h] = log(total) + top
-            if f > 0 and sights.shown[f] > 0.0:
+            if f > 0 and lines_of_sight.shown[f] > 0.0:
                 scan.share[h] += scan.hand[f, h]
     if prior.only_natural[0] > 0.0:
         scan.share[_STRAIGHT] = scan.share[_FREE] = -inf
@@ -114,7 +116,9 @@ def _at(scan: Scan, f: int, place: float, out: Float) -> None:
 
 
 @inner
-def choose(hand: HandTables, settings: Settings, sights: Sights, prior: Prior, f: int, scan: Scan) -> None:
+def choose(
+    hand: HandTables, settings: Settings, lines_of_sight: LinesOfSight, prior: Prior, f: int, scan: Scan
+) -> None:
     """Write what is believed of finger f: the median of the part that weighs most, its likeliest pose, and the spread.
 
     By the densities that `weigh_hands` left.
@@ -134,8 +138,8 @@ def choose(hand: HandTables, settings: Settings, sights: Sights, prior: Prior, f
         total += p[k]
     for k in range(count):
         p[k] /= total
-        off = (low + k * step - prior.last[f]) / prior.walked[f]
-        scan.near[k] = p[k] * exp(-0.5 * off * off) if prior.recent[f] > 0.0 else p[k]
+        off = (low + k * step - prior.last[f]) / prior.process_noise[f]
+        scan.near[k] = p[k] * exp(-0.5 * off * off) if prior.had_previous[f] > 0.0 else p[k]
     # Parts: the density is walked from top to top.
     begin, best_begin, best_end, best, parts = 0, 0, count, -1.0, 0
     while begin < count:
@@ -185,4 +189,4 @@ def choose(hand: HandTables, settings: Settings, sights: Sights, prior: Prior, f
             scan.out[f, k] = scan.mode[f, k] = prior.natural[f, k] + prior.slope[f, k] * prior.law[f]
     share = place / FINE - node
     for i in range(2):
-        sights.lack[f, i] = (1.0 - share) * scan.lack[f, node, i] + share * scan.lack[f, node + 1, i]
+        lines_of_sight.lack[f, i] = (1.0 - share) * scan.lack[f, node, i] + share * scan.lack[f, node + 1, i]

@@ -20,18 +20,18 @@ from typing import Any
 from common.arrays import Float, Int
 from common.kernels import inlined, inner
 from common.records import record
-from master.estimator.finger_surface import NO_MOVES, OWN_MOVES, Surface, cut, first_hit, look
+from master.estimator.finger_surface import NO_MOVES, OWN_MOVES, Surface, first_hit, laser_centroid, look
 from master.estimator.hand_tables import HandTables
 from master.estimator.kinematics import twist_hand
 from master.estimator.matrices import cholesky, substitute
 from master.estimator.settings import Settings
-from master.estimator.wrist_device import Sights
+from master.estimator.wrist_device import LinesOfSight
 
 NODES, FINE = 16, 4
 ROWS = 8  # laser 2, tip 2, depth, abduction, DIP, twist
 HANDS = 3
-_STEPS, _STEPS_AFRESH = 3, 5  # from the pose of the PIP before, and from one that was tried
-_AFRESH = 5  # every so many nodes others are tried
+_STEPS, _STEPS_RESTART = 3, 5  # from the pose of the PIP before, and from one that was tried
+_RESTART = 5  # every so many nodes others are tried
 _FARTHEST_RAD = 0.3  # of one step
 _COARSE_RAD = (0.15, 0.6, 1.05, 1.4)  # flexions that are tried
 _COARSE = 4
@@ -44,14 +44,14 @@ class Prior:
     """What is believed of fingers before a triple is seen.
 
     Attributes:
-        palm: (4, 4) palm, camera frame, and `bend_axes` (2, 3) as of `bent_palm`.
+        palm: (4, 4) palm, camera frame, and `wrist_axes` (2, 3) as of `flexed_palm`.
         twist, twist2: (5,) mean and variance of the twist of the hinges [rad].
         light, light2: (1,) mean and variance of the logarithm of the light's unit.
         natural, slope: (5, 4) natural angles by the PIP: natural + slope PIP.
         abduction, flexion: (5,) standard deviations of abduction and flexion about them [rad].
         coupled_share, coupled_spread: (1,) by how much of the PIP more this hand bends in its MCP, and within how much
             of it (`master.estimator.finger_coupling`).
-        last: (5,) PIPs where the fingers are expected, `walked` (5,) how far from there they may be, and `recent` (5,)
+        last: (5,) PIPs expected, `process_noise` (5,) how far from there they may be, `had_previous` (5,)
             whether they are expected anywhere.
         near_rad: (5,) how far from there a finger that is well known is searched; 0: everywhere.
         only_natural: (1,) 1 where fingers are taken to bend naturally, whatever is seen (level "fk").
@@ -60,7 +60,7 @@ class Prior:
     """
 
     palm: Float
-    bend_axes: Float
+    wrist_axes: Float
     twist: Float
     twist2: Float
     light: Float
@@ -72,8 +72,8 @@ class Prior:
     coupled_share: Float
     coupled_spread: Float
     last: Float
-    walked: Float
-    recent: Float
+    process_noise: Float
+    had_previous: Float
     near_rad: Float
     only_natural: Float
     law: Float
@@ -85,7 +85,7 @@ class Prior:
         return record(
             cls,
             palm=(4, 4),
-            bend_axes=(2, 3),
+            wrist_axes=(2, 3),
             twist=5,
             twist2=5,
             light=1,
@@ -97,8 +97,8 @@ class Prior:
             coupled_share=1,
             coupled_spread=1,
             last=5,
-            walked=5,
-            recent=5,
+            process_noise=5,
+            had_previous=5,
             near_rad=5,
             only_natural=1,
             law=5,
@@ -214,30 +214,32 @@ def _dip_sigma(settings: Settings, f: int, pip: float) -> float:
 
 
 @inner
-def _rows(settings: Settings, sights: Sights, prior: Prior, f: int, tip: bool, scan: Scan) -> float:
+def _rows(
+    settings: Settings, lines_of_sight: LinesOfSight, prior: Prior, f: int, tip: bool, scan: Scan
+) -> float:
     """Write residuals (8,) and derivatives (8, 4) of what `look` left in `scan.surface`; return half chi square."""
     seen, G, r, J, a = scan.surface.seen, scan.surface.J, scan.r, scan.J, scan.angles
     for i in range(ROWS):
         r[i] = 0.0
         for u in range(4):
             J[i, u] = 0.0
-    W = sights.laser_W[f]
+    W = lines_of_sight.laser_W[f]
     p = sqrt(W[0, 0])
     q = W[1, 0] / p
     d = sqrt(max(W[1, 1] - q * q, 0.0))
-    r0 = seen[0] + sights.lack[f, 0] - sights.laser[f, 0]
-    r1 = seen[1] + sights.lack[f, 1] - sights.laser[f, 1]
+    r0 = seen[0] + lines_of_sight.lack[f, 0] - lines_of_sight.laser[f, 0]
+    r1 = seen[1] + lines_of_sight.lack[f, 1] - lines_of_sight.laser[f, 1]
     r[0], r[1] = p * r0 + q * r1, d * r1
     for u in range(4):
         c = _column(u)
         J[0, u], J[1, u] = p * G[0, c] + q * G[1, c], d * G[1, c]
     if tip:
-        p = sqrt(sights.tip_W[f, 0, 0])
-        r[2], r[3] = p * (seen[2] - sights.tip[f, 0]), p * (seen[3] - sights.tip[f, 1])
-        w = sights.depth_w2[f]
+        p = sqrt(lines_of_sight.tip_W[f, 0, 0])
+        r[2], r[3] = p * (seen[2] - lines_of_sight.tip[f, 0]), p * (seen[3] - lines_of_sight.tip[f, 1])
+        w = lines_of_sight.depth_w2[f]
         if w > 0.0 and prior.light2[0] < 1.0:
             w = sqrt(1.0 / (1.0 / w + prior.light2[0]))
-            r[4] = w * (seen[4] + prior.light[0] - sights.depth[f])
+            r[4] = w * (seen[4] + prior.light[0] - lines_of_sight.depth[f])
         else:
             w = 0.0
         for u in range(4):
@@ -287,7 +289,7 @@ def scan_finger(
     hand: HandTables,
     device: Any,
     settings: Settings,
-    sights: Sights,
+    lines_of_sight: LinesOfSight,
     prior: Prior,
     f: int,
     tip: bool,
@@ -307,38 +309,42 @@ def scan_finger(
     for node in range(scan.first[f], scan.last[f] + 1):
         pip = low + (high - low) * node / (NODES - 1)
         a[4 * f + 2] = pip
-        sights.lack[f, 0] = sights.lack[f, 1] = 0.0
+        lines_of_sight.lack[f, 0] = lines_of_sight.lack[f, 1] = 0.0
         dip, aside = (
             prior.natural[f, 3] + prior.slope[f, 3] * pip,
             prior.natural[f, 0] + prior.slope[f, 0] * pip,
         )
         best, at = inf, _COARSE
-        if (node - scan.first[f]) % _AFRESH == 0:
+        if (node - scan.first[f]) % _RESTART == 0:
             for start in range(_COARSE):
                 _put(hand, f, aside, _COARSE_RAD[start], dip, prior.twist[f], scan)
-                look(hand, device, prior.palm, prior.bend_axes, a, f, NO_MOVES, surface)
-                cost = _rows(settings, sights, prior, f, tip, scan)
+                look(hand, device, prior.palm, prior.wrist_axes, a, f, NO_MOVES, surface)
+                cost = _rows(settings, lines_of_sight, prior, f, tip, scan)
                 if cost < best:
                     best, at = cost, start
         if node > scan.first[f]:
             before = x[f, node - 1]
             _put(hand, f, before[0], before[1], before[3], before[4], scan)
             if at < _COARSE:
-                look(hand, device, prior.palm, prior.bend_axes, a, f, NO_MOVES, surface)
-                if _rows(settings, sights, prior, f, tip, scan) < best:
+                look(hand, device, prior.palm, prior.wrist_axes, a, f, NO_MOVES, surface)
+                if _rows(settings, lines_of_sight, prior, f, tip, scan) < best:
                     at = _COARSE
         if at < _COARSE:
             _put(hand, f, aside, _COARSE_RAD[at], dip, prior.twist[f], scan)
-        steps = _STEPS if at == _COARSE else _STEPS_AFRESH
+        steps = _STEPS if at == _COARSE else _STEPS_RESTART
         length = cost = 0.0
         for k in range(steps + 1):
-            look(hand, device, prior.palm, prior.bend_axes, a, f, OWN_MOVES, surface)
+            look(hand, device, prior.palm, prior.wrist_axes, a, f, OWN_MOVES, surface)
             if k == steps - 1:
-                length = cut(device, f, surface)
+                length = laser_centroid(device, f, surface)
                 if length > 0.0:
-                    sights.lack[f, 0] = surface.cut[0] / surface.cut[2] - surface.seen[0]
-                    sights.lack[f, 1] = surface.cut[1] / surface.cut[2] - surface.seen[1]
-            cost = _rows(settings, sights, prior, f, tip, scan)
+                    lines_of_sight.lack[f, 0] = (
+                        surface.laser_centroid[0] / surface.laser_centroid[2] - surface.seen[0]
+                    )
+                    lines_of_sight.lack[f, 1] = (
+                        surface.laser_centroid[1] / surface.laser_centroid[2] - surface.seen[1]
+                    )
+            cost = _rows(settings, lines_of_sight, prior, f, tip, scan)
             if not _normal(scan) or k == steps:
                 break
             for u in range(4):
@@ -368,7 +374,7 @@ def scan_finger(
         substitute(scan.L, 4, scan.S[0])
         scan.flexion2[f, node] = scan.S[0, 1]
         scan.length_px[f, node] = length
-        scan.lack[f, node, 0], scan.lack[f, node, 1] = sights.lack[f, 0], sights.lack[f, 1]
+        scan.lack[f, node, 0], scan.lack[f, node, 1] = lines_of_sight.lack[f, 0], lines_of_sight.lack[f, 1]
         for i in range(ROWS):
             scan.rows[f, node, i] = scan.r[i]
         scan.misfit[f] = min(scan.misfit[f], 2.0 * cost)

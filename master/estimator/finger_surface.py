@@ -1,11 +1,11 @@
 """Kernels of a finger before a wrist device: its skin, where the laser meets it, and its tip.
 
-The skin of a finger is a chain of round cones (`common.hand_skin`), cut by the plane of the laser. What the camera
+The skin of a finger is a chain of capsules (`common.palmar_surface`), cut by the plane of the laser. What the camera
 makes of the cut is the centroid of the part that is lit and seen. It lies near a *ridge*: the points of the spheres
 that face the laser, pulled in to 0.77 of the radius, for the mean of a cosine over the half circle that faces the light
 lies there (pi / 4, less what is seen at a slant). Where the chain of ridge points crosses the plane nearest to the
 laser is the laser point: within 0.2 mm (median) from a PIP of 45 degrees on, 0.4 mm over all, at most about 1 mm. The
-ridge has derivatives in closed form; the exact cut (`cut`) tells what it lacks.
+ridge has derivatives in closed form; the exact cut (`laser_centroid`) tells what it lacks.
 
 A body that turns about an axis moves its point q on the plane by v, and the plane then meets the chain, of direction s,
 at q + v - s (n . v) / (n . s), with n the normal of the plane.
@@ -37,7 +37,7 @@ _STRETCH = 0.5  # share of the finger's breadth that one chord may span: more is
 
 
 class Surface:
-    """Room for one finger."""
+    """Scratch for one finger."""
 
     S: Float  # (8, 3) spheres
     Q: Float  # (9, 3) ridge
@@ -51,7 +51,7 @@ class Surface:
     lit: Float  # (RAYS, 5) x, y, z, clearness, body
     reached: Float  # (7,) whether the plane comes near a cone
     begins: Float  # (7,) no part of a cone is nearer to the camera [m]
-    cut: Float  # (3,) point of the exact cut
+    laser_centroid: Float  # (3,) point of the exact cut
     R: Float  # (4, 3, 3) joints, camera frame
     P: Float  # (4, 3)
     axis: Float  # (7, 3) about which each of `MOVES` turns what is beyond
@@ -76,7 +76,7 @@ class Surface:
             lit=(RAYS, 5),
             reached=7,
             begins=7,
-            cut=3,
+            laser_centroid=3,
             R=(4, 3, 3),
             P=(4, 3),
             axis=(7, 3),
@@ -133,8 +133,8 @@ def crossing(device: Any, f: int, work: Surface) -> int:
         dot = x * along[k, 0] + y * along[k, 1] + z * along[k, 2]
         x, y, z = x - dot * along[k, 0], y - dot * along[k, 1], z - dot * along[k, 2]
         scale = device.radius[f, k] / sqrt(x * x + y * y + z * z)
-        for_ridge = _PULLED_IN * scale
-        Q[k, 0], Q[k, 1], Q[k, 2] = S[k, 0] + for_ridge * x, S[k, 1] + for_ridge * y, S[k, 2] + for_ridge * z
+        pulled_in = _PULLED_IN * scale
+        Q[k, 0], Q[k, 1], Q[k, 2] = S[k, 0] + pulled_in * x, S[k, 1] + pulled_in * y, S[k, 2] + pulled_in * z
         if k == 7:
             out, ahead = _CAP_OUT * scale, _CAP_ALONG * device.radius[f, k]
             Q[8, 0] = S[7, 0] + out * x + ahead * along[7, 0]
@@ -204,7 +204,7 @@ def _away(S: Float, k: int) -> float:
 
 @inlined
 def first_hit(t: Float, dx: float, dy: float, dz: float) -> float:
-    """How far along a unit ray the cone of terms (12,) begins; inf: it is missed (`common.round_cones`)."""
+    """How far along a unit ray the cone of terms (12,) begins; inf: it is missed (`common.tapered_capsules`)."""
     m2, m3 = dx * t[0] + dy * t[1] + dz * t[2], dx * t[3] + dy * t[4] + dz * t[5]
     best, d2 = inf, t[6]
     k2, k1 = d2 - m2 * m2, d2 * m3 + m2 * t[8]
@@ -225,8 +225,8 @@ def first_hit(t: Float, dx: float, dy: float, dz: float) -> float:
 
 
 @inner
-def cut(device: Any, f: int, work: Surface) -> float:
-    """Write the centroid of the line that is lit and seen on finger f, of `work.S`, to `work.cut` (3,) [m].
+def laser_centroid(device: Any, f: int, work: Surface) -> float:
+    """Write the centroid of the line that is lit and seen on finger f, of `work.S`, to `work.laser_centroid` (3,) [m].
 
     Returns:
         Length of that line in the undistorted image [px]; 0: the laser misses the finger, or it is not seen.
@@ -258,14 +258,14 @@ def cut(device: Any, f: int, work: Surface) -> float:
             by = S[k - 1, 1] + share * (S[k, 1] - S[k - 1, 1]) - laser[1]
             bz = S[k - 1, 2] + share * (S[k, 2] - S[k - 1, 2]) - laser[2]
             across, ahead = a0 * bx + a1 * by + a2 * bz, c0 * bx + c1 * by + c2 * bz
-            turn, thick = atan2(across, ahead), max(r, device.radius[f, k - 1])
+            angle, thick = atan2(across, ahead), max(r, device.radius[f, k - 1])
             wide = 1.3 * thick / sqrt(across * across + ahead * ahead)
-            low, high = min(low, turn - wide), max(high, turn + wide)
+            low, high = min(low, angle - wide), max(high, angle + wide)
         if abs(height) < r:
             across, ahead = a0 * x + a1 * y + a2 * z, c0 * x + c1 * y + c2 * z
             wide = sqrt(r * r - height * height) / sqrt(across * across + ahead * ahead)
-            turn = atan2(across, ahead)
-            low, high = min(low, turn - 1.1 * wide), max(high, turn + 1.1 * wide)
+            angle = atan2(across, ahead)
+            low, high = min(low, angle - 1.1 * wide), max(high, angle + 1.1 * wide)
         near = height
     if not low < high:
         return 0.0
@@ -276,8 +276,8 @@ def cut(device: Any, f: int, work: Surface) -> float:
     step = (high - low) / (RAYS - 1)
     first = _ROOT - 1 if f == 0 else 0
     for ray in range(RAYS):
-        turn = low + ray * step
-        s, c = sin(turn), cos(turn)
+        angle = low + ray * step
+        s, c = sin(angle), cos(angle)
         dx, dy, dz = s * a0 + c * c0, s * a1 + c * c1, s * a2 + c * c2
         far, body = inf, -1
         for k in range(7):
@@ -326,7 +326,7 @@ def cut(device: Any, f: int, work: Surface) -> float:
         return 0.0
     u, v = u / total, v / total
     far = offset / (n[0] * u + n[1] * v + n[2])
-    work.cut[0], work.cut[1], work.cut[2] = far * u, far * v, far
+    work.laser_centroid[0], work.laser_centroid[1], work.laser_centroid[2] = far * u, far * v, far
     return total * device.focal[0]
 
 
@@ -335,7 +335,7 @@ def look(
     hand: HandTables,
     device: Any,
     T: Float,
-    bend_axes: Float,
+    wrist_axes: Float,
     angles: Float,
     f: int,
     moves: int,
@@ -345,7 +345,7 @@ def look(
 
     Args:
         hand, device: What is looked at, and by what.
-        T: (4, 4) palm, camera frame, and `bend_axes` (2, 3) about which the wrist bends (`bent_palm`).
+        T: (4, 4) palm, camera frame, and `wrist_axes` (2, 3) about which the wrist bends (`flexed_palm`).
         angles: (20,) [rad].
         f: Finger.
         moves: By how many of `MOVES` derivatives are wanted.
@@ -374,7 +374,7 @@ def look(
     for i in range(3):
         A[1, i], A[2, i], A[3, i] = -R[0, i, 0], -R[1, i, 0], -R[2, i, 0]
         A[4, i] = 0.0
-        A[5, i], A[6, i] = bend_axes[0, i], bend_axes[1, i]
+        A[5, i], A[6, i] = wrist_axes[0, i], wrist_axes[1, i]
     # The twist turns about the first bone as it is before the flexion.
     c, s = cos(angles[4 * f + 1]), sin(angles[4 * f + 1])
     swing, u = hand.swing, hand.twist_axis[f]

@@ -19,16 +19,18 @@ import numpy as np
 from common.arrays import Float
 from common.calibration import ImuCalibration
 from common.geometry import Wxyz, matrix_of, matrix_to_quaternion, quaternion_product
-from common.wrist_bend import bend_quaternion
-from master.estimator.epoch import Turn
+from common.wrist_joint import wrist_quaternion
+from master.estimator.epoch import OrientationMeasurement
 from master.estimator.imu_samples import Between, OrientationSamples
-from master.estimator.palm_imu import SURE_RAD, turn_of
+from master.estimator.palm_imu import SURE_RAD, rotation_of
 from master.estimator.settings import DEFAULT
-from master.estimator.wrist_device import BEND, HEADING, TILT
+from master.estimator.wrist_device import HEADING, TILT, WRIST_ANGLES
 
 ANYWHERE_RAD = pi / sqrt(3.0)  # standard deviation of a uniform circle
 LOST_RAD = 1.0  # a heading less sure than this may point anywhere
-_WALK2, _MOST2 = np.radians([0.2, 5.0]) ** 2  # [rad^2/s] a heading walks at least and, unless evenly, at most
+_PROCESS_NOISE2, _MOST2 = (
+    np.radians([0.2, 5.0]) ** 2
+)  # [rad^2/s] a heading walks at least and, unless evenly, at most
 _CONTRARY_NS, _CONTRARY = 500_000_000, 5  # what contradicts for so long, and so often, is right
 _RESTARTED_S = 0.25  # an IMU that begins anew is silent for longer, until it knows where up is
 _SMALL_RAD = 1e-9  # a tilt by less is taken as small
@@ -40,7 +42,7 @@ class Forearm:
     """Push machine. Holds the samples of an IMU, and since when palms contradict it.
 
     Attributes:
-        lost: Whether the IMU began anew since `turn_at` was asked.
+        lost: Whether the IMU began anew since `orientation_at` was asked.
         counts: `orientation.used`, epochs that had a sample, `orientation.absent`, those farther than 50 ms from any;
             samples left out, as of `OrientationSamples`; `forearm.begun`, how often the heading began anew, and
             `forearm.outlier`, palms that contradicted it.
@@ -53,8 +55,10 @@ class Forearm:
             CalibrationError: The file does not say how it is mounted.
         """
         self.counts: Counter[str] = Counter() if counts is None else counts
-        self._imu, self._imu_forearm = imu, _wxyz(turn_of("q_palm_imu", imu.q_palm_imu).T)
-        self._rig_world = None if imu.q_rig_world is None else _wxyz(turn_of("q_rig_world", imu.q_rig_world))
+        self._imu, self._imu_forearm = imu, _wxyz(rotation_of("q_palm_imu", imu.q_palm_imu).T)
+        self._rig_world = (
+            None if imu.q_rig_world is None else _wxyz(rotation_of("q_rig_world", imu.q_rig_world))
+        )
         self._samples = OrientationSamples(self.counts, imu.heading_drift_rad_s, imu.stamp_offset_us)
         self._sample_ns, self._sample_drift_rad = 0, nan
         self._asked_ns: int | None = None
@@ -78,7 +82,7 @@ class Forearm:
             self.lost, self._drift_rad = True, heading_sigma_rad
         self._sample_ns, self._sample_drift_rad = t_ns, heading_sigma_rad
 
-    def turn_at(self, t_ns: int, z: Float, z_cov: Float) -> Turn | None:
+    def orientation_at(self, t_ns: int, z: Float, z_cov: Float) -> OrientationMeasurement | None:
         """How the forearm turns the palm at an epoch; None: no sample is near, or the rig does not place its world.
 
         Args:
@@ -88,25 +92,31 @@ class Forearm:
         found = self._between(t_ns)
         if found is None or self._rig_world is None:
             return None
-        walked = self._walked_rad2(t_ns, found)
-        tilted, turned = self._tilted(self._rig_world, z), 0.5 * float(z[HEADING])
-        heading = cos(turned), 0.0, 0.0, sin(turned)
+        process_noise = self._process_noise_rad2(t_ns, found)
+        tilted, half_heading = self._tilted(self._rig_world, z), 0.5 * float(z[HEADING])
+        heading = cos(half_heading), 0.0, 0.0, sin(half_heading)
         rotation = matrix_of(quaternion_product(quaternion_product(tilted, heading), self._forearm(found)))
-        sigma = hypot(DEFAULT.strap_rad, DEFAULT.palm_walk_rad_s * found.away_s)
+        sigma = hypot(DEFAULT.strap_rad, DEFAULT.palm_process_noise_rad_s * found.away_s)
         axes = matrix_of(self._rig_world).T.copy()  # about x and y of the world the forearm tilts,
         axes[2] = matrix_of(tilted)[:, 2]  # about the vertical that is believed it turns
-        wide = z_cov[HEADING, HEADING] + walked + np.trace(z_cov[BEND : BEND + 2, BEND : BEND + 2])
-        return Turn(rotation, _EYE / sigma**2, bool(wide < SURE_RAD**2), axes, walked)
+        wide = (
+            z_cov[HEADING, HEADING]
+            + process_noise
+            + np.trace(z_cov[WRIST_ANGLES : WRIST_ANGLES + 2, WRIST_ANGLES : WRIST_ANGLES + 2])
+        )
+        return OrientationMeasurement(
+            rotation, _EYE / sigma**2, bool(wide < SURE_RAD**2), axes, process_noise
+        )
 
     def heading_of(self, t_ns: int, R_rig_palm: Float, z: Float) -> float | None:
         """The heading that comes nearest to a palm (3, 3) [rad]; None: no sample is near."""
         found = self._samples.between(t_ns)
         if found is None or self._rig_world is None:
             return None
-        flexion, deviation = z[BEND : BEND + 2].tolist()
-        palm = matrix_of(quaternion_product(self._forearm(found), bend_quaternion(flexion, deviation)))
-        turn = matrix_of(self._tilted(self._rig_world, z)).T @ R_rig_palm @ palm.T
-        return atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+        flexion, deviation = z[WRIST_ANGLES : WRIST_ANGLES + 2].tolist()
+        palm = matrix_of(quaternion_product(self._forearm(found), wrist_quaternion(flexion, deviation)))
+        rotation = matrix_of(self._tilted(self._rig_world, z)).T @ R_rig_palm @ palm.T
+        return atan2(rotation[1, 0] - rotation[0, 1], rotation[0, 0] + rotation[1, 1])
 
     def contradicted(self, t_ns: int, *, by_palm: bool) -> bool:
         """Note whether the palm contradicts at an epoch; return whether it did so for long, and is right."""
@@ -118,12 +128,12 @@ class Forearm:
         long = abs(t_ns - self._contrary_ns[0]) > _CONTRARY_NS
         return long and len(self._contrary_ns) >= _CONTRARY
 
-    def world_at(self, t_ns: int, bend_rad: Float, bend_cov: Float) -> tuple[Float, Float]:
+    def world_at(self, t_ns: int, wrist_angles_rad: Float, wrist_cov: Float) -> tuple[Float, Float]:
         """The palm at an instant in the IMU's own world, which needs no heading.
 
         Args:
             t_ns: The instant.
-            bend_rad, bend_cov: (2,), (2, 2) of the wrist.
+            wrist_angles_rad, wrist_cov: (2,), (2, 2) of the wrist.
 
         Returns:
             Quaternion (4,), palm axes -> the IMU's world, and standard deviations (2,) [rad]: tilt per axis, heading;
@@ -132,16 +142,16 @@ class Forearm:
         found = self._between(t_ns)
         if found is None:
             return NO_WORLD
-        turned = DEFAULT.palm_walk_rad_s * found.away_s
-        forearm, (flexion, deviation) = self._forearm(found), bend_rad.tolist()
-        (ff, fd), (_, dd) = bend_cov.tolist()
+        half_heading = DEFAULT.palm_process_noise_rad_s * found.away_s
+        forearm, (flexion, deviation) = self._forearm(found), wrist_angles_rad.tolist()
+        (ff, fd), (_, dd) = wrist_cov.tolist()
         c, s = cos(deviation), sin(deviation)
         # Along each axis of the world: what a flexion, about the forearm's x as it deviates, and a deviation leave.
         about = [(c * x - s * z, y) for x, y, z in matrix_of(forearm).tolist()]
         x, y, z = (u * u * ff + 2.0 * u * v * fd + v * v * dd for u, v in about)
-        tilt = hypot(self._imu.orientation_sigma_rad, turned, sqrt(0.5 * (x + y)))
-        heading = hypot(self._imu.heading_sigma_rad or 0.0, found.drift_rad, turned, sqrt(z))
-        palm = np.array(quaternion_product(forearm, bend_quaternion(flexion, deviation)))
+        tilt = hypot(self._imu.orientation_sigma_rad, half_heading, sqrt(0.5 * (x + y)))
+        heading = hypot(self._imu.heading_sigma_rad or 0.0, found.drift_rad, half_heading, sqrt(z))
+        palm = np.array(quaternion_product(forearm, wrist_quaternion(flexion, deviation)))
         return -palm if palm[0] < 0.0 else palm, np.array([tilt, min(heading, ANYWHERE_RAD)])
 
     def _between(self, t_ns: int) -> Between | None:
@@ -161,7 +171,7 @@ class Forearm:
         share = sin(0.5 * angle) / angle if angle > _SMALL_RAD else 0.5
         return quaternion_product(rig_world, (cos(0.5 * angle), share * x, share * y, 0.0))
 
-    def _walked_rad2(self, t_ns: int, found: Between) -> float:
+    def _process_noise_rad2(self, t_ns: int, found: Between) -> float:
         """Variance [rad^2] of what the heading has drifted since the epoch before.
 
         Drifts that a filter tells are no walks: mostly a bias that nobody knows, whose variance grows with the square
@@ -169,11 +179,11 @@ class Forearm:
         """
         since_s = 0.0 if self._asked_ns is None else 1e-9 * abs(t_ns - self._asked_ns)
         even_rad = abs(found.drift_rad - self._drift_rad)
-        walked = found.drift_rad**2 - self._drift_rad**2
+        process_noise = found.drift_rad**2 - self._drift_rad**2
         if found.drift_rad >= ANYWHERE_RAD:  # as much as is ever told
-            even_rad, walked = max(even_rad, self._imu.heading_drift_rad_s * since_s), _MOST2 * since_s
+            even_rad, process_noise = max(even_rad, self._imu.heading_drift_rad_s * since_s), _MOST2 * since_s
         self._asked_ns, self._drift_rad = t_ns, found.drift_rad
-        return float(max(even_rad**2, min(max(walked, _WALK2 * since_s), _MOST2 * since_s)))
+        return float(max(even_rad**2, min(max(process_noise, _PROCESS_NOISE2 * since_s), _MOST2 * since_s)))
 
 
 def _wxyz(rotation: Float) -> Wxyz:

@@ -14,17 +14,17 @@ import numpy as np
 from common.arrays import Bool, Code, Float
 from common.hand_model import FINGERS
 from common.messages import Detections, HandPose, WristDetections
-from master.estimator.epoch import Fitted, Turn, WristRows
+from master.estimator.cycle_reader import CycleReader
+from master.estimator.epoch import Fitted, OrientationMeasurement, WristRows
 from master.estimator.estimator import Estimator
 from master.estimator.forearm import LOST_RAD, Forearm
-from master.estimator.ground import ON_MARKERS
+from master.estimator.observation_sources import ON_MARKERS
 from master.estimator.pipeline import MarkerPipeline, SolvedPose
-from master.estimator.triple_reader import TripleReader
-from master.estimator.wrist_device import BEND, HEADING
+from master.estimator.wrist_device import HEADING, WRIST_ANGLES
 from master.wrist_setup import WristSetup
 
 _SILENT_FRAMES = 2.2  # of the slowest camera: when so long no epoch came, the device's triples lead
-_FRESH_NS = 70_000_000  # an older triple says nothing of fingers now
+_MAX_AGE_NS = 70_000_000  # an older triple says nothing of fingers now
 _OWN_NS = 17_000_000  # half of the time from triple to triple: of epochs that are unrelated
 _KEPT = 8
 
@@ -37,7 +37,7 @@ class WristSide:
     """
 
     def __init__(
-        self, setup: WristSetup, reader: TripleReader, counts: Counter[str], *, continuous: bool
+        self, setup: WristSetup, reader: CycleReader, counts: Counter[str], *, continuous: bool
     ) -> None:
         """Join the parts.
 
@@ -55,7 +55,7 @@ class WristSide:
         self._waiting: deque[WristDetections] = deque(maxlen=_KEPT)
         self._last_ns = -(2**62)
         self.laser_m, self.laser_ns = np.full((5, 3), nan), -(2**62)
-        self.level, self.ambiguous = np.zeros(5, np.uint8), np.zeros(5, np.bool_)
+        self.solver_mode, self.ambiguous = np.zeros(5, np.uint8), np.zeros(5, np.bool_)
 
     def push(self, message: WristDetections) -> int | None:
         """Take a triple; return its time, or None: it is not later than the last."""
@@ -76,7 +76,7 @@ class WristSide:
         else:
             while self._waiting and self._waiting[0].t_ns + late_ns <= t_ns:
                 message = self._waiting.popleft()
-            if message is not None and t_ns - message.t_ns - late_ns > _FRESH_NS:
+            if message is not None and t_ns - message.t_ns - late_ns > _MAX_AGE_NS:
                 message = None
         if message is None:
             return None
@@ -84,59 +84,66 @@ class WristSide:
         self.laser_ns = message.t_ns + late_ns
         return rows
 
-    def turn_at(self, t_ns: int, estimator: Estimator) -> Turn | None:
+    def orientation_at(self, t_ns: int, estimator: Estimator) -> OrientationMeasurement | None:
         """How the IMU has the palm turned at an epoch; None: it does not say, or its heading may be any."""
         if self.forearm is None:
             return None
         if self.forearm.lost:
             self.forearm.lost = False
             estimator.forget_heading()
-        turn = self.forearm.turn_at(t_ns, estimator.extras, estimator.extras_cov)
+        orientation = self.forearm.orientation_at(t_ns, estimator.extras, estimator.extras_cov)
         unknown = estimator.extras_cov[HEADING, HEADING] > LOST_RAD**2
-        return None if unknown else turn
+        return None if unknown else orientation
 
-    def solved(self, t_ns: int, hand: Fitted, estimator: Estimator, *, turned: bool) -> None:
+    def solved(self, t_ns: int, hand: Fitted, estimator: Estimator, *, oriented: bool) -> None:
         """Learn from an epoch that was solved.
 
         Args:
             t_ns: The epoch.
             hand: As it was solved.
             estimator: What solved it.
-            turned: Whether it had a TURN row to begin with.
+            oriented: Whether it had a TURN row to begin with.
         """
-        if hand.level.any():
-            self.level, self.ambiguous = hand.level, hand.ambiguous
+        if hand.solver_mode.any():
+            self.solver_mode, self.ambiguous = hand.solver_mode, hand.ambiguous
         self._count("tip_refused", hand.refused)
         self._count("off", hand.off)
         self._count("ambiguous", hand.ambiguous)
-        if self.forearm is None or hand.solution is None or not hand.rests[5] & ON_MARKERS:
+        if self.forearm is None or hand.solution is None or not hand.sources[5] & ON_MARKERS:
             return
-        if turned and self.forearm.contradicted(t_ns, by_palm=hand.turn_left_out):
+        if oriented and self.forearm.contradicted(t_ns, by_palm=hand.rotation_rejected):
             estimator.forget_heading()
-            turned = False
-        if turned:
+            oriented = False
+        if oriented:
             return
         heading = self.forearm.heading_of(t_ns, hand.solution.T_rig_palm[:3, :3], estimator.extras)
         if heading is not None:
             self.counts["forearm.begun"] += 1
-            bend = estimator.extras_cov[BEND : BEND + 2, BEND : BEND + 2]
-            estimator.begin_heading(heading, float(np.trace(bend) + np.trace(hand.solution.alone[:3, :3])))
+            wrist_angles = estimator.extras_cov[
+                WRIST_ANGLES : WRIST_ANGLES + 2, WRIST_ANGLES : WRIST_ANGLES + 2
+            ]
+            estimator.begin_heading(
+                heading, float(np.trace(wrist_angles) + np.trace(hand.solution.alone[:3, :3]))
+            )
 
     def told(self, pose: HandPose, estimator: Estimator) -> HandPose:
         """The pose with what else is known of the hand."""
         changes: dict[str, Float | Code | Bool] = {}
         if self.forearm is not None:
-            bend, cov = (
-                estimator.extras[BEND : BEND + 2].copy(),
-                estimator.extras_cov[BEND : BEND + 2, BEND : BEND + 2],
+            wrist_angles, cov = (
+                estimator.extras[WRIST_ANGLES : WRIST_ANGLES + 2].copy(),
+                estimator.extras_cov[WRIST_ANGLES : WRIST_ANGLES + 2, WRIST_ANGLES : WRIST_ANGLES + 2],
             )
-            changes["wrist_bend_rad"], changes["wrist_bend_sigma_rad"] = bend, np.sqrt(np.diag(cov))
-            world = self.forearm.world_at(pose.t_ns, bend, cov)
+            changes["wrist_angles_rad"], changes["wrist_angles_sigma_rad"] = (
+                wrist_angles,
+                np.sqrt(np.diag(cov)),
+            )
+            world = self.forearm.world_at(pose.t_ns, wrist_angles, cov)
             changes["palm_world_wxyz"], changes["palm_world_sigma_rad"] = world
-        if abs(pose.t_ns - self.laser_ns) <= _FRESH_NS:
-            changes["laser_m"], changes["level"], changes["ambiguous"] = (
+        if abs(pose.t_ns - self.laser_ns) <= _MAX_AGE_NS:
+            changes["laser_m"], changes["solver_mode"], changes["ambiguous"] = (
                 self.laser_m,
-                self.level,
+                self.solver_mode,
                 self.ambiguous,
             )
         return msgspec.structs.replace(pose, **changes)
@@ -172,7 +179,7 @@ class FusedPipeline:
         t_ns = self._side.push(message)
         if t_ns is None or (self._last_ns is not None and t_ns - self._last_ns <= self._silent_ns):
             return []
-        solved = self._markers.blind(t_ns, message.ready_t_ns)
+        solved = self._markers.no_observation(t_ns, message.ready_t_ns)
         self.counts["poses_by_wrist"] += 1
         return [] if solved is None else [solved]
 

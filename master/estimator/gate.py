@@ -88,17 +88,17 @@ class Association:
 
 def among(others_m: Float, on_hand: Int, settings: GateSettings = SETTINGS) -> Prior:
     """Expect markers `on_hand` around the others (M, 3); no hand is solved."""
-    points, placed = np.full(others_m.shape, np.nan), others_m[on_hand]
-    placed = placed[np.isfinite(placed[:, 0])]
-    if len(placed):
-        points[on_hand] = np.median(placed, axis=0)
+    points, triangulated = np.full(others_m.shape, np.nan), others_m[on_hand]
+    triangulated = triangulated[np.isfinite(triangulated[:, 0])]
+    if len(triangulated):
+        points[on_hand] = np.median(triangulated, axis=0)
     return Prior(points, np.tile(settings.spread_m**2 * np.eye(3), (len(points), 1, 1)))
 
 
 def associate(
     cameras: CameraArrays,
     pixels: tuple[Float, Float, Float],
-    rivals: tuple[Float, Float],
+    alternatives: tuple[Float, Float],
     hand: Prior,
     past: tuple[Float, Float],
     rays_px: float = 0.0,
@@ -116,7 +116,7 @@ def associate(
         settings: Numbers.
     """
     first_uv, first_sigma, area = pixels
-    alternative: Bool = np.isfinite(rivals[0][..., 0])
+    alternative: Bool = np.isfinite(alternatives[0][..., 0])
     taken = np.zeros(len(area[0]), np.bool_)
     out = Association(first_uv.copy(), first_sigma.copy(), area.copy(), taken, taken.copy())
     for m in np.flatnonzero(alternative.any(axis=0)):
@@ -128,7 +128,7 @@ def associate(
         uv = np.repeat(out.uv[:, m : m + 1], len(second), axis=1)
         sigma_px = np.repeat(first_sigma[:, m : m + 1], len(second), axis=1)
         for c, use in zip(where, second.T, strict=True):
-            uv[c, use], sigma_px[c, use] = rivals[0][c, m], rivals[1][c, m]
+            uv[c, use], sigma_px[c, use] = alternatives[0][c, m], alternatives[1][c, m]
         age_s = past[1][m]
         moved = (settings.place_m + settings.speed_m_s * age_s) ** 2 * np.eye(3)
         was = past[0][m] if age_s <= settings.forget_s else np.full(3, np.nan)
@@ -171,7 +171,7 @@ def _best(
     else:
         found = triangulate(cameras, uv, sigma_px, rays_px)
         places, cov, cost = found.points_m, found.cov_m2, found.chi_square
-        fits, same = np.isfinite(places[:, 0]) & ~found.apart, settings.same_m
+        fits, same = np.isfinite(places[:, 0]) & ~found.outliers, settings.same_m
     from_hand, from_past = (_distances(places, cov, *prior) for prior in priors)
     farthest = float(chdtri(places.shape[1], settings.false_alarm))
     fits = fits & (from_hand <= farthest) & ((from_past <= farthest) | (overruled == 0))
@@ -189,8 +189,8 @@ def rehearse(cameras: CameraArrays) -> None:
     nothing = Prior(np.full((1, 3), np.nan), np.full((1, 3, 3), np.nan))
     _in_image(cameras, 0, Prior(nothing.points_m[0], nothing.cov_m2[0]))
     one = np.ones((len(cameras.scale), 1))
-    pixels, rivals = np.full((*one.shape, 2), 100.0), np.full((*one.shape, 2), 101.0)
-    associate(cameras, (pixels, one, one), (rivals, one), nothing, (nothing.points_m, one[0]))
+    pixels, alternatives = np.full((*one.shape, 2), 100.0), np.full((*one.shape, 2), 101.0)
+    associate(cameras, (pixels, one, one), (alternatives, one), nothing, (nothing.points_m, one[0]))
 
 
 @kernel

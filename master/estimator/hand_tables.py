@@ -18,7 +18,7 @@ class HandTables:
 
     Attributes:
         swing: (3, 5, 4, 3, 3) as `HandModel.swing`.
-        tip_turn: (5, 3, 3) rest rotation of the tip in the frame of the joint before it.
+        tip_rotation: (5, 3, 3) rest rotation of the tip in the frame of the joint before it.
         root_m: (5, 3) first joint of each chain, palm frame [m].
         bone_m: (5, 3, 3) bones in the frames of their joints [m].
         abduction_axis: (5, 3) palm frame.
@@ -39,11 +39,11 @@ class HandTables:
         twist: (5,) [rad] by which the hinges of each finger are rolled about its first bone, in `swing` (`twist_hand`).
         twist_axis: (5, 3) that bone, in the frame of the abduction.
         untwisted: (3, 5, 3, 3) `swing` of the abductions with hinges as the profile has them.
-        turned: (3, 3) room.
+        product: (3, 3) room.
     """
 
     swing: Float
-    tip_turn: Float
+    tip_rotation: Float
     root_m: Float
     bone_m: Float
     abduction_axis: Float
@@ -57,7 +57,7 @@ class HandTables:
     legal_low: Float
     legal_high: Float
     beyond_w2: Float
-    rests: Bool
+    at_low_limit: Bool
     anywhere: Float
     limits: Float
     finger: Int
@@ -68,7 +68,7 @@ class HandTables:
     twist: Float
     twist_axis: Float
     untwisted: Float
-    turned: Float
+    product: Float
 
     @classmethod
     def of(cls, model: HandModel, parameters: HandParameters) -> "HandTables":
@@ -91,7 +91,7 @@ class HandTables:
         first_bone = np.einsum("fij,fj->fi", model.swing[:2, :, 1].sum(axis=0), model.bone_m[:, 0])
         tables: dict[str, Float | Int | Bool] = {
             "swing": model.swing,
-            "tip_turn": model.turn[:, 2],
+            "tip_rotation": model.link_rotation[:, 2],
             "root_m": model.rest_position_m[CHAINS[:, 0]],
             "bone_m": model.bone_m,
             "abduction_axis": axis,
@@ -105,7 +105,7 @@ class HandTables:
             "legal_low": parameters.legal_low,
             "legal_high": parameters.legal_high,
             "beyond_w2": parameters.beyond_w2,
-            "rests": parameters.rests,
+            "at_low_limit": parameters.at_low_limit,
             "anywhere": parameters.anywhere,
             "limits": model.limits_rad
             + REACH * np.stack([-model.tolerance_rad, model.tolerance_rad], axis=2),
@@ -117,7 +117,7 @@ class HandTables:
             "twist": np.zeros(5),
             "twist_axis": first_bone / np.linalg.norm(first_bone, axis=1, keepdims=True),
             "untwisted": model.swing[:, :, 0],
-            "turned": np.zeros((3, 3)),
+            "product": np.zeros((3, 3)),
         }
         return filled(cls, tables)
 

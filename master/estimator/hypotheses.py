@@ -39,7 +39,7 @@ class Posterior:
 
     @classmethod
     def empty(cls, n: int, extras: int, markers: int) -> "Posterior":
-        """Room for one."""
+        """Scratch for one."""
         N = 6 + n + extras
         return record(
             cls,
@@ -92,14 +92,14 @@ class Hypothesis:
     surprise: Float
     information: Float
     cost: Float
-    apart: Float
+    outliers: Float
     share: Float
     step: Float
     off: Float
 
     @classmethod
     def empty(cls, n: int, extras: int, markers: int) -> "Hypothesis":
-        """Room for one."""
+        """Scratch for one."""
         N = 6 + n + extras
         return record(
             cls,
@@ -111,15 +111,15 @@ class Hypothesis:
             surprise=markers,
             information=(markers, 3, 3),
             cost=1,
-            apart=1,
+            outliers=1,
             share=1,
             step=N,
             off=N,
         )
 
 
-class Room:
-    """Room for both hypotheses of N = 6 + n + K unknowns and M markers."""
+class Scratch:
+    """Scratch for both hypotheses of N = 6 + n + K unknowns and M markers."""
 
     each: Sequence[Hypothesis]  # (2,) natural and free
     start_T: Float  # (4, 4)
@@ -136,7 +136,7 @@ class Room:
     search: Search
 
     @classmethod
-    def empty(cls, n: int, extras: int, markers: int) -> "Room":
+    def empty(cls, n: int, extras: int, markers: int) -> "Scratch":
         """Allocate it."""
         N, M = 6 + n + extras, markers
         return record(
@@ -158,6 +158,6 @@ class Room:
 
 
 @inlined
-def likelier(room: Room) -> int:
+def likelier(scratch: Scratch) -> int:
     """The hypothesis with the larger probability."""
-    return 0 if room.each[0].share[0] >= room.each[1].share[0] else 1
+    return 0 if scratch.each[0].share[0] >= scratch.each[1].share[0] else 1

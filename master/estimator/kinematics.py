@@ -21,7 +21,7 @@ PLACE, DIRECTION = constant(0), constant(1)
 
 
 class Scratch:
-    """Room for the intermediate results of kernels; holds nothing from one call to the next."""
+    """Scratch for the intermediate results of kernels; holds nothing from one call to the next."""
 
     uv: Float  # (2,)
     J: Float  # (2, 3)
@@ -157,8 +157,8 @@ def finger_chain(tables: HandTables, T: Float, angles: Float, f: int, R: Float, 
         before, after = max(k - 2, 0), max(k - 1, 0)
         for i in range(3):
             for j in range(3):
-                turned = c * tables.swing[1, f, k, i, j] + s * tables.swing[2, f, k, i, j]
-                local[i, j] = tables.swing[0, f, k, i, j] + turned
+                partial = c * tables.swing[1, f, k, i, j] + s * tables.swing[2, f, k, i, j]
+                local[i, j] = tables.swing[0, f, k, i, j] + partial
         for i in range(3):
             a, b, d = R[before, i, 0], R[before, i, 1], R[before, i, 2]
             if k == 0:
@@ -168,8 +168,8 @@ def finger_chain(tables: HandTables, T: Float, angles: Float, f: int, R: Float, 
     for i in range(3):
         a, b, d = R[2, i, 0], R[2, i, 1], R[2, i, 2]
         for j in range(3):
-            turned = a * tables.tip_turn[f, 0, j] + b * tables.tip_turn[f, 1, j]
-            R[3, i, j] = turned + d * tables.tip_turn[f, 2, j]
+            partial = a * tables.tip_rotation[f, 0, j] + b * tables.tip_rotation[f, 1, j]
+            R[3, i, j] = partial + d * tables.tip_rotation[f, 2, j]
     for k in range(3):
         for i in range(3):
             bone = R[k, i, 0] * tables.bone_m[f, k, 0] + R[k, i, 1] * tables.bone_m[f, k, 1]
@@ -197,7 +197,7 @@ def twist_hand(tables: HandTables, twist: Float) -> None:
         tables.twist[f] = twist[f]
         c, s = cos(twist[f]), sin(twist[f])
         x, y, z = tables.twist_axis[f, 0], tables.twist_axis[f, 1], tables.twist_axis[f, 2]
-        Q = tables.turned
+        Q = tables.product
         Q[0, 0], Q[0, 1], Q[0, 2] = (
             c + x * x * (1.0 - c),
             x * y * (1.0 - c) - z * s,
@@ -261,8 +261,8 @@ def joints(tables: HandTables, T: Float, R: Float, P: Float, position: Float, ro
             position[joint, i] = T[i, 3]
             for j in range(3):
                 position[joint, i] += T[i, j] * tables.rest_m[joint, j]
-                turned = T[i, 0] * tables.rest_R[joint, 0, j] + T[i, 1] * tables.rest_R[joint, 1, j]
-                rotation[joint, i, j] = turned + T[i, 2] * tables.rest_R[joint, 2, j]
+                partial = T[i, 0] * tables.rest_R[joint, 0, j] + T[i, 1] * tables.rest_R[joint, 1, j]
+                rotation[joint, i, j] = partial + T[i, 2] * tables.rest_R[joint, 2, j]
 
 
 @inlined
@@ -353,7 +353,7 @@ def rotate_by(step: Float, T: Float, out: Float) -> None:
 
 
 @inlined
-def turn_between(A: Float, B: Float, c: Float, out: Float) -> None:
+def rotation_between(A: Float, B: Float, c: Float, out: Float) -> None:
     """Write the rotation vector (3,) of A B' of rotations (>= 3, >= 3); `c`: (3, 3) scratch."""
     for i in range(3):
         for j in range(3):

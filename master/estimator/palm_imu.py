@@ -23,7 +23,7 @@ from common.geometry import (
     quaternion_to_matrix,
     rotation_vector_to_matrix,
 )
-from master.estimator.epoch import Turn
+from master.estimator.epoch import OrientationMeasurement
 from master.estimator.imu_samples import OrientationSamples
 from master.estimator.settings import DEFAULT
 from master.fabrik.estimate import SolvedHand
@@ -49,8 +49,8 @@ class OrientationTrack:
             CalibrationError: The file does not say how it is mounted, or how its world lies to the rig.
         """
         self._imu = imu
-        self._palm_imu = turn_of("q_palm_imu", imu.q_palm_imu)
-        self._rig_world = turn_of("q_rig_world", imu.q_rig_world)
+        self._palm_imu = rotation_of("q_palm_imu", imu.q_palm_imu)
+        self._rig_world = rotation_of("q_rig_world", imu.q_rig_world)
         self._up = self._rig_world[:, 2]
         self.counts: Counter[str] = Counter() if counts is None else counts
         self._samples = OrientationSamples(self.counts, imu.heading_drift_rad_s, imu.stamp_offset_us)
@@ -59,7 +59,7 @@ class OrientationTrack:
         """Take one sample: quaternion (4,), IMU axes -> its world; see `OrientationSamples.push`."""
         self._samples.push(t_ns, orientation_wxyz, heading_sigma_rad)
 
-    def at(self, t_ns: int, near: SolvedHand | None) -> Turn | None:
+    def at(self, t_ns: int, near: SolvedHand | None) -> OrientationMeasurement | None:
         """The palm's orientation at an instant; None where no sample is near enough.
 
         Args:
@@ -74,28 +74,28 @@ class OrientationTrack:
         self.counts["orientation.used"] += 1
         rotation = self._rig_world @ matrix_of(found.q_wxyz) @ self._palm_imu.T
         if heading_rad is None and near is not None:
-            rotation = _turn_about(self._up, near.T_rig_palm[:3, :3] @ rotation.T) @ rotation
-        tilt_2 = self._imu.orientation_sigma_rad**2 + (DEFAULT.palm_walk_rad_s * found.away_s) ** 2
+            rotation = _twist_about(self._up, near.T_rig_palm[:3, :3] @ rotation.T) @ rotation
+        tilt_2 = self._imu.orientation_sigma_rad**2 + (DEFAULT.palm_process_noise_rad_s * found.away_s) ** 2
         about_2 = max((_FREE_RAD if heading_rad is None else heading_rad) ** 2, tilt_2)
         along = np.outer(self._up, self._up)
         information = _EYE / tilt_2 + (1.0 / about_2 - 1.0 / tilt_2) * along
-        return Turn(rotation, information, sure=about_2 < SURE_RAD**2)
+        return OrientationMeasurement(rotation, information, sure=about_2 < SURE_RAD**2)
 
     def _heading_rad(self, drift_rad: float) -> float | None:
         """Standard deviation of the heading after such a drift; None: not known."""
         if self._imu.heading_sigma_rad is None:
             return None
-        grown = hypot(self._imu.heading_sigma_rad, drift_rad)
-        return grown if grown < _LOST_RAD else None
+        predicted = hypot(self._imu.heading_sigma_rad, drift_rad)
+        return predicted if predicted < _LOST_RAD else None
 
 
-def _turn_about(axis: Float, rotation: Float) -> Float:
+def _twist_about(axis: Float, rotation: Float) -> Float:
     """The turn (3, 3) about a unit axis (3,) that comes nearest to a rotation (3, 3): its twist."""
     w, *v = matrix_to_quaternion(rotation)
     return rotation_vector_to_matrix(2.0 * atan2(float(np.array(v) @ axis), float(w)) * axis)
 
 
-def turn_of(key: str, value: Quaternion | None) -> Float:
+def rotation_of(key: str, value: Quaternion | None) -> Float:
     """The rotation (3, 3) of a key of the rig file.
 
     Raises:

@@ -50,7 +50,7 @@ class HandParameters:
     legal_low: Float
     legal_high: Float
     beyond_w2: Float
-    rests: Bool
+    at_low_limit: Bool
     abduction: Int | slice
     flexion: Int | slice
     most: Float

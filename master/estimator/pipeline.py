@@ -20,7 +20,7 @@ from common.hand_model import HandModel
 from common.kernels import bound
 from common.messages import HandPose, MarkerDetections, restamped
 from master.estimator.cameras import CameraArrays
-from master.estimator.epoch import Epoch, Fitted, Turn, WristRows
+from master.estimator.epoch import Epoch, Fitted, OrientationMeasurement, WristRows
 from master.estimator.estimator import Estimator
 from master.estimator.gate import Prior, among, associate
 from master.estimator.hand_tables import Mounts
@@ -47,11 +47,11 @@ class WristSideOf(Protocol):
         """The rows of a triple that no epoch had; None: there is none."""
         ...
 
-    def turn_at(self, t_ns: int, estimator: Estimator) -> Turn | None:
+    def orientation_at(self, t_ns: int, estimator: Estimator) -> OrientationMeasurement | None:
         """How the IMU has the palm turned; None: it does not say."""
         ...
 
-    def solved(self, t_ns: int, hand: Fitted, estimator: Estimator, *, turned: bool) -> None:
+    def solved(self, t_ns: int, hand: Fitted, estimator: Estimator, *, oriented: bool) -> None:
         """Learn from an epoch that was solved."""
         ...
 
@@ -88,7 +88,7 @@ class MarkerPipeline:
         side: "WristSideOf | None" = None,
         counts: Counter[str] | None = None,
         stage: Stage = lambda name: nullcontext(),
-        shed: Callable[[], bool] | None = None,
+        dropped_epochs: Callable[[], bool] | None = None,
     ) -> None:
         """Join the parts.
 
@@ -107,7 +107,7 @@ class MarkerPipeline:
             side: Wrist device and IMU on the forearm of this hand; None: there are none.
             counts: Counted into; None: counts of its own.
             stage: Opens a timer by stage name.
-            shed: Asked for each epoch whether it is left out, for newer ones wait (`master.hurry`); None: none is.
+            shed: Asked for each epoch whether to drop it for newer ones (`master.load_shedding`); None: none is.
         """
         self.model, self.markers = model, markers
         self.counts: Counter[str] = Counter() if counts is None else counts
@@ -120,7 +120,7 @@ class MarkerPipeline:
         joints = [model.mount(name).joint for name in self._hand_markers]
         self._joint = np.array([0 if joint is None else joint for joint in joints])  # 0: the palm
         self._finger_of = Mounts.of(model, self._hand_markers).finger
-        self._stage, self._volume, self._shed, self._side = stage, volume, shed, side
+        self._stage, self._volume, self._dropped_epochs, self._side = stage, volume, dropped_epochs, side
         self._orientation = None if imu is None or not imu.placed else OrientationTrack(imu, self.counts)
         self._last_ns = -(2**63)
         self._late_ns = {name: round(1e3 * us) for name, us in (stamp_offset_us or {}).items()}
@@ -132,13 +132,13 @@ class MarkerPipeline:
         """Take one camera's detections; return the poses they complete, oldest first."""
         if late_ns := self._late_ns.get(message.camera):
             message = restamped(message, t_ns=message.t_ns + late_ns)
-        with self._stage("pairing"):
+        with self._stage("frame_sync"):
             sets = self._line.sync.push(message)
-        if self._line.sync.outdated:
-            self.counts["instants_outdated"] = self._line.sync.outdated
+        if self._line.sync.stale:
+            self.counts["instants_outdated"] = self._line.sync.stale
         return self._solved(sets)
 
-    def blind(self, t_ns: int, ready_t_ns: int) -> SolvedPose | None:
+    def no_observation(self, t_ns: int, ready_t_ns: int) -> SolvedPose | None:
         """The pose at an epoch at which no camera saw anything, by what else watches the hand; None: it is past."""
         shape = (len(self._names), len(self.markers))
         unseen, nothing = np.full(shape, np.nan), np.full((*shape, 2), np.nan)
@@ -165,7 +165,7 @@ class MarkerPipeline:
                 self.counts["instants_late"] += 1
                 continue
             self._last_ns = frames.t_ns
-            if self._shed is not None and self._shed():
+            if self._dropped_epochs is not None and self._dropped_epochs():
                 self.counts["instants_shed"] += 1
                 continue
             poses.append(self._solve(frames))
@@ -178,15 +178,15 @@ class MarkerPipeline:
         with self._stage("triangulate"):
             if self._lens_shift.any:
                 frames = replace(frames, uv=self._lens_shift.centres(frames.uv, frames.area))
-            if frames.rival_uv is not None:
+            if frames.alt_uv is not None:
                 frames = self._associated(frames)
         line = self._line.solve(frames, last, age_s)
         hand: HandEstimate | Fitted = line
         found = line.markers
         if self._estimator is not None:
-            found = self._placed(frames, line, last, age_s)
+            found = self._triangulated(frames, line, last, age_s)
             hand = self._fitted(self._estimator, frames, line, found)
-        if found.apart.any() or found.left_out.any():
+        if found.outliers.any() or found.rejected.any():
             self._count_outliers(found, frames)
         pose = pose_of(hand, self.model, t_ns, line.smooth_m, line.markers, self._volume)
         if self._side is not None and self._estimator is not None:
@@ -201,19 +201,21 @@ class MarkerPipeline:
 
     def _recent(self, t_ns: int) -> SolvedHand | None:
         """The hand that was fitted last, if it still says anything."""
-        if self._estimator is None or self._last is None or not self._estimator.recent(t_ns):
+        if self._estimator is None or self._last is None or not self._estimator.has_previous(t_ns):
             return None
         return self._last.solution
 
-    def _placed(
+    def _triangulated(
         self, frames: FrameSet, line: HandEstimate, last: SolvedHand | None, age_s: float
     ) -> MarkerPositions:
         """The markers by the rays of all cameras; the line's own where it goes by these."""
         if self._rays is None or isinstance(line.markers, RayPositions):
             return line.markers
         with self._stage("triangulate"):
-            near = last or line.solution
-            return self._rays(frames.uv, frames.sigma_px, frames.area, near, age_s, as_seen=near is None)
+            warm_start = last or line.solution
+            return self._rays(
+                frames.uv, frames.sigma_px, frames.area, warm_start, age_s, as_seen=warm_start is None
+            )
 
     def _fitted(
         self, estimator: Estimator, frames: FrameSet, line: HandEstimate, found: MarkerPositions
@@ -225,57 +227,63 @@ class MarkerPipeline:
             if isinstance(found, RayPositions):
                 uv, variance, own = found.uv, found.variance_px2, found.own_m2
             others = self._side is not None or self._orientation is not None
-            turn = self._turned(frames.t_ns, line) if others else None
+            orientation = self._measured_orientation(frames.t_ns, line) if others else None
             hand = estimator.push(
                 Epoch(
                     frames.t_ns,
                     found.points_m,
-                    line.facing,
+                    line.back_normal,
                     uv=uv,
                     variance_px2=variance,
                     own_m2=own,
-                    turn=turn,
+                    orientation=orientation,
                     wrist=None if self._side is None else self._side.rows_at(frames.t_ns),
                     start=line.solution if line.solved else None,
                 )
             )
             self._last = hand
             if self._side is not None:
-                self._side.solved(frames.t_ns, hand, estimator, turned=turn is not None)
+                self._side.solved(frames.t_ns, hand, estimator, oriented=orientation is not None)
             if self._smooth is not None:
                 on_hand = self._on_hand
                 hand = self._smooth.push(frames.t_ns, hand, found.noise_m2[on_hand], found.points_m[on_hand])
             return hand
 
-    def _turned(self, t_ns: int, line: HandEstimate) -> Turn | None:
+    def _measured_orientation(self, t_ns: int, line: HandEstimate) -> OrientationMeasurement | None:
         """How an IMU on the palm, or on the forearm, has the palm turned at an epoch."""
         if self._side is not None and self._estimator is not None:
-            return self._side.turn_at(t_ns, self._estimator)
+            return self._side.orientation_at(t_ns, self._estimator)
         if self._orientation is None:
             return None
         return self._orientation.at(t_ns, self._recent(t_ns) or line.solution)
 
     def _associated(self, frames: FrameSet) -> FrameSet:
         """The epoch with one place for each marker."""
-        assert frames.rival_uv is not None
-        assert frames.rival_sigma_px is not None
-        in_doubt = np.isfinite(frames.rival_uv[..., 0]).any(axis=0)
+        assert frames.alt_uv is not None
+        assert frames.alt_sigma_px is not None
+        in_doubt = np.isfinite(frames.alt_uv[..., 0]).any(axis=0)
         if not in_doubt.any():  # an alternative was named in a frame nearby, and is not carried to this epoch
-            return replace(frames, rival_uv=None)
+            return replace(frames, alt_uv=None)
         first = triangulate(self._cameras, frames.uv, frames.sigma_px, self._rays_px)
-        clear = np.where((in_doubt | first.apart)[:, None], np.nan, first.points_m)
+        clear = np.where((in_doubt | first.outliers)[:, None], np.nan, first.points_m)
         others = self._line.solve_once(clear, first.cov_m2, frames.area)
-        chosen = associate(
+        associated = associate(
             self._cameras,
             (frames.uv, frames.sigma_px, frames.area),
-            (frames.rival_uv, frames.rival_sigma_px),
+            (frames.alt_uv, frames.alt_sigma_px),
             among(clear, self._on_hand) if others is None else self._expected(others),
             (self._was_m, np.asarray((frames.t_ns - self._was_ns) * 1e-9, np.float64)),
             self._rays_px,
         )
-        self._count("rival", chosen.taken)
-        self._count("unclear", chosen.dropped)
-        return replace(frames, uv=chosen.uv, sigma_px=chosen.sigma_px, area=chosen.area_px2, rival_uv=None)
+        self._count("alternative", associated.taken)
+        self._count("unclear", associated.dropped)
+        return replace(
+            frames,
+            uv=associated.uv,
+            sigma_px=associated.sigma_px,
+            area=associated.area_px2,
+            alt_uv=None,
+        )
 
     def _expected(self, hand: SolvedHand) -> Prior:
         """Where a hand has the markers."""
@@ -292,12 +300,12 @@ class MarkerPipeline:
 
     def _count_outliers(self, found: MarkerPositions, frames: FrameSet) -> None:
         """Count markers whose rays do not meet, and what is left out of each camera."""
-        if found.apart.any():
-            self._count("apart", found.apart)
-            self.counts["epipolar_misfits"] += int(found.apart.sum())
+        if found.outliers.any():
+            self._count("apart", found.outliers)
+            self.counts["epipolar_misfits"] += int(found.outliers.sum())
         sees = np.isfinite(frames.uv[..., 0]) & np.isfinite(found.points_m[:, 0])
-        mostly = found.left_out.sum(axis=1) > 0.5 * sees.sum(axis=1)
-        for c in np.flatnonzero(found.left_out.any(axis=1)):
-            self.counts[f"left_out.{self._names[c]}"[:_NAME]] += int(found.left_out[c].sum())
+        mostly = found.rejected.sum(axis=1) > 0.5 * sees.sum(axis=1)
+        for c in np.flatnonzero(found.rejected.any(axis=1)):
+            self.counts[f"rejected.{self._names[c]}"[:_NAME]] += int(found.rejected[c].sum())
             if mostly[c]:
                 self.counts[f"mostly_left_out.{self._names[c]}"[:_NAME]] += 1

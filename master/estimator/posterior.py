@@ -26,8 +26,8 @@ from math import exp, log
 
 from common.arrays import Float
 from common.kernels import constant, inlined, inner
-from master.estimator.hypotheses import Blank, Hypothesis, Posterior, Room, likelier
-from master.estimator.kinematics import markers_of, rotate_by, turn_between
+from master.estimator.hypotheses import Blank, Hypothesis, Posterior, Scratch, likelier
+from master.estimator.kinematics import markers_of, rotate_by, rotation_between
 from master.estimator.matrices import cholesky, copy, half_log_determinant, inverse, substitute
 from master.estimator.priors import Habits
 from master.estimator.problem import Belief, Rig
@@ -50,12 +50,12 @@ def _solve_each(
     T: Float,
     x: Float,
     z: Float,
-    room: Room,
+    scratch: Scratch,
 ) -> int:
     """Search under each hypothesis from one start; return the steps of the first."""
     steps = 0
     for h in range(habits.constant.shape[0]):
-        one = room.each[h]
+        one = scratch.each[h]
         copy(T, one.palm)
         for i in range(x.shape[0]):
             one.x[i] = x[i]
@@ -74,35 +74,35 @@ def _solve_each(
             one.z,
             one.gradient,
             one.normal,
-            room.search,
+            scratch.search,
         )
         one.cost[0] = linearise(
-            rig, habits, belief, observed, h, one.palm, one.x, one.z, one.gradient, one.normal, room.search
+            rig, habits, belief, observed, h, one.palm, one.x, one.z, one.gradient, one.normal, scratch.search
         )
-        one.apart[0] = room.search.apart[0]
+        one.outliers[0] = scratch.search.outliers[0]
         for m in range(rig.mounts.finger.shape[0]):
-            one.surprise[m] = room.search.surprise[m]
+            one.surprise[m] = scratch.search.surprise[m]
             for i in range(3):
                 for j in range(3):
-                    one.information[m, i, j] = room.search.information[m, i, j]
+                    one.information[m, i, j] = scratch.search.information[m, i, j]
         steps = taken if h == 0 else steps
     return steps
 
 
 @inner
-def _weigh(habits: Habits, settings: Settings, natural: float, counts: float, room: Room) -> None:
+def _weigh(habits: Habits, settings: Settings, natural: float, counts: float, scratch: Scratch) -> None:
     """Write the probability of each hypothesis, from its evidence and what it was before.
 
     `natural` is the probability of a natural hand a moment ago, `counts` what that counts, 0 ... 1.
     """
-    N, share, other = room.middle.shape[0], room.each[0].share, room.each[1].share
+    N, share, other = scratch.middle.shape[0], scratch.each[0].share, scratch.each[1].share
     share[0], other[0] = 1.0, 0.0
     if habits.constant.shape[0] < 2:
         return
     odds = 0.0
     for h in range(2):
-        one = room.each[h]
-        known = half_log_determinant(room.L, N) if cholesky(one.normal, N, room.L) else 0.0
+        one = scratch.each[h]
+        known = half_log_determinant(scratch.L, N) if cholesky(one.normal, N, scratch.L) else 0.0
         odds += (1.0 - 2.0 * h) * (habits.log_density[h] - one.cost[0] - known)
     odds = min(max(odds, -settings.certain), settings.certain)
     then = log(max(natural, 1e-9)) - log(max(1.0 - natural, 1e-9))
@@ -112,27 +112,27 @@ def _weigh(habits: Habits, settings: Settings, natural: float, counts: float, ro
 
 
 @inner
-def _least(habits: Habits, belief: Belief, h: int, room: Room) -> float:
+def _least(habits: Habits, belief: Belief, h: int, scratch: Scratch) -> float:
     """The least that habits and beliefs about single angles of this instant cost: what they contradict each other."""
     n = belief.own.shape[0]
-    x = room.cut.weight
+    x = scratch.cut.weight
     for i in range(n):
         for j in range(n):
-            room.work[i, j] = habits.normal[h, i, j]
-        room.work[i, i] += belief.own_w2[i]
+            scratch.work[i, j] = habits.normal[h, i, j]
+        scratch.work[i, i] += belief.own_w2[i]
         x[i] = habits.pull[h, i] + belief.own_w2[i] * belief.own[i]
-    if not cholesky(room.work, n, room.L):
+    if not cholesky(scratch.work, n, scratch.L):
         return 0.0
-    substitute(room.L, n, x)
+    substitute(scratch.L, n, x)
     return own_cost(habits, belief, h, x)
 
 
 @inner
 def _covariance(
-    rig: Rig, settings: Settings, habits: Habits, belief: Belief, h: int, numbers: float, room: Room
+    rig: Rig, settings: Settings, habits: Habits, belief: Belief, h: int, numbers: float, scratch: Scratch
 ) -> float:
     """Write the covariance (N, N) of one hypothesis by this instant alone; return its scale."""
-    N, A, one = room.middle.shape[0], room.A, room.each[h]
+    N, A, one = scratch.middle.shape[0], scratch.A, scratch.each[h]
     for i in range(N):
         for j in range(i + 1):
             A[i, j] = one.normal[i, j]
@@ -143,23 +143,23 @@ def _covariance(
             A[6 + i, 6 + i] -= rig.hand.beyond_w2[i]
     for i in range(3):
         for j in range(i + 1):
-            A[3 + i, 3 + j] -= belief.depth_w2[0] * belief.sight[i] * belief.sight[j]
-    if not cholesky(A, N, room.L):  # by rounding: nothing is known but limits
+            A[3 + i, 3 + j] -= belief.depth_w2[0] * belief.line_of_sight[i] * belief.line_of_sight[j]
+    if not cholesky(A, N, scratch.L):  # by rounding: nothing is known but limits
         known = rig.hand.anywhere.shape[0]
         for i in range(N):
             for j in range(N):
-                room.cov[i, j] = 0.0
+                scratch.cov[i, j] = 0.0
             w2 = rig.hand.anywhere[i] if i < known else belief.z_info[i - known, i - known]
-            room.cov[i, i] = 1.0 / w2
+            scratch.cov[i, i] = 1.0 / w2
         return 1.0
-    inverse(room.L, N, room.work, room.cov)
-    past = past_cost(belief, one.palm, one.x, room.search.off)
-    chi2 = 2.0 * (one.cost[0] - past - one.apart[0] - _least(habits, belief, h, room))
+    inverse(scratch.L, N, scratch.work, scratch.cov)
+    past = past_cost(belief, one.palm, one.x, scratch.search.off)
+    chi2 = 2.0 * (one.cost[0] - past - one.outliers[0] - _least(habits, belief, h, scratch))
     free = max(numbers - 6.0, 0.0)
     scale = max((settings.claimed + max(chi2, 0.0)) / (settings.claimed + free), 1.0)
     for i in range(N):
         for j in range(N):
-            room.cov[i, j] *= scale
+            scratch.cov[i, j] *= scale
     return scale
 
 
@@ -170,69 +170,71 @@ def _mix(
     habits: Habits,
     belief: Belief,
     numbers: float,
-    room: Room,
+    scratch: Scratch,
     out: Posterior,
 ) -> int:
     """Write mean step and covariance of the hypotheses together; return the likelier one."""
-    n, N = out.x.shape[0], room.middle.shape[0]
-    best = likelier(room)
-    if room.each[best].share[0] > 1.0 - settings.negligible:
-        room.each[best].share[0], room.each[1 - best].share[0] = 1.0, 0.0
+    n, N = out.x.shape[0], scratch.middle.shape[0]
+    best = likelier(scratch)
+    if scratch.each[best].share[0] > 1.0 - settings.negligible:
+        scratch.each[best].share[0], scratch.each[1 - best].share[0] = 1.0, 0.0
     out.scale[0] = 0.0
     for i in range(N):
-        room.middle[i] = 0.0
+        scratch.middle[i] = 0.0
         for j in range(N):
             out.cov[i, j] = 0.0
     for h in range(habits.constant.shape[0]):
-        one, from_here = room.each[h], room.each[best]
+        one, from_here = scratch.each[h], scratch.each[best]
         share = one.share[0]
         for i in range(N):
             one.off[i] = one.step[i] = 0.0
         if share == 0.0:
             continue
         if h != best:
-            turn_between(one.palm, from_here.palm, room.search.J, one.off)
+            rotation_between(one.palm, from_here.palm, scratch.search.J, one.off)
             for i in range(3):
                 one.off[3 + i] = one.palm[i, 3] - from_here.palm[i, 3]
             for i in range(n):
                 one.off[6 + i] = one.x[i] - from_here.x[i]
             for i in range(out.z.shape[0]):
                 one.off[6 + n + i] = one.z[i] - from_here.z[i]
-        out.scale[0] += share * _covariance(rig, settings, habits, belief, h, numbers, room)
+        out.scale[0] += share * _covariance(rig, settings, habits, belief, h, numbers, scratch)
         for i in range(N):
             for j in range(N):
-                out.cov[i, j] += share * room.cov[i, j]
+                out.cov[i, j] += share * scratch.cov[i, j]
         if h > 0 and share > settings.noticed:
-            mean_within(rig.hand, one.normal, one.gradient, one.x, room.cut, one.step)
+            mean_within(rig.hand, one.normal, one.gradient, one.x, scratch.cut, one.step)
         for i in range(N):
             one.off[i] += one.step[i]
-            room.middle[i] += share * one.off[i]
+            scratch.middle[i] += share * one.off[i]
     for h in range(habits.constant.shape[0]):
-        one = room.each[h]
+        one = scratch.each[h]
         for i in range(N):
             for j in range(N):
-                between = (one.off[i] - room.middle[i]) * (one.off[j] - room.middle[j])
+                between = (one.off[i] - scratch.middle[i]) * (one.off[j] - scratch.middle[j])
                 out.cov[i, j] += one.share[0] * between
     return best
 
 
 @inlined
-def _ends(rig: Rig, one: Hypothesis, room: Room) -> None:
+def _ends(rig: Rig, one: Hypothesis, scratch: Scratch) -> None:
     """Write where the step of a hypothesis brings the markers, to room.here (M, 3), as if on straight lines."""
-    markers_of(rig.hand, rig.mounts, one.palm, one.x, room.search.rows, room.here)
+    markers_of(rig.hand, rig.mounts, one.palm, one.x, scratch.search.rows, scratch.here)
     moves = False
     for i in range(one.step.shape[0]):
-        room.search.step[i] = _LITTLE * one.step[i]
+        scratch.search.step[i] = _LITTLE * one.step[i]
         moves = moves or one.step[i] != 0.0
     if not moves:
         return
-    rotate_by(room.search.step, one.palm, room.search.palm)
+    rotate_by(scratch.search.step, one.palm, scratch.search.palm)
     for i in range(one.x.shape[0]):
-        room.search.x[i] = one.x[i] + room.search.step[6 + i]
-    markers_of(rig.hand, rig.mounts, room.search.palm, room.search.x, room.search.rows, room.there)
+        scratch.search.x[i] = one.x[i] + scratch.search.step[6 + i]
+    markers_of(
+        rig.hand, rig.mounts, scratch.search.palm, scratch.search.x, scratch.search.rows, scratch.there
+    )
     for m in range(rig.mounts.finger.shape[0]):
         for i in range(3):
-            room.here[m, i] += (room.there[m, i] - room.here[m, i]) / _LITTLE
+            scratch.here[m, i] += (scratch.there[m, i] - scratch.here[m, i]) / _LITTLE
 
 
 @inner
@@ -242,7 +244,7 @@ def _onto(
     observed: Observations,
     blank: Blank,
     best: int,
-    room: Room,
+    scratch: Scratch,
     out: Posterior,
 ) -> None:
     """Move the likelier hand by the mean step, then to where the mean of the markers is.
@@ -250,26 +252,26 @@ def _onto(
     What is between two hands that explain the markers does so a little worse, since fingers move on arcs. So it is one
     step, the shortest by the normal matrix, to where the mean of their markers is.
     """
-    n, N, between, likely = out.x.shape[0], room.middle.shape[0], blank.between, room.each[best]
+    n, N, between, likely = out.x.shape[0], scratch.middle.shape[0], blank.between, scratch.each[best]
     for m in range(rig.mounts.finger.shape[0]):
-        between.seen[m] = between.placed[m] = observed.seen[m]
+        between.seen[m] = between.triangulated[m] = observed.seen[m]
         for i in range(3):
             between.point[m, i] = 0.0
             for j in range(3):
                 between.information[m, i, j] = likely.information[m, i, j]
     for h in range(2):
-        one = room.each[h]
+        one = scratch.each[h]
         if one.share[0] > 0.0:
-            _ends(rig, one, room)
+            _ends(rig, one, scratch)
             for m in range(rig.mounts.finger.shape[0]):
                 for i in range(3):
-                    between.point[m, i] += one.share[0] * room.here[m, i]
-    search = room.search
-    rotate_by(room.middle, likely.palm, out.palm)
+                    between.point[m, i] += one.share[0] * scratch.here[m, i]
+    search = scratch.search
+    rotate_by(scratch.middle, likely.palm, out.palm)
     for i in range(n):
-        out.x[i] = likely.x[i] + room.middle[6 + i]
+        out.x[i] = likely.x[i] + scratch.middle[6 + i]
     for i in range(out.z.shape[0]):
-        out.z[i] = likely.z[i] + room.middle[6 + n + i]
+        out.z[i] = likely.z[i] + scratch.middle[6 + n + i]
     linearise(
         rig,
         blank.habits,
@@ -286,9 +288,9 @@ def _onto(
     for i in range(N):
         search.step[i] = -search.gradient[i]
         for j in range(i + 1):
-            room.A[i, j] = search.normal[i, j] + settings.stiff * likely.normal[i, j]
-    if cholesky(room.A, N, room.L):
-        substitute(room.L, N, search.step)
+            scratch.A[i, j] = search.normal[i, j] + settings.stiff * likely.normal[i, j]
+    if cholesky(scratch.A, N, scratch.L):
+        substitute(scratch.L, N, search.step)
         copy(out.palm, search.palm)
         rotate_by(search.step, search.palm, out.palm)
         for i in range(n):
@@ -313,7 +315,7 @@ def posterior(
     counts: float,
     numbers: float,
     blank: Blank,
-    room: Room,
+    scratch: Scratch,
     out: Posterior,
 ) -> None:
     """Fit one epoch from a start.
@@ -323,19 +325,19 @@ def posterior(
         palm, x, z: (4, 4), (n,), (K,) where both searches begin.
         natural, counts: Probability of a natural hand a moment ago, and what that counts, 0 ... 1.
         numbers: How many numbers are measured.
-        blank, room: Room.
+        blank, room: Scratch.
         out: Written.
     """
-    out.steps[0] = _solve_each(rig, settings, habits, belief, observed, T, x, z, room)
-    _weigh(habits, settings, natural, counts, room)
-    out.natural[0] = room.each[0].share[0]
-    best = _mix(rig, settings, habits, belief, numbers, room, out)
-    likely = room.each[best]
+    out.steps[0] = _solve_each(rig, settings, habits, belief, observed, T, x, z, scratch)
+    _weigh(habits, settings, natural, counts, scratch)
+    out.natural[0] = scratch.each[0].share[0]
+    best = _mix(rig, settings, habits, belief, numbers, scratch, out)
+    likely = scratch.each[best]
     moves = False
-    for i in range(room.middle.shape[0]):
-        moves = moves or room.middle[i] != 0.0
+    for i in range(scratch.middle.shape[0]):
+        moves = moves or scratch.middle[i] != 0.0
     if moves:
-        _onto(rig, settings, observed, blank, best, room, out)
+        _onto(rig, settings, observed, blank, best, scratch, out)
     else:
         copy(likely.palm, out.palm)
         for i in range(x.shape[0]):

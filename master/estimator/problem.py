@@ -8,7 +8,7 @@ from master.estimator.cameras import CameraArrays
 from master.estimator.finger_surface import Surface
 from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.kinematics import Scratch
-from master.estimator.wrist_device import Device, Sights
+from master.estimator.wrist_device import Device, LinesOfSight
 
 
 class Rig(NamedTuple):
@@ -29,9 +29,9 @@ class Belief:
         palm: (4, 4) the palm by the state before.
         palm_w2: (6,) inverse variances of turn [rad] and shift [m] from there; 0: nothing is believed.
         sight: (3,) unit vector along which depth is held, and `depth_w2` (1,) how firmly [1/m^2].
-        facing: (3,) unit vector along which the back looks, and `facing_w2` (1,).
+        back_normal: (3,) unit vector along which the back looks, and `back_normal_w2` (1,).
         z, z_info: (K,), (K, K) mean and information of the extra unknowns (`master.estimator.wrist_device`).
-        turn_info: (3, 3) [1/rad^2] information about the palm's turn by other sensors, rig axes; `turned` (1,) whether
+        orientation_info: (3, 3) [1/rad^2] information of the measured orientation, rig axes; `oriented` (1,) whether
             there is any.
         forearm: (4, 4) the palm by these in its first rows and columns; where `on_forearm` (1,) that of a straight
             wrist, and `axes` (3, 3) about which tilt and heading turn it, as rows, rig axes.
@@ -45,20 +45,20 @@ class Belief:
     past: Float
     palm: Float
     palm_w2: Float
-    sight: Float
+    line_of_sight: Float
     depth_w2: Float
-    facing: Float
-    facing_w2: Float
+    back_normal: Float
+    back_normal_w2: Float
     z: Float
     z_info: Float
-    turn_info: Float
-    turned: Float
+    orientation_info: Float
+    oriented: Float
     forearm: Float
     on_forearm: Float
     axes: Float
     place: Float
     place_w2: Float
-    sights: Sights
+    lines_of_sight: LinesOfSight
 
     @classmethod
     def none(cls, n: int, extras: int) -> "Belief":
@@ -71,25 +71,25 @@ class Belief:
             past=n,
             palm=(4, 4),
             palm_w2=6,
-            sight=3,
+            line_of_sight=3,
             depth_w2=1,
-            facing=3,
-            facing_w2=1,
+            back_normal=3,
+            back_normal_w2=1,
             z=extras,
             z_info=(extras, extras),
-            turn_info=(3, 3),
-            turned=1,
+            orientation_info=(3, 3),
+            oriented=1,
             forearm=(4, 4),
             on_forearm=1,
             axes=(3, 3),
             place=3,
             place_w2=1,
-            sights=Sights.empty(),
+            lines_of_sight=LinesOfSight.empty(),
         )
 
 
 class Search:
-    """Room for a search, of N = 6 + n + K unknowns: the palm, n free angles, K extras."""
+    """Scratch for a search, of N = 6 + n + K unknowns: the palm, n free angles, K extras."""
 
     gradient: Float  # (N,)
     normal: Float  # (N, N)
@@ -104,13 +104,13 @@ class Search:
     z: Float  # (K,)
     q: Float  # (3,)
     J: Float  # (3, 3)
-    turned: Float  # (4, 4)
+    palm_straight: Float  # (4, 4)
     slope: Float  # (5, 3)
-    by_turn: Float  # (8, 3)
+    by_rotation: Float  # (8, 3)
     palm_camera: Float  # (4, 4)
-    bend_axes: Float  # (2, 3)
+    wrist_axes: Float  # (2, 3)
     twist: Float  # (5,)
-    bend_share: Float  # (1,) as of `Settings`
+    wrist_share: Float  # (1,) as of `Settings`
     local_J: Float  # (3, 8)
     local_r: Float  # (3,)
     local_w: Float  # (3,)
@@ -119,14 +119,14 @@ class Search:
     held: Bool  # (N,)
     surprise: Float  # (M,)
     information: Float  # (M, 3, 3)
-    apart: Float  # (1,)
+    outliers: Float  # (1,)
     rows: Scratch
 
     @classmethod
     def empty(cls, n: int, extras: int, markers: int) -> "Search":
         """Allocate it."""
         N = 6 + n + extras
-        room = record(
+        scratch = record(
             cls,
             gradient=N,
             normal=(N, N),
@@ -141,13 +141,13 @@ class Search:
             z=extras,
             q=3,
             J=(3, 3),
-            turned=(4, 4),
+            palm_straight=(4, 4),
             slope=(5, 3),
-            by_turn=(8, 3),
+            by_rotation=(8, 3),
             palm_camera=(4, 4),
-            bend_axes=(2, 3),
+            wrist_axes=(2, 3),
             twist=5,
-            bend_share=1,
+            wrist_share=1,
             local_J=(3, 8),
             local_r=3,
             local_w=3,
@@ -156,8 +156,8 @@ class Search:
             held=("u1", N),
             surprise=markers,
             information=(markers, 3, 3),
-            apart=1,
+            outliers=1,
             rows=Scratch.empty(),
         )
-        room.bend_share[0] = 1.0
-        return room
+        scratch.wrist_share[0] = 1.0
+        return scratch

@@ -45,13 +45,13 @@ class Observations(NamedTuple):
     own: Float
     point: Float
     information: Float
-    placed: Bool
+    triangulated: Bool
     seen: Bool
     rays: Int
 
     @classmethod
     def empty(cls, cameras: int, markers: int) -> "Observations":
-        """Room for one epoch; nothing is seen yet."""
+        """Scratch for one epoch; nothing is seen yet."""
         return cls(
             np.zeros((cameras, markers, 2)),
             np.zeros((cameras, markers)),
@@ -98,7 +98,7 @@ def marker_rows(
         g[a] = 0.0
         for b in range(3):
             H[a, b] = 0.0
-    if observed.placed[m]:
+    if observed.triangulated[m]:
         for i in range(3):
             for j in range(3):
                 H[i, j] = observed.information[m, i, j]
@@ -152,7 +152,7 @@ def observe_rays(uv: Float, variance: Float, own: Float, markers: Int, observed:
             observed.weight[c, k] = 1.0 / variance[c, m] if row else 0.0
             observed.uv[c, k, 0], observed.uv[c, k, 1] = uv[c, m, 0], uv[c, m, 1]
             rays += 1 if row else 0
-        observed.seen[k], observed.placed[k], observed.rays[k] = rays > 0, False, rays
+        observed.seen[k], observed.triangulated[k], observed.rays[k] = rays > 0, False, rays
         if rays > 0:
             inverse_3(own[m], zero, observed.own[k])
 
@@ -177,7 +177,7 @@ def observe_points(point: Float, cov: Float, own_m2: float, observed: Observatio
             for j in range(3):
                 total += cov[m, i, j]
         seen = np.isfinite(total)
-        observed.seen[m], observed.placed[m], observed.rays[m] = seen, seen, 2 if seen else 0
+        observed.seen[m], observed.triangulated[m], observed.rays[m] = seen, seen, 2 if seen else 0
         for c in range(observed.weight.shape[0]):
             observed.weight[c, m] = 0.0
         if seen:

@@ -12,7 +12,7 @@ from common.records import filled
 
 _HANDS = "round value for hands at work; a handful compared on simulated and recorded hands, nothing fitted"
 _COORDINATION = "Hager-Ross, Schieber 2000; Ingram et al. 2008: fingers move together"
-_STRAY = (
+_GROWTH = (
     "how far joint angles get in a time: hands that handle things, by motion capture, and Leap recordings"
 )
 _CHI = "quantile of chi square"
@@ -72,17 +72,17 @@ class Settings(NamedTuple):
         float, Range("rad", 0.1, 3.0, "a finger bent by less in all its joints shows its end from behind")
     ] = radians(45.0)
     # What is wrong with markers, bones and caps.
-    facing_rad: Annotated[
+    back_normal_rad: Annotated[
         float, Range("rad", 0.05, 1.5, "a marker on the back that is seen well faces the cameras")
     ] = radians(22.0)
     bones_m: Annotated[float, Range("m", 1e-4, 1e-2, "bones and caps are known to about 1 mm")] = 1.0e-3
     # How far a hand that is seen moves in a time, as a random walk: wide, so that what is seen decides.
-    walk_rad_s: Annotated[float, Range("rad/s", 0.5, 50.0, _HANDS)] = 8.0
-    palm_walk_rad_s: Annotated[float, Range("rad/s", 0.1, 50.0, _HANDS)] = 2.5
+    process_noise_rad_s: Annotated[float, Range("rad/s", 0.5, 50.0, _HANDS)] = 8.0
+    palm_process_noise_rad_s: Annotated[float, Range("rad/s", 0.1, 50.0, _HANDS)] = 2.5
     palm_held_rad_s: Annotated[
         float, Range("rad/s", 0.05, 50.0, "with a hidden thumb little tells how the palm turns")
     ] = 0.9
-    palm_walk_m_s: Annotated[float, Range("m/s", 0.05, 20.0, _HANDS)] = 2.0
+    palm_process_noise_m_s: Annotated[float, Range("m/s", 0.05, 20.0, _HANDS)] = 2.0
     shortest_s: Annotated[
         float, Range("s", 1e-5, 1e-2, "a shorter step would weld the hand to its last pose")
     ] = 1e-3
@@ -94,14 +94,14 @@ class Settings(NamedTuple):
     rate_memory_s: Annotated[
         float, Range("s", 1e-3, 1.0, "half of a new rate counts at 60 frames a second")
     ] = 0.024
-    stray_rad: Annotated[float, Range("rad", 0.05, 2.0, _STRAY)] = radians(36.0)
-    stray_aside_rad: Annotated[float, Range("rad", 0.02, 2.0, _STRAY)] = radians(14.0)
-    stray_thumb_rad: Annotated[float, Range("rad", 0.02, 2.0, _STRAY)] = radians(20.0)
-    stray_s: Annotated[float, Range("s", 0.05, 10.0, _STRAY)] = 1.0
+    growth_rad: Annotated[float, Range("rad", 0.05, 2.0, _GROWTH)] = radians(36.0)
+    growth_aside_rad: Annotated[float, Range("rad", 0.02, 2.0, _GROWTH)] = radians(14.0)
+    growth_thumb_rad: Annotated[float, Range("rad", 0.02, 2.0, _GROWTH)] = radians(20.0)
+    growth_s: Annotated[float, Range("s", 0.05, 10.0, _GROWTH)] = 1.0
     alike: Annotated[float, Range("1", 0.0, 0.99, _COORDINATION)] = 0.7
     held_rad: Annotated[float, Range("rad", 0.001, 0.5, "a finger that was just lost")] = radians(3.0)
     # A palm without markers.
-    lost_turn_rad_s: Annotated[float, Range("rad/s", 0.01, 5.0, _HANDS)] = radians(20.0)
+    lost_rotation_rad_s: Annotated[float, Range("rad/s", 0.01, 5.0, _HANDS)] = radians(20.0)
     lost_shift_m_s: Annotated[float, Range("m/s", 0.001, 1.0, _HANDS)] = 0.02
     lost_goes_on: Annotated[float, Range("1", 0.0, 2.0, "share of its speed, along each axis")] = 0.35
     speed_memory_s: Annotated[
@@ -111,10 +111,10 @@ class Settings(NamedTuple):
     held_depth_m: Annotated[
         float, Range("m", 1e-4, 0.1, "a step of depth of a hand that one camera sees")
     ] = 0.004
-    drift_m_s: Annotated[
+    unobserved_depth_m_s: Annotated[
         float, Range("m/s", 0.001, 1.0, "simulated hands that one camera saw: 20 to 30 mm off after 0.6 s")
     ] = 0.08
-    drift_most_m: Annotated[float, Range("m", 0.01, 1.0, "as far as the volume goes")] = 0.15
+    unobserved_depth_most_m: Annotated[float, Range("m", 0.01, 1.0, "as far as the volume goes")] = 0.15
     # Both hypotheses.
     certain: Annotated[float, Range("1", 1.0, 50.0, "log odds that count as certain")] = 12.0
     negligible: Annotated[
@@ -133,7 +133,9 @@ class Settings(NamedTuple):
     straight_rad: Annotated[
         float, Range("rad", 0.0, 1.0, "a turn by less is 0.2 mm off the tangent at the far end of a hand")
     ] = radians(3.0)
-    turns_most_rad: Annotated[float, Range("rad", 0.1, 3.0, "a turn less sure leads nowhere farther")] = 1.0
+    rotation_most_rad: Annotated[float, Range("rad", 0.1, 3.0, "a turn less sure leads nowhere farther")] = (
+        1.0
+    )
     # Gates.
     explained: Annotated[float, Range("chi square", 5.0, 50.0, _CHI + " of three numbers, 1 in 1000")] = 16.3
     misled: Annotated[
@@ -151,7 +153,7 @@ class Settings(NamedTuple):
     tracked_age_s: Annotated[
         float, Range("s", 0.0, 1.0, "how old the newest measurement of a TRACKED finger may be")
     ] = 0.03
-    tracked_triple_s: Annotated[
+    tracked_cycle_s: Annotated[
         float, Range("s", 0.0, 1.0, "the same where a wrist device told it, of which triples come at 30 Hz")
     ] = 0.055
     # What is shown.
@@ -226,13 +228,13 @@ class Settings(NamedTuple):
         float,
         Range("chi square", 1.0, 100.0, "of laser point and fingertip of a finger that teaches nothing"),
     ] = 5.0
-    light_unit: Annotated[float, Range("1", 0.1, 10.0, "of the unit's logarithm, which may be any")] = 3.0
+    led_scale: Annotated[float, Range("1", 0.1, 10.0, "of the unit's logarithm, which may be any")] = 3.0
     flexion_rad: Annotated[float, Range("rad", 0.01, 1.5, "of wrists; Palmer et al. 1985")] = radians(14.0)
     deviation_rad: Annotated[float, Range("rad", 0.01, 1.5, "of wrists; Palmer et al. 1985")] = radians(11.0)
-    worn_rad: Annotated[
+    calibrated_palm_rad: Annotated[
         float, Range("rad", 0.001, 0.5, "of a palm that was calibrated before its device")
     ] = radians(1.0)
-    bend_share: Annotated[
+    wrist_share: Annotated[
         float, Range("1", 0.0, 1.0, "of what fingers tell of the wrist's bend: they err together")
     ] = 0.6
     strap_rad: Annotated[
@@ -242,7 +244,7 @@ class Settings(NamedTuple):
     habit_s: Annotated[float, Range("s", 1.0, 600.0, "as long as a posture of the wrist is kept")] = 20.0
     tilt_s: Annotated[float, Range("s", 0.1, 600.0, "as long as an IMU has the vertical off")] = 5.0
     errs_s: Annotated[float, Range("s", 0.01, 60.0, "as long as errors of shape and skin stay")] = 0.5
-    turn_errs_s: Annotated[
+    wrist_errs_s: Annotated[
         float,
         Range(
             "s", 0.001, 60.0, "as long as errors of a palm by markers stay, of what a wrist moves meanwhile"
@@ -279,7 +281,7 @@ class Settings(NamedTuple):
 
     @classmethod
     def of(cls, changes: Sequence[str]) -> Self:
-        """The defaults with changes such as `estimator.walk_rad_s=6`.
+        """The defaults with changes such as `estimator.process_noise_rad_s=6`.
 
         Raises:
             CalibrationError: One is malformed, there is no such setting, or the value is out of its range.
@@ -287,8 +289,8 @@ class Settings(NamedTuple):
         settings = cls()
         for change in changes:
             name, equals, value = change.partition("=")
-            room, dot, name = name.partition(".")
-            if not (room == "estimator" and dot and equals):
+            scratch, dot, name = name.partition(".")
+            if not (scratch == "estimator" and dot and equals):
                 raise CalibrationError(f"--set {change!r}: expected estimator.NAME=VALUE")
             try:
                 number = float(value)

@@ -23,7 +23,7 @@ of how far it is shown from where it is solved to be; one whose region is too la
 
 A hand that was wrong a moment ago, as its tracker says, is shown at once where it is, and the filter begins anew.
 
-A hand that several kinds of sensors watch leaps more often, and is led in as `master.estimator.lead` has it.
+A hand that several kinds of sensors watch leaps more often, and is led in as `master.estimator.blend` has it.
 
 Beside that the covariance is the solution's. Filtering takes noise away and adds lag; neither is in it.
 """
@@ -36,10 +36,10 @@ from common.arrays import Float
 from common.hand_model import HandJoints, HandModel
 from common.kernels import bound
 from common.records import boxed, fields
+from master.estimator.blend import Blend
 from master.estimator.epoch import Fitted, FittedHand
 from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.kinematics import twist_boxed
-from master.estimator.lead import Lead
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT, Settings
 from master.estimator.smoothing import REST, SIGNALS, WHOLE, Pose, Smoothing, smooth
@@ -55,7 +55,7 @@ class HandOneEuro:
         model: HandModel,
         markers: tuple[str, ...],
         parameters: OneEuroParameters,
-        lead_m_s: float | None = None,
+        blend_m_s: float | None = None,
         settings: Settings = DEFAULT,
     ) -> None:
         """Set up.
@@ -64,7 +64,7 @@ class HandOneEuro:
             model: The hand.
             markers: Names of its markers in the order of the covariances.
             parameters: Of the 1 € filter [m, s].
-            lead_m_s: How fast the palm, and a finger on it, may be led over [m/s]; None: within a tenth of a second.
+            blend_m_s: How fast the palm, and a finger on it, may be led over [m/s]; None: within a tenth of a second.
             settings: Of the estimator.
 
         Raises:
@@ -72,8 +72,8 @@ class HandOneEuro:
         """
         self._settings = settings
         self._on_palm = Mounts.of(model, markers).on_back
-        self._lead_m_s = lead_m_s
-        self._lead: Lead | None = None
+        self._blend_m_s = blend_m_s
+        self._blend: Blend | None = None
         state = Smoothing.of(model, markers, parameters, settings)
         self._t_ns, self._values, self._signals = state.t_ns, state.values, state.signals
         self._state = boxed(state)
@@ -81,9 +81,9 @@ class HandOneEuro:
         tables = HandTables.of(model, HandParameters.of(model))
         self._hand, self._tables = boxed(tables), fields(tables)
         twist_boxed(self._hand, np.zeros(5))  # compiled now
-        rests, cov, room = np.zeros(6, np.int64), np.zeros((len(markers), 3, 3)), Pose.empty()
+        sources, cov, scratch = np.zeros(6, np.int64), np.zeros((len(markers), 3, 3)), Pose.empty()
         none = np.zeros(26, np.bool_)
-        self._kernel = bound(smooth, self._hand, self._state, WHOLE, 0, rests, cov, room, room, none)
+        self._kernel = bound(smooth, self._hand, self._state, WHOLE, 0, sources, cov, scratch, scratch, none)
 
     def push(self, t_ns: int, hand: Fitted, cov_m2: Float, points_m: Float | None = None) -> Fitted:
         """Filter palm, angles and joints of a hand; the rest of it stays.
@@ -95,14 +95,14 @@ class HandOneEuro:
                 the noise it shows.
             points_m: (M, 3) [m] the markers, of a hand that other sensors watch, too; NaN: not seen.
         """
-        solution, rests = hand.solution, hand.rests
+        solution, sources = hand.solution, hand.sources
         if solution is None or not hand.valid.any():
             self._t_ns[0] = NEVER_NS
             return hand
         gap_s = (t_ns - int(self._t_ns[0])) * 1e-9
-        if gap_s > self._settings.forget_s or (hand.anew and self._lead_m_s is None):
+        if gap_s > self._settings.forget_s or (hand.reinitialised and self._blend_m_s is None):
             self._state[:], gap_s = self._fresh, 0.0
-            self._lead = None if self._lead_m_s is None else Lead(self._lead_m_s, self._on_palm)
+            self._blend = None if self._blend_m_s is None else Blend(self._blend_m_s, self._on_palm)
         elif gap_s <= 0.0:
             return hand
         at = solution.joints
@@ -110,21 +110,21 @@ class HandOneEuro:
         if (self._tables.twist != solution.twist).any():
             twist_boxed(self._hand, solution.twist)
         shown, cov_m2 = Pose.empty(), np.ascontiguousarray(cov_m2)
-        lead, tracked, before, what = self._lead, hand.tracked.copy(), self._values.copy(), WHOLE
-        if lead is not None and points_m is not None:
-            self._kernel(self._hand, self._state, SIGNALS, t_ns, rests, cov_m2, solved, shown, tracked)
-            self._signals += lead.push(gap_s, rests, before, self._signals, points_m)
+        blend, tracked, before, what = self._blend, hand.tracked.copy(), self._values.copy(), WHOLE
+        if blend is not None and points_m is not None:
+            self._kernel(self._hand, self._state, SIGNALS, t_ns, sources, cov_m2, solved, shown, tracked)
+            self._signals += blend.push(gap_s, sources, before, self._signals, points_m)
             what = REST
-        off = self._kernel(self._hand, self._state, what, t_ns, rests, cov_m2, solved, shown, tracked)
-        if lead is not None:
-            lead.moved(gap_s, self._values - before)
+        off = self._kernel(self._hand, self._state, what, t_ns, sources, cov_m2, solved, shown, tracked)
+        if blend is not None:
+            blend.moved(gap_s, self._values - before)
         smooth_hand = FittedHand(
             T_rig_palm=shown.palm,
             angles_rad=shown.angles,
             joints=HandJoints(shown.position, shown.rotation, shown.palm),
             cov_m2=shown.cov if off else solution.cov_m2,
             tilt_cov_rad2=solution.tilt_cov_rad2,
-            tilt_walk_rad2_s2=solution.tilt_walk_rad2_s2,
+            tilt_process_noise_rad2_s2=solution.tilt_process_noise_rad2_s2,
             alone=solution.alone,
             x=solution.x,
             scale=solution.scale,

@@ -9,10 +9,10 @@ from common.arrays import Bool, Float, Int
 from common.hand_model import CHAINS, MIDDLE_PROXIMAL, TIPS, HandModel
 from common.kernels import constant, inner, kernel
 from common.records import record
+from master.estimator.blend import PARTS
 from master.estimator.certainty import is_small
 from master.estimator.hand_tables import HandTables
-from master.estimator.kinematics import Scratch, chains, clamp, joints, rotate_by, turn_between
-from master.estimator.lead import PARTS
+from master.estimator.kinematics import Scratch, chains, clamp, joints, rotate_by, rotation_between
 from master.estimator.matrices import copy
 from master.estimator.settings import Settings
 from master.estimator.state import NEVER_NS, PALM_PART
@@ -33,7 +33,7 @@ class Pose(NamedTuple):
 
     @classmethod
     def empty(cls) -> "Pose":
-        """Room for one."""
+        """Scratch for one."""
         joint = np.empty((26, 3)), np.empty((26, 3, 3)), np.empty((26, 3, 3))
         return cls(np.empty((4, 4)), np.empty((5, 4)), *joint)
 
@@ -45,7 +45,7 @@ class Smoothing:
 
     Attributes:
         t_ns: (1,) when; NEVER_NS: there is no hand.
-        rests: (6,) what the fingers, and the palm, rested on: `Fitted.rests`.
+        rests: (6,) what the fingers, and the palm, rested on: `Fitted.sources`.
         values: (26,) [m] the filtered signals.
         palm: (4, 4) as filtered.
         offset: (26,) [m] what was shown less what was solved, when each part was last seen again.
@@ -61,7 +61,7 @@ class Smoothing:
     """
 
     t_ns: Int
-    rests: Int
+    sources: Int
     values: Float
     palm: Float
     offset: Float
@@ -101,7 +101,7 @@ class Smoothing:
             ),
             **dict.fromkeys(("dt_s", "across", "dip_per_pip", "blend_s", "tracked_m"), 1),
             **dict.fromkeys(("t_ns", "until_ns"), ("i8", 1)),
-            **dict.fromkeys(("rests", "since_ns"), ("i8", 6)),
+            **dict.fromkeys(("sources", "since_ns"), ("i8", 6)),
             **dict.fromkeys(("part", "seen_ns"), ("i8", 26)),
             count=("i8", 2),
             marker_of=("i8", 5),
@@ -133,13 +133,13 @@ class Smoothing:
 def _write_signals(state: Smoothing, solved: Pose) -> None:
     """Write the signals of a solved hand."""
     T, angles = solved.palm, solved.angles
-    turn = state.work.g
-    turn_between(T, state.palm, state.work.K, turn)
+    rotation = state.work.g
+    rotation_between(T, state.palm, state.work.K, rotation)
     for i in range(3):
         state.signals[i] = T[i, 3]
         for j in range(3):
             state.signals[i] += T[i, j] * state.knuckle[j]
-        state.signals[3 + i] = state.values[3 + i] + state.across[0] * turn[i]
+        state.signals[3 + i] = state.values[3 + i] + state.across[0] * rotation[i]
     for f in range(5):
         for k in range(4):
             follows = state.dip_per_pip[0] * angles[f, 2] if f > 0 and k == 3 else 0.0
@@ -147,7 +147,7 @@ def _write_signals(state: Smoothing, solved: Pose) -> None:
 
 
 @inner
-def _blend(state: Smoothing, t_ns: int, rests: Int) -> bool:
+def _blend(state: Smoothing, t_ns: int, sources: Int) -> bool:
     """Add what is left of leaps to the signals; return whether anything is.
 
     What is seen again leaps now; without frames, nothing was seen.
@@ -155,7 +155,7 @@ def _blend(state: Smoothing, t_ns: int, rests: Int) -> bool:
     blend_s = state.blend_s[0]
     gap = (t_ns - state.t_ns[0]) * 1e-9 > blend_s
     for p in range(6):
-        if rests[p] > 0 and (gap or state.rests[p] == 0):
+        if sources[p] > 0 and (gap or state.sources[p] == 0):
             state.since_ns[p] = t_ns
             state.until_ns[0] = t_ns + round(blend_s * 1e9)
     if t_ns >= state.until_ns[0]:
@@ -170,12 +170,12 @@ def _blend(state: Smoothing, t_ns: int, rests: Int) -> bool:
 
 
 @inner
-def _write_largest(state: Smoothing, rests: Int, cov: Float) -> None:
+def _write_largest(state: Smoothing, sources: Int, cov: Float) -> None:
     """Write variances (26,) [m^2] of the markers that each part rests on.
 
     A finger rests on its own and the palm's; NaN: on none.
     """
-    count, turn, place = 0, 0.0, state.work.g
+    count, rotation, place = 0, 0.0, state.work.g
     for i in range(3):
         place[i] = 0.0
     for m in range(cov.shape[0]):
@@ -185,23 +185,23 @@ def _write_largest(state: Smoothing, rests: Int, cov: Float) -> None:
                 place[i] += cov[m, i, i]
     for i in range(3):
         place[i] /= max(count, 1)
-        turn += place[i] / 3.0
+        rotation += place[i] / 3.0
     for i in range(26):
         p = state.part[i]
         state.largest[i] = nan
-        if count == 0 or rests[p] == 0:
+        if count == 0 or sources[p] == 0:
             continue
         if p == PALM_PART:
-            state.largest[i] = place[i] if i < 3 else turn
+            state.largest[i] = place[i] if i < 3 else rotation
         elif state.marker_of[p] >= 0:
             m = state.marker_of[p]
-            state.largest[i] = (cov[m, 0, 0] + cov[m, 1, 1] + cov[m, 2, 2]) / 3.0 + turn
+            state.largest[i] = (cov[m, 0, 0] + cov[m, 1, 1] + cov[m, 2, 2]) / 3.0 + rotation
 
 
 @inner
-def _filter(state: Smoothing, t_ns: int, rests: Int, marker_cov: Float) -> None:
+def _filter(state: Smoothing, t_ns: int, sources: Int, marker_cov: Float) -> None:
     """Write the filtered signals."""
-    _write_largest(state, rests, marker_cov)
+    _write_largest(state, sources, marker_cov)
     measure(t_ns, state.signals, state.largest, state.count, state.dt_s, state.past, state.noise)
     filter_step(
         t_ns,
@@ -220,10 +220,10 @@ def _filter(state: Smoothing, t_ns: int, rests: Int, marker_cov: Float) -> None:
 @inner
 def _write_pose(hand: HandTables, state: Smoothing, shown: Pose) -> None:
     """Write palm, angles and joints of the filtered signals."""
-    T, turn, angles, work = state.work.palm, state.work.g, state.work.angles, state.work
+    T, rotation, angles, work = state.work.palm, state.work.g, state.work.angles, state.work
     for i in range(3):
-        turn[i] = (state.filtered[3 + i] - state.values[3 + i]) / state.across[0]
-    rotate_by(turn, state.palm, T)
+        rotation[i] = (state.filtered[3 + i] - state.values[3 + i]) / state.across[0]
+    rotate_by(rotation, state.palm, T)
     for i in range(3):
         T[i, 3] = state.filtered[i]
         for j in range(3):
@@ -262,7 +262,7 @@ def smooth(
     boxed_state: Any,
     what: int,
     t_ns: int,
-    rests: Int,
+    sources: Int,
     marker_cov: Float,
     solved: Pose,
     shown: Pose,
@@ -289,14 +289,14 @@ def smooth(
         _write_signals(state, solved)
         if what == SIGNALS:
             return False
-        added = not begins and _blend(state, t_ns, rests)
-    _filter(state, t_ns, rests, marker_cov)
+        added = not begins and _blend(state, t_ns, sources)
+    _filter(state, t_ns, sources, marker_cov)
     _write_pose(hand, state, shown)
     if added:
         _add_offset(hand, state, solved, shown, tracked)
     state.t_ns[0] = t_ns
     for p in range(6):
-        state.rests[p] = rests[p]
+        state.sources[p] = sources[p]
     for i in range(26):
         state.values[i] = state.filtered[i]
     copy(shown.palm, state.palm)

@@ -28,8 +28,8 @@ from master.estimator.matrices import cholesky, copy, substitute
 from master.estimator.priors import Habits
 from master.estimator.problem import Belief, Rig, Search
 from master.estimator.residuals import Observations, marker_rows
-from master.estimator.wrist_device import BEND, EXTRAS, bent_palm
-from master.estimator.wrist_rows import finger_rows, turn_row
+from master.estimator.wrist_device import EXTRAS, WRIST_ANGLES, flexed_palm
+from master.estimator.wrist_rows import finger_rows, orientation_row
 
 MAX_ITERATIONS = 25
 _ROLLED_RAD = 0.25  # no hinges are askew by more
@@ -41,10 +41,10 @@ def palm_off(T: Float, palm: Float, out: Float) -> None:
     """Write turn, as sine times axis, and shift from a palm (4, 4) to T: (6,)."""
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
-        turned = 0.0
+        skew_sum = 0.0
         for c in range(3):
-            turned += T[k, c] * palm[j, c] - T[j, c] * palm[k, c]
-        out[i] = 0.5 * turned
+            skew_sum += T[k, c] * palm[j, c] - T[j, c] * palm[k, c]
+        out[i] = 0.5 * skew_sum
         out[3 + i] = T[i, 3] - palm[i, 3]
 
 
@@ -56,7 +56,7 @@ def past_cost(belief: Belief, T: Float, x: Float, off: Float) -> float:
     for i in range(6):
         cost += 0.5 * belief.palm_w2[i] * off[i] * off[i]
     for i in range(3):
-        depth += belief.sight[i] * off[3 + i]
+        depth += belief.line_of_sight[i] * off[3 + i]
     cost += 0.5 * belief.depth_w2[0] * depth * depth
     for i in range(x.shape[0]):
         cost += 0.5 * belief.past_w2[i] * (x[i] - belief.past[i]) ** 2
@@ -97,14 +97,14 @@ def _believed(
     cost = past_cost(belief, T, x, search.off) + own_cost(habits, belief, h, x)
     depth = 0.0
     for i in range(3):
-        depth += belief.sight[i] * search.off[3 + i]
+        depth += belief.line_of_sight[i] * search.off[3 + i]
     for i in range(6):
         gradient[i] = belief.palm_w2[i] * search.off[i]
         normal[i, i] = belief.palm_w2[i]
     for i in range(3):
-        gradient[3 + i] += belief.depth_w2[0] * depth * belief.sight[i]
+        gradient[3 + i] += belief.depth_w2[0] * depth * belief.line_of_sight[i]
         for j in range(3):
-            normal[3 + i, 3 + j] += belief.depth_w2[0] * belief.sight[i] * belief.sight[j]
+            normal[3 + i, 3 + j] += belief.depth_w2[0] * belief.line_of_sight[i] * belief.line_of_sight[j]
     for i in range(n):
         total = 0.0
         for j in range(n):
@@ -144,14 +144,14 @@ def _beyond(hand: HandTables, x: Float, gradient: Float, normal: Float) -> float
 
 @inlined
 def _faced(belief: Belief, T: Float, gradient: Float, normal: Float) -> float:
-    """Add that the back (the palm's +y) looks along `facing`; return its cost."""
-    w2 = belief.facing_w2[0]
+    """Add that the back (the palm's +y) looks along `back_normal`; return its cost."""
+    w2 = belief.back_normal_w2[0]
     cost = 0.0
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
-        off = T[i, 1] - belief.facing[i]
+        off = T[i, 1] - belief.back_normal[i]
         cost += 0.5 * w2 * off * off
-        off_j, off_k = T[j, 1] - belief.facing[j], T[k, 1] - belief.facing[k]
+        off_j, off_k = T[j, 1] - belief.back_normal[j], T[k, 1] - belief.back_normal[k]
         gradient[i] += w2 * (T[j, 1] * off_k - T[k, 1] * off_j)
         normal[i, i] += w2 * (T[j, 1] * T[j, 1] + T[k, 1] * T[k, 1])
         normal[i, j] -= w2 * T[i, 1] * T[j, 1]
@@ -183,27 +183,29 @@ def linearise(
         h: Hypothesis.
         palm, x, z: (4, 4), (n,), (K,) the hand.
         gradient, normal: Written.
-        search: Room.
+        search: Scratch.
     """
     work = search.rows
     cost = _believed(habits, belief, h, T, x, z, gradient, normal, search)
     cost += _beyond(rig.hand, x, gradient, normal)
-    if belief.facing_w2[0] > 0.0:
+    if belief.back_normal_w2[0] > 0.0:
         cost += _faced(belief, T, gradient, normal)
-    if belief.turned[0] > 0.0:
-        cost += turn_row(belief, T, z, x.shape[0], gradient, normal, search)
+    if belief.oriented[0] > 0.0:
+        cost += orientation_row(belief, T, z, x.shape[0], gradient, normal, search)
     hand, mounts = rig.hand, rig.mounts
     angles_of(hand, x, work.angles, work.by)
     if z.shape[0] == EXTRAS:
         for f in range(5):
             search.twist[f] = z[f]
         twist_hand(hand, search.twist)
-        if belief.sights.rows[0] > 0.0:
-            bent_palm(rig.device.palm, z[BEND], z[BEND + 1], search.palm_camera, search.bend_axes)
+        if belief.lines_of_sight.rows[0] > 0.0:
+            flexed_palm(
+                rig.device.palm, z[WRIST_ANGLES], z[WRIST_ANGLES + 1], search.palm_camera, search.wrist_axes
+            )
             for f in range(5):
                 cost += finger_rows(rig, belief, f, z, x.shape[0], gradient, normal, search)
     chains(hand, T, work.angles, work.R, work.P)
-    search.apart[0] = 0.0
+    search.outliers[0] = 0.0
     for m in range(mounts.finger.shape[0]):
         search.surprise[m] = 0.0
         if not observed.seen[m]:
@@ -221,7 +223,7 @@ def _marker(
     f = mounts.finger[m]
     marker_point(mounts, m, T, work.R, work.P, work.point)
     cost, search.surprise[m] = marker_rows(rig.cameras, observed, m, work.point, work)
-    search.apart[0] += cost - 0.5 * search.surprise[m]
+    search.outliers[0] += cost - 0.5 * search.surprise[m]
     for i in range(3):
         work.arm[i] = work.point[i] - T[i, 3]
         for j in range(3):
@@ -302,7 +304,7 @@ def descend(
         tolerance, share: A search ends where a step gains less than tolerance and that share of the cost.
         palm, x, z: (4, 4), (n,), (K,) where it begins, inside the limits, and then where it ended.
         gradient, normal: Written: (N,), (N, N) there, or before the last step.
-        search: Room.
+        search: Scratch.
     """
     n, K, hand = x.shape[0], z.shape[0], rig.hand
     cost = linearise(rig, habits, belief, observed, h, T, x, z, gradient, normal, search)

@@ -39,15 +39,15 @@ class HandState:
         t_ns: (1,) when.
         known: (1,) whether there is a hand.
         seen_ns: (1,) when anything of it was measured last.
-        placed_ns: (1,) when two cameras, or a depth law, placed a marker of it last.
+        triangulated_ns: (1,) when two cameras, or a depth law, placed a marker of it last.
         told_ns: (6,) when each finger, and the palm, was measured last.
         palm, x, angles: (4, 4) palm, (n,) free and (20,) all angles [rad].
         rates: (20,) [rad/s].
         cov: (N, N) of turn [rad], shift [m], rig axes, free angles [rad] and extras.
         z, z_cov: (K,), (K, K) mean and covariance of the extras, which are filtered (`master.estimator.extras`).
-        z_ns: (1,) when they were stepped last, `usual` (K,) variances that their doubt grows to, and `habit` (2,) [rad]
+        z_ns: (1,) when they were stepped last, `stationary` (K,) variances that they grow to, and `habit` (2,) [rad]
             the bend of the wrist that is kept.
-        level: (5,) `Level` codes of what a wrist device told each finger from last; 0: markers told it since.
+        solver_mode: (5,) `SolverMode` codes of what a wrist device told each finger from last; 0: markers since.
         searched: (5,) triples since the whole valley of a finger was searched.
         vague: (5,) whether that was not well enough to be tracked.
         coupling: (3,) sums of what was learnt of MCP and PIP (`master.estimator.finger_coupling`).
@@ -56,13 +56,13 @@ class HandState:
         hidden_ns: (5,) when each finger that was hidden at the last epoch was seen last; NEVER_NS: it was seen there.
         then, then_rates: (5, 20) the angles and rates of the whole hand at that time.
         then_alike: (5,) how neighbours correlated then.
-        turn: (3, 3) how other sensors had the palm turned, and `turn_known` (1,) whether they said so.
+        measured_rotation: (3, 3) of the palm by other sensors, and `measured_rotation_known` (1,) whether they said so.
     """
 
     t_ns: Int
     known: Bool
     seen_ns: Int
-    placed_ns: Int
+    triangulated_ns: Int
     told_ns: Int
     palm: Float
     x: Float
@@ -72,9 +72,9 @@ class HandState:
     z: Float
     z_cov: Float
     z_ns: Int
-    usual: Float
+    stationary: Float
     habit: Float
-    level: Code
+    solver_mode: Code
     searched: Int
     vague: Bool
     coupling: Float
@@ -85,8 +85,8 @@ class HandState:
     then: Float
     then_rates: Float
     then_alike: Float
-    turn: Float
-    turn_known: Bool
+    measured_rotation: Float
+    measured_rotation_known: Bool
 
     @classmethod
     def unknown(cls, n: int, extras: int) -> "HandState":
@@ -97,7 +97,7 @@ class HandState:
             t_ns=("i8", 1),
             known=("u1", 1),
             seen_ns=("i8", 1),
-            placed_ns=("i8", 1),
+            triangulated_ns=("i8", 1),
             told_ns=("i8", 6),
             palm=(4, 4),
             x=n,
@@ -107,9 +107,9 @@ class HandState:
             z=extras,
             z_cov=(extras, extras),
             z_ns=("i8", 1),
-            usual=extras,
+            stationary=extras,
             habit=2,
-            level=("u1", 5),
+            solver_mode=("u1", 5),
             searched=("i8", 5),
             vague=("u1", 5),
             coupling=3,
@@ -120,10 +120,17 @@ class HandState:
             then=(5, 20),
             then_rates=(5, 20),
             then_alike=5,
-            turn=(3, 3),
-            turn_known=("u1", 1),
+            measured_rotation=(3, 3),
+            measured_rotation_known=("u1", 1),
         )
-        for never in (state.t_ns, state.z_ns, state.seen_ns, state.placed_ns, state.told_ns, state.hidden_ns):
+        for never in (
+            state.t_ns,
+            state.z_ns,
+            state.seen_ns,
+            state.triangulated_ns,
+            state.told_ns,
+            state.hidden_ns,
+        ):
             never[:] = NEVER_NS
         state.z_cov[:] = np.eye(extras)
         return state
@@ -151,19 +158,19 @@ class Hidden:
 
     @classmethod
     def none(cls, n: int) -> "Hidden":
-        """Room for one hand."""
+        """Scratch for one hand."""
         return record(cls, angles=20, sigma=20, gone_s=5, own=5, x=n, K=(4, 4), L=(4, 4), weight=4, ahead=20)
 
 
 @inlined
-def strayed(settings: Settings, a: int, gone_s: float) -> float:
+def growth(settings: Settings, a: int, gone_s: float) -> float:
     """Variance [rad^2] of angle a of 20 about where it was heading, a time after its finger was last seen."""
-    most = settings.stray_rad
+    most = settings.growth_rad
     if a < 4:
-        most = settings.stray_thumb_rad
+        most = settings.growth_thumb_rad
     elif a % 4 == 0:
-        most = settings.stray_aside_rad
-    return most**2 * (1.0 - exp(-((gone_s / settings.stray_s) ** 2)))
+        most = settings.growth_aside_rad
+    return most**2 * (1.0 - exp(-((gone_s / settings.growth_s) ** 2)))
 
 
 @inner
@@ -221,7 +228,7 @@ def hide(
         if f > 0:
             _neighbours(settings, state, f, shown, hidden)
         for a in range(4 * f, 4 * f + 4):
-            hidden.sigma[a] = sqrt(settings.held_rad**2 + hidden.own[f] * strayed(settings, a, gone_s))
+            hidden.sigma[a] = sqrt(settings.held_rad**2 + hidden.own[f] * growth(settings, a, gone_s))
     clamp(hand, hidden.angles)
 
 
@@ -249,16 +256,16 @@ def predict(
     hide(hand, settings, state, t_ns, shown, hidden)
     free_of(hand, hidden.angles, hidden.x)
     age_s = max((t_ns - state.seen_ns[0]) * 1e-9, settings.shortest_s)
-    walked = 1.0 / (settings.walk_rad_s * age_s) ** 2
+    process_noise = 1.0 / (settings.process_noise_rad_s * age_s) ** 2
     for f in range(5):
         for c in range(hand.first[f], hand.first[f + 1]):
             held = 0.0 if shown[f] else 1.0 / hidden.sigma[4 * f + c - hand.first[f]] ** 2
-            belief.past_w2[c] = walked + held
-            belief.past[c] = (walked * state.x[c] + held * hidden.x[c]) / (walked + held)
-    turns_rad_s = settings.palm_walk_rad_s if shown[0] else settings.palm_held_rad_s
+            belief.past_w2[c] = process_noise + held
+            belief.past[c] = (process_noise * state.x[c] + held * hidden.x[c]) / (process_noise + held)
+    rotation_rad_s = settings.palm_process_noise_rad_s if shown[0] else settings.palm_held_rad_s
     for i in range(3):
-        belief.palm_w2[i] = 1.0 / (turns_rad_s * age_s) ** 2
-        belief.palm_w2[3 + i] = 1.0 / (settings.palm_walk_m_s * age_s) ** 2
+        belief.palm_w2[i] = 1.0 / (rotation_rad_s * age_s) ** 2
+        belief.palm_w2[3 + i] = 1.0 / (settings.palm_process_noise_m_s * age_s) ** 2
     copy(state.palm, belief.palm)
 
 
@@ -278,8 +285,11 @@ def grow(
     - a finger that is hidden: by how far hidden fingers stray,
     - a palm without markers: by a turn and a shift that grow with the time it is lost, the shift with its speed, too.
     """
-    walked_s = max(dt_s, settings.shortest_s)
-    turn2, shift2 = (settings.palm_walk_rad_s * walked_s) ** 2, (settings.palm_walk_m_s * walked_s) ** 2
+    elapsed_noise_s = max(dt_s, settings.shortest_s)
+    rotation2, shift2 = (
+        (settings.palm_process_noise_rad_s * elapsed_noise_s) ** 2,
+        (settings.palm_process_noise_m_s * elapsed_noise_s) ** 2,
+    )
     if palm_shown:
         squared = 0.0
         for i in range(3):
@@ -294,17 +304,17 @@ def grow(
         before = state.lost_s[0]
         state.lost_s[0] = before + dt_s
         longer = state.lost_s[0] ** 2 - before**2
-        turn2 = settings.lost_turn_rad_s**2 * longer
+        rotation2 = settings.lost_rotation_rad_s**2 * longer
         shift2 = (settings.lost_shift_m_s + settings.lost_goes_on * state.speed[0]) ** 2 * longer
     for i in range(3):
-        state.cov[i, i] += turn2
+        state.cov[i, i] += rotation2
         state.cov[3 + i, 3 + i] += shift2
     for f in range(5):
         gone_s = hidden.gone_s[f]
         for c in range(hand.first[f], hand.first[f + 1]):
-            added = (settings.walk_rad_s * dt_s) ** 2
+            added = (settings.process_noise_rad_s * dt_s) ** 2
             if gone_s > 0.0:
                 a = 4 * f + c - hand.first[f]
-                added = strayed(settings, a, gone_s) - strayed(settings, a, max(gone_s - dt_s, 0.0))
+                added = growth(settings, a, gone_s) - growth(settings, a, max(gone_s - dt_s, 0.0))
                 added *= hidden.own[f]
             state.cov[6 + c, 6 + c] += added

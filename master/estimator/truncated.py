@@ -24,7 +24,7 @@ _ON_LIMIT_RAD = 1e-9
 
 
 class Cut:
-    """Room for the mean within limits, of N unknowns, of which n are angles."""
+    """Scratch for the mean within limits, of N unknowns, of which n are angles."""
 
     weight: Float  # (n,)
     push: Float  # (n,)
@@ -73,14 +73,14 @@ def mean_within(hand: HandTables, normal: Float, gradient: Float, x: Float, cut:
         normal: (N, N) normal matrix of the cost at the likeliest hand.
         gradient: (N,) there; counts where the angles stand at a limit, elsewhere it is 0.
         x: (n,) its angles.
-        cut: Room.
+        cut: Scratch.
         mean: Written: turn [rad], shift [m] and angles [rad]; the angles stay within the limits.
     """
     n, N = x.shape[0], cut.pull.shape[0]
     for i in range(N):
         cut.pull[i] = 0.0
     for i in range(n):
-        below, above = (-inf if hand.rests[i] else hand.low[i] - x[i]), hand.high[i] - x[i]
+        below, above = (-inf if hand.at_low_limit[i] else hand.low[i] - x[i]), hand.high[i] - x[i]
         fixed = above - below < _FIXED_RAD
         cut.weight[i], cut.push[i] = _FIXED_WEIGHT if fixed else 0.0, 0.0
         if below > -_ON_LIMIT_RAD or above < _ON_LIMIT_RAD:
@@ -104,7 +104,7 @@ def mean_within(hand: HandTables, normal: Float, gradient: Float, x: Float, cut:
         if sweep == _SWEEPS:
             break
         for i in range(n):
-            below, above = (-inf if hand.rests[i] else hand.low[i] - x[i]), hand.high[i] - x[i]
+            below, above = (-inf if hand.at_low_limit[i] else hand.low[i] - x[i]), hand.high[i] - x[i]
             if above - below < _FIXED_RAD:
                 continue
             variance = cut.cov[6 + i, 6 + i]
@@ -116,5 +116,5 @@ def mean_within(hand: HandTables, normal: Float, gradient: Float, x: Float, cut:
             cut.weight[i] += _DAMPING * (better - cut.weight[i])
             cut.push[i] += _DAMPING * (at / narrow - middle / alone - cut.push[i])
     for i in range(n):
-        below = -inf if hand.rests[i] else hand.low[i] - x[i]
+        below = -inf if hand.at_low_limit[i] else hand.low[i] - x[i]
         mean[6 + i] = min(max(mean[6 + i], below), hand.high[i] - x[i])

@@ -11,10 +11,10 @@ from common.messages import Source
 from master.estimator.arcs import add_arcs
 from master.estimator.certainty import is_small, linear, only_limits, surer, tilts
 from master.estimator.extras import keep_extras
-from master.estimator.ground import Ground
 from master.estimator.hypotheses import Blank, likelier
 from master.estimator.kinematics import angles_of, chains, clamp, free_of, joints, marker_point
 from master.estimator.matrices import copy, inverse_3
+from master.estimator.observation_sources import Ground
 from master.estimator.posterior import posterior
 from master.estimator.priors import Habits
 from master.estimator.problem import Belief, Rig, Search
@@ -41,7 +41,7 @@ class Estimate(NamedTuple):
         position, rotation: (26, 3) [m], (26, 3, 3), rig frame.
         cov: (26, 3, 3) [m^2] of the joints.
         tilt: (5, 3, 3) [rad^2] of the last phalanges' directions, by this instant alone.
-        tilt_walk: (5,) [rad^2/s^2] by how much their trace is expected to grow, by the time squared.
+        tilt_process_noise: (5,) [rad^2/s^2] by how much their trace is expected to grow, by the time squared.
         tracked: (26,), and `source` (26,) as of `HandPose`.
     """
 
@@ -51,13 +51,13 @@ class Estimate(NamedTuple):
     rotation: Float
     cov: Float
     tilt: Float
-    tilt_walk: Float
+    tilt_process_noise: Float
     tracked: Bool
     source: Code
 
     @classmethod
     def empty(cls) -> "Estimate":
-        """Room for one."""
+        """Scratch for one."""
         return cls(
             palm=np.empty((4, 4)),
             angles=np.empty(20),
@@ -65,7 +65,7 @@ class Estimate(NamedTuple):
             rotation=np.empty((26, 3, 3)),
             cov=np.empty((26, 3, 3)),
             tilt=np.empty((5, 3, 3)),
-            tilt_walk=np.empty(5),
+            tilt_process_noise=np.empty(5),
             tracked=np.empty(26, np.bool_),
             source=np.empty(26, np.uint8),
         )
@@ -73,7 +73,7 @@ class Estimate(NamedTuple):
 
 @inner
 def chi_square(
-    rig: Rig, observed: Observations, T: Float, x: Float, walked_m: float, search: Search
+    rig: Rig, observed: Observations, T: Float, x: Float, process_noise_m: float, search: Search
 ) -> float:
     """Chi square of the markers on a hand that may have walked so far, in any direction, since."""
     work, mounts = search.rows, rig.mounts
@@ -84,15 +84,15 @@ def chi_square(
         if not observed.seen[m]:
             continue
         kept = search.J
-        own = observed.information[m] if observed.placed[m] else observed.own[m]
+        own = observed.information[m] if observed.triangulated[m] else observed.own[m]
         marker_point(mounts, m, T, work.R, work.P, work.point)
         for i in range(3):
             for j in range(3):
                 kept[i, j], work.K[i, j] = own[i, j], 0.0
-        if walked_m > 0.0:
+        if process_noise_m > 0.0:
             inverse_3(own, work.K, own)
             for i in range(3):
-                own[i, i] += walked_m * walked_m
+                own[i, i] += process_noise_m * process_noise_m
             inverse_3(own, work.K, own)
         _, chi2 = marker_rows(rig.cameras, observed, m, work.point, work)
         copy(kept, own)
@@ -118,14 +118,14 @@ def _judge(
     for joint in range(26):
         f = hand.finger[joint]
         part = f if f >= 0 else PALM_PART
-        by_wrist = f >= 0 and state.level[f] > 0
-        most_s = settings.tracked_triple_s if by_wrist else settings.tracked_age_s
-        fresh = (t_ns - state.told_ns[part]) * 1e-9 <= most_s
+        by_wrist = f >= 0 and state.solver_mode[f] > 0
+        most_s = settings.tracked_cycle_s if by_wrist else settings.tracked_age_s
+        measured_lately = (t_ns - state.told_ns[part]) * 1e-9 <= most_s
         sure = f < 0 or not state.vague[f]
-        out.tracked[joint] = fresh and sure and is_small(hand, out.cov, joint, settings.tracked_m)
+        out.tracked[joint] = measured_lately and sure and is_small(hand, out.cov, joint, settings.tracked_m)
         now = state.told_ns[part] == t_ns
         out.source[joint] = _SOLVED if now else _HELD
-        if by_wrist and fresh:
+        if by_wrist and measured_lately:
             out.source[joint] = _WRIST
     for m in range(rig.mounts.finger.shape[0]):
         f = rig.mounts.finger[m]
@@ -136,23 +136,26 @@ def _judge(
 
 
 @inner
-def _drift(
+def _depth_noise(
     settings: Settings, state: HandState, t_ns: int, ground: Ground, belief: Belief, out: Estimate
 ) -> None:
     """Add how far a hand may have drifted along the sight while one camera alone saw it.
 
     Perspective tells the depth of a hand to centimetres only, and the fit is as sure of it as of the last epoch's.
     """
-    placed, seen = ground.most[0] > 1, ground.seen[0] > 0
-    if placed or state.placed_ns[0] == NEVER_NS:
-        state.placed_ns[0] = t_ns
-    if placed or not seen:
+    triangulated, seen = ground.most[0] > 1, ground.seen[0] > 0
+    if triangulated or state.triangulated_ns[0] == NEVER_NS:
+        state.triangulated_ns[0] = t_ns
+    if triangulated or not seen:
         return
-    sigma_m = min(settings.drift_m_s * (t_ns - state.placed_ns[0]) * 1e-9, settings.drift_most_m)
+    sigma_m = min(
+        settings.unobserved_depth_m_s * (t_ns - state.triangulated_ns[0]) * 1e-9,
+        settings.unobserved_depth_most_m,
+    )
     for joint in range(26):
         for i in range(3):
             for j in range(3):
-                out.cov[joint, i, j] += sigma_m * sigma_m * belief.sight[i] * belief.sight[j]
+                out.cov[joint, i, j] += sigma_m * sigma_m * belief.line_of_sight[i] * belief.line_of_sight[j]
 
 
 @kernel
@@ -170,44 +173,44 @@ def predict_epoch(model: Model, boxed_state: Any, observed: Observations, boxed_
         no motion explains them, but it does.
     """
     state, space, settings = boxed_state[0], boxed_space[0], model.settings[0]
-    rig, task, belief, room = (
+    rig, task, belief, scratch = (
         Rig(model.hand[0], model.mounts, model.cameras, model.device[0]),
         space.task,
         space.belief,
-        space.room,
+        space.scratch,
     )
     t_ns, limit = task.t_ns[0], np.inf
     dt_s = (t_ns - state.t_ns[0]) * 1e-9
     if task.may_leave[0] > 0:
         free_of(rig.hand, task.angles, task.x)
-        limit = chi_square(rig, observed, task.palm, task.x, 0.0, room.search) + settings.misled
-        walked_m = settings.palm_walk_m_s * dt_s
-        if chi_square(rig, observed, state.palm, state.x, walked_m, room.search) > limit:
+        limit = chi_square(rig, observed, task.palm, task.x, 0.0, scratch.search) + settings.misled
+        process_noise_m = settings.palm_process_noise_m_s * dt_s
+        if chi_square(rig, observed, state.palm, state.x, process_noise_m, scratch.search) > limit:
             return -1.0
     predict(rig.hand, settings, state, t_ns, space.ground.shown, space.hidden, belief)
-    _turn_on(state, belief, room.search)
+    _rotate_on(state, belief, scratch.search)
     task.natural[0], task.counts[0] = state.natural[0], exp(-dt_s / settings.habit_memory_s)
-    copy(belief.palm, room.start_T)
+    copy(belief.palm, scratch.start_T)
     for c in range(state.x.shape[0]):
-        room.start_x[c] = state.x[c]
-    start_scanned(rig.hand, space.scan, task.scanned, room.search.x, room.start_x)
+        scratch.start_x[c] = state.x[c]
+    start_scanned(rig.hand, space.scan, task.scanned, scratch.search.x, scratch.start_x)
     return limit
 
 
 @inner
-def _turn_on(state: HandState, belief: Belief, search: Search) -> None:
+def _rotate_on(state: HandState, belief: Belief, search: Search) -> None:
     """Write the palm of the state, turned on as other sensors say, to `belief.palm`."""
     by = search.J
     for i in range(3):
         for j in range(3):
             by[i, j] = 1.0 if i == j else 0.0
-    if belief.turned[0] > 0.0 and state.turn_known[0] > 0:
+    if belief.oriented[0] > 0.0 and state.measured_rotation_known[0] > 0:
         sensed_palm(belief, state.z, search)
         for i in range(3):
             for j in range(3):
                 by[i, j] = 0.0
                 for k in range(3):
-                    by[i, j] += search.palm[i, k] * state.turn[j, k]
+                    by[i, j] += search.palm[i, k] * state.measured_rotation[j, k]
     for i in range(3):
         for j in range(3):
             belief.palm[i, j] = 0.0
@@ -222,20 +225,20 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
     Args:
         model, habits: What is the same at every epoch.
         observed: What is measured.
-        blank: Room.
+        blank: Scratch.
         boxed_space: (1,) `Workspace`, with the task and what is believed; what is found is in its `found`.
 
     Returns:
         Chi square of the markers; of a rough search its cost.
     """
     space, settings = boxed_space[0], model.settings[0]
-    rig, task, belief, room = (
+    rig, task, belief, scratch = (
         Rig(model.hand[0], model.mounts, model.cameras, model.device[0]),
         space.task,
         space.belief,
-        space.room,
+        space.scratch,
     )
-    search, found = room.search, space.found
+    search, found = scratch.search, space.found
     if task.rough[0] > 0:
         cost, _ = descend(
             rig,
@@ -247,9 +250,9 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
             settings.tolerance_share,
             task.palm,
             task.x,
-            room.start_z,
-            room.each[0].gradient,
-            room.each[0].normal,
+            scratch.start_z,
+            scratch.each[0].gradient,
+            scratch.each[0].normal,
             search,
         )
         return cost
@@ -259,21 +262,21 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
         habits,
         belief,
         observed,
-        room.start_T,
-        room.start_x,
-        room.start_z,
+        scratch.start_T,
+        scratch.start_x,
+        scratch.start_z,
         task.natural[0],
         task.counts[0],
         space.ground.numbers[0],
         blank,
-        room,
+        scratch,
         found,
     )
     if found.z.shape[0] == EXTRAS:
         extras_alone(belief, found, search)
-    if belief.sights.rows[0] > 0.0:
+    if belief.lines_of_sight.rows[0] > 0.0:
         take_scanned(rig, space.ground, space.scan, found, search.rows)
-    found.contrary[0] = contrary(belief, found.palm, found.z, search) if belief.turned[0] > 0.0 else 0.0
+    found.contrary[0] = contrary(belief, found.palm, found.z, search) if belief.oriented[0] > 0.0 else 0.0
     return chi_square(rig, observed, found.palm, found.x, 0.0, search)
 
 
@@ -309,7 +312,7 @@ def take_over_epoch(
     state, space, settings = boxed_state[0], boxed_space[0], model.settings[0]
     rig, task = Rig(model.hand[0], model.mounts, model.cameras, model.device[0]), space.task
     t_ns, shown, palm_shown = task.t_ns[0], space.ground.shown, task.palm_shown[0] > 0
-    found, hidden, room, work = space.found, space.hidden, space.certainty, space.room.search.rows
+    found, hidden, scratch, work = space.found, space.hidden, space.certainty, space.scratch.search.rows
     hand, n = rig.hand, found.x.shape[0]
     angles_of(hand, found.x, work.angles, work.by)
     clamp(hand, work.angles)
@@ -329,17 +332,17 @@ def take_over_epoch(
         for part in range(6):  # what was measured was another hand
             state.told_ns[part] = NEVER_NS
     if goes_on and lost:
-        now = space.room.cov
+        now = space.scratch.cov
         copy(found.cov, now)
         only_limits(hand, found.x, hidden, now)
-        surer(now, state.cov, room, space.room.A)
-        copy(space.room.A, state.cov)
+        surer(now, state.cov, scratch, space.scratch.A)
+        copy(space.scratch.A, state.cov)
     else:
         copy(found.cov, state.cov)
     chains(hand, found.palm, work.angles, work.R, work.P)
     joints(hand, found.palm, work.R, work.P, out.position, out.rotation)
-    linear(hand, found.palm, state.cov, work, room, out.cov)
-    tilts(hand, settings, found.palm, found.cov, work, room, out.tilt, out.tilt_walk)
+    linear(hand, found.palm, state.cov, work, scratch, out.cov)
+    tilts(hand, settings, found.palm, found.cov, work, scratch, out.tilt, out.tilt_process_noise)
     if task.second_order[0] > 0:
         add_arcs(
             rig,
@@ -347,12 +350,12 @@ def take_over_epoch(
             found.palm,
             state.cov,
             observed.seen,
-            space.room.each[likelier(space.room)].information,
+            space.scratch.each[likelier(space.scratch)].information,
             work,
-            room,
+            scratch,
             out.cov,
         )
-    _drift(settings, state, t_ns, space.ground, space.belief, out)
+    _depth_noise(settings, state, t_ns, space.ground, space.belief, out)
     state.t_ns[0], state.known[0], state.natural[0] = t_ns, True, found.natural[0]
     for f in range(5):
         if shown[f]:
@@ -363,19 +366,19 @@ def take_over_epoch(
     since_s = dt_s if goes_on else _LONG_S  # what begins owes nothing to an epoch before
     keep_extras(settings, state, since_s, space.belief, found.z, found.cov, found.scale[0], space.extras)
     # With tilt and heading as this epoch leaves them, so that what is learnt of these is no motion.
-    state.turn_known[0] = space.belief.turned[0] > 0.0
-    if state.turn_known[0] > 0:
-        sensed_palm(space.belief, state.z, space.room.search)
+    state.measured_rotation_known[0] = space.belief.oriented[0] > 0.0
+    if state.measured_rotation_known[0] > 0:
+        sensed_palm(space.belief, state.z, space.scratch.search)
         for i in range(3):
             for j in range(3):
-                state.turn[i, j] = space.room.search.palm[i, j]
+                state.measured_rotation[i, j] = space.scratch.search.palm[i, j]
     for f in range(5):
         pip = 6 + hand.first[f] + 2
-        bend_open = state.cov[pip, pip] > settings.tracked_pip_rad**2
-        if space.ground.rests[f] > 0:
-            state.level[f], state.vague[f] = 0, f > 0 and bend_open
+        pip_open = state.cov[pip, pip] > settings.tracked_pip_rad**2
+        if space.ground.sources[f] > 0:
+            state.solver_mode[f], state.vague[f] = 0, f > 0 and pip_open
         elif space.scan.known[f] > 0.0:
-            state.level[f], state.vague[f] = task.level[f], task.ambiguous[f] or bend_open
+            state.solver_mode[f], state.vague[f] = task.solver_mode[f], task.ambiguous[f] or pip_open
     copy(found.palm, out.palm)
     for a in range(20):
         out.angles[a] = state.angles[a] = work.angles[a]

@@ -6,11 +6,11 @@ from common.arrays import Bool, Code, Float, Int
 from common.records import record
 from master.estimator.cameras import CameraArrays
 from master.estimator.certainty import Certainty
-from master.estimator.extras import ExtrasRoom
+from master.estimator.extras import ExtrasScratch
 from master.estimator.finger_scan import Prior, Scan
-from master.estimator.ground import Ground
 from master.estimator.hand_tables import Mounts
-from master.estimator.hypotheses import Posterior, Room
+from master.estimator.hypotheses import Posterior, Scratch
+from master.estimator.observation_sources import Ground
 from master.estimator.problem import Belief
 from master.estimator.state import Hidden
 
@@ -27,11 +27,11 @@ class Task:
         rough: (1,) whether a search is to end early, in place, under the widest hypothesis alone.
         natural: (1,) probability of a natural hand a moment ago, and `counts` (1,) what that counts, 0 ... 1.
         second_order: (1,) whether covariance is wanted to second order.
-        walked_rad2: (1,) variance of what the heading has drifted since the last epoch.
+        process_noise_rad2: (1,) variance of what the heading has drifted since the last epoch.
         continuous: (1,) whether epochs follow each other.
         scanned: (20,) angles of fingers whose valley was searched, where it is likeliest.
         refused: (5,) fingertips, and `off` (5,) laser points, that no pose explains.
-        level: (5,) `Level` codes of what fingers are told from.
+        solver_mode: (5,) `SolverMode` codes of what fingers are told from.
         ambiguous: (5,) whether another pose explains as much.
     """
 
@@ -45,17 +45,17 @@ class Task:
     natural: Float
     counts: Float
     second_order: Bool
-    walked_rad2: Float
+    process_noise_rad2: Float
     continuous: Bool
     scanned: Float
     refused: Bool
     off: Bool
-    level: Code
+    solver_mode: Code
     ambiguous: Bool
 
     @classmethod
     def empty(cls, n: int) -> "Task":
-        """Room for one."""
+        """Scratch for one."""
         return record(
             cls,
             t_ns=("i8", 1),
@@ -68,29 +68,29 @@ class Task:
             natural=1,
             counts=1,
             second_order=("u1", 1),
-            walked_rad2=1,
+            process_noise_rad2=1,
             continuous=("u1", 1),
             scanned=20,
             refused=("u1", 5),
             off=("u1", 5),
-            level=("u1", 5),
+            solver_mode=("u1", 5),
             ambiguous=("u1", 5),
         )
 
 
 class Workspace:
-    """Room for all kernels of one hand, what is to be done, and what is believed at the epoch."""
+    """Scratch for all kernels of one hand, what is to be done, and what is believed at the epoch."""
 
     task: Task
     ground: Ground
     belief: Belief
     hidden: Hidden
     found: Posterior
-    room: Room
+    scratch: Scratch
     certainty: Certainty
     prior: Prior
     scan: Scan
-    extras: ExtrasRoom
+    extras: ExtrasScratch
 
     @classmethod
     def empty(cls, n: int, extras: int, markers: int) -> "Workspace":
@@ -102,11 +102,11 @@ class Workspace:
             belief=Belief.none(n, extras),
             hidden=Hidden.none(n),
             found=Posterior.empty(n, extras, markers),
-            room=Room.empty(n, extras, markers),
+            scratch=Scratch.empty(n, extras, markers),
             certainty=Certainty.empty(6 + n + extras, markers),
             prior=Prior.empty(),
             scan=Scan.empty(),
-            extras=ExtrasRoom.empty(extras),
+            extras=ExtrasScratch.empty(extras),
         )
 
 

@@ -12,13 +12,13 @@ import numpy as np
 
 from common.arrays import Float
 from common.fingertips import Fingertips
-from common.hand_skin import PLACES, SPREAD, Skin
 from common.kernels import inlined, inner, kernel
+from common.palmar_surface import PLACES, SPREAD, PalmarSurface
 from common.records import filled, record
 from master.estimator.laser_plane import PlaneAxes
 from master.wrist_setup import WristSetup
 
-TWIST, BEND, RATE, TILT, HEADING, LIGHT, EXTRAS = 0, 5, 7, 9, 11, 12, 13
+TWIST, WRIST_ANGLES, RATE, TILT, HEADING, LED_SCALE, EXTRAS = 0, 5, 7, 9, 11, 12, 13
 NO_EXTRAS = 1  # of a rig without wrist device: one that means nothing
 _PALM_M = 7e-4  # what calibration leaves of plane and palm: a palm pitched by 0.2 degrees, and 0.3 mm
 _BLUR_PX = 0.5
@@ -42,7 +42,7 @@ class Device:
         local: (5, 8, 3) their centres in the frames of their bones' joints.
         back: (5, 3, 3) unit vectors towards the back of each bone, in the frame of its joint.
         tip: (5, 3) fingertip in the frame of the last joint but the tip.
-        skin2: (5,) [m^2] variance of the skin's distance from the bone.
+        surface2: (5,) [m^2] variance of the skin's distance from the bone.
         tip2: (5,) [m^2] variance of where the skin ends.
     """
 
@@ -57,15 +57,15 @@ class Device:
     local: Float
     back: Float
     tip: Float
-    skin2: Float
+    surface2: Float
     tip2: Float
 
     @classmethod
     def of(cls, setup: WristSetup) -> "Device":
         """Lay out a device."""
-        model, skin, axes = setup.model, Skin.of(setup.model), PlaneAxes.of(setup)
+        model, surface, axes = setup.model, PalmarSurface.of(setup.model), PlaneAxes.of(setup)
         tips = Fingertips.of(model)
-        deep = skin.radius_m - skin.palmar_m
+        deep = surface.radius_m - surface.palmar_m
         back, local = np.zeros((5, 3, 3)), np.zeros((5, len(PLACES), 3))
         up = np.array([0.0, 1.0, 0.0])
         for f in range(5):
@@ -87,19 +87,19 @@ class Device:
                 "offset": np.array([setup.offset_m]),
                 "focal": np.array([setup.optics.matrix[0, 0]]),
                 "before": np.array([side]),
-                "radius": skin.radius_m,
+                "radius": surface.radius_m,
                 "deep": deep,
                 "local": local,
                 "back": back,
                 "tip": last * (1.0 + tips.beyond_m / length)[:, None] + tips.dorsal_m * back[:, 2],
-                "skin2": (SPREAD * skin.palmar_m.mean(axis=1)) ** 2,
+                "surface2": (SPREAD * surface.palmar_m.mean(axis=1)) ** 2,
                 "tip2": (SPREAD * tips.beyond_m) ** 2 + _PALM_M**2,
             },
         )
 
     @classmethod
     def none(cls) -> "Device":
-        """Room of the same shape, of a rig without wrist device."""
+        """Scratch of the same shape, of a rig without wrist device."""
         return record(
             cls,
             palm=(4, 4),
@@ -113,12 +113,12 @@ class Device:
             local=(5, 8, 3),
             back=(5, 3, 3),
             tip=(5, 3),
-            skin2=5,
+            surface2=5,
             tip2=5,
         )
 
 
-class Sights:
+class LinesOfSight:
     """What one triple shows of five fingers, as rows; x, y are those of undistorted rays (x, y, 1).
 
     Attributes:
@@ -149,7 +149,7 @@ class Sights:
     rows: Float
 
     @classmethod
-    def empty(cls) -> "Sights":
+    def empty(cls) -> "LinesOfSight":
         """Nothing is seen."""
         return record(
             cls,
@@ -190,7 +190,7 @@ def loosen(W: Float, J: Float, row: int, cov: Float) -> None:
     a, b, c = W[1, 1] / det, -W[0, 1] / det, W[0, 0] / det
     for i in range(2):
         for j in range(2):
-            p = cov[BEND + i, BEND + j]
+            p = cov[WRIST_ANGLES + i, WRIST_ANGLES + j]
             a += J[row, 5 + i] * p * J[row, 5 + j]
             b += J[row, 5 + i] * p * J[row + 1, 5 + j]
             c += J[row + 1, 5 + i] * p * J[row + 1, 5 + j]
@@ -198,11 +198,13 @@ def loosen(W: Float, J: Float, row: int, cov: Float) -> None:
 
 
 @inner
-def loosen_short(device: Any, sights: Sights, f: int, length_px: float, point: Float, A: Float) -> bool:
+def loosen_short(
+    device: Any, lines_of_sight: LinesOfSight, f: int, length_px: float, point: Float, A: Float
+) -> bool:
     """Take from the information of a laser point what it does not say of a line that is hidden in part.
 
     Args:
-        device, sights: `Sights.laser_W` is changed.
+        device, sights: `LinesOfSight.laser_W` is changed.
         f: Finger.
         length_px: The line's, were all of it seen.
         point, A: (3,), (2, 2) room.
@@ -210,11 +212,11 @@ def loosen_short(device: Any, sights: Sights, f: int, length_px: float, point: F
     Returns:
         Whether the line is that short.
     """
-    seen_px = sights.laser_px[f]
-    x, y = sights.laser[f, 0], sights.laser[f, 1]
+    seen_px = lines_of_sight.laser_px[f]
+    x, y = lines_of_sight.laser[f, 0], lines_of_sight.laser[f, 1]
     if seen_px == 0.0 or seen_px > _WHOLE * length_px or not on_plane(device, x, y, point, A):
         return False
-    W = sights.laser_W[f]
+    W = lines_of_sight.laser_W[f]
     det = W[0, 0] * W[1, 1] - W[0, 1] * W[1, 0]
     a, b, c = W[1, 1] / det, -W[0, 1] / det, W[0, 0] / det
     off = 0.5 * (length_px - seen_px) / device.focal[0]
@@ -265,7 +267,7 @@ def observe_wrist(
         tip_depth: (5,) distances of the tips by light.
         depth_sigma: Standard deviation of their logarithms; 0: they are not used.
         laser_s, tip_s: How much later than the epoch laser points and tips were seen.
-        boxed_out: (1,) `Sights`, written.
+        boxed_out: (1,) `LinesOfSight`, written.
     """
     device, out = boxed_device[0], boxed_out[0]
     point, A = np.zeros(3), np.zeros((2, 2))
@@ -279,8 +281,8 @@ def observe_wrist(
         x, y = laser[f, 0], laser[f, 1]
         if np.isfinite(x + y + laser_sigma_px[f]) and on_plane(device, x, y, point, A):
             sensed = (laser_sigma_px[f] ** 2 + _BLUR_PX**2) / device.focal[0] ** 2
-            across = 0.25 * device.skin2[f] + _PALM_M**2
-            along = device.skin2[f] + _PALM_M**2
+            across = 0.25 * device.surface2[f] + _PALM_M**2
+            along = device.surface2[f] + _PALM_M**2
             a = sensed + A[0, 0] ** 2 * across + A[0, 1] ** 2 * along
             b = A[0, 0] * A[1, 0] * across + A[0, 1] * A[1, 1] * along
             c = sensed + A[1, 0] ** 2 * across + A[1, 1] ** 2 * along
@@ -298,10 +300,10 @@ def observe_wrist(
 
 
 @inner
-def bent_palm(F: Float, flexion: float, deviation: float, T: Float, axes: Float) -> None:
+def flexed_palm(F: Float, flexion: float, deviation: float, T: Float, axes: Float) -> None:
     """Write the palm (4, 4) of a wrist that is bent, and the axes (2, 3) of flexion and deviation.
 
-    F: (4, 4) palm of the straight wrist, or the rotation of the forearm in it (`common.wrist_bend`).
+    F: (4, 4) palm of the straight wrist, or the rotation of the forearm in it (`common.wrist_joint`).
     """
     c, s, cd, sd = cos(flexion), sin(flexion), cos(deviation), sin(deviation)
     for i in range(3):

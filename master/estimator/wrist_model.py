@@ -10,7 +10,7 @@ from common.errors import CalibrationError
 from common.hand_limits import ABDUCTION, FLEXION
 from common.hand_model import HandModel
 from master.estimator.cubic import CubicLaw, lit
-from master.estimator.natural_curve import DIP, PIP, NaturalCurve
+from master.estimator.flexion_synergy import DIP, PIP, FlexionSynergy
 from master.estimator.wrist_device import Device
 from master.wrist_setup import WristSetup
 
@@ -56,14 +56,14 @@ class WristModel:
         Raises:
             CalibrationError: The laser passes by the hand.
         """
-        curve, optics = NaturalCurve.of(setup.model), setup.optics
-        slope = curve.slope.copy()
-        if setup.model.profile.couplings is None and setup.level != "fk":
+        synergy, optics = FlexionSynergy.of(setup.model), setup.optics
+        slope = synergy.slope.copy()
+        if setup.model.profile.couplings is None and setup.solver_mode != "fk":
             slope[1:, DIP] = _DIP_PER_PIP
         slope[0, DIP] = _IP_PER_MCP
-        natural = curve.base_rad.copy()
+        natural = synergy.base_rad.copy()
         natural[0, DIP] = 0.0
-        if not lit(setup, curve):
+        if not lit(setup, synergy):
             raise CalibrationError(
                 "laser_plane, T_camera_palm: the laser meets no finger of this hand however it is bent: calibrate plane"
                 " and palm"
@@ -81,7 +81,7 @@ class WristModel:
             loose,
             0.0 if setup.imu is None else setup.imu.orientation_sigma_rad,
             None if setup.imu is None else setup.imu.heading_sigma_rad,
-            setup.level == "fk",
+            setup.solver_mode == "fk",
             CubicLaw(setup) if setup.cubic else None,
         )
 

@@ -15,18 +15,18 @@ from common.arrays import Bool, Float
 from common.hand_model import CHAINS, FINGERS
 from common.kernels import bound
 from common.messages import HandPose, Source, WristDetections
-from master.estimator.epoch import Epoch, Fitted, Turn
+from master.estimator.cycle_reader import CycleReader
+from master.estimator.epoch import Epoch, Fitted, OrientationMeasurement
 from master.estimator.estimator import Estimator
 from master.estimator.forearm import NO_WORLD, Forearm
 from master.estimator.kinematics import quaternions
 from master.estimator.pipeline import SolvedPose, Stage
 from master.estimator.settings import DEFAULT, Settings
-from master.estimator.triple_reader import TripleReader
 from master.estimator.wrist_model import WristModel, loosened
 from master.volume import inside
 from master.wrist_setup import WristSetup
 
-_TURN_INFO = np.eye(3) * 1e6  # of a palm that stands: a thousandth of a radian
+_ORIENTATION_INFO = np.eye(3) * 1e6  # of a palm that stands: a thousandth of a radian
 _PALM = np.setdiff1d(np.arange(26), CHAINS)
 _NO_AXES = np.zeros((3, 3))
 _NO_POINTS = np.empty((0, 3)), np.empty((0, 3, 3))
@@ -60,9 +60,11 @@ class WristPipeline:
             (setup.optics,), self._hand, (), (), continuous=continuous, settings=settings, wrist=self._model
         )
         self._quaternions = bound(quaternions, np.empty((26, 3, 3)), np.empty((26, 4)))
-        self._reader = TripleReader(setup, self._model.cubic, self.counts)
+        self._reader = CycleReader(setup, self._model.cubic, self.counts)
         T = setup.T_camera_palm
-        self._turn = Turn(np.ascontiguousarray(T[:3, :3]), _TURN_INFO, sure=True, axes=_NO_AXES)
+        self._orientation = OrientationMeasurement(
+            np.ascontiguousarray(T[:3, :3]), _ORIENTATION_INFO, sure=True, axes=_NO_AXES
+        )
         self._place = np.ascontiguousarray(T[:3, 3])
         self._forearm = None if setup.imu is None else Forearm(setup.imu, self.counts)
         self._last_ns, self._seen_ns = _NEVER_NS, np.full(5, _NEVER_NS)
@@ -79,7 +81,14 @@ class WristPipeline:
             rows, laser_m = self._reader.read(message, t_ns)
         with self._stage("hand"):
             hand = self._estimator.push(
-                Epoch(t_ns, _NO_POINTS[0], np.zeros(3), turn=self._turn, wrist=rows, place=self._place)
+                Epoch(
+                    t_ns,
+                    _NO_POINTS[0],
+                    np.zeros(3),
+                    orientation=self._orientation,
+                    wrist=rows,
+                    place=self._place,
+                )
             )
             pose = self._pose(t_ns, hand, laser_m)
         self.counts["poses"] += 1
@@ -102,7 +111,7 @@ class WristPipeline:
             self._hand,
             NO_WORLD if self._forearm is None else self._forearm.world_at(t_ns, *_STRAIGHT),
         )
-        told: Bool = hand.level > 0
+        told: Bool = hand.solver_mode > 0
         self._seen_ns[told] = t_ns
         known: Bool = t_ns - self._seen_ns <= (self._forget_ns if self._continuous else 0)
         for event, fingers in (
@@ -148,6 +157,6 @@ class WristPipeline:
             laser_m=laser_m,
             palm_world_wxyz=world[0],
             palm_world_sigma_rad=world[1],
-            level=hand.level,
+            solver_mode=hand.solver_mode,
             ambiguous=hand.ambiguous,
         )

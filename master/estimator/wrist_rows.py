@@ -7,7 +7,7 @@
 
 What was seen before or after the epoch is brought to it by the rates of the angles (`master.estimator.update`).
 A finger is seen from the forearm, so the first three move with its own angles, the twist of its hinges and the bend of
-the wrist, and not with where the hand is in the room. Of the bend they tell a little only (`bend_share`), for that all
+the wrist, and not with where the hand is in the room. Of the bend they tell a little only (`wrist_share`), for that all
 fingers seem bent by as much is mostly an error that they share; what its doubt makes of them is in their noise.
 """
 
@@ -16,29 +16,29 @@ from math import sqrt, tan
 from common.arrays import Float
 from common.kernels import inlined, inner
 from master.estimator.finger_surface import MOVES, look
-from master.estimator.kinematics import turn_between
+from master.estimator.kinematics import rotation_between
 from master.estimator.problem import Belief, Rig, Search
-from master.estimator.wrist_device import BEND, LIGHT, TILT, bent_palm
+from master.estimator.wrist_device import LED_SCALE, TILT, WRIST_ANGLES, flexed_palm
 
 _SMALL_RAD = 1e-4  # below it a rotation vector counts as so long in the derivative
 
 
 @inlined
-def turn_slope(turn: Float, J: Float) -> None:
+def rotation_vector_jacobian(rotation: Float, J: Float) -> None:
     """Write the derivative (3, 3) of a rotation vector (3,) by a small turn in front of it.
 
     The inverse of the left Jacobian of SO(3) (Sola, Deray, Atchuthan 2018, "A micro Lie theory", eq. 146).
     """
-    squared = turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2]
+    squared = rotation[0] * rotation[0] + rotation[1] * rotation[1] + rotation[2] * rotation[2]
     angle = max(sqrt(squared), _SMALL_RAD)
     factor = 1.0 / (angle * angle) - 0.5 / (angle * tan(0.5 * angle))
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         for c in range(3):
-            J[i, c] = factor * turn[i] * turn[c]
+            J[i, c] = factor * rotation[i] * rotation[c]
         J[i, i] += 1.0 - factor * squared
-        J[i, j] += 0.5 * turn[k]
-        J[i, k] -= 0.5 * turn[j]
+        J[i, j] += 0.5 * rotation[k]
+        J[i, k] -= 0.5 * rotation[j]
 
 
 @inner
@@ -48,33 +48,33 @@ def sensed_palm(belief: Belief, z: Float, search: Search) -> None:
     By an IMU on the forearm it is  exp(axes . (tilt, heading less the believed)) forearm R_y(deviation) R_x(flexion),
     and extras are tilt 2, heading, flexion, deviation; by one on the palm itself it is `forearm`, which none turns.
     """
-    R, slope, F = search.turned, search.slope, belief.forearm
+    R, slope, F = search.palm_straight, search.slope, belief.forearm
     if belief.on_forearm[0] == 0.0:
         for i in range(3):
             for j in range(3):
                 search.palm[i, j] = F[i, j]
         return
-    bent_palm(F, z[BEND], z[BEND + 1], R, search.bend_axes)
+    flexed_palm(F, z[WRIST_ANGLES], z[WRIST_ANGLES + 1], R, search.wrist_axes)
     for i in range(3):  # rig axes
         for a in range(3):
             slope[a, i] = belief.axes[a, i]
-        slope[3, i], slope[4, i] = search.bend_axes[0, i], search.bend_axes[1, i]
+        slope[3, i], slope[4, i] = search.wrist_axes[0, i], search.wrist_axes[1, i]
     for i in range(3):
         search.off[i] = 0.0
         for a in range(3):
             search.off[i] += belief.axes[a, i] * (z[TILT + a] - belief.z[TILT + a])
-    turn_by(search.off, R, search.palm)
+    rotate_by_vector(search.off, R, search.palm)
 
 
 @inner
 def contrary(belief: Belief, T: Float, z: Float, search: Search) -> float:
     """Chi square of a palm against how other sensors have it turned, and of what the extras gave in to it."""
     sensed_palm(belief, z, search)
-    turn_between(T, search.palm, search.J, search.q)
+    rotation_between(T, search.palm, search.J, search.q)
     total, q = 0.0, search.q
     for i in range(3):
         for j in range(3):
-            total += q[i] * belief.turn_info[i, j] * q[j]
+            total += q[i] * belief.orientation_info[i, j] * q[j]
     for i in range(z.shape[0]):
         for j in range(z.shape[0]):
             total += (z[i] - belief.z[i]) * belief.z_info[i, j] * (z[j] - belief.z[j])
@@ -82,22 +82,22 @@ def contrary(belief: Belief, T: Float, z: Float, search: Search) -> float:
 
 
 @inner
-def turn_row(
+def orientation_row(
     belief: Belief, T: Float, z: Float, n: int, gradient: Float, normal: Float, search: Search
 ) -> float:
     """Add the TURN row; return its cost."""
     J, q, slope = search.J, search.q, search.slope
     K = 5 if belief.on_forearm[0] > 0.0 else 0
     sensed_palm(belief, z, search)
-    turn_between(T, search.palm, J, q)
-    turn_slope(q, J)
-    L, w = belief.turn_info, search.off
+    rotation_between(T, search.palm, J, q)
+    rotation_vector_jacobian(q, J)
+    L, w = belief.orientation_info, search.off
     cost = 0.0
     for i in range(3):
         w[i] = L[i, 0] * q[0] + L[i, 1] * q[1] + L[i, 2] * q[2]
         cost += 0.5 * w[i] * q[i]
     # Rows of the unknowns: the palm's turn in front of T by J, the sensed palm's by -J' (from behind).
-    D = search.by_turn
+    D = search.by_rotation
     for i in range(3):
         for c in range(3):
             D[i, c] = J[c, i]
@@ -120,13 +120,13 @@ def turn_row(
 @inlined
 def _column(n: int, a: int) -> int:
     """The unknown of tilt 2, heading, flexion, deviation."""
-    return 6 + n + (TILT + a if a < 3 else BEND + a - 3)
+    return 6 + n + (TILT + a if a < 3 else WRIST_ANGLES + a - 3)
 
 
 @inlined
-def turn_by(turn: Float, R: Float, out: Float) -> None:
+def rotate_by_vector(rotation: Float, R: Float, out: Float) -> None:
     """Write R (3, 3) turned in front by a rotation vector (3,) that is small: to second order."""
-    x, y, z = turn[0], turn[1], turn[2]
+    x, y, z = rotation[0], rotation[1], rotation[2]
     for j in range(3):
         a, b, c = R[0, j], R[1, j], R[2, j]
         u, v, w = y * c - z * b, z * a - x * c, x * b - y * a
@@ -141,9 +141,9 @@ def finger_rows(
 ) -> float:
     """Add the rows of finger f, of angles `search.rows.angles`; return their cost.
 
-    `search.palm_camera` and `search.bend_axes` are those of the bend.
+    `search.palm_camera` and `search.wrist_axes` are those of the bend.
     """
-    hand, sights, work, surface = rig.hand, belief.sights, search.rows, search.surface
+    hand, lines_of_sight, work, surface = rig.hand, belief.lines_of_sight, search.rows, search.surface
     start = hand.first[f]
     count, base = hand.first[f + 1] - start, 6 + n
     J, r, w, at = search.local_J, search.local_r, search.local_w, search.at
@@ -151,28 +151,31 @@ def finger_rows(
         at[c] = 6 + start + c
     at[count], at[count + 1], at[count + 2], at[count + 3] = (
         base + f,
-        base + BEND,
-        base + BEND + 1,
-        base + LIGHT,
+        base + WRIST_ANGLES,
+        base + WRIST_ANGLES + 1,
+        base + LED_SCALE,
     )
     size, cost = count + 4, 0.0
-    if sights.lit[f] == 0.0 and sights.shown[f] == 0.0:
+    if lines_of_sight.lit[f] == 0.0 and lines_of_sight.shown[f] == 0.0:
         return 0.0
-    look(hand, rig.device, search.palm_camera, search.bend_axes, work.angles, f, MOVES, surface)
+    look(hand, rig.device, search.palm_camera, search.wrist_axes, work.angles, f, MOVES, surface)
     for what in range(2):
-        if (what == 0 and sights.lit[f] == 0.0) or (what == 1 and sights.shown[f] == 0.0):
+        if (what == 0 and lines_of_sight.lit[f] == 0.0) or (what == 1 and lines_of_sight.shown[f] == 0.0):
             continue
         rows, first = 2, 0
         if what == 0:
-            W = sights.laser_W[f]
-            r[0] = surface.seen[0] + sights.lack[f, 0] - sights.laser[f, 0]
-            r[1] = surface.seen[1] + sights.lack[f, 1] - sights.laser[f, 1]
+            W = lines_of_sight.laser_W[f]
+            r[0] = surface.seen[0] + lines_of_sight.lack[f, 0] - lines_of_sight.laser[f, 0]
+            r[1] = surface.seen[1] + lines_of_sight.lack[f, 1] - lines_of_sight.laser[f, 1]
         else:
-            W, first = sights.tip_W[f], 2
-            r[0], r[1] = surface.seen[2] - sights.tip[f, 0], surface.seen[3] - sights.tip[f, 1]
-            if sights.depth_w2[f] > 0.0:
+            W, first = lines_of_sight.tip_W[f], 2
+            r[0], r[1] = (
+                surface.seen[2] - lines_of_sight.tip[f, 0],
+                surface.seen[3] - lines_of_sight.tip[f, 1],
+            )
+            if lines_of_sight.depth_w2[f] > 0.0:
                 rows = 3
-                r[2] = surface.seen[4] + z[LIGHT] - sights.depth[f]
+                r[2] = surface.seen[4] + z[LED_SCALE] - lines_of_sight.depth[f]
         for i in range(rows):
             for c in range(count):
                 J[i, c] = 0.0
@@ -180,28 +183,28 @@ def finger_rows(
                     J[i, c] += surface.J[first + i, k] * work.by[4 * f + k, c]
             for c in range(3):
                 J[i, count + c] = surface.J[first + i, 4 + c]
-            J[i, count] *= sights.teaches[f]
+            J[i, count] *= lines_of_sight.teaches[f]
             J[i, count + 3] = 1.0 if i == 2 else 0.0
         for i in range(rows):
             if i == 2:
-                w[2] = sights.depth_w2[f] * r[2]
+                w[2] = lines_of_sight.depth_w2[f] * r[2]
             else:
                 w[i] = W[i, 0] * r[0] + W[i, 1] * r[1]
             cost += 0.5 * w[i] * r[i]
         for a in range(size):
             # What fingers tell of the bend counts for little: they err together, as the device is put on.
-            of_bend = a == count + 1 or a == count + 2
-            share = search.bend_share[0] if of_bend else 1.0
+            of_wrist = a == count + 1 or a == count + 2
+            share = search.wrist_share[0] if of_wrist else 1.0
             for i in range(rows):
                 gradient[at[a]] += share * J[i, a] * w[i]
             p0 = W[0, 0] * J[0, a] + W[0, 1] * J[1, a]
             p1 = W[1, 0] * J[0, a] + W[1, 1] * J[1, a]
-            p2 = sights.depth_w2[f] * J[2, a] if rows == 3 else 0.0
+            p2 = lines_of_sight.depth_w2[f] * J[2, a] if rows == 3 else 0.0
             for b in range(size):
                 total = p0 * J[0, b] + p1 * J[1, b]
                 if rows == 3:
                     total += p2 * J[2, b]
-                if b == count + 1 or b == count + 2 or of_bend:
-                    total *= search.bend_share[0]
+                if b == count + 1 or b == count + 2 or of_wrist:
+                    total *= search.wrist_share[0]
                 normal[at[a], at[b]] += total
     return cost

@@ -5,24 +5,32 @@ from typing import Any
 
 from common.arrays import Float
 from common.kernels import inner, kernel
-from common.messages import Level
+from common.messages import SolverMode
 from master.estimator.extras import predict_extras
 from master.estimator.finger_coupling import expect_coupling, learn_coupling
 from master.estimator.finger_density import choose, weigh_hands
 from master.estimator.finger_scan import ROWS, Prior, Scan, scan_finger
 from master.estimator.finger_surface import MOVES, look
-from master.estimator.ground import Ground
 from master.estimator.hand_tables import HandTables
 from master.estimator.hypotheses import Posterior
 from master.estimator.kinematics import Scratch, angles_of, clamp, free_of
+from master.estimator.observation_sources import Ground
 from master.estimator.problem import Belief, Rig, Search
 from master.estimator.settings import Settings
 from master.estimator.solve import palm_off
 from master.estimator.state import NEVER_NS, HandState
 from master.estimator.workspace import Model, Task
-from master.estimator.wrist_device import BEND, EXTRAS, LIGHT, Sights, bent_palm, loosen, loosen_short
+from master.estimator.wrist_device import (
+    EXTRAS,
+    LED_SCALE,
+    WRIST_ANGLES,
+    LinesOfSight,
+    flexed_palm,
+    loosen,
+    loosen_short,
+)
 
-_FK, _IK = int(Level.FK), int(Level.IK)
+_FK, _IK = int(SolverMode.FK), int(SolverMode.IK)
 
 
 @inner
@@ -32,43 +40,48 @@ def _expected(
     settings: Settings,
     state: HandState,
     task: Task,
-    sights: Sights,
+    lines_of_sight: LinesOfSight,
     scan: Scan,
     prior: Prior,
 ) -> None:
     """Write what is believed of the fingers before a triple; bring what was seen to the epoch, by their rates."""
     dt_s = (task.t_ns[0] - state.t_ns[0]) * 1e-9
-    fresh = task.continuous[0] > 0 and state.known[0] > 0 and 0.0 < dt_s <= settings.forget_s
-    prior.light[0], prior.light2[0] = state.z[LIGHT], state.z_cov[LIGHT, LIGHT]
+    measured_lately = task.continuous[0] > 0 and state.known[0] > 0 and 0.0 < dt_s <= settings.forget_s
+    prior.light[0], prior.light2[0] = state.z[LED_SCALE], state.z_cov[LED_SCALE, LED_SCALE]
     for f in range(5):
         prior.twist[f], prior.twist2[f] = state.z[f], max(state.z_cov[f, f], 1e-8)
         told_s = (task.t_ns[0] - state.told_ns[f]) * 1e-9
-        recent = fresh and told_s <= settings.forget_s
-        prior.recent[f] = 1.0 if recent else 0.0
-        known = recent and state.level[f] > 0 and state.vague[f] == 0 and told_s <= settings.tracked_triple_s
+        had_previous = measured_lately and told_s <= settings.forget_s
+        prior.had_previous[f] = 1.0 if had_previous else 0.0
+        known = (
+            had_previous
+            and state.solver_mode[f] > 0
+            and state.vague[f] == 0
+            and told_s <= settings.tracked_cycle_s
+        )
         state.searched[f] = state.searched[f] + 1 if known else 0
         known = known and state.searched[f] % settings.search_again != 0
         prior.near_rad[f] = settings.near_rad if known else 0.0
         for k in range(4 * f, 4 * f + 4):
             scan.angles[k] = settings.curled_rad  # somewhere
-            if recent:
+            if had_previous:
                 scan.angles[k] = state.angles[k]
         prior.last[f] = scan.angles[4 * f + 2]
-        prior.walked[f] = max(settings.walk_rad_s * told_s, settings.goes_on_rad)
-        if sights.lit[f] == 0.0 and sights.shown[f] == 0.0:
+        prior.process_noise[f] = max(settings.process_noise_rad_s * told_s, settings.goes_on_rad)
+        if lines_of_sight.lit[f] == 0.0 and lines_of_sight.shown[f] == 0.0:
             continue
-        look(hand, device, prior.palm, prior.bend_axes, scan.angles, f, MOVES, scan.surface)
+        look(hand, device, prior.palm, prior.wrist_axes, scan.angles, f, MOVES, scan.surface)
         J = scan.surface.J
-        loosen(sights.laser_W[f], J, 0, state.z_cov)
-        loosen(sights.tip_W[f], J, 2, state.z_cov)
-        if not recent:
+        loosen(lines_of_sight.laser_W[f], J, 0, state.z_cov)
+        loosen(lines_of_sight.tip_W[f], J, 2, state.z_cov)
+        if not had_previous:
             continue
         for k in range(4):
             rate = state.rates[4 * f + k]
             for i in range(2):
-                sights.laser[f, i] -= J[i, k] * rate * sights.laser_s[0]
-                sights.tip[f, i] -= J[2 + i, k] * rate * sights.tip_s[0]
-            sights.depth[f] -= J[4, k] * rate * sights.tip_s[0]
+                lines_of_sight.laser[f, i] -= J[i, k] * rate * lines_of_sight.laser_s[0]
+                lines_of_sight.tip[f, i] -= J[2 + i, k] * rate * lines_of_sight.tip_s[0]
+            lines_of_sight.depth[f] -= J[4, k] * rate * lines_of_sight.tip_s[0]
 
 
 @kernel
@@ -85,57 +98,59 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
     """
     state, space, settings = boxed_state[0], boxed_space[0], model.settings[0]
     hand, device, task, belief = model.hand[0], model.device[0], space.task, space.belief
-    sights, scan, prior = belief.sights, space.scan, space.prior
+    lines_of_sight, scan, prior = belief.lines_of_sight, space.scan, space.prior
     dt_s = 0.0 if state.z_ns[0] == NEVER_NS else (task.t_ns[0] - state.z_ns[0]) * 1e-9
-    predict_extras(settings, state, dt_s, task.walked_rad2[0], belief, space.extras)
+    predict_extras(settings, state, dt_s, task.process_noise_rad2[0], belief, space.extras)
     state.z_ns[0] = task.t_ns[0]
     for i in range(state.z.shape[0]):
-        space.room.start_z[i] = state.z[i]
+        space.scratch.start_z[i] = state.z[i]
     for f in range(5):
-        scan.known[f] = sights.teaches[f] = 0.0
+        scan.known[f] = lines_of_sight.teaches[f] = 0.0
         task.refused[f] = task.off[f] = task.ambiguous[f] = False
-        task.level[f] = 0
-    if state.z.shape[0] < EXTRAS or sights.rows[0] == 0.0:
+        task.solver_mode[f] = 0
+    if state.z.shape[0] < EXTRAS or lines_of_sight.rows[0] == 0.0:
         return
-    bent_palm(device.palm, state.z[BEND], state.z[BEND + 1], prior.palm, prior.bend_axes)
-    _expected(hand, device, settings, state, task, sights, scan, prior)
+    flexed_palm(device.palm, state.z[WRIST_ANGLES], state.z[WRIST_ANGLES + 1], prior.palm, prior.wrist_axes)
+    _expected(hand, device, settings, state, task, lines_of_sight, scan, prior)
     expect_coupling(settings, state, max(dt_s, 0.0), prior)
     for f in range(5):
-        if sights.lit[f] == 0.0:
-            if prior.recent[f] == 0.0:
-                sights.shown[f] = 0.0
+        if lines_of_sight.lit[f] == 0.0:
+            if prior.had_previous[f] == 0.0:
+                lines_of_sight.shown[f] = 0.0
             continue
-        scan_finger(hand, device, settings, sights, prior, f, sights.shown[f] > 0.0, scan)
-        if loosen_short(device, sights, f, _length_px(scan, f), scan.g[:3], scan.H[:2, :2]):
-            scan_finger(hand, device, settings, sights, prior, f, sights.shown[f] > 0.0, scan)
+        scan_finger(hand, device, settings, lines_of_sight, prior, f, lines_of_sight.shown[f] > 0.0, scan)
+        if loosen_short(device, lines_of_sight, f, _length_px(scan, f), scan.g[:3], scan.H[:2, :2]):
+            scan_finger(hand, device, settings, lines_of_sight, prior, f, lines_of_sight.shown[f] > 0.0, scan)
         if prior.near_rad[f] > 0.0 and scan.misfit[f] > settings.refused:
             prior.near_rad[f] = 0.0
-            scan_finger(hand, device, settings, sights, prior, f, sights.shown[f] > 0.0, scan)
-        if scan.misfit[f] > settings.refused and sights.depth_w2[f] > 0.0:
-            sights.depth_w2[f] = 0.0  # a tip may shine, or lie in shade: what it is off then is its light
-            scan_finger(hand, device, settings, sights, prior, f, True, scan)
-        explained = settings.refused if sights.depth_w2[f] > 0.0 else settings.refused_unlit
-        if scan.misfit[f] > explained and sights.shown[f] > 0.0:
-            task.refused[f], sights.shown[f] = True, 0.0
-            scan_finger(hand, device, settings, sights, prior, f, False, scan)
+            scan_finger(hand, device, settings, lines_of_sight, prior, f, lines_of_sight.shown[f] > 0.0, scan)
+        if scan.misfit[f] > settings.refused and lines_of_sight.depth_w2[f] > 0.0:
+            lines_of_sight.depth_w2[f] = (
+                0.0  # a tip may shine, or lie in shade: what it is off then is its light
+            )
+            scan_finger(hand, device, settings, lines_of_sight, prior, f, True, scan)
+        explained = settings.refused if lines_of_sight.depth_w2[f] > 0.0 else settings.refused_unlit
+        if scan.misfit[f] > explained and lines_of_sight.shown[f] > 0.0:
+            task.refused[f], lines_of_sight.shown[f] = True, 0.0
+            scan_finger(hand, device, settings, lines_of_sight, prior, f, False, scan)
         if scan.misfit[f] > settings.refused:
-            task.off[f], sights.lit[f], scan.known[f] = True, 0.0, 0.0
-    weigh_hands(hand, settings, sights, prior, scan)
+            task.off[f], lines_of_sight.lit[f], scan.known[f] = True, 0.0, 0.0
+    weigh_hands(hand, settings, lines_of_sight, prior, scan)
     for f in range(5):
         if scan.known[f] > 0.0:
-            choose(hand, settings, sights, prior, f, scan)
+            choose(hand, settings, lines_of_sight, prior, f, scan)
             for k in range(4):
                 task.scanned[4 * f + k] = scan.mode[f, k]
-            task.level[f] = _IK if sights.shown[f] > 0.0 else _FK
+            task.solver_mode[f] = _IK if lines_of_sight.shown[f] > 0.0 else _FK
             curled = f > 0 and scan.out[f, 2] > settings.branch_rad
-            task.ambiguous[f] = scan.parts[f] > 1.5 or (curled and sights.shown[f] == 0.0)
+            task.ambiguous[f] = scan.parts[f] > 1.5 or (curled and lines_of_sight.shown[f] == 0.0)
             # The unit of light is learnt a little at a time, and nothing of a finger that is in doubt.
             doubted = task.ambiguous[f] or scan.misfit[f] > settings.doubted
-            sights.teaches[f] = 1.0 if sights.shown[f] > 0.0 and not doubted else 0.0
-            sights.depth_w2[f] *= 0.0 if doubted else settings.light_share
-            if f > 0 and not curled and sights.teaches[f] > 0.0:
+            lines_of_sight.teaches[f] = 1.0 if lines_of_sight.shown[f] > 0.0 and not doubted else 0.0
+            lines_of_sight.depth_w2[f] *= 0.0 if doubted else settings.light_share
+            if f > 0 and not curled and lines_of_sight.teaches[f] > 0.0:
                 learn_coupling(prior, f, scan, state)
-    _count(sights, space.ground)
+    _count(lines_of_sight, space.ground)
 
 
 @inner
@@ -152,12 +167,12 @@ def _length_px(scan: Scan, f: int) -> float:
 
 
 @inner
-def _count(sights: Sights, ground: Ground) -> None:
+def _count(lines_of_sight: LinesOfSight, ground: Ground) -> None:
     """Count the rows of a wrist device; fingertips alone, without laser points, count for nothing."""
     lit, shown = 0, 0
     for f in range(5):
-        shown += 1 if sights.shown[f] > 0.0 else 0
-        if sights.lit[f] > 0.0:
+        shown += 1 if lines_of_sight.shown[f] > 0.0 else 0
+        if lines_of_sight.lit[f] > 0.0:
             lit += 1
             ground.shown[f] = True
     if lit > 0:
@@ -184,11 +199,11 @@ def extras_alone(belief: Belief, found: Posterior, search: Search) -> None:
     palm_off(found.palm, belief.palm, off)
     depth = 0.0
     for i in range(3):
-        depth += belief.sight[i] * off[3 + i]
+        depth += belief.line_of_sight[i] * off[3 + i]
     for i in range(6):
         search.step[i] = belief.palm_w2[i] * off[i]
         if i >= 3:
-            search.step[i] += belief.depth_w2[0] * depth * belief.sight[i - 3]
+            search.step[i] += belief.depth_w2[0] * depth * belief.line_of_sight[i - 3]
     for i in range(n):
         search.step[6 + i] = belief.past_w2[i] * (found.x[i] - belief.past[i])
     for k in range(K):
@@ -207,13 +222,13 @@ def take_scanned(rig: Rig, ground: Ground, scan: Scan, found: Posterior, work: S
     hand, cov = rig.hand, found.cov
     angles_of(hand, found.x, work.angles, work.by)
     for f in range(5):
-        if scan.known[f] > 0.0 and ground.rests[f] == 0:
+        if scan.known[f] > 0.0 and ground.sources[f] == 0:
             for k in range(4):
                 work.angles[4 * f + k] = scan.out[f, k]
     clamp(hand, work.angles)
     free_of(hand, work.angles, found.x)
     for f in range(5):
-        if scan.known[f] == 0.0 or ground.rests[f] > 0:
+        if scan.known[f] == 0.0 or ground.sources[f] > 0:
             continue
         first, count = 6 + hand.first[f], hand.first[f + 1] - hand.first[f]
         pip, N = first + 2, cov.shape[0]

@@ -22,7 +22,7 @@ from common.geometry import quaternion_to_matrix
 from common.hand_model import WRIST
 from common.replacing import replacing
 from master.export.motion import Motion
-from master.export.skeleton import CHILDREN, ORDER, PARENT, Skeleton, back, name_of, times, turn
+from master.export.skeleton import CHILDREN, ORDER, PARENT, Skeleton, back, name_of, rotate, times
 
 Up = Literal["y", "rig"]
 Unit = Literal["m", "cm", "mm"]
@@ -30,7 +30,7 @@ PER_METRE: dict[Unit, float] = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 
 RIGID_M = 1e-5
 _ROWS = 256
-_HALF_TURN_ABOUT_X = np.array([0.0, 1.0, 0.0, 0.0])
+_HALF_ROTATION_ABOUT_X = np.array([0.0, 1.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ def upright(motion: Motion, up: Up) -> Motion:
     return Motion(
         motion.t_ns,
         motion.position_m * np.array([1.0, -1.0, -1.0]),
-        times(_HALF_TURN_ABOUT_X, motion.orientation_wxyz),
+        times(_HALF_ROTATION_ABOUT_X, motion.orientation_wxyz),
         motion.held,
         motion.gap_ns,
     )
@@ -84,7 +84,7 @@ def write_bvh(
     Raises:
         OSError: It cannot be written; nothing half written is left.
     """
-    turned, offset = _channels(upright(motion, axes.up), skeleton)
+    rotated, offset = _channels(upright(motion, axes.up), skeleton)
     rest = _rest_offsets(skeleton)
     free = tuple(
         joint for joint in PARENT if float(np.abs(offset[:, joint] - rest[joint]).max(initial=0.0)) > RIGID_M
@@ -95,7 +95,7 @@ def write_bvh(
         head = ["HIERARCHY", *_hierarchy(WRIST, rest * scale, ends, free, 0)]
         head += ["MOTION", f"Frames: {len(motion)}", f"Frame Time: {1.0 / rate_hz:.9f}"]
         file.write(("\n".join(head) + "\n").encode())
-        _frames(file, turned, offset * scale, free, tell)
+        _frames(file, rotated, offset * scale, free, tell)
     return free
 
 
@@ -110,12 +110,12 @@ def _rest_offsets(skeleton: Skeleton) -> Float:
 def _channels(motion: Motion, skeleton: Skeleton) -> tuple[Float, Float]:
     """Of each joint how it is turned from rest, as seen from its parent (T, 26, 4), and its offset (T, 26, 3) [m]."""
     from_rest = times(motion.orientation_wxyz, back(skeleton.orientation_wxyz))
-    turned, offset = from_rest.copy(), motion.position_m.copy()
+    rotated, offset = from_rest.copy(), motion.position_m.copy()
     for joint, parent in PARENT.items():
         q = back(from_rest[:, parent])
-        turned[:, joint] = times(q, from_rest[:, joint])
-        offset[:, joint] = turn(q, motion.position_m[:, joint] - motion.position_m[:, parent])
-    return turned, offset
+        rotated[:, joint] = times(q, from_rest[:, joint])
+        offset[:, joint] = rotate(q, motion.position_m[:, joint] - motion.position_m[:, parent])
+    return rotated, offset
 
 
 def _hierarchy(
@@ -143,14 +143,14 @@ def _numbers(values: Float) -> str:
 
 
 def _frames(
-    file: IO[bytes], turned: Float, offset: Float, free: tuple[int, ...], tell: Callable[[int, int], None]
+    file: IO[bytes], rotated: Float, offset: Float, free: tuple[int, ...], tell: Callable[[int, int], None]
 ) -> None:
     """A line a frame: the channels of the joints in the order of the hierarchy."""
     columns: list[Float] = []
     for joint in ORDER:
         if joint == WRIST or joint in free:
             columns.append(offset[:, joint])
-        columns.append(euler_zxy_deg(quaternion_to_matrix(turned[:, joint])))
+        columns.append(euler_zxy_deg(quaternion_to_matrix(rotated[:, joint])))
     rows = np.concatenate(columns, axis=1) + 0.0  # -0 is written as 0
     for start in range(0, len(rows), _ROWS):
         np.savetxt(file, rows[start : start + _ROWS], fmt="%.6f")

@@ -63,7 +63,7 @@ def hand_columns(poses: Poses, begin_t_ns: int) -> list[Column]:
             for k, name in enumerate(names)
         ]
     out += [
-        Column(f"wrist_{name}_rad", poses.wrist_bend_rad[:, k], "rad", "forearm", "bend of the wrist")
+        Column(f"wrist_{name}_rad", poses.wrist_angles_rad[:, k], "rad", "forearm", "bend of the wrist")
         for k, name in enumerate(("flexion", "deviation"))
     ]
     out.append(
@@ -75,7 +75,7 @@ def hand_columns(poses: Poses, begin_t_ns: int) -> list[Column]:
 def _joint_columns(poses: Poses, joint: int, title: str) -> Iterator[Column]:
     name = title.replace("-", "_")
     yield from _place(name, poses.position_m[:, joint], "joint position")
-    yield from _turn(name, poses.orientation_wxyz[:, joint], "joint orientation, joint axes to rig")
+    yield from _quaternion(name, poses.orientation_wxyz[:, joint], "joint orientation, joint axes to rig")
     yield Column(f"{name}_valid", poses.valid[:, joint], text="the pose of the joint may be used")
     yield Column(f"{name}_tracked", poses.tracked[:, joint], text="it is observed now, not inferred")
     spread = np.sqrt(np.trace(poses.cov_m2[:, joint], axis1=1, axis2=2) / 3.0)
@@ -92,14 +92,14 @@ def object_columns(poses: ObjectPoses, begin_t_ns: int) -> list[Column]:
     return [
         *_times(poses.t_ns, begin_t_ns, "the instant at which the pose holds"),
         *_place("", poses.position_m, "position of the object's own frame"),
-        *_turn("", poses.orientation_wxyz, "orientation, object axes to rig"),
+        *_quaternion("", poses.orientation_wxyz, "orientation, object axes to rig"),
         *(
             Column(
                 f"sigma_{axis}_{unit}",
                 np.sqrt(poses.cov[:, k, k]),
                 unit,
                 RIG,
-                f"standard deviation {'along' if unit == 'm' else 'of a turn about'} {axis}",
+                f"standard deviation {'along' if unit == 'm' else 'of a rotation about'} {axis}",
             )
             for k, (axis, unit) in enumerate([(axis, unit) for unit in ("m", "rad") for axis in _AXES])
         ),
@@ -184,7 +184,7 @@ def _place(name: str, values: Float, text: str) -> Iterator[Column]:
         yield Column(f"{before}{axis}_m", values[:, k], "m", RIG, text)
 
 
-def _turn(name: str, values: Float, text: str) -> Iterator[Column]:
+def _quaternion(name: str, values: Float, text: str) -> Iterator[Column]:
     before = f"{name}_" if name else ""
     for k, part in enumerate(_QUATERNION):
         yield Column(f"{before}{part}", values[:, k], "", RIG, f"{text}; unit quaternion")

@@ -171,7 +171,7 @@ def export(
         Axes(unit or "cm", up or "y"),
     )
     progress = _Progress()
-    export_source(source, wanted, progress.say, progress.tell)
+    export_source(source, wanted, progress.notify, progress.tell)
 
 
 def _refuse(wrong: bool, option: str, purpose: str, this: str) -> None:
@@ -192,7 +192,7 @@ class _Progress:
             self._shown_ns = now_ns()
             self._line.show(f"{bar(done / max(total, 1))} {what}, {done} of {total}")
 
-    def say(self, line: str) -> None:
+    def notify(self, line: str) -> None:
         """Something is done."""
         if sys.stderr.isatty():
             sys.stderr.write("\r\x1b[K")

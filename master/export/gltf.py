@@ -44,7 +44,7 @@ from common.replacing import replacing
 from master.export.bvh import RIGID_M, Up, upright
 from master.export.hand_mesh import Skin, skin_of
 from master.export.motion import Motion, local
-from master.export.skeleton import CHILDREN, PARENT, Skeleton, back, name_of, times, turn
+from master.export.skeleton import CHILDREN, PARENT, Skeleton, back, name_of, rotate, times
 
 _STILL = 1e-6  # of a quaternion
 _HOLD_S = 1e-3  # before the end of a gap the hand still stands where it was
@@ -158,7 +158,7 @@ def _rest(skeleton: Skeleton) -> tuple[Float, Float]:
     at, q = skeleton.position_m.copy(), skeleton.orientation_wxyz.copy()
     for joint, parent in PARENT.items():
         there = back(skeleton.orientation_wxyz[parent])
-        at[joint] = turn(there, skeleton.position_m[joint] - skeleton.position_m[parent])
+        at[joint] = rotate(there, skeleton.position_m[joint] - skeleton.position_m[parent])
         q[joint] = times(there, skeleton.orientation_wxyz[joint])
     return at, q
 

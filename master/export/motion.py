@@ -18,7 +18,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.errors import RecordingError
 from common.hand_model import WRIST
-from master.export.skeleton import ORDER, PARENT, Skeleton, back, times, turn
+from master.export.skeleton import ORDER, PARENT, Skeleton, back, rotate, times
 from master.outputs.poses import Poses
 
 GAP_S = 0.25  # without a pose: longer than that nobody knows how the hand went
@@ -87,12 +87,12 @@ def complete(batches: Iterable[Poses], skeleton: Skeleton) -> Motion:
             continue
         at, q = _held(joint, usable, position, orientation, skeleton)
         parent = PARENT[joint]
-        away = position[:, parent] + turn(orientation[:, parent], at)
+        away = position[:, parent] + rotate(orientation[:, parent], at)
         position[:, joint] = np.where(good[:, None], position[:, joint], away)
-        turned = times(orientation[:, parent], q)
-        orientation[:, joint] = np.where(good[:, None], orientation[:, joint], turned)
-    usual_ns = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0.0
-    return Motion(t_ns, position, orientation, ~usable, int(max(GAP_S * 1e9, _GAP_POSES * usual_ns)))
+        composed = times(orientation[:, parent], q)
+        orientation[:, joint] = np.where(good[:, None], orientation[:, joint], composed)
+    typical_ns = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0.0
+    return Motion(t_ns, position, orientation, ~usable, int(max(GAP_S * 1e9, _GAP_POSES * typical_ns)))
 
 
 def _stacked(batches: Iterable[Poses]) -> tuple[Int, Float, Float, Bool]:
@@ -127,13 +127,13 @@ def _held(
     both = usable[:, joint] & usable[:, parent]
     if not both.any():
         q = back(skeleton.orientation_wxyz[parent])
-        at = turn(q, skeleton.position_m[joint] - skeleton.position_m[parent])
+        at = rotate(q, skeleton.position_m[joint] - skeleton.position_m[parent])
         shape = (len(usable), 1)
         return np.tile(at, shape), np.tile(times(q, skeleton.orientation_wxyz[joint]), shape)
     row = _last(both)
     q = back(orientation[row, parent])
     return (
-        turn(q, position[row, joint] - position[row, parent]),
+        rotate(q, position[row, joint] - position[row, parent]),
         times(q, orientation[row, joint]),
     )
 
@@ -143,7 +143,7 @@ def local(motion: Motion) -> Motion:
     position, orientation = motion.position_m.copy(), motion.orientation_wxyz.copy()
     for joint, parent in PARENT.items():
         q = back(motion.orientation_wxyz[:, parent])
-        position[:, joint] = turn(q, motion.position_m[:, joint] - motion.position_m[:, parent])
+        position[:, joint] = rotate(q, motion.position_m[:, joint] - motion.position_m[:, parent])
         orientation[:, joint] = times(q, motion.orientation_wxyz[:, joint])
     flips = np.vecdot(orientation[1:], orientation[:-1]) < 0.0
     sign = np.where(np.cumsum(flips, axis=0) % 2 == 1, -1.0, 1.0)
@@ -155,7 +155,7 @@ def world(motion: Motion) -> Motion:
     """The way back from `local`."""
     position, orientation = motion.position_m.copy(), motion.orientation_wxyz.copy()
     for joint, parent in PARENT.items():
-        position[:, joint] = position[:, parent] + turn(orientation[:, parent], position[:, joint])
+        position[:, joint] = position[:, parent] + rotate(orientation[:, parent], position[:, joint])
         orientation[:, joint] = times(orientation[:, parent], orientation[:, joint])
     return Motion(motion.t_ns, position, orientation, motion.held, motion.gap_ns)
 

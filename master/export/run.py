@@ -62,7 +62,7 @@ class Wanted:
     axes: Axes = field(default_factory=Axes)
 
 
-def export(source: Path, wanted: Wanted, say: Callable[[str], None], tell: Tell) -> tuple[Path, ...]:
+def export(source: Path, wanted: Wanted, notify: Callable[[str], None], tell: Tell) -> tuple[Path, ...]:
     """Export a source.
 
     Args:
@@ -81,15 +81,15 @@ def export(source: Path, wanted: Wanted, say: Callable[[str], None], tell: Tell)
     """
     take = open_take(source, wanted.window)
     for remark in take.remarks:
-        say(remark)
+        notify(remark)
     hands = _chosen(take, wanted.only, source)
     target = _target(source, wanted)
     if wanted.kind in ("csv", "parquet"):
-        written = _tables(take, hands, target, wanted.kind, say, tell)
+        written = _tables(take, hands, target, wanted.kind, notify, tell)
     elif wanted.kind == "rrd":
-        written = _viewed(take, hands, target, wanted, say, tell)
+        written = _viewed(take, hands, target, wanted, notify, tell)
     else:
-        written = _motions(take, hands, target, wanted, say, tell)
+        written = _motions(take, hands, target, wanted, notify, tell)
     if not written:
         part = "" if wanted.window == Window() else " in this part of time"
         raise RecordingError(f"{source}: holds no poses of a hand{part}, nothing to export as {wanted.kind}")
@@ -146,12 +146,12 @@ def _target(source: Path, wanted: Wanted) -> Path:
     return folder / name
 
 
-def _beside(target: Path, what: str) -> Path:
+def _sibling(target: Path, what: str) -> Path:
     return target.with_name(f"{target.stem}-{what}{target.suffix}")
 
 
 def _of_hand(target: Path, hands: tuple[str, ...], hand: str) -> Path:
-    return target if hand == hands[0] else _beside(target, hand)
+    return target if hand == hands[0] else _sibling(target, hand)
 
 
 def _tables(
@@ -159,7 +159,7 @@ def _tables(
     hands: tuple[str, ...],
     target: Path,
     kind: TableKind,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
     tell: Tell,
 ) -> tuple[Path, ...]:
     """A table for each hand, object and pair of both, and one of gestures, where there are any."""
@@ -171,7 +171,7 @@ def _tables(
             count = write_table(path, kind, empty, rows, about)
         except OSError as error:
             raise cannot_write(path, error) from error
-        say(f"wrote {path}: {what}, {count} rows of {len(empty)} columns")
+        notify(f"wrote {path}: {what}, {count} rows of {len(empty)} columns")
         written.append(path)
 
     for hand in hands:
@@ -180,16 +180,16 @@ def _tables(
     for thing in take.objects():
         _refuse_path(thing.object, target)
         columns = object_columns(thing, begin)
-        write(_beside(target, f"object_{thing.object}"), f"object {thing.object}", columns, [columns])
+        write(_sibling(target, f"object_{thing.object}"), f"object {thing.object}", columns, [columns])
     for near in take.contacts():
         columns, name = contact_columns(near, begin), f"{near.hand}_{near.object}"
         _refuse_path(name, target)
         if near.hand in hands:
             what = f"contact of {near.hand} and {near.object}"
-            write(_beside(target, f"contact_{name}"), what, columns, [columns])
+            write(_sibling(target, f"contact_{name}"), what, columns, [columns])
     if gestures := [one for one in take.gestures() if one.hand in hands]:
         columns = gesture_columns(gestures, begin)
-        write(_beside(target, "gestures"), "gestures", columns, [columns])
+        write(_sibling(target, "gestures"), "gestures", columns, [columns])
     return tuple(written)
 
 
@@ -214,7 +214,7 @@ def _motions(
     hands: tuple[str, ...],
     target: Path,
     wanted: Wanted,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
     tell: Tell,
 ) -> tuple[Path, ...]:
     """A file for each hand that has a valid pose."""
@@ -227,11 +227,11 @@ def _motions(
         except RecordingError as error:
             if len(hands) == 1:
                 raise
-            say(f"{error}: no file of it")
+            notify(f"{error}: no file of it")
             continue
         path = _of_hand(target, hands, hand)
         try:
-            say(_motion(path, motion, skeletons[hand], wanted, tell))
+            notify(_motion(path, motion, skeletons[hand], wanted, tell))
         except OSError as error:
             raise cannot_write(path, error) from error
         written.append(path)
@@ -248,13 +248,13 @@ def _motion(path: Path, motion: Motion, skeleton: Skeleton, wanted: Wanted, tell
     else:
         motion = motion if rate_hz is None else resample(motion, rate_hz)
         free = write_gltf(path, motion, skeleton, wanted.axes.up)
-    said = f"wrote {path}: hand {skeleton.hand}, {len(motion)} {'frames' if rate_hz else 'keys'}"
-    said += f" at {rate_hz:g} Hz" if rate_hz else ""
+    text = f"wrote {path}: hand {skeleton.hand}, {len(motion)} {'frames' if rate_hz else 'keys'}"
+    text += f" at {rate_hz:g} Hz" if rate_hz else ""
     if held := motion.held_frames:
-        said += f"; in {held} of them something was not observed and stands still"
+        text += f"; in {held} of them something was not observed and stands still"
     if free:
-        said += f"; {_named(free)} moved on {'its' if len(free) == 1 else 'their'} bone and has position keys"
-    return said
+        text += f"; {_named(free)} moved on {'its' if len(free) == 1 else 'their'} bone and has position keys"
+    return text
 
 
 def _named(joints: tuple[int, ...]) -> str:
@@ -278,9 +278,9 @@ def skeleton_of(hand: str, tree: Path, profiles: tuple[Path, ...]) -> Skeleton:
         profile = load(path, HandProfile)
         if profile.name == hand:
             return _skeleton(path, profile)
-    said = "".join(f"; {path} is of {profile.name!r}" for path, profile in given.items())
+    text = "".join(f"; {path} is of {profile.name!r}" for path, profile in given.items())
     raise CalibrationError(
-        f"{tree / 'hands'}: no profile of hand {hand!r}{said}: give --hand FILE or --calibration DIR"
+        f"{tree / 'hands'}: no profile of hand {hand!r}{text}: give --hand FILE or --calibration DIR"
     )
 
 
@@ -296,7 +296,7 @@ def _viewed(
     hands: tuple[str, ...],
     target: Path,
     wanted: Wanted,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
     tell: Tell,
 ) -> tuple[Path, ...]:
     """An .rrd for each hand that has poses."""
@@ -308,11 +308,11 @@ def _viewed(
         for hand in hands:
             poses = list(_counted(take, hand, tell))
             if not poses:
-                say(f"hand {hand}: no poses: no file of it")
+                notify(f"hand {hand}: no poses: no file of it")
                 continue
             path = _of_hand(target, hands, hand)
             setup = setup_of(hand, tree, rigs, wanted.profiles)
             write_take(path, take, poses, setup, partial(tell, path.name))
-            say(f"wrote {path}: hand {hand}, {sum(map(len, poses))} poses (open with: rerun {path})")
+            notify(f"wrote {path}: hand {hand}, {sum(map(len, poses))} poses (open with: rerun {path})")
             written.append(path)
     return tuple(written)

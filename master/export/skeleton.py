@@ -52,8 +52,8 @@ class Skeleton:
 
     def ahead_m(self, joint: int) -> Float:
         """From a joint to the end of its flesh, (3,) [m], palm frame: its radius along its -z."""
-        turned = turn(self.orientation_wxyz[joint], np.array([0.0, 0.0, -1.0]))
-        return self.radius_m[joint] * turned
+        rotated = rotate(self.orientation_wxyz[joint], np.array([0.0, 0.0, -1.0]))
+        return self.radius_m[joint] * rotated
 
 
 def name_of(joint: int) -> str:
@@ -81,7 +81,7 @@ def back(q_wxyz: Float) -> Float:
     return q_wxyz * np.array([1.0, -1.0, -1.0, -1.0])
 
 
-def turn(q_wxyz: Float, vector: Float) -> Float:
+def rotate(q_wxyz: Float, vector: Float) -> Float:
     """Vectors (..., 3) turned by unit quaternions (..., 4)."""
     w, axis = q_wxyz[..., :1], q_wxyz[..., 1:]
     side = 2.0 * np.cross(axis, vector)

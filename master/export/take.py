@@ -101,8 +101,13 @@ class RunTake:
         """
         self._folder, self._window = path.parent, window
         first = load_poses(path)
-        beside = {file: load_poses(file) for file in sorted(path.parent.glob(f"{path.stem}-*{path.suffix}"))}
-        hands = [first, *(poses for file, poses in beside.items() if file == path_of_hand(path, poses.hand))]
+        siblings = {
+            file: load_poses(file) for file in sorted(path.parent.glob(f"{path.stem}-*{path.suffix}"))
+        }
+        hands = [
+            first,
+            *(poses for file, poses in siblings.items() if file == path_of_hand(path, poses.hand)),
+        ]
         self.begin_t_ns = min((int(poses.t_ns[0]) for poses in hands if len(poses)), default=0)
         self._poses = {poses.hand: window.of(poses, self.begin_t_ns) for poses in hands}
 
@@ -189,12 +194,12 @@ class MessageTake:
     @property
     def remarks(self) -> tuple[str, ...]:
         """Whether the file is whole."""
-        said: list[str] = []
+        lines: list[str] = []
         if self._recording.cut:
-            said.append("the recording has no end (it broke off); all up to there is exported")
+            lines.append("the recording has no end (it broke off); all up to there is exported")
         if self._recording.broken:
-            said.append(f"{self._recording.broken} parts of the recording cannot be read and are left out")
-        return tuple(said)
+            lines.append(f"{self._recording.broken} parts of the recording cannot be read and are left out")
+        return tuple(lines)
 
     def count(self, hand: str) -> int:
         """As of `Take`."""

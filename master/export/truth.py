@@ -45,7 +45,7 @@ class Wanted:
 
 
 def compare_source(
-    source: Path, truth: Path, wanted: Wanted, say: Callable[[str], None]
+    source: Path, truth: Path, wanted: Wanted, notify: Callable[[str], None]
 ) -> dict[str, object]:
     """Compare a source with a motion capture.
 
@@ -66,20 +66,20 @@ def compare_source(
     aligned = wanted.aligned
     take = open_take(source, wanted.window)
     for remark in take.remarks:
-        say(remark)
+        notify(remark)
     poses = _poses(take, wanted.hands, source)
     motion = read_motion(truth, wanted.reading)
     for remark in motion.remarks:
-        say(remark)
+        notify(remark)
     names = _marker_names(poses, wanted)
     ours, theirs = _common(poses, motion, names)
     if aligned:
         alignment, how = _own_clock(take.begin_t_ns, poses, motion)
-        say(how)
+        notify(how)
     else:
         alignment = align(ours, theirs)
         for line in alignment_lines(alignment):
-            say(line)
+            notify(line)
     compared = compare(poses, motion, alignment, names)
     found = figures(compared)
     if found["joint_mm"] is None and not np.isfinite(compared.marker_mm).any():
@@ -87,7 +87,7 @@ def compare_source(
             f"{truth}: at no instant of the poses of {source} does it know a point that they have"
         )
     for line in table_lines(found):
-        say(line)
+        notify(line)
     fitted = alignment_json(None if aligned else alignment)
     return {"truth": str(truth), "hand": poses.hand, "alignment": fitted, **found}
 

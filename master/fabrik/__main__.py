@@ -3,14 +3,14 @@
 import time
 from pathlib import Path
 
+from master.dispatcher import new_dispatcher
 from master.rig import load_setup
-from master.world import fresh_world
 
 
 def main() -> None:
     """Compile what the shipped rig calls, or find it compiled."""
     setup, began_s = load_setup(Path("calib_json"), "desk"), time.process_time()
-    fresh_world([setup])
+    new_dispatcher([setup])
     print(f"kernels are compiled ({time.process_time() - began_s:.0f} s)")
 
 

@@ -78,20 +78,20 @@ def seen_shift(caps: CapTables, row: int, ahead: Float, back: Float, out: Float)
         out[0] = out[1] = out[2] = np.nan
         return np.nan
     cosine = min(max(cosine, -1.0), 1.0)
-    last = caps.looks.shape[1] - 1
+    last = caps.appearances.shape[1] - 1
     place = acos(cosine) * (last / np.pi)
     low = min(max(int(place), 0), last - 1)
     part = place - low
-    along = (1.0 - part) * caps.looks[row, low, 0] + part * caps.looks[row, low + 1, 0]
-    towards = (1.0 - part) * caps.looks[row, low, 1] + part * caps.looks[row, low + 1, 1]
+    along = (1.0 - part) * caps.appearances[row, low, 0] + part * caps.appearances[row, low + 1, 0]
+    towards = (1.0 - part) * caps.appearances[row, low, 1] + part * caps.appearances[row, low + 1, 1]
     towards /= max(sqrt(1.0 - cosine * cosine), 1e-9)
     for i in range(3):
         out[i] = along * ahead[i] + towards * (back[i] - cosine * ahead[i])
-    return (1.0 - part) * caps.looks[row, low, 2] + part * caps.looks[row, low + 1, 2]
+    return (1.0 - part) * caps.appearances[row, low, 2] + part * caps.appearances[row, low + 1, 2]
 
 
 @kernel
-def tilted(row: int, R: Float, tilt_rad2: Float, turned_rad2: float, out: Float) -> None:
+def tilted(row: int, R: Float, tilt_rad2: Float, rotation_rad2: float, out: Float) -> None:
     """Write the direction of a cap, and six tilted as far as it is uncertain.
 
     The six are sigma points of two uncertain numbers: the mean square of what differs between them and the first is
@@ -102,10 +102,10 @@ def tilted(row: int, R: Float, tilt_rad2: Float, turned_rad2: float, out: Float)
         row: Which.
         R: (K, 3, 3) rotations of the tip joints, rig frame; -z is the finger's direction.
         tilt_rad2: (K, 3, 3) covariance of these directions; only that across them counts.
-        turned_rad2: Variance that their age adds.
+        rotation_rad2: Variance that their age adds.
         out: Written: (TILTED, 3) unit vectors.
     """
-    xx, xy, yy = turned_rad2, 0.0, turned_rad2
+    xx, xy, yy = rotation_rad2, 0.0, rotation_rad2
     for a in range(3):
         for b in range(3):
             xx += R[row, a, 0] * tilt_rad2[row, a, b] * R[row, b, 0]

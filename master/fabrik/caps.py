@@ -33,7 +33,7 @@ class CapSettings(NamedTuple):
         reach: Least hidden part by the largest of all cameras. What hides a part from one is near the line of sight of
             the others, and none of them can measure what is hidden from all: of 20 rendered caps the lesser hidden
             part by the larger is 0.16 in the mean, 0.28 rms.
-        turn_rad_s: [rad/s] standard deviation of how fast a finger end turns: a fist closes in a second.
+        rotation_rad_s: [rad/s] standard deviation of how fast a finger end turns: a fist closes in a second.
         radius_share: Relative error of a profile's radii: 0.8 mm.
         relief_m: [m] of a flat marker on a back that is not flat: 16 mm of paint on a radius of curvature of 50 mm
             bulge by 0.6 mm.
@@ -45,7 +45,7 @@ class CapSettings(NamedTuple):
     least_share: float = 0.8
     alike_share: float = 0.9
     reach: float = 0.2
-    turn_rad_s: float = 2.0
+    rotation_rad_s: float = 2.0
     radius_share: float = 0.1
     relief_m: float = 0.4e-3
     most_tilt: float = 2.0
@@ -59,7 +59,7 @@ class CapTables(NamedTuple):
     """How the M markers of a rig look from all sides; K of them are caps.
 
     Attributes:
-        row: (M,) row of `looks`; -1: flat, its centroid is what is seen.
+        row: (M,) row of `appearances`; -1: flat, its centroid is what is seen.
         looks: (K, A + 1, 3) over the angle between finger and sight, 0 to pi: shift of the seen centroid along the
             finger and towards the eye [m], and the area seen [m^2].
         radius_m: (K,).
@@ -68,7 +68,7 @@ class CapTables(NamedTuple):
     """
 
     row: Int
-    looks: Float
+    appearances: Float
     radius_m: Float
     joint: Int
     finger: Int
@@ -85,8 +85,8 @@ class CapTables(NamedTuple):
     def flat(cls, count: int) -> "CapTables":
         """Tables of markers that are all flat."""
         nothing = np.zeros(0, np.int64)
-        looks = np.zeros((0, _ANGLES + 1, 3))
-        return cls(np.full(count, -1, np.int64), looks, np.zeros(0), nothing, nothing)
+        appearances = np.zeros((0, _ANGLES + 1, 3))
+        return cls(np.full(count, -1, np.int64), appearances, np.zeros(0), nothing, nothing)
 
     def pointing(self, hand: SolvedHand, age_s: float) -> tuple[Float, Float]:
         """Directions of the caps of a hand of `age_s` [s] ago.
@@ -97,15 +97,15 @@ class CapTables(NamedTuple):
         ahead, tilt = np.full((len(self.row), 3), np.nan), np.zeros((len(self.row), 3, 3))
         caps = self.row >= 0
         ahead[caps] = -hand.joints.rotation[self.joint, :, 2]
-        turned = (CAPS.turn_rad_s * age_s) ** 2 * np.eye(3)
-        tilt[caps] = hand.tilt_cov_rad2[self.finger] + turned
+        rotation_m2 = (CAPS.rotation_rad_s * age_s) ** 2 * np.eye(3)
+        tilt[caps] = hand.tilt_cov_rad2[self.finger] + rotation_m2
         return ahead, tilt
 
 
 @lru_cache(maxsize=64)
 def _tables(model: HandModel, markers: tuple[str, ...]) -> CapTables:
     out = CapTables.flat(len(markers))
-    joints, fingers, looks = list[int](), list[int](), list[Float]()
+    joints, fingers, appearances = list[int](), list[int](), list[Float]()
     for m, name in enumerate(markers):
         mount = model.mount(name) if name in model.mounts else None
         if mount is None or mount.joint is None or mount.finger is None:
@@ -113,22 +113,22 @@ def _tables(model: HandModel, markers: tuple[str, ...]) -> CapTables:
         points, normals, areas = cap_surface(float(model.radius_m[mount.joint]), float(-mount.offset_m[2]))
         # The sampled cap is placed so that its centroid is exactly the profile's point.
         points -= np.average(points, axis=0, weights=areas)
-        out.row[m] = len(looks)
-        looks.append(_looks(points, normals, areas))
+        out.row[m] = len(appearances)
+        appearances.append(_appearances(points, normals, areas))
         joints.append(mount.joint)
         fingers.append(mount.finger)
-    if not looks:
+    if not appearances:
         return out
     radii = np.array([model.radius_m[joint] for joint in joints])
     return out._replace(
-        looks=np.array(looks),
+        appearances=np.array(appearances),
         radius_m=radii,
         joint=np.array(joints, np.int64),
         finger=np.array(fingers, np.int64),
     )
 
 
-def _looks(points: Float, normals: Float, areas: Float) -> Float:
+def _appearances(points: Float, normals: Float, areas: Float) -> Float:
     """Tabulate a cap whose finger points 0..180 degrees away from the eye.
 
     Returns:
@@ -137,9 +137,9 @@ def _looks(points: Float, normals: Float, areas: Float) -> Float:
     """
     angle = np.arange(_ANGLES + 1) * (np.pi / _ANGLES)
     eye = np.stack([np.sin(angle), np.zeros_like(angle), -np.cos(angle)], axis=1)
-    facing = np.maximum(eye @ normals.T, 0.0) * areas
-    shown = facing.sum(axis=1)
-    seen = facing @ points / np.maximum(shown, _LEAST_AREA_M2)[:, None]
+    visible_m2 = np.maximum(eye @ normals.T, 0.0) * areas
+    shown = visible_m2.sum(axis=1)
+    seen = visible_m2 @ points / np.maximum(shown, _LEAST_AREA_M2)[:, None]
     return np.stack([-seen[:, 2], seen[:, 0], shown], axis=1)
 
 

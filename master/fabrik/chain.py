@@ -1,7 +1,7 @@
 """A chain of bones with limited joints, and its forward kinematics.
 
 Everything is in the chain's root frame, its first joint at the origin. Link k turns from its parent's frame by
-the fixed `turn`, then by its joint's Q(angles), and its bone leads to joint k + 1:
+the fixed `rotation`, then by its joint's Q(angles), and its bone leads to joint k + 1:
 
     O_k = O_{k-1} turn_k Q_k          p_{k+1} = p_k + O_k bone_k
 
@@ -31,12 +31,12 @@ class Link:
     """One joint and the bone behind it.
 
     Attributes:
-        turn: Rest orientation in the parent's frame (`world` joints: in the root frame).
+        rotation: Rest orientation in the parent's frame (`world` joints: in the root frame).
         joint: What it allows.
         bone: To the next joint, in the joint's own frame [m].
     """
 
-    turn: Matrix
+    rotation: Matrix
     joint: Joint
     bone: Vector
 
@@ -119,7 +119,7 @@ class Chain:
         return positions, orientations.reshape(-1, 3, 3)
 
 
-def nearest_reach(chain: Chain) -> float:
+def least_root_to_end(chain: Chain) -> float:
     """Least |end - root| [m] inside the limits.
 
     Pattern search over the joints behind the first, from several starts.
@@ -165,7 +165,7 @@ def _arrays(chain: Chain) -> ChainArrays:
     kinds = [(j.kind, link.joint.frame == "world") for j, link in zip(joints, chain.links, strict=True)]
     rows = [
         np.concatenate(
-            [np.ravel(link.turn), np.ravel(j.rest), link.bone, j.axis, [j.spread_at_full_flexion, j.sign]]
+            [np.ravel(link.rotation), np.ravel(j.rest), link.bone, j.axis, [j.spread_at_full_flexion, j.sign]]
         )
         for j, link in zip(joints, chain.links, strict=True)
     ]

@@ -14,7 +14,7 @@ ROOT = START = constant(
     0
 )  # the first link; where the numbers of a row begin that is all one vector or matrix
 KIND, WORLD, FIRST = map(constant, range(3))  # columns of `ChainArrays.joints`
-TURN, REST, BONE, AXIS, SPREAD, SIGN = map(constant, (0, 9, 18, 21, 24, 25))  # and of `ChainArrays.links`
+ROTATION, REST, BONE, AXIS, SPREAD, SIGN = map(constant, (0, 9, 18, 21, 24, 25))  # and of `ChainArrays.links`
 
 
 class ChainArrays(NamedTuple):
@@ -117,8 +117,8 @@ def follow(chain: ChainArrays, angles: Float) -> None:
 @inner
 def rest_frame(chain: ChainArrays, k: int, parent: Matrix) -> Matrix:
     """Frame in which joint k is measured, given the orientation of its parent."""
-    turn = matrix_at(chain.links, k, TURN)
-    return turn if k == 0 or chain.joints[k, WORLD] else product(parent, turn)
+    link_rotation = matrix_at(chain.links, k, ROTATION)
+    return link_rotation if k == 0 or chain.joints[k, WORLD] else product(parent, link_rotation)
 
 
 @kernel
@@ -126,7 +126,7 @@ def forward(chain: ChainArrays, angles: Float, positions: Float, orientations: F
     """Write joint positions (N + 1, 3) [m] and orientations (N, 9) of angles (n,)."""
     place = (0.0, 0.0, 0.0)
     put_vector(positions, ROOT, place)
-    parent = matrix_at(chain.links, ROOT, TURN)
+    parent = matrix_at(chain.links, ROOT, ROTATION)
     for k in range(len(chain.joints)):
         own = rotation(limits_of(chain, k), angles_of(chain, angles, k))
         parent = product(rest_frame(chain, k, parent), own)
@@ -139,7 +139,7 @@ def forward(chain: ChainArrays, angles: Float, positions: Float, orientations: F
 def end_of(chain: ChainArrays, angles: Float) -> Vector:
     """Where the chain ends at angles (n,) [rad]; [m], root frame."""
     place = (0.0, 0.0, 0.0)
-    parent = matrix_at(chain.links, ROOT, TURN)
+    parent = matrix_at(chain.links, ROOT, ROTATION)
     for k in range(len(chain.joints)):
         own = rotation(limits_of(chain, k), angles_of(chain, angles, k))
         parent = product(rest_frame(chain, k, parent), own)

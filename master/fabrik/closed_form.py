@@ -26,8 +26,8 @@ from master.fabrik.chain_arrays import (
     BONE,
     REST,
     ROOT,
+    ROTATION,
     SIGN,
-    TURN,
     ChainArrays,
     clamp_angles,
     end_of,
@@ -59,7 +59,13 @@ _FIRST_STEPS, _MOST_STEPS = constant(8), constant(60)
 
 @kernel
 def closed_form(
-    chain: ChainArrays, edges: Float, ratio: float, goal: Vector, near: Float, angles: Float, seeds: Float
+    chain: ChainArrays,
+    edges: Float,
+    ratio: float,
+    goal: Vector,
+    warm_start: Float,
+    angles: Float,
+    seeds: Float,
 ) -> float:
     """The legal pose that hits the target.
 
@@ -76,7 +82,7 @@ def closed_form(
     Returns:
         Distance of the point to the target [m]; infinite: no such pose is legal.
     """
-    local = rotate_back(matrix_at(chain.links, ROOT, TURN), goal)
+    local = rotate_back(matrix_at(chain.links, ROOT, ROTATION), goal)
     distance2, branches = dot(local, local), len(edges) - 1
     penalties, trial = np.full(2, inf), np.empty(4)
     best, residual = inf, inf
@@ -88,7 +94,7 @@ def closed_form(
             if cut <= _SLACK_RAD and off <= _EDGE_M2:
                 # bones out of plane cannot point exactly at the pole: legal angles may still miss
                 miss = length(minus(end_of(chain, trial), goal))
-                rank = _rank(trial, near, branches - 1 - b)
+                rank = _rank(trial, warm_start, branches - 1 - b)
                 if miss < REACHED_M and rank < best:
                     best, residual = rank, miss
                     _copy(trial, angles)
@@ -103,13 +109,17 @@ def distance2_of(chain: ChainArrays, ratio: float, pip: float) -> tuple[float, f
     """Squared distance |w|^2 [m^2] at a PIP [rad], and its derivative [m^2/rad]."""
     led = ratio * pip
     dip = min(max(led, chain.spans[3, 0]), chain.spans[3, 1])
-    slope, turn = ratio if dip == led else 0.0, matrix_at(chain.links, DIP, TURN)
+    slope, link_rotation = ratio if dip == led else 0.0, matrix_at(chain.links, DIP, ROTATION)
     tip = _flexed(dip, vector_at(chain.links, DIP, BONE))
-    turning = rotate(turn, (0.0, slope * tip[2], -slope * tip[1]))
-    end = plus(rotate(turn, tip), vector_at(chain.links, PIP, BONE))
-    end, turning, turn = _flexed(pip, end), _flexed(pip, turning), matrix_at(chain.links, PIP, TURN)
-    w = plus(rotate(turn, end), vector_at(chain.links, ROOT, BONE))
-    return dot(w, w), 2.0 * dot(w, rotate(turn, plus(turning, (0.0, end[2], -end[1]))))
+    rotating = rotate(link_rotation, (0.0, slope * tip[2], -slope * tip[1]))
+    end = plus(rotate(link_rotation, tip), vector_at(chain.links, PIP, BONE))
+    end, rotating, link_rotation = (
+        _flexed(pip, end),
+        _flexed(pip, rotating),
+        matrix_at(chain.links, PIP, ROTATION),
+    )
+    w = plus(rotate(link_rotation, end), vector_at(chain.links, ROOT, BONE))
+    return dot(w, w), 2.0 * dot(w, rotate(link_rotation, plus(rotating, (0.0, end[2], -end[1]))))
 
 
 @kernel
@@ -123,8 +133,8 @@ def distances2(chain: ChainArrays, ratio: float, pips: Float, squares: Float) ->
 def _point(chain: ChainArrays, pip: float, dip: float) -> Vector:
     """The point w [m] in the root joint's frame at PIP and DIP [rad]."""
     tip = _flexed(dip, vector_at(chain.links, DIP, BONE))
-    end = plus(rotate(matrix_at(chain.links, DIP, TURN), tip), vector_at(chain.links, PIP, BONE))
-    end = rotate(matrix_at(chain.links, PIP, TURN), _flexed(pip, end))
+    end = plus(rotate(matrix_at(chain.links, DIP, ROTATION), tip), vector_at(chain.links, PIP, BONE))
+    end = rotate(matrix_at(chain.links, PIP, ROTATION), _flexed(pip, end))
     return plus(end, vector_at(chain.links, ROOT, BONE))
 
 
@@ -182,13 +192,13 @@ def _known(angles: Float) -> bool:
 
 
 @inner
-def _rank(angles: Float, near: Float, branch: int) -> float:
+def _rank(angles: Float, warm_start: Float, branch: int) -> float:
     """Rank of a pose that hits, least first: change [rad], or branch and abduction."""
-    if not _known(near):
+    if not _known(warm_start):
         return branch * _PER_BRANCH + abs(angles[0])
     rank = 0.0
     for i in range(4):
-        rank += abs(angles[i] - near[i])
+        rank += abs(angles[i] - warm_start[i])
     return rank
 
 
@@ -231,17 +241,17 @@ def _in_plane(chain: ChainArrays, edges: Float, ratio: float, local: Vector, see
     x, y, z = local
     x, y, z = rotate_back(matrix_at(chain.links, ROOT, REST), (c * x - s * z, y, s * x + c * z))
     last, in_plane2 = len(edges) - 1, y * y + z * z
-    pip, beside = 0.0, 0.0
+    pip, lateral = 0.0, 0.0
     for _ in range(2):
-        pip, _off = _invert(chain, ratio, edges[last - 1], edges[last], in_plane2 + beside * beside)
-        beside = _point(chain, pip, ratio * pip)[0]
+        pip, _off = _invert(chain, ratio, edges[last - 1], edges[last], in_plane2 + lateral * lateral)
+        lateral = _point(chain, pip, ratio * pip)[0]
     w = _point(chain, pip, ratio * pip)
     f = hinge_fit(chain.spans[1, 0], chain.spans[1, 1], (-1.0, 0.0, 0.0), w, (x, y, z), 0.0)
     seeds[0, 0], seeds[0, 1], seeds[0, 2], seeds[0, 3] = a, f, pip, ratio * pip
 
 
 @kernel
-def nearest_pose(chain: ChainArrays, goal: Vector, near: Float, seeds: Float, angles: Float) -> float:
+def nearest_pose(chain: ChainArrays, goal: Vector, warm_start: Float, seeds: Float, angles: Float) -> float:
     """The legal pose nearest to the target, where none hits it in closed form.
 
     Args:
@@ -253,12 +263,12 @@ def nearest_pose(chain: ChainArrays, goal: Vector, near: Float, seeds: Float, an
         Distance of the point to the target [m].
     """
     best, trial = inf, np.empty(4)
-    local = rotate_back(matrix_at(chain.links, ROOT, TURN), goal)
+    local = rotate_back(matrix_at(chain.links, ROOT, ROTATION), goal)
     starts = len(seeds) if chain.follower >= 0 else _STARTS
     for start in range(starts + 1):
         steps = _FIRST_STEPS
         if start < starts:
-            _start(chain, local, near, seeds, start, trial)
+            _start(chain, local, warm_start, seeds, start, trial)
         else:
             steps = _MOST_STEPS
             _copy(angles, trial)
@@ -272,15 +282,17 @@ def nearest_pose(chain: ChainArrays, goal: Vector, near: Float, seeds: Float, an
 
 
 @inner
-def _start(chain: ChainArrays, local: Vector, near: Float, seeds: Float, start: int, angles: Float) -> None:
+def _start(
+    chain: ChainArrays, local: Vector, warm_start: Float, seeds: Float, start: int, angles: Float
+) -> None:
     """Write start (4,): a seed; for a free DIP also the last pose, and pairs."""
     pair = start - len(seeds) - 1
     if start < len(seeds):
         _copy_row(seeds, start, angles)
     elif pair < 0:
         _copy_row(seeds, _FIRST, angles)
-        if _known(near):
-            _copy(near, angles)
+        if _known(warm_start):
+            _copy(warm_start, angles)
     else:
         pip_share, dip_share = _SPREAD_OF_STARTS[pair // 2]
         pip = chain.spans[2, 0] + pip_share * (chain.spans[2, 1] - chain.spans[2, 0])

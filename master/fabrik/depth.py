@@ -179,13 +179,13 @@ def _crooked(left: CameraModel, right: CameraModel) -> str:
     correction off it (`master.fabrik.triangulate`) take.
     """
     R = left.T_rig_camera[:3, :3].T
-    turn = R @ right.T_rig_camera[:3, :3]
+    rotation = R @ right.T_rig_camera[:3, :3]
     x, y, z = R @ (right.centre - left.centre)
-    turned = float(np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0)))
+    angle = float(np.arccos(np.clip((np.trace(rotation) - 1.0) / 2.0, -1.0, 1.0)))
     focal = left.matrix[1, 1] / right.matrix[1, 1]
-    if turned > PARALLEL_RAD:
+    if angle > PARALLEL_RAD:
         return (
-            f"the second is turned by {np.degrees(turned):.1f} degrees against the first,"
+            f"the second is turned by {np.degrees(angle):.1f} degrees against the first,"
             f" at most {np.degrees(PARALLEL_RAD):.0f} are allowed"
         )
     if x <= 0.0:

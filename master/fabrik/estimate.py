@@ -19,14 +19,14 @@ class MarkerPositions:
         cov_m2: (M, 3, 3) [m^2].
         noise_m2: (M, 3, 3) [m^2] the part of it that may differ from one instant to the next.
         apart: (M,) what two cameras see is not one thing.
-        left_out: (C, M) outliers of single cameras, without which the rays of three or more meet.
+        rejected: (C, M) outliers of single cameras, without which the rays of three or more meet.
     """
 
     points_m: Float
     cov_m2: Float
     noise_m2: Float
-    apart: Bool
-    left_out: Bool
+    outliers: Bool
+    rejected: Bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +39,7 @@ class SolvedHand:
         joints: Forward kinematics of the two.
         cov_m2: (26, 3, 3) [m^2] covariance of the joint positions.
         tilt_cov_rad2: (5, 3, 3) [rad^2] covariance of the directions of the last phalanges, by this instant alone.
-        tilt_walk_rad2_s2: (5,) [rad^2/s^2] by how much their trace is expected to grow, by the time squared.
+        tilt_process_noise_rad2_s2: (5,) [rad^2/s^2] by how much their trace is expected to grow, by the time squared.
     """
 
     T_rig_palm: Float
@@ -47,7 +47,7 @@ class SolvedHand:
     joints: HandJoints
     cov_m2: Float
     tilt_cov_rad2: Float
-    tilt_walk_rad2_s2: Float
+    tilt_process_noise_rad2_s2: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +58,7 @@ class HandEstimate:
         t_ns: The instant.
         markers: Positions as triangulated.
         smooth_m: (M, 3) [m] after the 1 € filter.
-        facing: (3,) unit vector from the hand to the cameras that see its back.
+        back_normal: (3,) unit vector from the hand to the cameras that see its back.
         solution: The hand; None: none is known.
         valid, tracked, source: (26,) as of `HandPose`.
         seen: (5,) fingers whose marker was placed now.
@@ -71,7 +71,7 @@ class HandEstimate:
     t_ns: int
     markers: MarkerPositions
     smooth_m: Float
-    facing: Float
+    back_normal: Float
     solution: SolvedHand | None
     valid: Bool
     tracked: Bool
@@ -83,13 +83,15 @@ class HandEstimate:
     solved: bool = False
 
     @classmethod
-    def unseen(cls, t_ns: int, markers: MarkerPositions, smooth_m: Float, facing: Float) -> "HandEstimate":
+    def unseen(
+        cls, t_ns: int, markers: MarkerPositions, smooth_m: Float, back_normal: Float
+    ) -> "HandEstimate":
         """One of which nothing is known yet."""
         return cls(
             t_ns=t_ns,
             markers=markers,
             smooth_m=smooth_m,
-            facing=facing,
+            back_normal=back_normal,
             solution=None,
             valid=np.zeros(26, np.bool_),
             tracked=np.zeros(26, np.bool_),

@@ -28,7 +28,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.kernels import inner, kernel
-from master.fabrik.chain import Chain, Pose, nearest_reach
+from master.fabrik.chain import Chain, Pose, least_root_to_end
 from master.fabrik.chain_arrays import (
     START,
     ChainArrays,
@@ -119,7 +119,7 @@ class Fabrik:
             )
         if not 0 <= restarts <= len(_RESTART_BENDS):
             raise ValueError(f"{restarts} restarts: there are 0 to {len(_RESTART_BENDS)}")
-        return cls(chain, sum(chain.lengths), nearest_reach(chain), tolerance_m, max_iterations, restarts)
+        return cls(chain, sum(chain.lengths), least_root_to_end(chain), tolerance_m, max_iterations, restarts)
 
     def solve(
         self,
@@ -150,10 +150,10 @@ class Fabrik:
             chain.arrays, goal, self.tolerance_m, self.max_iterations, restarts, angles
         )
         positions, orientations = chain.forward_flat(angles)
-        turn = np.array(frame)
+        rotation = np.array(frame)
         return ChainResult(
-            positions=positions @ turn.T + np.array(root),
-            orientations=turn @ orientations,
+            positions=positions @ rotation.T + np.array(root),
+            orientations=rotation @ orientations,
             angles=chain.pose(angles),
             residual_m=residual,
             iterations=iterations,

@@ -113,7 +113,7 @@ class FingerSolver:
         """Low and high of the four angles [rad]; as of `Chain.spans`."""
         return self.chain.spans
 
-    def solve(self, target: Vector, near: Four | None = None) -> FingerSolution:
+    def solve(self, target: Vector, warm_start: Four | None = None) -> FingerSolution:
         """Angles that bring the point to `target`, or as near to it as the limits allow.
 
         Args:
@@ -127,7 +127,7 @@ class FingerSolver:
         goal = minus(target, self.root)
         if not isfinite(length(goal)):
             return NOT_SEEN
-        before, angles = np.array(_UNKNOWN if near is None else near), np.empty(4)
+        before, angles = np.array(_UNKNOWN if warm_start is None else warm_start), np.empty(4)
         left = self.start(self.chain.arrays, self.edges, self.ratio, goal, before, angles)
         a, f, pip, dip = angles.tolist()
         return FingerSolution(a, f, pip, dip, left, left < REACHED_M)
@@ -207,7 +207,7 @@ class Finger:
 
 @kernel
 def start_of(
-    chain: ChainArrays, edges: Float, ratio: float, goal: Vector, near: Float, angles: Float
+    chain: ChainArrays, edges: Float, ratio: float, goal: Vector, warm_start: Float, angles: Float
 ) -> float:
     """The pose from which FABRIK begins: the closed form, or the legal pose nearest to the target.
 
@@ -219,8 +219,8 @@ def start_of(
         Distance of the point to the target [m].
     """
     seeds = np.empty((3, 4))
-    left = closed_form(chain, edges, ratio, goal, near, angles, seeds)
-    return left if left < inf else nearest_pose(chain, goal, near, seeds, angles)
+    left = closed_form(chain, edges, ratio, goal, warm_start, angles, seeds)
+    return left if left < inf else nearest_pose(chain, goal, warm_start, seeds, angles)
 
 
 @kernel
@@ -238,12 +238,12 @@ def bring_onto(
     goal = minus((target[0], target[1], target[2]), root)
     if not isfinite(length(goal)):
         return nan, 0
-    near, before = angles.copy(), 0
-    if chain.follower < 0 and isfinite(near.sum()):
+    warm_start, before = angles.copy(), 0
+    if chain.follower < 0 and isfinite(warm_start.sum()):
         residual, before = solve_chain(chain, goal, tolerance_m, max_iterations, _NO_RESTARTS, angles)
         if residual <= tolerance_m:
             return residual, before
-    start_of(chain, edges, ratio, goal, near, angles)
+    start_of(chain, edges, ratio, goal, warm_start, angles)
     residual, iterations = solve_chain(chain, goal, tolerance_m, max_iterations, _NO_RESTARTS, angles)
     return residual, before + iterations
 
@@ -259,7 +259,7 @@ def finger_chain(model: HandModel, finger: int, offset_m: Float, *, coupled: boo
     """
     limits = [(float(low), float(high)) for low, high in model.limits_rad[finger]]
     rest = as_matrix(model.rest_rotation[CHAINS[finger, 0]])
-    turn, bone = model.turn[finger], model.bone_m[finger]
+    link_rotation, bone = model.link_rotation[finger], model.bone_m[finger]
     thumb = finger == THUMB
     root = Rotor(
         limits[0],
@@ -268,11 +268,11 @@ def finger_chain(model: HandModel, finger: int, offset_m: Float, *, coupled: boo
         sign=model.side_sign,
         rest=IDENTITY if thumb else rest,
     )
-    last = bone[2] + turn[2] @ np.asarray(offset_m, dtype=np.float64)
+    last = bone[2] + link_rotation[2] @ np.asarray(offset_m, dtype=np.float64)
     links = (
         Link(rest if thumb else IDENTITY, root, as_vector(bone[0])),
-        Link(as_matrix(turn[0]), Hinge(*limits[2]), as_vector(bone[1])),
-        Link(as_matrix(turn[1]), Hinge(*limits[3]), as_vector(last)),
+        Link(as_matrix(link_rotation[0]), Hinge(*limits[2]), as_vector(bone[1])),
+        Link(as_matrix(link_rotation[1]), Hinge(*limits[3]), as_vector(last)),
     )
     ratio = model.dip_per_pip
     if not coupled or thumb or ratio is None or model.dip_spread_rad > 0.0:

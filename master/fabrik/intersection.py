@@ -68,7 +68,7 @@ class Triangulation(NamedTuple):
     cov_m2: Float
     residual_px: Float
     chi_square: Float
-    apart: Bool
+    outliers: Bool
 
 
 class Rays(NamedTuple):
@@ -117,14 +117,14 @@ class Rays(NamedTuple):
 
 @inner
 def observe(
-    cameras: CameraArrays, observed: Float, left_out: Bool, rays_px: float, m: int, rays: Rays
+    cameras: CameraArrays, observed: Float, rejected: Bool, rays_px: float, m: int, rays: Rays
 ) -> int:
     """Write what the cameras see of marker m; return how many do.
 
     Args:
         cameras: Of the rig.
         observed: (C, M, 3 or more) u, v, sigma [px]; NaN: not seen.
-        left_out: (C, M) what does not count.
+        rejected: (C, M) what does not count.
         rays_px: Standard deviation that the calibration leaves.
         m: The marker.
         rays: Written.
@@ -133,7 +133,7 @@ def observe(
     for c in range(observed.shape[0]):
         u, v, sigma = observed[c, m, 0], observed[c, m, 1], observed[c, m, 2]
         rays.weight[c] = 0.0
-        if left_out[c, m] or not np.isfinite(u + v + sigma) or not undistort(cameras, c, u, v, rays.seen):
+        if rejected[c, m] or not np.isfinite(u + v + sigma) or not undistort(cameras, c, u, v, rays.seen):
             continue
         rays.uv[c, 0], rays.uv[c, 1] = u, v
         rays.xy[c, 0], rays.xy[c, 1] = rays.seen[0], rays.seen[1]
@@ -278,12 +278,12 @@ def intersect(
     rays_px: float,
     limits: Float,
     observed: Float,
-    left_out: Bool,
+    rejected: Bool,
     rays: Rays,
     points: Float,
     cov: Float,
     errors: Float,
-    apart: Bool,
+    outliers: Bool,
 ) -> None:
     """Triangulate M markers as they are seen.
 
@@ -292,21 +292,21 @@ def intersect(
         rays_px: Standard deviation that the calibration leaves.
         limits: (C + 1,) most chi-square by the number of cameras.
         observed: (C, M, 3) u, v, sigma [px].
-        left_out: (C, M) what does not count.
+        rejected: (C, M) what does not count.
         rays: Room.
         points, cov: (M, 3) [m], (M, 3, 3) [m^2] written; NaN: not determined.
         errors: (2, M) written: residual [px], chi-square.
         apart: (M,) written.
     """
     for m in range(observed.shape[1]):
-        count = observe(cameras, observed, left_out, rays_px, m, rays)
+        count = observe(cameras, observed, rejected, rays_px, m, rays)
         found = count >= 2 and linear(cameras, rays) and refine(cameras, rays)
         total = 0.0
         for c in range(observed.shape[0]):
             total += rays.error[c] if rays.weight[c] > 0.0 else 0.0
         errors[0, m] = sqrt(total / count) if found else np.nan
         errors[1, m] = chi_square(rays) if found else np.nan
-        apart[m] = count >= 2 and not errors[1, m] <= limits[count]
+        outliers[m] = count >= 2 and not errors[1, m] <= limits[count]
         for i in range(3):
             points[m, i] = rays.point[i] if found else np.nan
             for j in range(3):
@@ -343,7 +343,7 @@ def triangulate(
     observed = np.empty((count, markers, 3))
     observed[..., :2], observed[..., 2] = uv, sigma_px
     points, cov, errors = np.empty((markers, 3)), np.empty((markers, 3, 3)), np.empty((2, markers))
-    apart = np.empty(markers, np.bool_)
-    none, room = np.zeros((count, markers), np.bool_), Rays.empty(count)
-    intersect(cameras, rays_px, limits_of(count), observed, none, room, points, cov, errors, apart)
-    return Triangulation(points, cov, errors[0], errors[1], apart)
+    outliers = np.empty(markers, np.bool_)
+    none, scratch = np.zeros((count, markers), np.bool_), Rays.empty(count)
+    intersect(cameras, rays_px, limits_of(count), observed, none, scratch, points, cov, errors, outliers)
+    return Triangulation(points, cov, errors[0], errors[1], outliers)

@@ -15,8 +15,8 @@ from common.arrays import Float
 from common.kernels import inner, kernel
 from master.fabrik.chain_arrays import (
     ROOT,
+    ROTATION,
     START,
-    TURN,
     ChainArrays,
     clamp_angles,
     forward,
@@ -90,7 +90,11 @@ def _evaluate(chain: ChainArrays, goal: Vector, unknowns: Float, angles: Float, 
     positions, orientations = np.empty((4, 3)), np.empty((3, 9))
     forward(chain, angles, positions, orientations)
     end, sign = vector_at(positions, len(positions) - 1, START), limits.sign
-    x, y, z = chain.links[ROOT, TURN + 1], chain.links[ROOT, TURN + 4], chain.links[ROOT, TURN + 7]
+    x, y, z = (
+        chain.links[ROOT, ROTATION + 1],
+        chain.links[ROOT, ROTATION + 4],
+        chain.links[ROOT, ROTATION + 7],
+    )
     axis = (sign * x, sign * y, sign * z)
     put_vector(columns, ROOT, cross(axis, minus(end, vector_at(positions, ROOT, START))))
     for k in range(3):

@@ -48,7 +48,7 @@ from common.kernels import bound, kernel
 
 # Part of the variance of a marker's noise that is new in each frame: about 0.1 on rendered hands, here with room. The
 # rest is light and shape, which stay.
-FRESH = 0.25
+CARRY_NOTHING = 0.25
 _QUANTILE = 9.0  # chi-square, one degree of freedom, 99.7 %: what is beyond is motion
 UNSEEN_NS = -(2**63)
 
@@ -205,7 +205,7 @@ class PointFilter:
         Times as in `OneEuro.push`.
         """
         variance = np.vecdot(self._R @ cov, self._R)  # of each coordinate: the diagonal of R cov R'
-        return self._filter.push(t_ns, points @ self._R.T, FRESH * variance) @ self._R
+        return self._filter.push(t_ns, points @ self._R.T, CARRY_NOTHING * variance) @ self._R
 
 
 @kernel

@@ -6,8 +6,8 @@ from master.fabrik.chain_arrays import (
     BONE,
     KIND,
     ROOT,
+    ROTATION,
     START,
-    TURN,
     WORLD,
     ChainArrays,
     angles_of,
@@ -38,13 +38,13 @@ from master.fabrik.rotations import (
 @inner
 def aim(chain: ChainArrays, end: Vector, goal: Vector, angles: Float) -> None:
     """Turn the first joint so that the end lies towards the goal."""
-    limits, turn, now = (
+    limits, link_rotation, now = (
         limits_of(chain, ROOT),
-        matrix_at(chain.links, ROOT, TURN),
+        matrix_at(chain.links, ROOT, ROTATION),
         angles_of(chain, angles, ROOT),
     )
-    arm = rotate_back(rotation(limits, now), rotate_back(turn, end))
-    put_angles(chain, angles, ROOT, fit(limits, arm, rotate_back(turn, goal), now))
+    arm = rotate_back(rotation(limits, now), rotate_back(link_rotation, end))
+    put_angles(chain, angles, ROOT, fit(limits, arm, rotate_back(link_rotation, goal), now))
 
 
 @kernel
@@ -73,14 +73,14 @@ def backward_pass(
         elif chain.joints[k + 1, KIND] == HINGE:
             here = _before_hinge(chain, k, behind, angles, wanted)
         else:
-            here = _before_rotor(chain, k, behind, angles, _turned(now, bone, wanted))
+            here = _before_rotor(chain, k, behind, angles, _rotated_towards(now, bone, wanted))
         place = minus(place, rotate(here, bone))
         put_vector(places, k, place)
         behind = here
 
 
 @inner
-def _turned(orientation: Matrix, bone: Vector, wanted: Vector) -> Matrix:
+def _rotated_towards(orientation: Matrix, bone: Vector, wanted: Vector) -> Matrix:
     """Orientation turned the shortest way so that its bone points as wanted."""
     return product(between(rotate(orientation, bone), wanted), orientation)
 
@@ -93,10 +93,10 @@ def _pointed(chain: ChainArrays, k: int, now: Matrix, angles: Float, wanted: Vec
     """
     bone = vector_at(chain.links, k, BONE)
     if not chain.joints[k, WORLD]:
-        return _turned(now, bone, wanted)
-    limits, turn = limits_of(chain, k), matrix_at(chain.links, k, TURN)
-    fitted = fit(limits, bone, rotate_back(turn, wanted), angles_of(chain, angles, k))
-    return product(turn, rotation(limits, fitted))
+        return _rotated_towards(now, bone, wanted)
+    limits, link_rotation = limits_of(chain, k), matrix_at(chain.links, k, ROTATION)
+    fitted = fit(limits, bone, rotate_back(link_rotation, wanted), angles_of(chain, angles, k))
+    return product(link_rotation, rotation(limits, fitted))
 
 
 @inner
@@ -105,18 +105,18 @@ def _before_hinge(chain: ChainArrays, k: int, behind: Matrix, angles: Float, wan
 
     Seen from the bone `behind`, this bone turns the other way about the same axis.
     """
-    limits, turn = limits_of(chain, k + 1), matrix_at(chain.links, k + 1, TURN)
-    seen = rotate_back(turn, vector_at(chain.links, k, BONE))
+    limits, link_rotation = limits_of(chain, k + 1), matrix_at(chain.links, k + 1, ROTATION)
+    seen = rotate_back(link_rotation, vector_at(chain.links, k, BONE))
     now = angles_of(chain, angles, k + 1)
     angle = hinge_fit(-limits.high, -limits.low, limits.axis, seen, rotate_back(behind, wanted), -now[0])
-    return product(behind, product(rotation_about(limits.axis, angle), transposed(turn)))
+    return product(behind, product(rotation_about(limits.axis, angle), transposed(link_rotation)))
 
 
 @inner
 def _before_rotor(chain: ChainArrays, k: int, behind: Matrix, angles: Float, here: Matrix) -> Matrix:
     """Orientation `here` of link k, turned so that the next rotor allows `behind`."""
     limits, bone = limits_of(chain, k + 1), vector_at(chain.links, k + 1, BONE)
-    frame = product(here, matrix_at(chain.links, k + 1, TURN))
+    frame = product(here, matrix_at(chain.links, k + 1, ROTATION))
     actual = rotate(behind, bone)
     fitted = fit(limits, bone, rotate_back(frame, actual), angles_of(chain, angles, k + 1))
     allowed = rotate(frame, rotate(rotation(limits, fitted), bone))
@@ -130,7 +130,7 @@ def forward_pass(
     """Write the legal pose whose bones point to the places; `angles`: in, out [rad]."""
     place = (0.0, 0.0, 0.0)
     put_vector(positions, ROOT, place)
-    parent = matrix_at(chain.links, ROOT, TURN)
+    parent = matrix_at(chain.links, ROOT, ROTATION)
     for k in range(len(chain.joints)):
         limits, bone, frame = (
             limits_of(chain, k),

@@ -61,7 +61,7 @@ class _Hand(NamedTuple):
         as_seen: What is seen of a marker is taken for its centroid, and the whole correction for uncertainty.
         R: (K, 3, 3) rotations of the tip joints, rig frame.
         tilt_rad2: (K, 3, 3) covariance of their directions.
-        turned_rad2: Variance that their age adds.
+        rotation_rad2: Variance that their age adds.
         at: (K, 3) [m] about where they are.
         walked: (K,) by how much more their tilt may have grown to a fit that starts there; as a share of its variance.
     """
@@ -70,9 +70,9 @@ class _Hand(NamedTuple):
     as_seen: bool
     R: Float
     tilt_rad2: Float
-    turned_rad2: float
+    rotation_rad2: float
     at: Float
-    walked: Float
+    process_noise: Float
 
 
 @inner
@@ -84,13 +84,13 @@ def _covariance(
     shared: float,
     rays: Rays,
     views: Views,
-    walked: float,
+    process_noise: float,
     cov: Float,
     own: Float,
 ) -> None:
     """Write the covariance (3, 3) of a refined point: all parts (see the module); and of them what rays do not show.
 
-    `walked`: as of `_Hand`.
+    `process_noise`: as of `_Hand`.
     """
     moved, gain = views.moved, views.gain
     step, both = views.step, views.both  # of the point by a common step; gain gain'
@@ -123,7 +123,7 @@ def _covariance(
             for t in range(1, count):
                 tilt += (moved[t, i] - moved[0, i]) * (moved[t, j] - moved[0, j]) / (count - 1)
             cov[i, j] = rays.cov[i, j] + shared * common + shape + tilt
-            own[i, j] = shape + (1.0 + walked) * tilt
+            own[i, j] = shape + (1.0 + process_noise) * tilt
 
 
 @inner
@@ -145,7 +145,7 @@ def _correct(
     if row < 0:
         count = 1
     elif hand.known:
-        tilted(row, hand.R, hand.tilt_rad2, hand.turned_rad2, views.aim)
+        tilted(row, hand.R, hand.tilt_rad2, hand.rotation_rad2, views.aim)
     else:
         any_direction(cameras, rays.point, views.aim)
     appearance(cameras, caps, row, count, rays, views)
@@ -173,7 +173,7 @@ def _place(
     hand: _Hand,
     rays_px: float,
     observed: Float,
-    left_out: Bool,
+    rejected: Bool,
     m: int,
     rays: Rays,
     views: Views,
@@ -183,7 +183,7 @@ def _place(
     Returns:
         How many see it; whether its point is determined; and as `_correct`.
     """
-    seen = observe(cameras, observed, left_out, rays_px, m, rays)
+    seen = observe(cameras, observed, rejected, rays_px, m, rays)
     if seen < 2 or not linear(cameras, rays):
         return seen, False, 1, 0.0
     for c in range(observed.shape[0]):
@@ -193,7 +193,7 @@ def _place(
 
 
 @inner
-def _lone(
+def _monocular(
     cameras: CameraArrays,
     caps: CapTables,
     hand: _Hand,
@@ -221,7 +221,7 @@ def _lone(
 
 
 @kernel
-def locate(
+def correct_centres(
     cameras: CameraArrays,
     caps: CapTables,
     rays_px: float,
@@ -230,17 +230,17 @@ def locate(
     as_seen: bool,
     R: Float,
     tilt_rad2: Float,
-    turned_rad2: float,
+    rotation_rad2: float,
     at: Float,
-    walked: Float,
+    process_noise: Float,
     observed: Float,
     rays: Rays,
     views: Views,
     points: Float,
     cov: Float,
     noise: Float,
-    apart: Bool,
-    left_out: Bool,
+    outliers: Bool,
+    rejected: Bool,
     uv: Float,
     variance: Float,
     own: Float,
@@ -251,42 +251,44 @@ def locate(
         cameras, caps: Of the rig.
         rays_px: Standard deviation per axis that the calibration leaves.
         limits: (C + 1,) most chi-square by the number of cameras.
-        known, as_seen, R, tilt_rad2, turned_rad2, at, walked: Directions of the caps, as of `_Hand`.
+        known, as_seen, R, tilt_rad2, rotation_rad2, at, walked: Directions of the caps, as of `_Hand`.
         observed: (C, M, 4) u, v, sigma [px], area [px^2]; NaN: not seen.
         rays, views: Room.
         points, cov, noise: (M, 3), (M, 3, 3), (M, 3, 3) written as of `MarkerPositions`.
         apart: (M,) written: two cameras or more see it, but their rays do not meet.
-        left_out: (C, M) written: outliers, without which they do.
+        rejected: (C, M) written: outliers, without which they do.
         uv, variance, own: Written, as of `RayPositions`.
     """
-    hand = _Hand(known, as_seen, R, tilt_rad2, turned_rad2, at, walked)
+    hand = _Hand(known, as_seen, R, tilt_rad2, rotation_rad2, at, process_noise)
     for m in range(observed.shape[1]):
         for c in range(observed.shape[0]):
-            left_out[c, m] = False
-        seen, placed, count, shared = _place(cameras, caps, hand, rays_px, observed, left_out, m, rays, views)
-        meets = placed and chi_square(rays) <= limits[seen]
+            rejected[c, m] = False
+        seen, triangulated, count, shared = _place(
+            cameras, caps, hand, rays_px, observed, rejected, m, rays, views
+        )
+        meets = triangulated and chi_square(rays) <= limits[seen]
         if seen >= _FEWEST and not meets:
-            odd = outlier(cameras, limits[seen - 1], rays)
-            if odd >= 0:
-                left_out[odd, m] = True
-                seen, placed, count, shared = _place(
-                    cameras, caps, hand, rays_px, observed, left_out, m, rays, views
+            outlying = outlier(cameras, limits[seen - 1], rays)
+            if outlying >= 0:
+                rejected[outlying, m] = True
+                seen, triangulated, count, shared = _place(
+                    cameras, caps, hand, rays_px, observed, rejected, m, rays, views
                 )
-                meets = placed and chi_square(rays) <= limits[seen]
-                left_out[odd, m] = meets
-        apart[m] = seen >= 2 and not meets
+                meets = triangulated and chi_square(rays) <= limits[seen]
+                rejected[outlying, m] = meets
+        outliers[m] = seen >= 2 and not meets
         row = caps.row[m]
         for i in range(3):
             for j in range(3):
                 own[m, i, j] = 0.0
         if meets:
-            much = float(walked[row]) if known and row >= 0 else 0.0
+            much = float(process_noise[row]) if known and row >= 0 else 0.0
             _covariance(cameras, caps, row, count, shared, rays, views, much, cov[m], own[m])
         elif seen == 1 and known and row >= 0:
-            _lone(cameras, caps, hand, rays_px, observed, m, rays, views)
+            _monocular(cameras, caps, hand, rays_px, observed, m, rays, views)
         common = 0.0
         for c in range(observed.shape[0]):
-            used = rays.weight[c] > 0.0 and not apart[m]
+            used = rays.weight[c] > 0.0 and not outliers[m]
             alone = rays.variance[c] + rays_px * rays_px - (shared if meets else 0.0)
             variance[c, m] = alone if used else np.nan
             uv[c, m, 0], uv[c, m, 1] = rays.uv[c, 0], rays.uv[c, 1]
@@ -340,7 +342,7 @@ class RayTriangulator:
         self._limits = limits_of(len(cameras))
         self._rays, self._views = Rays.empty(len(cameras)), Views.empty(len(cameras))
         self._unknown = np.zeros((len(caps.radius_m), 3, 3))
-        self._locate: Callable[..., None] | None = None
+        self._correct_centres: Callable[..., None] | None = None
 
     def __call__(
         self,
@@ -357,19 +359,19 @@ class RayTriangulator:
         observed = np.empty((cameras, count, 4))
         observed[..., :2], observed[..., 2], observed[..., 3] = uv, sigma_px, area_px2
         R = tilt = self._unknown
-        at, walked = self._unknown[:, 0], self._unknown[:, 0, 0]
+        at, process_noise = self._unknown[:, 0], self._unknown[:, 0, 0]
         if hand is not None:
             R, tilt = hand.joints.rotation[self._caps.joint], hand.tilt_cov_rad2[self._caps.finger]
             at = hand.joints.position_m[self._caps.joint]
             # A fit believes that fingers move as fast as its priors allow. Told of less than it believes itself, it
             # would follow its own error, and finger and cap would drag each other away.
-            turned = 2.0 * (CAPS.turn_rad_s * age_s) ** 2
-            grown = hand.tilt_walk_rad2_s2[self._caps.finger] * age_s**2 - turned
-            ours = tilt[:, 0, 0] + tilt[:, 1, 1] + tilt[:, 2, 2] + turned
-            walked = np.maximum(grown, 0.0) / np.maximum(ours, 1e-12)
+            rotation_rad2 = 2.0 * (CAPS.rotation_rad_s * age_s) ** 2
+            grown = hand.tilt_process_noise_rad2_s2[self._caps.finger] * age_s**2 - rotation_rad2
+            ours = tilt[:, 0, 0] + tilt[:, 1, 1] + tilt[:, 2, 2] + rotation_rad2
+            process_noise = np.maximum(grown, 0.0) / np.maximum(ours, 1e-12)
         points, cov = np.empty((count, 3)), np.empty((count, 3, 3))
-        noise, apart = np.empty((count, 3, 3)), np.empty(count, np.bool_)
-        left_out = np.empty((cameras, count), np.bool_)
+        noise, outliers = np.empty((count, 3, 3)), np.empty(count, np.bool_)
+        rejected = np.empty((cameras, count), np.bool_)
         seen, variance = np.empty((cameras, count, 2)), np.empty((cameras, count))
         own = np.empty((count, 3, 3))
         arguments = (
@@ -381,25 +383,25 @@ class RayTriangulator:
             as_seen,
             R,
             tilt,
-            (CAPS.turn_rad_s * age_s) ** 2,
+            (CAPS.rotation_rad_s * age_s) ** 2,
             np.ascontiguousarray(at),
-            np.ascontiguousarray(walked),
+            np.ascontiguousarray(process_noise),
             observed,
             self._rays,
             self._views,
             points,
             cov,
             noise,
-            apart,
-            left_out,
+            outliers,
+            rejected,
             seen,
             variance,
             own,
         )
-        if self._locate is None:
-            self._locate = bound(locate, *arguments)
-        self._locate(*arguments)
-        return RayPositions(points, cov, noise, apart, left_out, seen, variance, own)
+        if self._correct_centres is None:
+            self._correct_centres = bound(correct_centres, *arguments)
+        self._correct_centres(*arguments)
+        return RayPositions(points, cov, noise, outliers, rejected, seen, variance, own)
 
     def triangulate(self, uv: Float, sigma_px: float | Float = 0.1) -> Triangulation:
         """Triangulate markers as they are seen (`master.fabrik.intersection`)."""

@@ -102,7 +102,7 @@ def between(a: Vector, b: Vector) -> Matrix:
     x, y, z = x / scale, y / scale, z / scale
     c = dot(a, b) / scale
     if c < -1.0 + 1e-12:
-        return _half_turn_across(a)
+        return _half_rotation_across(a)
     k = 1.0 / (1.0 + c)
     return (
         (c + k * x * x, k * x * y - z, k * x * z + y),
@@ -112,7 +112,7 @@ def between(a: Vector, b: Vector) -> Matrix:
 
 
 @inner
-def _half_turn_across(a: Vector) -> Matrix:
+def _half_rotation_across(a: Vector) -> Matrix:
     """Half a turn about an axis across a, and across the coordinate least in a."""
     across = (1.0, 0.0, 0.0)
     if abs(a[1]) < abs(a[0]) and abs(a[1]) <= abs(a[2]):

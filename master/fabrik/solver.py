@@ -17,21 +17,21 @@ from common.hand_model import CHAINS, METACARPALS, PALM, TIPS, WRIST, HandModel
 from common.messages import MarkerDetections, Source
 from master.estimator.epoch import Epoch, Fitted
 from master.estimator.estimator import Estimator
-from master.estimator.ground import ON_MARKERS
 from master.estimator.hand_tables import Mounts
+from master.estimator.observation_sources import ON_MARKERS
 from master.estimator.state import PALM_PART
 from master.fabrik.estimate import HandEstimate, SolvedHand
 from master.fabrik.finger import Finger
 from master.fabrik.one_euro import PointFilter
 from master.fabrik.sync import FrameSet, FrameSync
-from master.fabrik.targets import facing_of, targets_of
+from master.fabrik.targets import back_normal_of, targets_of
 from master.fabrik.triangulate import Triangulate
 
 Stage = Callable[[str], AbstractContextManager[None]]
 FORGET_S = 0.5  # after this long without markers nothing is known of the hand any more
 _ON_TARGET_M = 1e-4
 _FIT_M2 = (3e-3) ** 2  # of a finger's marker as the palm's fit has it
-_DRIFT_M_S = 0.3  # of a hand that is held
+_HELD_M_S = 0.3  # of a hand that is held
 _PALM_JOINTS = np.array([PALM, WRIST, *METACARPALS])
 _AWAY = rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))  # a hand before a camera at the origin
 
@@ -95,7 +95,7 @@ class FabrikSolver:
         return [self.solve(frames) for frames in self.sync.flush()]
 
     def solve(
-        self, frames: FrameSet, near: SolvedHand | None = None, near_age_s: float = 0.0
+        self, frames: FrameSet, warm_start: SolvedHand | None = None, warm_start_age_s: float = 0.0
     ) -> HandEstimate:
         """Solve one instant.
 
@@ -103,10 +103,10 @@ class FabrikSolver:
             frames: What the cameras see of it.
             near: A hand that is surer than this line's last one, for the side of the caps that the cameras see; this
                 line's then has its covariance to first order.
-            near_age_s: How long ago that held [s].
+            warm_start_age_s: How long ago that held [s].
         """
         last, age_s = self._recent(frames.t_ns)
-        seen_as, seen_age_s = (last, age_s) if near is None else (near, near_age_s)
+        seen_as, seen_age_s = (last, age_s) if warm_start is None else (warm_start, warm_start_age_s)
         pixels = frames.uv, frames.sigma_px, frames.area
         with self._stage("triangulate"):
             markers = self.triangulate(*pixels, seen_as, seen_age_s)
@@ -118,10 +118,12 @@ class FabrikSolver:
             if self._one_euro is not None:
                 smooth = self._one_euro.push(frames.t_ns, smooth, markers.noise_m2)
         with self._stage("fabrik"):
-            facing = self.towards(smooth[self.on_hand], frames.area)
-            out = HandEstimate.unseen(frames.t_ns, markers, smooth, facing)
+            back_normal = self.towards(smooth[self.on_hand], frames.area)
+            out = HandEstimate.unseen(frames.t_ns, markers, smooth, back_normal)
             palm = self._palm.push(
-                Epoch(frames.t_ns, smooth, facing, cov_m2=markers.cov_m2, second_order=near is None)
+                Epoch(
+                    frames.t_ns, smooth, back_normal, cov_m2=markers.cov_m2, second_order=warm_start is None
+                )
             )
             return self._estimate(out, smooth[self.on_hand], markers.cov_m2[self.on_hand], palm)
 
@@ -137,8 +139,8 @@ class FabrikSolver:
         Returns:
             The hand; None: the points are too few.
         """
-        facing = self.towards(points[self.on_hand], area_px2)
-        return self._once.push(Epoch(0, points, facing, cov_m2=cov)).solution
+        back_normal = self.towards(points[self.on_hand], area_px2)
+        return self._once.push(Epoch(0, points, back_normal, cov_m2=cov)).solution
 
     def rehearse(self) -> None:
         """Call every kernel once, so that none is compiled while a hand is tracked."""
@@ -166,14 +168,14 @@ class FabrikSolver:
         Of the hand's points (H, 3) [m], by the areas of all markers (C, M) [px^2].
         """
         out = self._ahead.copy()
-        facing_of(points, area_px2[:, self._back], self._centres, self._focal_px, out)
+        back_normal_of(points, area_px2[:, self._back], self._centres, self._focal_px, out)
         return out
 
     def _estimate(self, out: HandEstimate, points: Float, cov: Float, palm: Fitted) -> HandEstimate:
         """Bring a palm's fingers onto their markers; without a palm hold the last hand."""
         last, age_s = self._recent(out.t_ns)
-        fit, placed = palm.solution, np.isfinite(points[:, 0])
-        if fit is None or not placed.any():
+        fit, triangulated = palm.solution, np.isfinite(points[:, 0])
+        if fit is None or not triangulated.any():
             out.valid[:] = last is not None
             return out if last is None else replace(out, solution=_drifted(last, age_s))
         T, angles = fit.T_rig_palm, fit.angles_rad.copy()
@@ -186,25 +188,25 @@ class FabrikSolver:
         joints, _ = self._palm.pose(T, angles)
         off = joints.position_m - fit.joints.position_m
         joint_cov = fit.cov_m2 + off[:, :, None] * off[:, None, :]
-        hand = SolvedHand(T, angles, joints, joint_cov, fit.tilt_cov_rad2, fit.tilt_walk_rad2_s2)
-        self._judge(out, palm, fit.surprise, placed)
+        hand = SolvedHand(T, angles, joints, joint_cov, fit.tilt_cov_rad2, fit.tilt_process_noise_rad2_s2)
+        self._judge(out, palm, fit.surprise, triangulated)
         self._last, self._last_ns = hand, out.t_ns
         solved = bool(np.isfinite(out.residual_m).any() or out.tracked.any())
         return replace(out, solution=hand, solved=solved)
 
-    def _judge(self, out: HandEstimate, palm: Fitted, surprise: Float, placed: Bool) -> None:
-        """Write the bits of a solved hand; `placed`: (H,) which markers are.
+    def _judge(self, out: HandEstimate, palm: Fitted, surprise: Float, triangulated: Bool) -> None:
+        """Write the bits of a solved hand; `triangulated`: (H,) which markers are.
 
         What they explain is tracked.
         """
-        out.seen[self._finger_of[placed & self._on_finger]] = True
+        out.seen[self._finger_of[triangulated & self._on_finger]] = True
         explained = out.seen.copy()
         wrong = surprise >= self._palm.settings.explained
         explained[self._finger_of[wrong & self._on_finger]] = False
         out.valid[:] = True
         out.source[CHAINS[out.seen]] = Source.SOLVED
         out.source[TIPS[out.seen]] = Source.MEASURED
-        if palm.rests[PALM_PART] & ON_MARKERS:
+        if palm.sources[PALM_PART] & ON_MARKERS:
             out.tracked[_PALM_JOINTS], out.source[_PALM_JOINTS] = True, Source.SOLVED
             out.tracked[CHAINS[explained]] = True
         else:
@@ -213,4 +215,4 @@ class FabrikSolver:
 
 def _drifted(hand: SolvedHand, age_s: float) -> SolvedHand:
     """A hand that was solved a time ago, as much less sure as it may have moved."""
-    return replace(hand, cov_m2=hand.cov_m2 + (_DRIFT_M_S * age_s) ** 2 * np.eye(3))
+    return replace(hand, cov_m2=hand.cov_m2 + (_HELD_M_S * age_s) ** 2 * np.eye(3))

@@ -10,7 +10,7 @@ is the newest capture time seen: no clock is read here, so a replay synchronises
 that still waited for a camera when all fell silent, for as long as makes one silent, is *outdated* and left out.
 
 Each marker has its own capture time, t_row0 + row_time v: a rolling shutter sees the finger tips earlier than the back
-of the hand. `master.fabrik.carry` carries each to the instant; a sideways error Dt v would turn into a depth error
+of the hand. `master.fabrik.propagate` carries each to the instant; a sideways error Dt v would turn into a depth error
 D v Dt / B, the largest of an unsynchronised rig.
 """
 
@@ -23,7 +23,7 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 from common.messages import MarkerDetections
-from master.fabrik.carry import HISTORY, NEVER, SIGHTINGS, Recent, carry
+from master.fabrik.propagate import HISTORY, NEVER, OBSERVATIONS, TrackHistory, propagate
 
 SILENT_FRAMES = 12
 _SLOW, _SLOW_FRAMES = 2.2, 4  # times as many frames of others as the files say, between so many of its own
@@ -41,7 +41,7 @@ class FrameSet:
         area: (C, M) [px^2] of the nearest frame.
         ready_t_ns: When the last contributing frame was handed to its slave.
         missing: (C,) cameras that had no frame in time.
-        rival_uv, rival_sigma_px: As `uv` and `sigma_px` of the second places that slaves named; None: none at all.
+        alt_uv, alt_sigma_px: As `uv` and `sigma_px` of the second places that slaves named; None: none at all.
     """
 
     t_ns: int
@@ -50,8 +50,8 @@ class FrameSet:
     area: Float
     ready_t_ns: int
     missing: Bool
-    rival_uv: Float | None = None
-    rival_sigma_px: Float | None = None
+    alt_uv: Float | None = None
+    alt_sigma_px: Float | None = None
 
 
 class FrameSync:
@@ -85,15 +85,15 @@ class FrameSync:
         count, period_ns = len(models), int(1e9 / min(rates))
         self._markers, self._continuous = markers, continuous
         self._centre_row_ns = [round(0.5 * (model.height_px - 1) * model.row_time_ns) for model in models]
-        self._deadline_ns, self._outdated_ns = int(1.25 * period_ns), SILENT_FRAMES * period_ns
+        self._deadline_ns, self._stale_ns = int(1.25 * period_ns), SILENT_FRAMES * period_ns
         self._half_ns = [int(0.5e9 / rate) for rate in rates]
         self._slack_ns = self._half_ns if policy == "predict" else [0] * count
-        far_ns = int((SIGHTINGS + 0.25) * period_ns) if continuous else -1
+        far_ns = int((OBSERVATIONS + 0.25) * period_ns) if continuous else -1
         near_ns = self._deadline_ns if continuous else self._deadline_ns // 2
         self._reach_ns = near_ns, far_ns, far_ns, far_ns
         self._patience = SILENT_FRAMES * count
         self._slow_frames = [_SLOW * sum(rates) / rate for rate in rates]
-        self._recent = Recent(
+        self._history = TrackHistory(
             np.zeros(count, np.int64),
             np.full((count, HISTORY, 3), NEVER),
             np.zeros((count, HISTORY)),
@@ -109,7 +109,7 @@ class FrameSync:
         self._awaited = 0  # the camera that was waited for when an instant was last asked for
         self._pending: deque[int] = deque()
         self._newest_ns = self._last_ns = NEVER  # of all frames, of all instants
-        self.outdated = 0
+        self.stale = 0
 
     def push(self, message: MarkerDetections) -> list[FrameSet]:
         """Take one camera's detections; return the instants that became complete or due, oldest first.
@@ -128,7 +128,7 @@ class FrameSync:
         if centre_ns <= self._newest_of[c]:
             return []  # a restarted slave's first clock estimate may step back: wait until time goes on
         self._hold(c, centre_ns, message)
-        self._behind[c] = self._newest_ns - centre_ns > self._outdated_ns
+        self._behind[c] = self._newest_ns - centre_ns > self._stale_ns
         self._newest_of[c] = centre_ns
         self._newest_ns = max(self._newest_ns, centre_ns)
         if self._silent(c):
@@ -149,19 +149,19 @@ class FrameSync:
         shape = len(self._came), self._markers
         uv, sigma = np.empty((2, *shape, 2)), np.empty((2, *shape))
         area, missing = np.empty(shape), np.empty(shape[0], np.bool_)
-        ready_t_ns, rivals = carry(self._recent, t_ns, self._reach_ns, uv, sigma, area, missing)
-        second = (uv[1], sigma[1]) if rivals else (None, None)
+        ready_t_ns, alternatives = propagate(self._history, t_ns, self._reach_ns, uv, sigma, area, missing)
+        second = (uv[1], sigma[1]) if alternatives else (None, None)
         return FrameSet(t_ns, uv[0], sigma[0], area, ready_t_ns, missing, *second)
 
     def _hold(self, c: int, centre_ns: int, message: MarkerDetections) -> None:
         """Copy a frame into its camera's ring."""
-        total, times_ns, t_sigma_ns, all_marks, _, _ = self._recent
+        total, times_ns, t_sigma_ns, all_marks, _, _ = self._history
         slot = int(total[c]) % HISTORY
         total[c] += 1
         times_ns[c, slot, 0], times_ns[c, slot, 1] = centre_ns, message.t_ns
         times_ns[c, slot, 2], t_sigma_ns[c, slot] = message.ready_t_ns, message.t_sigma_ns
         marks = all_marks[c, slot]
-        marks[:2], marks[2:4] = message.uv.T, message.rival_uv.T
+        marks[:2], marks[2:4] = message.uv.T, message.alt_uv.T
         marks[4], marks[5] = message.sigma_px, message.area
 
     def _leader(self) -> int:
@@ -195,8 +195,8 @@ class FrameSync:
             if not (flush or waited_ns > self._deadline_ns or self._complete(t_ns)):
                 break
             self._pending.popleft()
-            if self._continuous and waited_ns > self._outdated_ns and self._lonely(t_ns):
-                self.outdated += 1
+            if self._continuous and waited_ns > self._stale_ns and self._lonely(t_ns):
+                self.stale += 1
             else:
                 out.append(self.at(t_ns))
         return out
@@ -217,7 +217,7 @@ class FrameSync:
         newest = self._newest_of[c]
         if newest >= t_ns:
             # At the very start one frame is not yet a track.
-            return self._continuous and self._recent.total[c] == 1 and not self._silent(c)
+            return self._continuous and self._history.total[c] == 1 and not self._silent(c)
         return newest + self._slack_ns[c] < t_ns and not self._silent(c)
 
     def _lonely(self, t_ns: int) -> bool:
@@ -226,7 +226,6 @@ class FrameSync:
         From half a period before it to a while after.
         """
         return any(
-            not self._silent(c)
-            and not any(-self._half_ns[c] <= s - t_ns <= self._outdated_ns for s in centres)
-            for c, centres in enumerate(self._recent.times_ns[:, :, 0].tolist())
+            not self._silent(c) and not any(-self._half_ns[c] <= s - t_ns <= self._stale_ns for s in centres)
+            for c, centres in enumerate(self._history.times_ns[:, :, 0].tolist())
         )

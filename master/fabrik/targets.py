@@ -10,7 +10,7 @@ from master.estimator.matrices import inverse_3_plus
 
 
 @kernel
-def facing_of(points: Float, area_px2: Float, centres: Float, focal_px: Float, out: Float) -> bool:
+def back_normal_of(points: Float, area_px2: Float, centres: Float, focal_px: Float, out: Float) -> bool:
     """Write the unit vector from a hand to the cameras that see its back.
 
     A flat marker shows each camera its area times the cosine of its tilt, so the directions to the cameras, weighed by

@@ -33,7 +33,7 @@ from master.fabrik.estimate import MarkerPositions, SolvedHand
 
 GRID = 48  # cells of the table along each side of the image
 _DEPTHS_M = np.array([0.35, 0.45, 0.6, 0.8, 1.1])
-_LAW_TURNS = 3  # each leaves a thousandth of the correction off the axis
+_LAW_ROUNDS = 3  # each leaves a thousandth of the correction off the axis
 _ANYHOW_RAD = (
     1.0  # standard deviation of the direction of a finger that shows its end, from that to the cameras
 )
@@ -165,7 +165,7 @@ def place_centroids(
         cell[c] = (1.0 - p) * upper + p * lower
     disparity = u - right_u
     z = depth(tables, disparity)
-    for _ in range(_LAW_TURNS):
+    for _ in range(_LAW_ROUNDS):
         z = depth(tables, disparity - cell[0] - cell[1] / z)
     if not np.isfinite(z):
         return np.nan, np.nan
@@ -183,7 +183,7 @@ def cap_bias(
 
     Args:
         tables, caps: The pair and the markers.
-        row: The marker's in `caps.looks`.
+        row: The marker's in `caps.appearances`.
         ahead: (3,) unit vector in which the finger points, rig frame.
         point: (3,) [m] about where the cap is, rig frame.
         bias, shown: Written: (2, 2) [px], and the area that it shows (2,) [m^2].
@@ -245,7 +245,7 @@ def triangulate(
     points: Float,
     cov: Float,
     noise: Float,
-    apart: Bool,
+    outliers: Bool,
 ) -> None:
     """Triangulate M markers with covariance.
 
@@ -268,7 +268,7 @@ def triangulate(
         points[m, :] = np.nan
         cov[m, :, :] = np.nan
         noise[m, :, :] = np.nan
-        apart[m] = False
+        outliers[m] = False
         if not np.isfinite(uv[0, m, 0] + uv[0, m, 1] + uv[1, m, 0] + uv[1, m, 1]):
             continue
         whole[0, 0] = whole[0, 1] = 0.0
@@ -335,7 +335,7 @@ def triangulate(
         if rows * rows > tables.row_limit * (rows2 + variance[0] + variance[1]):
             points[m, :] = np.nan
             cov[m, :, :] = np.nan
-            apart[m] = True
+            outliers[m] = True
             continue
         per_px, scale = metres_per_pixel(tables, z), z / tables.focal_px[0]
         for k in range(3):  # derivatives by u of the left camera, v of it, and u of the right one
@@ -410,6 +410,8 @@ class DepthTriangulator:
         elif not as_seen:
             ahead[self._caps.row >= 0], tilt[:] = -self._tables.R[:, 2], _ANYHOW_RAD**2 * np.eye(3)
         points, cov = np.empty((count, 3)), np.empty((count, 3, 3))
-        noise, apart = np.empty((count, 3, 3)), np.empty(count, np.bool_)
-        triangulate(self._tables, self._caps, uv, sigma_px, area_px2, ahead, tilt, points, cov, noise, apart)
-        return MarkerPositions(points, cov, noise, apart, np.zeros(uv.shape[:2], np.bool_))
+        noise, outliers = np.empty((count, 3, 3)), np.empty(count, np.bool_)
+        triangulate(
+            self._tables, self._caps, uv, sigma_px, area_px2, ahead, tilt, points, cov, noise, outliers
+        )
+        return MarkerPositions(points, cov, noise, outliers, np.zeros(uv.shape[:2], np.bool_))

@@ -12,27 +12,27 @@ finger has come to meet the thumb; and a finger that is stretched while a dial t
 from common.arrays import Float
 from common.gesture_settings import GestureSettings
 from common.messages import Gesture
-from master.gestures.dial import DialWatch
+from master.gestures.dial import DialMonitor
 from master.gestures.features import HandFeatures
-from master.gestures.pinch import PinchWatch
-from master.gestures.point import PointWatch
-from master.gestures.taps import TapWatch, is_pad
+from master.gestures.pinch import PinchMonitor
+from master.gestures.point import PointMonitor
+from master.gestures.taps import ThumbTapMonitor, is_pad
 from master.gestures.touch import thumb_touch
 
 
-class ActionWatch:
+class ActionMonitor:
     """Push machine. Holds the four watches, of which one at most is active."""
 
     def __init__(self, settings: GestureSettings, radius_m: Float) -> None:
         """Of a hand whose joints have the radii (26,) [m]."""
         self._radius_m, self._taps = radius_m, settings.tap
-        self.pinch, self.dial = PinchWatch(settings.pinch), DialWatch(settings.dial)
-        self.tap, self.point = TapWatch(settings.tap), PointWatch(settings.point)
+        self.pinch, self.dial = PinchMonitor(settings.pinch), DialMonitor(settings.dial)
+        self.tap, self.point = ThumbTapMonitor(settings.tap), PointMonitor(settings.point)
 
-    def push(self, seen: HandFeatures, *, worn_only: bool = False) -> list[Gesture]:
+    def push(self, seen: HandFeatures, *, wrist_device_only: bool = False) -> list[Gesture]:
         """What is to be told at the instant of the features.
 
-        `worn_only`: all that sees the hand is worn on its arm, and the rig frame goes with it.
+        `wrist_device_only`: all that sees the hand is worn on its arm, and the rig frame goes with it.
         """
         pinch, dial, tap, point = self.pinch, self.dial, self.tap, self.point
         touch = thumb_touch(seen, self._radius_m)
@@ -44,7 +44,9 @@ class ActionWatch:
             told += tap.push(seen, touch, may_begin=True)
         others = pinch.active or tap.active
         dial_may = not others and not point.active
-        told += dial.push(seen, float(touch.gap_m.min()), may_begin=dial_may, worn_only=worn_only)
+        told += dial.push(
+            seen, float(touch.gap_m.min()), may_begin=dial_may, wrist_device_only=wrist_device_only
+        )
         return told + point.push(seen, may_begin=not others and not dial.active)
 
     def lost(self, t_ns: int) -> list[Gesture]:

@@ -13,9 +13,9 @@ from common.gesture_settings import GestureSettings, default_gestures
 from common.hand_model import HandModel
 from common.messages import HandPose
 from master.calibrate.tree_files import provenance
-from master.gestures.lesson import held, lesson, what_lacks
 from master.gestures.reading import lines_of, read_gestures, spans_of
-from master.gestures.teach import FEWEST, MOST, Example, Taught, learn
+from master.gestures.template_session import held, template_session, what_lacks
+from master.gestures.templates import FEWEST, MOST, Example, PoseTemplate, learn
 from master.master_bus import join_bus
 from master.options import CALIB_JSON, HERE_BUS, BusEnd, Calibration
 from master.outputs.files import load_poses
@@ -39,7 +39,7 @@ _TOOL = "gestures teach"
 def gestures_app() -> typer.Typer:
     """The commands as one program, to be put under a name."""
     app = typer.Typer(no_args_is_help=True, add_completion=False, callback=_about)
-    for command in (teach, read, forget):
+    for command in (make_template, read, forget):
         app.command(command.__name__)(command)
     app.command("list")(show)
     return app
@@ -49,7 +49,7 @@ def _about() -> None:
     """The poses that a hand is known by: teach one, forget one, and read what recorded hands say."""
 
 
-def teach(
+def make_template(
     name: Annotated[str, typer.Argument(help="Name of the pose; one of that name is replaced.")],
     examples: Annotated[
         int, typer.Option(min=FEWEST, max=MOST, help="How many, before a running master.")
@@ -98,11 +98,11 @@ def teach(
         raise PhalanxError("--range: belongs to a recorded run, name it with --poses")
     else:
         shown, source = _live(name, examples, bus, hand, hand_name, calibration), "shown before the sensors"
-    taught = learn(name, shown, known, within)
+    templates = learn(name, shown, known, within)
     target = path if out is None else out
     target.parent.mkdir(parents=True, exist_ok=True)
-    save(target, with_pose(known, name, taught, source))
-    for line in (*taught.said, f"wrote {target}"):
+    save(target, with_pose(known, name, templates, source))
+    for line in (*templates.stated, f"wrote {target}"):
         typer.echo(line)
 
 
@@ -124,12 +124,12 @@ def read(
     path = _settings_path(calibration, settings)
     known = load(path, GestureSettings) if settings is not None else _settings(path)
     rows = load_poses(poses)
-    said = read_gestures(rows, known, _model(hand, rows.hand, calibration))
+    stated = read_gestures(rows, known, _model(hand, rows.hand, calibration))
     if every:
-        for gesture in said:
+        for gesture in stated:
             typer.echo(lines_of(gesture))
     begin_ns = int(rows.t_ns[0]) if len(rows) else 0
-    for span in spans_of(said):
+    for span in spans_of(stated):
         typer.echo(span.line(begin_ns))
 
 
@@ -137,8 +137,8 @@ def show(settings: Settings = None, calibration: Calibration = CALIB_JSON) -> No
     """The poses of a gestures file, and what is asked of each."""
     known = _settings(_settings_path(calibration, settings))
     for name, shape in known.poses.items():
-        taught = known.provenance.get(name)
-        typer.echo(f"{name}{'' if taught is None else f' (taught {taught.date})'}")
+        templates = known.provenance.get(name)
+        typer.echo(f"{name}{'' if templates is None else f' (template of {templates.date})'}")
         for quantity, span in shape.ranges.items():
             typer.echo(f"  {quantity:24s} {span.low:8.4g} to {span.high:8.4g}, border {span.soft:.3g}")
 
@@ -159,12 +159,12 @@ def forget(
     typer.echo(f"wrote {path}")
 
 
-def with_pose(settings: GestureSettings, name: str, taught: Taught, source: str) -> GestureSettings:
+def with_pose(settings: GestureSettings, name: str, templates: PoseTemplate, source: str) -> GestureSettings:
     """The settings with a taught pose, and where it comes from."""
-    made = provenance(_TOOL, (source,), taught.residual)
+    made = provenance(_TOOL, (source,), templates.residual)
     return msgspec.structs.replace(
         settings,
-        poses=settings.poses | {name: taught.shape},
+        poses=settings.poses | {name: templates.shape},
         provenance=settings.provenance | {name: made},
     )
 
@@ -222,7 +222,7 @@ def _live(
             return message if isinstance(message, HandPose) and message.hand == first.hand else None
 
         model = _model(hand, first.hand, calibration)
-        return lesson(receive, model, name, examples, SystemClock(), typer.echo)
+        return template_session(receive, model, name, examples, SystemClock(), typer.echo)
     finally:
         link.close()
 

@@ -3,14 +3,14 @@
 Palm and fingers both turn a knob, and the caps of the tips, turned as one in the room, have the sum of both; they are
 also what is measured best. A tip that is not seen goes with the palm, and counts less. The angle is against the grip's
 beginning, not summed up from step to step, so that neither noise nor a moment of loss adds up. A hand that lets go
-opens first: from when it begins to (`course`) the dial stands where it was, and goes on from there when it is gripped
+opens first: from when it begins to (`history`) the dial stands where it was, and goes on from there when it is gripped
 again.
 
 Tips that stand still to each other are a grip where most instants of the hold have its shape: which way the palm lies
 decides some of that, and cameras that see no more than fingertips doubt it from instant to instant.
 
 The axis begins as that of the circle through the tips; a turn tells its own axis the better the farther it goes, and
-what is known of it is the mean of both (`_turn`).
+what is known of it is the mean of both (`_rotate`).
 
 Where all that sees is worn on the arm (no markers, and the palm stands still in the camera's frame) it is the palm in
 the world of the IMU that turns.
@@ -23,10 +23,10 @@ from math import atan2, cos, pi, radians, sin, sqrt
 from common.arrays import Float
 from common.gesture_actions import DialSettings
 from common.messages import Gesture, Phase
-from master.gestures.course import Course
 from master.gestures.features import HandFeatures
-from master.gestures.grip import Tips, axis_of, is_grip, may_grip, spread_m, turned_by, widened_m
-from master.gestures.lasting import Lasting
+from master.gestures.grip import Tips, axis_of, is_grip, may_grip, rotation_between, spread_m, widened_m
+from master.gestures.grip_history import GripHistory
+from master.gestures.held_gesture import HeldGesture
 
 _AXIS_RAD = radians(15.0)  # how well the circle of the tips tells the axis of the knob
 _SWAY_RAD = radians(4.0)  # about other axes, by which a hand sways while it turns a knob
@@ -41,7 +41,7 @@ class _Grip:
         tips: As they were when it closed.
         circle_axis: (3,) of the circle of the tips.
         base_rad: By how much the dial had been turned then.
-        course: How it has gone of late.
+        history: How it has gone of late.
         farthest_rad: Of its largest turn so far.
         axis: (3,) of the knob, by both.
     """
@@ -49,17 +49,17 @@ class _Grip:
     tips: Tips
     circle_axis: Float
     base_rad: float
-    course: Course
+    history: GripHistory
     farthest_rad: float
     axis: Float
 
 
-class DialWatch:
+class DialMonitor:
     """Push machine. Holds the dial that has begun, its grip and its angle, and the grip that may become one."""
 
     def __init__(self, settings: DialSettings) -> None:
         self._settings = settings
-        self._dial: Lasting | None = None
+        self._dial: HeldGesture | None = None
         self._grip: _Grip | None = None
         self._maybe: deque[tuple[int, Tips, bool]] = deque()  # since when tips are as they are now; a grip's?
         self._angle = 0.0
@@ -73,7 +73,7 @@ class DialWatch:
         return self._dial is not None
 
     def push(
-        self, seen: HandFeatures, across_m: float, *, may_begin: bool, worn_only: bool = False
+        self, seen: HandFeatures, across_m: float, *, may_begin: bool, wrist_device_only: bool = False
     ) -> list[Gesture]:
         """What is to be told at the instant of the features.
 
@@ -81,7 +81,7 @@ class DialWatch:
             seen: The hand.
             across_m: Between the skins of the thumb and the finger next to it [m].
             may_begin: Whether a dial may begin.
-            worn_only: All that sees the hand is worn on its arm: the rig frame goes with it.
+            wrist_device_only: All that sees the hand is worn on its arm: the rig frame goes with it.
         """
         if self._dial is None and not may_begin:
             self._maybe.clear()
@@ -89,13 +89,13 @@ class DialWatch:
         grips = self._dial is None and may_grip(seen, across_m, self._settings)
         if self._dial is None and not grips and not self._maybe:
             return []
-        tips = Tips.of(seen, self._settings.sigma_most_m, worn_only=worn_only)
+        tips = Tips.of(seen, self._settings.sigma_most_m, wrist_device_only=wrist_device_only)
         if self._dial is None:
             grips = grips and is_grip(seen, tips, self._settings)
             axis = self._held(seen.t_ns, tips, self._settings.hold_s, grips=grips)
             if axis is None:
                 return []
-            self._dial = Lasting(seen.hand, "dial", "dial", seen.t_ns)
+            self._dial = HeldGesture(seen.hand, "dial", "dial", seen.t_ns)
             self._angle = 0.0
             self._take(tips, axis)
             self._closed_ns = self._known_ns = seen.t_ns
@@ -140,7 +140,7 @@ class DialWatch:
 
     def _take(self, tips: Tips, axis: Float) -> None:
         """A grip closes."""
-        self._grip = _Grip(tips, axis, self._angle, Course(self._settings.quick_m), 0.0, axis)
+        self._grip = _Grip(tips, axis, self._angle, GripHistory(self._settings.quick_m), 0.0, axis)
         self._maybe.clear()
 
     def _again(self, tips: Tips) -> bool:
@@ -160,34 +160,34 @@ class DialWatch:
                 self._closed_ns = t_ns
             return
         wide = widened_m(tips, grip.tips)
-        loosened = grip.course.loosens
-        if grip.course.sound(t_ns, wide, own.loose_m):
-            self._turn(t_ns, tips, grip, wide)
-        elif (ahead := grip.course.ahead_rad(t_ns)) is not None:
+        loosened = grip.history.loosens
+        if grip.history.sound(t_ns, wide, own.loose_m):
+            self._rotate(t_ns, tips, grip, wide)
+        elif (ahead := grip.history.ahead_rad(t_ns)) is not None:
             self._angle = ahead
         if not abs(wide) > own.open_m:
             self._closed_ns = t_ns
         elif loosened:
             self._grip, self._before = None, grip.tips
 
-    def _turn(self, t_ns: int, tips: Tips, grip: _Grip, wide_m: float) -> None:
+    def _rotate(self, t_ns: int, tips: Tips, grip: _Grip, wide_m: float) -> None:
         """The angle of tips that turn the knob.
 
         Its axis is that of most weight: that of the tips' circle as sure as it is, that of the turn as sure as it is
         far. A turn r sways by `_SWAY_RAD` about other axes, so it tells its axis to `_SWAY_RAD` / |r|: the weights of
         the two directions go with one over the square. The angle is the twist about it (Dobrowolski, 2015).
         """
-        turn = turned_by(tips, grip.tips)
-        far = sqrt(turn @ turn)
+        rotation = rotation_between(tips, grip.tips)
+        far = sqrt(rotation @ rotation)
         if far > grip.farthest_rad:
             grip.farthest_rad = far
-            grip.axis = axis_of(grip.circle_axis, (_SWAY_RAD / _AXIS_RAD) ** 2, turn)
-        along = float(turn @ grip.axis) / max(far, 1e-12)
+            grip.axis = axis_of(grip.circle_axis, (_SWAY_RAD / _AXIS_RAD) ** 2, rotation)
+        along = float(rotation @ grip.axis) / max(far, 1e-12)
         twist = 2.0 * atan2(along * sin(0.5 * far), cos(0.5 * far)) + grip.base_rad
         self._angle = twist + 2.0 * pi * round((self._angle - twist) / (2.0 * pi))
-        grip.course.push(t_ns, wide_m, self._angle)
+        grip.history.push(t_ns, wide_m, self._angle)
 
-    def _tell(self, dial: Lasting, phase: Phase, seen: HandFeatures, tips: Tips) -> Gesture:
+    def _tell(self, dial: HeldGesture, phase: Phase, seen: HandFeatures, tips: Tips) -> Gesture:
         grip = self._grip
         origin = 0.5 * seen.tips_m[0] + 0.5 * seen.tips_m[1:].mean(axis=0)
         way = seen.palmar if grip is None else tips.T_still_rig.T @ grip.axis

@@ -133,7 +133,7 @@ class FeatureExtractor:
             hand=pose.hand,
             t_ns=pose.t_ns,
             known=np.empty(5, np.bool_),
-            seen=pose.tracked[TIPS] | ((pose.level > 0) & ~pose.ambiguous),
+            seen=pose.tracked[TIPS] | ((pose.solver_mode > 0) & ~pose.ambiguous),
             sigma_m=np.empty(5),
             shape_sigma_m=np.empty(5),
             bend_rad=np.empty((5, 3)),
@@ -229,10 +229,10 @@ def _measure(
         shape_sigma[f] = sqrt(max(sigma[f] * sigma[f] - wrist * wrist, 0.0))
         known[f] = valid[tip] and sigma[f] <= KNOWN_SIGMA_M
         tip_radius[f] = radius[tip]
-        skin = radius[last] + PAD_SHARE * (radius[tip] - radius[last])
+        surface = radius[last] + PAD_SHARE * (radius[tip] - radius[last])
         for i in range(3):
             along = joints[last, i] + PAD_SHARE * (joints[tip, i] - joints[last, i])
-            tips[f, i], pads[f, i] = joints[tip, i], along - skin * rotation[tip, i, 1]
+            tips[f, i], pads[f, i] = joints[tip, i], along - surface * rotation[tip, i, 1]
             cap, joint = 0.0, hand.cap_joint[f]
             for k in range(3):
                 cap += rotation[joint, i, k] * hand.cap_offset_m[f, k]

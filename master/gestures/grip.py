@@ -40,16 +40,16 @@ class Tips(NamedTuple):
     T_still_rig: Float
 
     @classmethod
-    def of(cls, seen: HandFeatures, sigma_most_m: float, *, worn_only: bool) -> "Tips":
+    def of(cls, seen: HandFeatures, sigma_most_m: float, *, wrist_device_only: bool) -> "Tips":
         """Those of a hand.
 
-        `worn_only`: all that sees it is worn on its arm, and the rig frame goes with it.
+        `wrist_device_only`: all that sees it is worn on its arm, and the rig frame goes with it.
         """
-        turn = _EYE
-        if worn_only and not np.isnan(seen.palm_world_wxyz).any():
-            turn = quaternion_to_matrix(seen.palm_world_wxyz) @ seen.T_rig_palm[:3, :3].T
-        place = seen.caps_m if turn is _EYE else seen.caps_m @ turn.T
-        return cls(place, seen.sigma_m, seen.sigma_m <= sigma_most_m, turn @ seen.palmar, turn)
+        rotation = _EYE
+        if wrist_device_only and not np.isnan(seen.palm_world_wxyz).any():
+            rotation = quaternion_to_matrix(seen.palm_world_wxyz) @ seen.T_rig_palm[:3, :3].T
+        place = seen.caps_m if rotation is _EYE else seen.caps_m @ rotation.T
+        return cls(place, seen.sigma_m, seen.sigma_m <= sigma_most_m, rotation @ seen.palmar, rotation)
 
     def axis(self) -> Float | None:
         """Axis (3,) of the circle of the known tips, out of the palm.
@@ -193,16 +193,16 @@ def _along(place: Float, f: int, centre: Float, ways: Float, k: int) -> float:
     return total
 
 
-def turned_by(now: Tips, then: Tips) -> Float:
+def rotation_between(now: Tips, then: Tips) -> Float:
     """Rotation vector (3,) [rad] of the tips as one since `then`.
 
     Surer ones count more.
     """
-    return _turned(now.place_m, now.sigma_m, then.place_m, then.sigma_m)
+    return _rotation_between(now.place_m, now.sigma_m, then.place_m, then.sigma_m)
 
 
 @kernel
-def _turned(place: Float, sigma: Float, before: Float, sigma_before: Float) -> Float:
+def _rotation_between(place: Float, sigma: Float, before: Float, sigma_before: Float) -> Float:
     """Return the rotation vector (3,) from `before` to `place` (Horn, 1987)."""
     weight, total = np.empty(5), 0.0
     middle, middle_before = np.zeros(3), np.zeros(3)
@@ -241,7 +241,7 @@ def _turned(place: Float, sigma: Float, before: Float, sigma_before: Float) -> F
 
 
 @kernel
-def axis_of(prior: Float, weight: float, turn: Float) -> Float:
+def axis_of(prior: Float, weight: float, rotation: Float) -> Float:
     """Return the axis (3,) of most weight of a unit vector and a turn.
 
     The turn is a rotation vector (3,).
@@ -251,7 +251,7 @@ def axis_of(prior: Float, weight: float, turn: Float) -> Float:
     both, ways = np.empty((3, 3)), np.empty((3, 3))
     for i in range(3):
         for k in range(3):
-            both[i, k] = weight * prior[i] * prior[k] + turn[i] * turn[k]
+            both[i, k] = weight * prior[i] * prior[k] + rotation[i] * rotation[k]
     diagonalise(both, ways)
     best = 0
     for k in range(1, 3):
@@ -325,9 +325,9 @@ def _spread(place: Float, known: Bool, before: Float, known_before: Bool) -> flo
 
 def rehearse(seen: HandFeatures) -> None:
     """Call the kernels once, so that none is compiled while a hand is about a knob."""
-    tips = Tips.of(seen, inf, worn_only=False)
+    tips = Tips.of(seen, inf, wrist_device_only=False)
     is_grip(seen, tips, DialSettings())
-    axis_of(tips.palmar, 1.0, turned_by(tips, tips))
+    axis_of(tips.palmar, 1.0, rotation_between(tips, tips))
     spread_m(tips, tips)
     widened_m(tips, tips)
     tips.axis()

@@ -14,16 +14,16 @@ from common.gesture_actions import PinchSettings
 from common.hand_model import FINGERS
 from common.messages import Gesture, Phase
 from master.gestures.features import HandFeatures
-from master.gestures.lasting import Lasting, below
+from master.gestures.held_gesture import HeldGesture, below
 from master.gestures.touch import ThumbTouch
 
 
-class PinchWatch:
+class PinchMonitor:
     """Push machine. Holds the pinch that has begun, and when its gap was known last, and how wide it was."""
 
     def __init__(self, settings: PinchSettings) -> None:
         self._settings = settings
-        self._pinch: Lasting | None = None
+        self._pinch: HeldGesture | None = None
         self._finger, self._known_ns, self._gap_m = 0, 0, 0.0
         self._last: Gesture | None = None
 
@@ -40,7 +40,7 @@ class PinchWatch:
                 return []
             self._finger, self._known_ns = finger, seen.t_ns
             self._gap_m = float(touch.gap_m[finger])
-            self._pinch = Lasting(seen.hand, "pinch", FINGERS[finger + 1], seen.t_ns)
+            self._pinch = HeldGesture(seen.hand, "pinch", FINGERS[finger + 1], seen.t_ns)
             return [self._tell(self._pinch, "begin", seen, touch)]
         if self._known(touch, self._finger):
             self._known_ns, self._gap_m = seen.t_ns, float(touch.gap_m[self._finger])
@@ -74,15 +74,15 @@ class PinchWatch:
         clear_m = min(gaps[k] for k in others) - gap
         if clear_m >= own.away_m:
             return finger
-        turned_rad = float(touch.apart_rad[finger] + touch.apart_sigma_rad[finger])
-        if clear_m < own.clear_m or turned_rad > own.apart_rad:
+        opening_rad = float(touch.apart_rad[finger] + touch.apart_sigma_rad[finger])
+        if clear_m < own.clear_m or opening_rad > own.apart_rad:
             return None
         return finger if min(float(seen.curl[1 + k]) for k in others) < own.fist_curl else None
 
     def _known(self, touch: ThumbTouch, finger: int) -> bool:
         return bool(touch.key_sigma_m[finger, 2] <= self._settings.sigma_most_m)
 
-    def _tell(self, pinch: Lasting, phase: Phase, seen: HandFeatures, touch: ThumbTouch) -> Gesture:
+    def _tell(self, pinch: HeldGesture, phase: Phase, seen: HandFeatures, touch: ThumbTouch) -> Gesture:
         own, gap = self._settings, self._gap_m
         sigma = float(touch.key_sigma_m[self._finger, 2])
         strength = (own.open_gap_m - gap) / (own.open_gap_m - own.closed_gap_m)

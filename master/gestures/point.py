@@ -25,19 +25,19 @@ from common.kernels import kernel
 from common.messages import Gesture, Phase
 from master.estimator.matrices import spread
 from master.gestures.features import HandFeatures
-from master.gestures.lasting import Lasting
+from master.gestures.held_gesture import HeldGesture
 
-_LASTING = 1.5  # the doubt of a ray that is told already may be larger by this
+_HELD = 1.5  # the doubt of a ray that is told already may be larger by this
 _KNUCKLE, _TIP = int(CHAINS[1, 0]), int(CHAINS[1, 3])
 
 
-class PointWatch:
+class PointMonitor:
     """Push machine. Holds the pointing that has begun, since when its shape is there or was lost, and if the ray was
     sure."""
 
     def __init__(self, settings: PointSettings) -> None:
         self._settings = settings
-        self._point: Lasting | None = None
+        self._point: HeldGesture | None = None
         self._since_ns: int | None = None  # of the shape before it begins; of its loss after
         self._sure = False  # whether the ray was
         self._last: Gesture | None = None
@@ -51,7 +51,7 @@ class PointWatch:
         """What is to be told at the instant of the features; it begins only where it may."""
         own, point = self._settings, self._point
         shape, before = self._shape(seen), self._sure
-        most_rad = own.ray_sigma_rad * (1.0 if point is None else _LASTING)
+        most_rad = own.ray_sigma_rad * (1.0 if point is None else _HELD)
         self._sure = _ray_sigma_rad(seen.joints_m, seen.joints_cov_m2) <= most_rad
         if point is None:
             if not (shape and may_begin):
@@ -61,7 +61,7 @@ class PointWatch:
                 self._since_ns = seen.t_ns
             if (seen.t_ns - self._since_ns) * 1e-9 < own.hold_s or not (self._sure and before):
                 return []
-            self._point, self._since_ns = Lasting(seen.hand, "point", "point", self._since_ns), None
+            self._point, self._since_ns = HeldGesture(seen.hand, "point", "point", self._since_ns), None
             return [self._tell(self._point, "begin", seen)]
         if shape and self._sure:
             self._since_ns = None
@@ -101,7 +101,7 @@ class PointWatch:
         )
         return bent and (index <= own.stretched_rad + slack or not known[1])
 
-    def _tell(self, point: Lasting, phase: Phase, seen: HandFeatures) -> Gesture:
+    def _tell(self, point: HeldGesture, phase: Phase, seen: HandFeatures) -> Gesture:
         tip = seen.joints_m[_TIP]
         way = tip - seen.joints_m[_KNUCKLE]
         if not self._sure and self._last is not None:

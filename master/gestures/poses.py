@@ -238,18 +238,18 @@ class PoseRecogniser:
             self._coming, self._coming_ns = best, t_ns
         lasted_s = 1e-9 * (t_ns - self._coming_ns)
         enough = known >= _ENOUGH
-        rests = (
+        at_rest = (
             lasted_s >= (self._hold.begin_s if enough else self._hold.doubt_s)
             and speed <= self._hold.still_deg_s
         )
-        return best if rests or lasted_s >= self._hold.slow_s else None
+        return best if at_rest or lasted_s >= self._hold.slow_s else None
 
     def _begin(self, features: HandFeatures, pose: int, confidence: float) -> list[Gesture]:
         t_ns = features.t_ns
-        out = [] if self._held is None else [self._said(features.hand, t_ns, "end", 0.0)]
+        out = [] if self._held is None else [self._message(features.hand, t_ns, "end", 0.0)]
         self._held, self._began_ns, self._seen_ns, self._confidence = pose, t_ns, t_ns, confidence
         self._going_ns = None
-        return [*out, self._said(features.hand, t_ns, "begin", confidence)]
+        return [*out, self._message(features.hand, t_ns, "begin", confidence)]
 
     def _go_on(self, features: HandFeatures, fit: Fit) -> list[Gesture]:
         held, hand, t_ns = self._held, features.hand, features.t_ns
@@ -258,7 +258,7 @@ class PoseRecogniser:
         confidence, enough = float(fit.confidence[held]), bool(fit.known[held])
         if enough and confidence >= self._hold.end:
             self._going_ns, self._seen_ns, self._confidence = None, t_ns, confidence
-            return [self._said(hand, t_ns, "update", confidence)]
+            return [self._message(hand, t_ns, "update", confidence)]
         # Fingers that hide speak neither for nor against it, and other poses begin where they are told.
         if fit.score[held] >= self._hold.end:
             self._going_ns = None
@@ -267,21 +267,21 @@ class PoseRecogniser:
             self._going_ns = t_ns
         if t_ns - self._going_ns >= 1e9 * self._hold.end_s:
             return self._end(hand, t_ns)
-        return [self._said(hand, t_ns, "update", confidence)]
+        return [self._message(hand, t_ns, "update", confidence)]
 
     def _unsure(self, hand: str, t_ns: int, longest_s: float) -> list[Gesture]:
         """The held pose goes on for a while, ever less sure."""
         left = 1.0 - 1e-9 * (t_ns - self._seen_ns) / max(longest_s, 1e-9)
         if left <= 0.0:
             return self._end(hand, t_ns)
-        return [self._said(hand, t_ns, "update", min(left, 1.0) * self._confidence)]
+        return [self._message(hand, t_ns, "update", min(left, 1.0) * self._confidence)]
 
     def _end(self, hand: str, t_ns: int) -> list[Gesture]:
-        out = [self._said(hand, t_ns, "end", 0.0)]
+        out = [self._message(hand, t_ns, "end", 0.0)]
         self._held, self._going_ns = None, None
         return out
 
-    def _said(self, hand: str, t_ns: int, phase: Phase, confidence: float) -> Gesture:
+    def _message(self, hand: str, t_ns: int, phase: Phase, confidence: float) -> Gesture:
         assert self._held is not None
         name = self._table.names[self._held]
         return Gesture(

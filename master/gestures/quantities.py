@@ -72,12 +72,12 @@ def _write(
     sigma: Float,
 ) -> None:
     """Write values and standard deviations (Q,); arguments as of `HandFeatures`."""
-    turned = np.empty(5)
+    sigma_deg = np.empty(5)
     for f in range(5):
         lever = _length(joints, CHAINS[f, 1], CHAINS[f, 2]) + _length(joints, CHAINS[f, 2], CHAINS[f, 3])
-        turned[f] = degrees(doubt[f] / lever)
+        sigma_deg[f] = degrees(doubt[f] / lever)
     size = _length(joints, _FROM, _TO)
-    value[_THUMB_BEND], sigma[_THUMB_BEND] = degrees(bend[0, 1] + bend[0, 2]), turned[0]
+    value[_THUMB_BEND], sigma[_THUMB_BEND] = degrees(bend[0, 1] + bend[0, 2]), sigma_deg[0]
     for i in range(3):
         place = 0.0
         for k in range(3):
@@ -86,7 +86,7 @@ def _write(
         sigma[_THUMB_PLACE + i] = doubt[0] / size
     others, others_2, every, doubts = 0.0, 0.0, 0.0, 0.0
     for f in range(1, 5):
-        weight, turned[f] = _hidden(turned[f], seen[f])
+        weight, sigma_deg[f] = _hidden(sigma_deg[f], seen[f])
         both, column = 0.0, 3 * (f - 1)
         for k in range(2):
             own = degrees(bend[f, k])
@@ -94,25 +94,25 @@ def _write(
             both += value[column + k]
         value[column + 2] = both
         for k in range(3):
-            sigma[column + k] = turned[f]
+            sigma[column + k] = sigma_deg[f]
         off = sqrt(
             (tips[f, 0] - tips[0, 0]) ** 2 + (tips[f, 1] - tips[0, 1]) ** 2 + (tips[f, 2] - tips[0, 2]) ** 2
         )
         value[_GAPS + f - 1] = 1e3 * (off - radius[f] - radius[0])
         sigma[_GAPS + f - 1] = 1e3 * hypot(doubt[f], doubt[0])
         every += both / 4.0
-        doubts += turned[f] / 4.0  # neighbours are wrong alike
+        doubts += sigma_deg[f] / 4.0  # neighbours are wrong alike
         if f > 1:
             others += both / 3.0
-            others_2 += turned[f] * turned[f]
-    value[_AHEAD], sigma[_AHEAD] = value[2] - others, hypot(turned[1], sqrt(others_2) / 3.0)
+            others_2 += sigma_deg[f] * sigma_deg[f]
+    value[_AHEAD], sigma[_AHEAD] = value[2] - others, hypot(sigma_deg[1], sqrt(others_2) / 3.0)
     value[_ALL], sigma[_ALL] = every, doubts
     before = 0.0
     for f in range(1, 5):
         heading = _heading(f, joints, T, side)
         if f > 1:
             value[_SPREADS + f - 2] = before - heading
-            sigma[_SPREADS + f - 2] = hypot(turned[f - 1], turned[f])
+            sigma[_SPREADS + f - 2] = hypot(sigma_deg[f - 1], sigma_deg[f])
         before = heading
 
 

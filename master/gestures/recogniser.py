@@ -7,7 +7,7 @@ from common.gesture_settings import GestureSettings
 from common.hand_model import HandModel
 from common.messages import JOINT_COUNT, Gesture, HandPose, Source
 from master.fabrik.compile import log_if_slow
-from master.gestures.action import ActionWatch
+from master.gestures.action import ActionMonitor
 from master.gestures.features import FeatureExtractor
 from master.gestures.grip import rehearse
 from master.gestures.poses import PoseRecogniser
@@ -18,7 +18,7 @@ class GestureRecogniser:
 
     def __init__(self, settings: GestureSettings, model: HandModel) -> None:
         self._features, self._poses = FeatureExtractor(model), PoseRecogniser(settings)
-        self._actions = ActionWatch(settings, model.radius_m)
+        self._actions = ActionMonitor(settings, model.radius_m)
         with log_if_slow():
             self._rehearse(settings, model)
 
@@ -27,7 +27,7 @@ class GestureRecogniser:
         seen = self._features.of(_at_rest(model))
         assert seen is not None
         PoseRecogniser(settings).push(seen)
-        ActionWatch(settings, model.radius_m).push(seen)
+        ActionMonitor(settings, model.radius_m).push(seen)
         rehearse(seen)
 
     def push(self, pose: HandPose) -> list[Gesture]:
@@ -38,7 +38,7 @@ class GestureRecogniser:
         seen = self._features.of(pose)
         if seen is None:
             return self._poses.lose(pose.hand, pose.t_ns) + self._actions.lost(pose.t_ns)
-        return self._poses.push(seen) + self._actions.push(seen, worn_only=len(pose.markers_m) == 0)
+        return self._poses.push(seen) + self._actions.push(seen, wrist_device_only=len(pose.markers_m) == 0)
 
 
 def _at_rest(model: HandModel) -> HandPose:

@@ -23,7 +23,7 @@ from common.hand_model import CHAINS, TIPS
 from common.messages import Gesture
 from master.estimator.matrices import spread
 from master.gestures.features import HandFeatures
-from master.gestures.lasting import Lasting, below
+from master.gestures.held_gesture import HeldGesture, below
 from master.gestures.touch import ThumbTouch
 
 KEYS = (("3", "2", "1"), ("6", "5", "4"), ("9", "8", "7"), ("hash", "0", "star"))
@@ -34,7 +34,7 @@ _DOWN_M = 0.001  # a thumb whose gap is larger than the least by less is down
 _NEVER_NS = -(2**61)
 
 
-class _Instant(NamedTuple):
+class _Epoch(NamedTuple):
     """The thumb at an instant of a touch.
 
     Attributes:
@@ -58,10 +58,10 @@ class _Touch:
     began_ns: int
     bend_rad: float
     least_m: float
-    instants: list[_Instant]
+    epochs: list[_Epoch]
 
 
-class TapWatch:
+class ThumbTapMonitor:
     """Push machine. Holds the touch that goes on, when the thumb was clear of all keys last, and of the last tap."""
 
     def __init__(self, settings: TapSettings) -> None:
@@ -86,7 +86,7 @@ class TapWatch:
         sigma = float(touch.key_sigma_m[finger, segment])
         # Of the finger its PIP must be known, too, along its worst axis.
         known = sigma <= own.sigma_most_m and _worst_m(seen, CHAINS[finger + 1, 1]) <= own.place_sigma_m
-        now = _Instant(gaps, sigma, float(seen.sigma_m[0]), seen.joints_m)
+        now = _Epoch(gaps, sigma, float(seen.sigma_m[0]), seen.joints_m)
         if self._touch is not None:
             return self._go_on(self._touch, seen, now, known=known)
         if not known:
@@ -102,7 +102,7 @@ class TapWatch:
         """Forget the touch: the hand is gone, or does something else."""
         self._touch, self._clear_ns = None, _NEVER_NS
 
-    def _go_on(self, going: _Touch, seen: HandFeatures, now: _Instant, *, known: bool) -> list[Gesture]:
+    def _go_on(self, going: _Touch, seen: HandFeatures, now: _Epoch, *, known: bool) -> list[Gesture]:
         """A touch goes on, ends as a tap, or was none."""
         own, gap = self._settings, min(now.gap_m)
         lasted = (seen.t_ns - going.began_ns) * 1e-9
@@ -112,7 +112,7 @@ class TapWatch:
             return []
         if not known:
             return []
-        going.instants.append(now)
+        going.epochs.append(now)
         going.least_m = min(going.least_m, gap)
         if gap < min(own.leave_gap_m, max(going.least_m + own.rise_m, own.touch_gap_m)):
             return []
@@ -128,23 +128,23 @@ class TapWatch:
 
     def _tapped(self, gone: _Touch, seen: HandFeatures) -> list[Gesture]:
         """The tap of a touch that is over; nothing where two fingers may have been touched."""
-        least = [min(one.gap_m) for one in gone.instants]
+        least = [min(one.gap_m) for one in gone.epochs]
         down = next(k for k, gap in enumerate(least) if gap <= gone.least_m + _DOWN_M)
-        course, nearest = gone.instants[down:], gone.instants[int(np.argmin(least))]
-        weight = np.array([1.0 / max(one.thumb_sigma_m, 1e-4) ** 2 for one in course])
+        flight, nearest = gone.epochs[down:], gone.epochs[int(np.argmin(least))]
+        weight = np.array([1.0 / max(one.thumb_sigma_m, 1e-4) ** 2 for one in flight])
         weight = weight / weight.sum()
-        gap = weight @ np.array([one.gap_m for one in course])
+        gap = weight @ np.array([one.gap_m for one in flight])
         finger = int(gap.argmin())
         nearer_m = float(np.delete(gap, finger).min() - gap[finger])
         if nearer_m < self._settings.nearer_m:
             return []
-        beyond = weight @ _beyond_m(np.array([one.joints_m for one in course]), finger)
+        beyond = weight @ _beyond_m(np.array([one.joints_m for one in flight]), finger)
         segment = 2 if beyond[1] > 0.0 else int(beyond[0] > 0.0)
         sigma = nearest.sigma_m
         sure = below(gone.least_m, self._settings.leave_gap_m, sigma) * below(0.0, nearer_m, sigma)
         sure *= below(0.0, float(np.abs(beyond).min()), sigma)
         self._tapped_ns = seen.t_ns
-        tap = Lasting(seen.hand, "tap", KEYS[finger][segment], gone.began_ns)
+        tap = HeldGesture(seen.hand, "tap", KEYS[finger][segment], gone.began_ns)
         ends = CHAINS[finger + 1, segment : segment + 2]
         middle = 0.5 * (nearest.joints_m[ends].mean(axis=0) + nearest.joints_m[TIPS[0]])
         return [tap.told("end", seen.t_ns, sure, distance_m=gone.least_m, origin_m=middle)]

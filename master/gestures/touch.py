@@ -7,9 +7,9 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from common.arrays import Float
+from common.capsule_gaps import ROUNDS, foot_of, nearest
 from common.hand_model import CHAINS
 from common.kernels import constant, inner, kernel
-from common.skin_gaps import ROUNDS, foot_of, nearest
 from master.estimator.matrices import spread
 from master.fabrik.rotations import Vector, cross, dot, length, minus
 from master.gestures.features import PAD_SHARE, HandFeatures
@@ -67,7 +67,7 @@ def _write(joints: Float, cov: Float, pads: Float, radius: Float, out: ThumbTouc
     """Write a touch; arguments as of `HandFeatures`."""
     thumb, tip = CHAINS[0, 2], CHAINS[0, 3]
     thumb_side = _palmar(_THUMB, _SIDE, joints, pads)
-    thumb_turned = _turned_rad(_THUMB, joints, cov)
+    thumb_sigma_rad = _direction_sigma_rad(_THUMB, joints, cov)
     for k in range(4):
         for s in range(3):
             a, b = CHAINS[k + 1, s], CHAINS[k + 1, s + 1]
@@ -88,7 +88,7 @@ def _write(joints: Float, cov: Float, pads: Float, radius: Float, out: ThumbTouc
                     out.middle_m[k, i] = start[i] + (radius_a + 0.5 * out.gap_m[k]) * way[i]
                 face = min(dot(way, thumb_side), -dot(way, side))
                 out.apart_rad[k] = acos(min(max(face, -1.0), 1.0))
-        out.apart_sigma_rad[k] = hypot(thumb_turned, _turned_rad(k + 1, joints, cov))
+        out.apart_sigma_rad[k] = hypot(thumb_sigma_rad, _direction_sigma_rad(k + 1, joints, cov))
 
 
 @inner
@@ -105,7 +105,7 @@ def _on(joints: Float, a: int, b: int, share: float) -> Vector:
 
 @inner
 def _shares(joints: Float, radius: Float, a: int, a_end: int, b: int, b_end: int) -> tuple[float, float]:
-    """Return where along two segments their skins are nearest, as `common.skin_gaps`."""
+    """Return where along two segments their skins are nearest, as `common.capsule_gaps`."""
     u, v = minus(_at(joints, a_end), _at(joints, a)), minus(_at(joints, b_end), _at(joints, b))
     apart = minus(_at(joints, b), _at(joints, a))
     uu, vv, uv, au, bv, square = (
@@ -129,7 +129,7 @@ def _shares(joints: Float, radius: Float, a: int, a_end: int, b: int, b_end: int
 
 
 @kernel
-def _turned_rad(f: int, joints: Float, cov: Float) -> float:
+def _direction_sigma_rad(f: int, joints: Float, cov: Float) -> float:
     """Return the standard deviation [rad] of the direction of a last bone.
 
     That of its ends, over its length.

@@ -37,7 +37,7 @@ class Alignment:
         rotation_sigma_deg, shift_sigma_m, offset_sigma_s: Standard deviations; of the shift amid the points.
         residual_m: Median distance that is left.
         correlation: Of the speeds; NaN where nothing was fitted.
-        rival_s: Another offset is nearly as likely, this much later; NaN: none.
+        alternative_s: Another offset is nearly as likely, this much later; NaN: none.
         mirrored: Their axes are left-handed, or it is the other hand.
     """
 
@@ -48,7 +48,7 @@ class Alignment:
     offset_sigma_s: float = 0.0
     residual_m: float = float("nan")
     correlation: float = float("nan")
-    rival_s: float = float("nan")
+    alternative_s: float = float("nan")
     mirrored: bool = False
 
     def moved(self, track: Track) -> Track:
@@ -63,7 +63,7 @@ def align(ours: Track, theirs: Track) -> Alignment:
     Raises:
         FitError: They do not move alike, share too little, or all points lie on a line.
     """
-    offset_ns, correlation, rival_s = clock_offset(ours, theirs)
+    offset_ns, correlation, alternative_s = clock_offset(ours, theirs)
     rows = _rows(ours)
     target = ours.position_m[rows]
     start = [_registered(theirs.at(ours.t_ns[rows] - offset_ns), target, mirror) for mirror in (False, True)]
@@ -80,7 +80,7 @@ def align(ours: Track, theirs: Track) -> Alignment:
         offset_sigma_s=float(sigma[6]),
         residual_m=fit.residual_m,
         correlation=correlation,
-        rival_s=rival_s,
+        alternative_s=alternative_s,
         mirrored=mirrored,
     )
 
@@ -164,8 +164,8 @@ class _Fit:
             middle = found[both].mean(axis=0)
             fit._normal(found, target, speed, both, part, middle)
             step = _solved(fit.normal.sum(axis=0), fit.gradient.sum(axis=0))
-            turned = rotation_vector_to_matrix(step[:3])
-            fit.T = rigid(turned, middle - turned @ middle + step[3:6]) @ fit.T
+            rotated = rotation_vector_to_matrix(step[:3])
+            fit.T = rigid(rotated, middle - rotated @ middle + step[3:6]) @ fit.T
             fit.offset_ns += float(np.clip(1e9 * step[6], -5e7, 5e7))
             if np.abs(step[:3]).max() < 1e-7 and np.abs(step[3:6]).max() < 1e-7 and abs(step[6]) < 1e-6:
                 break

@@ -124,19 +124,19 @@ def _positions(joints: list[_Joint], values: Float) -> Float:
     position, rotation = np.zeros((count, len(joints), 3)), np.zeros((count, len(joints), 3, 3))
     column = 0
     for k, joint in enumerate(joints):
-        offset, turned = np.tile(joint.offset, (count, 1)), np.tile(np.eye(3), (count, 1, 1))
+        offset, rotations = np.tile(joint.offset, (count, 1)), np.tile(np.eye(3), (count, 1, 1))
         for channel in joint.channels:
             if channel < 3:
                 offset[:, channel] = values[:, column]
             else:
-                turned = turned @ _about(channel - 3, np.radians(values[:, column]))
+                rotations = rotations @ _about(channel - 3, np.radians(values[:, column]))
             column += 1
         if joint.parent < 0:
-            position[:, k], rotation[:, k] = offset, turned
+            position[:, k], rotation[:, k] = offset, rotations
             continue
         above = rotation[:, joint.parent]
         position[:, k] = position[:, joint.parent] + (above @ offset[:, :, None])[:, :, 0]
-        rotation[:, k] = above @ turned
+        rotation[:, k] = above @ rotations
     return position
 
 

@@ -176,7 +176,7 @@ def _joint(finger: int, part: int) -> str | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Chosen:
+class MatchedNames:
     """The points of one hand.
 
     Attributes:
@@ -194,7 +194,7 @@ def choose_names(
     where: str,
     given: Mapping[str, str | None],
     side: Side | None,
-) -> Chosen:
+) -> MatchedNames:
     """Which name of a file is which point of one hand.
 
     Args:
@@ -232,7 +232,7 @@ def choose_names(
                 f' a JSON file such as {{"{point}": "{meant[-1]}"}}'
             )
         out[point] = meant[0]
-    return Chosen(own, {point: out[point] for point in POINTS if point in out})
+    return MatchedNames(own, {point: out[point] for point in POINTS if point in out})
 
 
 def shown(names: Iterable[str]) -> str:

@@ -47,15 +47,15 @@ def read_motion(path: Path, reading: Reading | None = None) -> JointMotion:
     reading = reading or Reading()
     table = _table(path, reading.rate_hz)
     given = _given(reading.joints)
-    chosen = choose_names(table.names, table.ends, str(path), given, reading.side)
-    if not chosen.names:
+    matched = choose_names(table.names, table.ends, str(path), given, reading.side)
+    if not matched.names:
         raise RecordingError(
             f"{path}: no name in it is that of a joint of a hand; it has {shown(table.names)}. Say which is which with"
             f' --joints, a JSON file of pairs such as {{"index-finger-tip": "NAME"}}; ours are {", ".join(POINTS)}'
         )
     t_ns = checked_times(table.t_s, str(path))
-    columns = [table.names.index(name) for name in chosen.names.values()]
-    names, position = tuple(chosen.names), table.position[:, columns]
+    columns = [table.names.index(name) for name in matched.names.values()]
+    names, position = tuple(matched.names), table.position[:, columns]
     unit, remarks = reading.unit or table.unit, list[str]()
     if unit is None:
         unit, palm_m = unit_by_size(names, position, path)
@@ -63,10 +63,10 @@ def read_motion(path: Path, reading: Reading | None = None) -> JointMotion:
             f"{path.name} does not say its unit of length: with {unit} there are {1e3 * palm_m:.0f} mm from wrist to"
             " middle knuckle"
         )
-    left_out = [name for name in table.names if name not in chosen.names.values()]
-    if left_out:
-        remarks.append(f"not of this hand, or of no name that is known: {shown(left_out)}")
-    return JointMotion(t_ns, names, METRES[unit] * position, chosen.side, str(path), tuple(remarks))
+    rejected = [name for name in table.names if name not in matched.names.values()]
+    if rejected:
+        remarks.append(f"not of this hand, or of no name that is known: {shown(rejected)}")
+    return JointMotion(t_ns, names, METRES[unit] * position, matched.side, str(path), tuple(remarks))
 
 
 def require(motion: JointMotion, needed: tuple[str, ...], what: str) -> None:

@@ -23,10 +23,11 @@ _COLUMNS = (
 
 def alignment_lines(alignment: Alignment) -> list[str]:
     """How frame and clock were brought together."""
-    turn, shift = _turn_deg(alignment), alignment.T_rig_file[:3, 3]
+    rotation, shift = _rotation_deg(alignment), alignment.T_rig_file[:3, 3]
     fitted = (
         f"clock {1e-9 * alignment.offset_ns:+.4f} s ± {1e3 * alignment.offset_sigma_s:.1f} ms (speeds correlate by"
-        f" {alignment.correlation:.2f}); frame turned by {turn:.1f}° ± {alignment.rotation_sigma_deg:.2f}°, moved by"
+        f" {alignment.correlation:.2f});"
+        f" frame turned by {rotation:.1f}° ± {alignment.rotation_sigma_deg:.2f}°, moved by"
         f" {1e3 * np.linalg.norm(shift):.0f} mm ± {1e3 * alignment.shift_sigma_m:.1f} mm;"
         f" {1e3 * alignment.residual_m:.1f} mm left in the median"
     )
@@ -39,9 +40,9 @@ def alignment_lines(alignment: Alignment) -> list[str]:
             "the file's hand is the mirror image of ours and was turned over: left-handed axes (Unity, Unreal), or the"
             " other hand"
         )
-    if np.isfinite(alignment.rival_s):
+    if np.isfinite(alignment.alternative_s):
         lines.append(
-            f"an offset {alignment.rival_s:+.2f} s from there fits nearly as well: a movement that repeats;"
+            f"an offset {alignment.alternative_s:+.2f} s from there fits nearly as well: a movement that repeats;"
             " make one that does not"
         )
     return lines
@@ -71,23 +72,23 @@ def alignment_json(alignment: Alignment | None) -> dict[str, object]:
     """The same for programs; None: frame and clock were said to be ours."""
     if alignment is None:
         return {"aligned": True}
-    rival = alignment.rival_s
+    alternative = alignment.alternative_s
     return {
         "aligned": False,
         "T_rig_file": [[round(float(value), 9) for value in row] for row in alignment.T_rig_file],
         "offset_ns": alignment.offset_ns,
         "offset_sigma_ms": 1e3 * alignment.offset_sigma_s,
-        "rotation_deg": _turn_deg(alignment),
+        "rotation_deg": _rotation_deg(alignment),
         "rotation_sigma_deg": alignment.rotation_sigma_deg,
         "shift_sigma_mm": 1e3 * alignment.shift_sigma_m,
         "residual_mm": 1e3 * alignment.residual_m,
         "speed_correlation": alignment.correlation,
-        "rival_offset_s": rival if np.isfinite(rival) else None,
+        "rival_offset_s": alternative if np.isfinite(alternative) else None,
         "mirrored": alignment.mirrored,
     }
 
 
-def _turn_deg(alignment: Alignment) -> float:
+def _rotation_deg(alignment: Alignment) -> float:
     linear = alignment.T_rig_file[:3, :3]
     linear = linear @ np.diag([1.0, 1.0, -1.0]) if alignment.mirrored else linear
     return float(np.degrees(np.linalg.norm(matrix_to_rotation_vector(linear))))

@@ -16,7 +16,7 @@ HALF_NS = 20_000_000
 _STEP_NS = 10_000_000
 _LEAST_S = 2.0  # that both must show together
 _CORRELATED = 0.5
-_RIVAL, _APART_NS = 0.9, 500_000_000  # a second peak that counts
+_ALTERNATIVE, _APART_NS = 0.9, 500_000_000  # a second peak that counts
 _MOST_STEPS = 400_000  # 67 minutes
 
 
@@ -41,14 +41,16 @@ def clock_offset(ours: Track, theirs: Track) -> tuple[int, float, float]:
     inner = score[best - 1 : best + 2]
     shift = 0.0
     if 0 < best < len(score) - 1 and np.isfinite(inner).all():
-        bend = inner[0] - 2.0 * inner[1] + inner[2]
-        shift = 0.5 * (inner[0] - inner[2]) / bend if bend < 0.0 else 0.0
+        curvature = inner[0] - 2.0 * inner[1] + inner[2]
+        shift = 0.5 * (inner[0] - inner[2]) / curvature if curvature < 0.0 else 0.0
     lags = np.arange(len(score)) - best
     far = np.where(np.abs(lags) * _STEP_NS > _APART_NS, score, -1.0)
     second = int(np.argmax(far))
-    rival_s = (second - best) * _STEP_NS * 1e-9 if far[second] > _RIVAL * score[best] else float("nan")
+    alternative_s = (
+        (second - best) * _STEP_NS * 1e-9 if far[second] > _ALTERNATIVE * score[best] else float("nan")
+    )
     lag = best + shift - (len(b) - 1)
-    return round(first_a - first_b + lag * _STEP_NS), float(score[best]), rival_s
+    return round(first_a - first_b + lag * _STEP_NS), float(score[best]), alternative_s
 
 
 def _speeds(track: Track) -> tuple[Float, int]:

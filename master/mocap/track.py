@@ -30,8 +30,8 @@ class Track:
     @property
     def gap_ns(self) -> int:
         """Frames that are farther apart have nothing between them."""
-        usual = float(np.median(np.diff(self.t_ns))) if len(self.t_ns) > 1 else 0.0
-        return int(min(max(_GAP_NS, _GAP_FRAMES * usual), _MOST_GAP_NS))
+        typical = float(np.median(np.diff(self.t_ns))) if len(self.t_ns) > 1 else 0.0
+        return int(min(max(_GAP_NS, _GAP_FRAMES * typical), _MOST_GAP_NS))
 
     def at(self, t_ns: Int) -> Float:
         """Positions (N, J, 3) [m] at instants (N,), between two frames linearly.

@@ -152,8 +152,8 @@ class ResidualTiming:
             return Track(np.empty((0, 0)), np.empty((0, 0, 2)))
         uv = np.array([frame.uv for frame in frames])
         for k, frame in enumerate(frames):
-            if frame.has_rivals:
-                uv[k, np.isfinite(frame.rival_uv[:, 0])] = np.nan
+            if frame.has_alternatives:
+                uv[k, np.isfinite(frame.alt_uv[:, 0])] = np.nan
         rows = np.where(np.isnan(uv[..., 1]), 0.5 * (model.height_px - 1), uv[..., 1])
         t_s = np.array([(frame.t_ns - begin_ns) * 1e-9 for frame in frames])[:, None]
         return Track(t_s + 1e-9 * model.row_time_ns * rows, model.undistort(uv))

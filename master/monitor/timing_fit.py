@@ -95,8 +95,8 @@ def _plausible(evidence: Evidence, floor: Float) -> Bool:
     good = np.isfinite(evidence.value + evidence.rate + evidence.instrument + evidence.place.sum(axis=-1))
     value = np.where(good, evidence.value, np.nan)
     padded = np.pad(value, ((2, 2), (0, 0)), constant_values=np.nan)
-    course = _median(np.stack([padded[i : i + len(value)] for i in range(5)]))
-    jump = np.abs(value - course)
+    smoothed = _median(np.stack([padded[i : i + len(value)] for i in range(5)]))
+    jump = np.abs(value - smoothed)
     unlike = np.abs(np.where(good, evidence.rate - evidence.instrument, np.nan))
     return (jump <= _FAR * _median(jump) + np.sqrt(floor)) & (unlike <= _FAR * _median(unlike))
 
@@ -142,13 +142,15 @@ def fit_offset(blocks: Float) -> TimeOffset | None:
         if total <= 0.0:
             return None
         offset = float((weight * ze).sum()) / total
-    told, said, beside = ((weight[:, None] * blocks[..., part]).sum(axis=2).ravel() for part in (1, 2, 3))
-    scatter = [_scatter(told, said - offset * told, length) for length in _LENGTHS]
+    told, lagged, weight_of_rays = (
+        (weight[:, None] * blocks[..., part]).sum(axis=2).ravel() for part in (1, 2, 3)
+    )
+    scatter = [_scatter(told, lagged - offset * told, length) for length in _LENGTHS]
     if scatter[0][1] < _BATCHES_AT_LEAST:
         return None
     sigma, count = max([scatter[0], *(of for of in scatter[1:] if of[1] >= _LONG_BATCHES_AT_LEAST)])
     sigma *= float(stdtrit(count - 1.0, _THREE_SIGMA)) / 3.0
-    sigma = hypot(sigma, sqrt(2.0) * RAYS.rig_px * float(beside.sum()) / total)
+    sigma = hypot(sigma, sqrt(2.0) * RAYS.rig_px * float(weight_of_rays.sum()) / total)
     return TimeOffset(offset * 1e9, sigma * 1e9, count)
 
 

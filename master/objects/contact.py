@@ -1,6 +1,6 @@
 """How near the fingers of a hand are to objects, and which of them touch.
 
-The skin of a finger is round cones from joint to joint with the radii of the profile (`common.round_cones`). The
+The skin of a finger is capsules from joint to joint with the radii of the profile (`common.tapered_capsules`). The
 distance that is published is that of the last segment; a finger *touches* with any of its three, since whoever grasps a
 bar often holds it with the middle ones. The object's poses around the hand's instant are brought to it: between two of
 them by interpolation, behind the last by its motion, a tenth of a second at most.
@@ -33,12 +33,12 @@ from common.geometry import (
 from common.hand_model import CHAINS, METACARPALS, HandModel
 from common.messages import Contact, HandPose, ObjectPose
 from common.object_profile import ObjectProfile
-from common.round_cones import Cones
+from common.tapered_capsules import Capsules
 from master.objects.carried import Carried
 from master.objects.surface import Nearest, Surface
 
 NEAR_M, FAR_M = 2.5e-3, 5.0e-3
-FLESH_M = 1.0e-3  # standard deviation of the skin about the profile's radii
+SURFACE_SIGMA_M = 1.0e-3  # standard deviation of the skin about the profile's radii
 LED_S = 0.1  # by which an object's pose is led on, at most
 _POSES = 6
 _SURE_M = 0.02  # a distance less sure than this tells of no touch
@@ -56,14 +56,14 @@ _FREE = 2.5  # standard deviations of a distance beyond which a finger surely do
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Placed:
+class _PointEstimate:
     """An object at an instant: `T_rig_object` (4, 4) and covariance (6, 6)."""
 
     T: Float
     cov: Float
 
 
-class ContactWatch:
+class ContactMonitor:
     """Push machine of one hand. Holds the last poses of each object, and which finger touches which."""
 
     def __init__(self, model: HandModel, objects: Sequence[ObjectProfile]) -> None:
@@ -131,18 +131,18 @@ def _touches(distance: Float, sigma: Float, before: Bool) -> Bool:
     """(N,) what touches, by distances and standard deviations (N,) [m] and what touched before; NaN: not known."""
     sure = sigma < _SURE_M
     begins = distance < NEAR_M + _DOUBT * np.minimum(sigma, FAR_M)
-    stays = before & (distance < FAR_M + _DOUBT * np.minimum(sigma, FAR_M))
-    return sure & (begins | stays)
+    stay_near = before & (distance < FAR_M + _DOUBT * np.minimum(sigma, FAR_M))
+    return sure & (begins | stay_near)
 
 
-def _gaps(pose: HandPose, surface: Surface, placed: _Placed) -> tuple[Nearest, Float]:
+def _gaps(pose: HandPose, surface: Surface, placed: _PointEstimate) -> tuple[Nearest, Float]:
     """Distances of all bones (19,), object frame, and their standard deviations; NaN where a joint is not valid."""
     points = transform(invert(placed.T), np.nan_to_num(pose.position_m))
     start, stop = _BONES.T
-    cones = Cones(points[start], points[stop], pose.radius_m[start], pose.radius_m[stop])
-    found = surface.nearest_to_cones(cones)
+    capsules = Capsules(points[start], points[stop], pose.radius_m[start], pose.radius_m[stop])
+    found = surface.nearest_to_capsules(capsules)
     usable = (pose.valid & np.isfinite(pose.position_m).all(axis=1))[_BONES].all(axis=1)
-    middle = cones.start_m + found.along[:, None] * (cones.stop_m - cones.start_m)
+    middle = capsules.start_m + found.along[:, None] * (capsules.stop_m - capsules.start_m)
     out = middle - found.point_m
     length = np.linalg.norm(out, axis=1)
     R = placed.T[:3, :3]
@@ -154,29 +154,29 @@ def _gaps(pose: HandPose, surface: Surface, placed: _Placed) -> tuple[Nearest, F
     hand = np.einsum("ni,nij,nj->n", normal, cov, normal)
     pull = np.concatenate([normal, cross(lever, normal)], axis=1)
     own = np.einsum("ni,ij,nj->n", pull, placed.cov, pull)
-    sigma = np.sqrt(hand + own + FLESH_M**2)
+    sigma = np.sqrt(hand + own + SURFACE_SIGMA_M**2)
     nan = np.where(usable, 0.0, np.nan)
     return Nearest(found.distance_m + nan, found.point_m + nan[:, None], found.along), sigma + nan
 
 
-def _at(poses: Sequence[ObjectPose], t_ns: int) -> _Placed | None:
+def _at(poses: Sequence[ObjectPose], t_ns: int) -> _PointEstimate | None:
     """Where an object was at an instant, by its last poses; None: nobody knows."""
     if not poses or t_ns - poses[-1].t_ns > LED_S * 1e9 or poses[0].t_ns - t_ns > LED_S * 1e9:
         return None
     if len(poses) == 1:
         one = poses[0]
         dt = (t_ns - one.t_ns) * 1e-9
-        return _Placed(_pose_of(one), one.cov + _led(dt))
+        return _PointEstimate(_pose_of(one), one.cov + _led(dt))
     after = next((k for k, one in enumerate(poses) if one.t_ns >= t_ns), len(poses) - 1)
     a, b = poses[max(after, 1) - 1], poses[max(after, 1)]
     share = (t_ns - a.t_ns) / (b.t_ns - a.t_ns)
     T_a, T_b = _pose_of(a), _pose_of(b)
-    turn = matrix_to_rotation_vector(T_b[:3, :3] @ T_a[:3, :3].T)
-    R = rotation_vector_to_matrix(share * turn) @ T_a[:3, :3]
+    rotation = matrix_to_rotation_vector(T_b[:3, :3] @ T_a[:3, :3].T)
+    R = rotation_vector_to_matrix(share * rotation) @ T_a[:3, :3]
     T = rigid(R, T_a[:3, 3] + share * (T_b[:3, 3] - T_a[:3, 3]))
     near = b if share > 0.5 else a
     beyond_s = max(t_ns - b.t_ns, a.t_ns - t_ns, 0) * 1e-9
-    return _Placed(T, near.cov + _led(beyond_s))
+    return _PointEstimate(T, near.cov + _led(beyond_s))
 
 
 def _led(dt_s: float) -> Float:

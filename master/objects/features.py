@@ -133,23 +133,29 @@ class Features:
             return np.zeros(0, np.bool_)
         corners, seen = self.points[self.beads :].reshape(count, 4, 3), uv[self.beads :].reshape(count, 4, 2)
         normal = self.normals[self.beads :]
-        sight = eye - corners.mean(axis=1)
-        turned = np.vecdot(normal, sight) >= ease * _TAG_COSINE * np.linalg.norm(sight, axis=1)
+        line_of_sight = eye - corners.mean(axis=1)
+        facing_camera = np.vecdot(normal, line_of_sight) >= ease * _TAG_COSINE * np.linalg.norm(
+            line_of_sight, axis=1
+        )
         edges = np.linalg.norm(seen - np.roll(seen, 1, axis=1), axis=2).min(axis=1)
         # A little off the paper, which lies on the surface.
         lifted = (
             np.concatenate([corners, corners.mean(axis=1, keepdims=True)], axis=1) + 1e-4 * normal[:, None]
         )
-        return turned & (edges >= ease * _CELL_PX * self.cells) & ~self.surface.hides(eye, lifted).any(axis=1)
+        return (
+            facing_camera
+            & (edges >= ease * _CELL_PX * self.cells)
+            & ~self.surface.hides(eye, lifted).any(axis=1)
+        )
 
     def _beads_show(self, eye: Float, focal_px: float, ease: float) -> Bool:
         """(B,) beads that are large enough for an eye (3,) [m], object frame, and not behind the object."""
         if not self.beads:
             return np.zeros(0, np.bool_)
         points, radius = self.points[: self.beads], self.radius_m[: self.beads]
-        sight = eye - points
-        away = np.linalg.norm(sight, axis=1)
-        ahead = sight / away[:, None]
+        line_of_sight = eye - points
+        away = np.linalg.norm(line_of_sight, axis=1)
+        ahead = line_of_sight / away[:, None]
         across = cross(ahead, np.eye(3)[np.argmin(np.abs(ahead), axis=1)])
         across /= np.linalg.norm(across, axis=1, keepdims=True)
         # The near half of the ball, so that the rod that it is on is not before it.

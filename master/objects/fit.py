@@ -3,7 +3,7 @@
 Each observation (a bead, a corner of a tag) has its own time, that of its row, and a place in the distorted image. The
 object's motion about the instant is a Taylor series of its place and of its turn (`master.objects.motion`), to the
 fourth order, whose speed, acceleration, jerk and snap are drawn at random with the sizes of what hands do (as
-`master.fabrik.carry` has it for single markers; Rasmussen, Williams 2006, 2.7).
+`master.fabrik.propagate` has it for single markers; Rasmussen, Williams 2006, 2.7).
 
 Minimised is the reprojection error in units of its noise plus these priors, by Gauss-Newton from a start. Everything is
 one linear problem of 30 unknowns per round, whatever the number of cameras and features: cameras need not be in step,
@@ -69,8 +69,8 @@ class Fitted:
 
     def poorer(self, most_m: float, most_rad: float) -> bool:
         """Whether place or turn is less sure than this in some direction."""
-        place, turn = np.linalg.eigvalsh(np.stack([self.cov[:3, :3], self.cov[3:6, 3:6]]))[:, -1].tolist()
-        return not (place < most_m**2 and turn < most_rad**2)
+        place, rotation = np.linalg.eigvalsh(np.stack([self.cov[:3, :3], self.cov[3:6, 3:6]]))[:, -1].tolist()
+        return not (place < most_m**2 and rotation < most_rad**2)
 
 
 class PoseFit:
@@ -195,17 +195,17 @@ class _Task:
         """The problem linearised at a motion; None: something is behind its camera."""
         rates = motion.rates.reshape(ORDERS, 6)
         way = self.basis @ rates
-        turn = rotation_vector_to_matrix(way[:, 3:])
-        arm = (turn @ (self.points @ motion.T[:3, :3].T)[..., None])[..., 0]
+        rotation = rotation_vector_to_matrix(way[:, 3:])
+        arm = (rotation @ (self.points @ motion.T[:3, :3].T)[..., None])[..., 0]
         uv, by_place, depth = self.views.see(arm + motion.T[:3, 3] + way[:, :3])
         miss = self.seen.uv - uv
         if not np.isfinite(miss).all():
             return None
-        by_turn = -(by_place @ skew(arm))
-        speed = by_place @ rates[1, :3] + by_turn @ rates[1, 3:]
+        by_rotation = -(by_place @ skew(arm))
+        speed = by_place @ rates[1, :3] + by_rotation @ rates[1, 3:]
         lag_2 = np.vecdot(speed, speed) * self.seen.t_sigma_s**2 * 0.5
         misfit, weight, cost = self.sums.weigh(miss, lag_2)
-        rows = self._rows(by_place, by_turn, turn, way[:, 3:], miss)
+        rows = self._rows(by_place, by_rotation, rotation, way[:, 3:], miss)
         normal, gradient = self.sums.normal(rows, weight, lag_2)
         if self.past is not None:
             normal[:12, :12] += self.past.precision
@@ -215,16 +215,16 @@ class _Task:
         residual = np.sqrt(np.vecdot(miss, miss)) * depth / self.views.focal[:, 0]
         return _Problem(normal, gradient - self.prior @ now, cost, now, weight, misfit, residual)
 
-    def _rows(self, by_place: Float, by_turn: Float, turn: Float, theta: Float, miss: Float) -> Float:
+    def _rows(self, by_place: Float, by_rotation: Float, rotation: Float, theta: Float, miss: Float) -> Float:
         """(n, 2, 31) derivatives by all unknowns, of each order place and turn; then what is missed."""
         rows = np.empty((len(miss), 2, _N + 1))
         rows[..., _N] = miss
         rows[..., :3] = by_place
         # A small turn of R0 is turned with it; one of theta turns as the left Jacobian of the rotation vector has it.
-        rows[..., 3:6] = by_turn @ turn
+        rows[..., 3:6] = by_rotation @ rotation
         about = skew(theta)
-        by_turn = by_turn @ (_EYE + 0.5 * about + about @ about / 6.0)
-        both = np.concatenate([by_place, by_turn], axis=2)
+        by_rotation = by_rotation @ (_EYE + 0.5 * about + about @ about / 6.0)
+        both = np.concatenate([by_place, by_rotation], axis=2)
         for order in range(1, ORDERS):
             rows[..., 6 * order : 6 * order + 6] = self.basis[:, order, None, None] * both
         return rows

@@ -12,7 +12,7 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 from master.objects.features import Features
-from master.objects.window import Sighting, Window
+from master.objects.window import ImageObservation, Window
 
 _PART = 0.63  # of what a bead shows when it is whole
 _NEARLY = 0.93  # of that, a bead may show and be whole
@@ -72,11 +72,15 @@ class Hidden:
         """What share of their discs (..., B) beads of these areas [px^2] show, and the radii (B,) of the discs [px]."""
         rows = slice(0, self._features.beads)
         camera = self._cameras[c]
-        sight = self._features.points[rows] @ T[:3, :3].T + (T[:3, 3] - camera.centre)
-        radius = self._features.radius_m[rows] * camera.matrix[0, 0] / np.sqrt(np.vecdot(sight, sight))
+        line_of_sight = self._features.points[rows] @ T[:3, :3].T + (T[:3, 3] - camera.centre)
+        radius = (
+            self._features.radius_m[rows]
+            * camera.matrix[0, 0]
+            / np.sqrt(np.vecdot(line_of_sight, line_of_sight))
+        )
         return area_px2 / (np.pi * radius * radius), radius
 
-    def _partly(self, c: int, T: Float, markers: Sighting, seen: Bool) -> bool:
+    def _partly(self, c: int, T: Float, markers: ImageObservation, seen: Bool) -> bool:
         """Whether a bead that is seen shows too little; learns what they show."""
         share = np.where(seen, self._share(c, T, markers.area_px2)[0], np.nan)
         whole = self._whole[c]

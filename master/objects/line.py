@@ -5,9 +5,9 @@ fitted (`master.objects.fit`) from where it was led to from the last one; where 
 what is seen in the wrong place, from what is seen alone (`master.objects.start`), the best of all starts.
 
 **Too little is seen** to tell all of it, as two beads of three: then what was known before counts as well
-(`master.objects.course`), as it was at a time before all frames of this fit, so that nothing counts twice.
+(`master.objects.trajectory`), as it was at a time before all frames of this fit, so that nothing counts twice.
 
-**One tag** has two poses that nearly explain it (`master.objects.lone_tag`).
+**One tag** has two poses that nearly explain it (`master.objects.single_tag`).
 
 **Nothing is seen**: the pose is led on with dying speed, and after `HELD_S` there is none.
 """
@@ -26,15 +26,15 @@ from common.object_profile import ObjectProfile
 from master.estimator.cameras import CameraArrays
 from master.fabrik.depth import CalibrationResidual
 from master.fabrik.one_euro import OneEuroParameters
-from master.objects.chosen import Chosen, sighted_now
-from master.objects.course import Course, unheeded
+from master.objects.association import Association, sighted_now
 from master.objects.features import Features
 from master.objects.fit import Fitted, PoseFit
 from master.objects.hidden import Hidden
-from master.objects.lone_tag import LoneTag
 from master.objects.motion import Motion
+from master.objects.pose_filter import PoseFilter
+from master.objects.single_tag import SingleTag
 from master.objects.start import poses_of_beads, poses_of_tags
-from master.objects.steady import Steady
+from master.objects.trajectory import Trajectory, unheeded
 from master.objects.window import Window, Windows
 
 # What light does to a ball's centroid beyond what a slave says, and to a corner.
@@ -45,7 +45,7 @@ _LOST_M, _LOST_RAD = 0.05, np.radians(30.0)  # less sure than this is no pose
 _MOST = 0.5  # share of what is seen that must be in its place
 _START_MISFIT = 25.0  # chi square per number of what a pose from nothing rests on
 _TRACKED_M, _TRACKED_RAD = 15e-3, np.radians(10.0)  # less sure than this is led on rather than measured
-_FRESH_PERIODS = 2.25  # an observation older than this is not now
+_MAX_AGE_PERIODS = 2.25  # an observation older than this is not now
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,16 +76,16 @@ class ObjectLine:
         self._cameras = tuple(models.values())
         self._features = Features.of(profile, rig.markers)
         late = {name: round(1e3 * us) for name, us in rig.stamp_offset_us.items()}
-        self._windows = Windows(models, self._features, predict=rig.pairing == "predict", late_ns=late)
+        self._windows = Windows(models, self._features, predict=rig.frame_sync == "predict", late_ns=late)
         least_px = np.where(self._features.radius_m > 0.0, _BEAD_FLOOR_PX, _CORNER_FLOOR_PX)
         floor_px = np.maximum(CalibrationResidual.of(rig).rays_px, least_px)
         self._fit = PoseFit(self._cameras, self._features.points, self._features.radius_m, floor_px)
         self._arrays = CameraArrays.of(self._cameras)
         self._hidden = Hidden(self._features, self._cameras)
         middle = self._features.points.mean(axis=0) if len(self._features.points) else np.zeros(3)
-        self._steady = Steady(middle, OneEuroParameters.of(rig.filter))
-        self._course = Course()
-        self._lone = LoneTag(self._features, self._cameras, self._fit)
+        self._filter = PoseFilter(middle, OneEuroParameters.of(rig.filter))
+        self._trajectory = Trajectory()
+        self._single_tag = SingleTag(self._features, self._cameras, self._fit)
         self._lost_behind = False
         self._last_ns = -(2**63)
 
@@ -110,25 +110,25 @@ class ObjectLine:
         return out
 
     def _solve(self, window: Window) -> ObjectPose:
-        predicted = self._course.predicted(window.t_ns)
-        seen = self._chosen(window, None if predicted is None else predicted.T)
+        predicted = self._trajectory.predicted(window.t_ns)
+        seen = self._associated(window, None if predicted is None else predicted.T)
         now = (
             seen is not None
-            and float(np.abs(seen.seen.tau_s).min()) <= _FRESH_PERIODS * window.period_ns * 1e-9
+            and float(np.abs(seen.seen.tau_s).min()) <= _MAX_AGE_PERIODS * window.period_ns * 1e-9
         )
         fitted = None
         if seen is not None and now:
             fitted = self._found(window, seen, predicted)
         if fitted is None or seen is None:
             return self._held(window, predicted)
-        if not self._course.push(window.t_ns, fitted):
+        if not self._trajectory.push(window.t_ns, fitted):
             return self._none(window)
         tracked = fitted.alone or not fitted.poorer(_TRACKED_M, _TRACKED_RAD)
         shown = self._hidden.look(window, fitted.motion.T, seen.used(fitted))
         self._lost_behind = shown.occluded
-        T = self._steady.push(window.t_ns, fitted.motion.T, fitted.cov[:6, :6])
+        T = self._filter.push(window.t_ns, fitted.motion.T, fitted.cov[:6, :6])
         features = self._features.feature[seen.seen.point[fitted.used]]
-        near = fitted.used & (np.abs(seen.seen.tau_s) <= _FRESH_PERIODS * window.period_ns * 1e-9)
+        near = fitted.used & (np.abs(seen.seen.tau_s) <= _MAX_AGE_PERIODS * window.period_ns * 1e-9)
         return ObjectPose(
             object=self.name,
             t_ns=window.t_ns,
@@ -147,15 +147,15 @@ class ObjectLine:
         """What a pose that rests on these features comes from; both are called markers."""
         return ObjectSource.MARKERS if (features < self._features.beads).any() else ObjectSource.TAGS
 
-    def _found(self, window: Window, seen: Chosen, predicted: Motion | None) -> Fitted | None:
+    def _found(self, window: Window, seen: Association, predicted: Motion | None) -> Fitted | None:
         """The pose at the instant; None: what is seen is not it, or does not tell."""
         if predicted is not None:
             led = self._fitted(seen, predicted, window.t_ns, led=True)
             if led is not None and self._holds(seen, led):
-                return self._lone.of_two(window, seen, led, begins=False)
-        best: tuple[Fitted, Chosen] | None = None
+                return self._single_tag.of_two(window, seen, led, begins=False)
+        best: tuple[Fitted, Association] | None = None
         for T in self._starts(window):
-            again = self._chosen(window, T)
+            again = self._associated(window, T)
             if (
                 again is None
                 or (fitted := self._fitted(again, Motion.still(T), window.t_ns, led=False)) is None
@@ -167,15 +167,15 @@ class ObjectLine:
         if best is None:
             return None
         # What was known of where it went is of another thing.
-        self._course.clear()
-        self._lone.forget()
-        return self._lone.of_two(window, best[1], best[0], begins=True)
+        self._trajectory.clear()
+        self._single_tag.forget()
+        return self._single_tag.of_two(window, best[1], best[0], begins=True)
 
-    def _chosen(self, window: Window, T: Float | None) -> Chosen | None:
+    def _associated(self, window: Window, T: Float | None) -> Association | None:
         """What is seen of the object, near a pose (4, 4) if there is one."""
-        return Chosen.of(window, self._features, self._cameras, T, self._hidden.doubt_px)
+        return Association.of(window, self._features, self._cameras, T, self._hidden.doubt_px)
 
-    def _fitted(self, seen: Chosen, start: Motion, t_ns: int, *, led: bool) -> Fitted | None:
+    def _fitted(self, seen: Association, start: Motion, t_ns: int, *, led: bool) -> Fitted | None:
         """The fit; of one that was led there with the past, where the present does not tell enough.
 
         How it may have moved since is then in it.
@@ -186,21 +186,21 @@ class ObjectLine:
         both = None
         if led:
             oldest_ns = t_ns + round(float(seen.seen.tau_s.min()) * 1e9)
-            past = self._course.past(t_ns, oldest_ns)
+            past = self._trajectory.past(t_ns, oldest_ns)
             both = self._fit(seen.seen, start, past, feature=seen.feature)
         if alone is None:
             return None if both is None else replace(both, alone=False)
         if both is None or not alone.poorer(_UNTOLD_M, _UNTOLD_RAD):
             return alone if both is None else both
-        return unheeded(both, alone, self._course.unsure_s(t_ns), _POOR_M)
+        return unheeded(both, alone, self._trajectory.unsure_s(t_ns), _POOR_M)
 
-    def _holds(self, seen: Chosen, fitted: Fitted) -> bool:
+    def _holds(self, seen: Association, fitted: Fitted) -> bool:
         """Whether a pose is determined, and most of what is seen now is in its place."""
         if fitted.poorer(_LOST_M, _LOST_RAD):
             return False
         return float(fitted.weight.mean()) >= _MOST and len(np.unique(seen.feature[fitted.used])) >= 1
 
-    def _begins(self, seen: Chosen, fitted: Fitted) -> bool:
+    def _begins(self, seen: Association, fitted: Fitted) -> bool:
         """Whether a pose may begin with no past: three beads, or a tag, that fit."""
         features = np.unique(seen.feature[fitted.used])
         enough = len(features) >= 3 or bool((features >= self._features.beads).any())
@@ -216,14 +216,14 @@ class ObjectLine:
 
     def _held(self, window: Window, predicted: Motion | None) -> ObjectPose:
         """The pose while nothing tells: led on, or none."""
-        cov = self._course.held_cov(window.t_ns)
+        cov = self._trajectory.held_cov(window.t_ns)
         if predicted is None or cov is None:
             return self._none(window)
         shown = self._hidden.look(
             window, predicted.T, np.zeros((len(self._cameras), self._features.count), np.bool_)
         )
         self._lost_behind = shown.occluded
-        T = self._steady.held(window.t_ns, predicted.T)
+        T = self._filter.held(window.t_ns, predicted.T)
         return ObjectPose(
             object=self.name,
             t_ns=window.t_ns,
@@ -247,7 +247,7 @@ class ObjectLine:
 
     def _none(self, window: Window) -> ObjectPose:
         """No pose; what hid it when it was lost is taken to hide it still."""
-        self._steady.forget()
+        self._filter.forget()
         return ObjectPose(
             object=self.name,
             t_ns=window.t_ns,

@@ -76,16 +76,16 @@ def two_poses(corners: Float, xy: Float) -> list[tuple[float, Float]]:
         return []
     v = H[:2, 2]
     J = H[:2, :2] - v[:, None] * H[2, :2]
-    turn = _turn_to(np.array([v[0], v[1], 1.0]))
+    rotation = _rotation_to(np.array([v[0], v[1], 1.0]))
     try:
-        A = np.asarray(np.linalg.solve(turn[:2, :2] - v[:, None] * turn[2, :2], J), np.float64)
+        A = np.asarray(np.linalg.solve(rotation[:2, :2] - v[:, None] * rotation[2, :2], J), np.float64)
         A /= float(np.linalg.norm(A, 2))
-        return _ways(A, turn, corners, flat, xy)
+        return _ways(A, rotation, corners, flat, xy)
     except np.linalg.LinAlgError:  # corners that no tag can have
         return []
 
 
-def _ways(A: Float, turn: Float, corners: Float, flat: Float, xy: Float) -> list[tuple[float, Float]]:
+def _ways(A: Float, rotation: Float, corners: Float, flat: Float, xy: Float) -> list[tuple[float, Float]]:
     """The two poses of a tag whose turn has `A` (2, 2) as upper left part.
 
     As `two_poses` returns them.
@@ -94,7 +94,7 @@ def _ways(A: Float, turn: Float, corners: Float, flat: Float, xy: Float) -> list
     b = np.sqrt(np.maximum(np.diagonal(left), 0.0)) * [1.0, 1.0 if left[0, 1] >= 0.0 else -1.0]
     out: list[tuple[float, Float]] = []
     for sign in (1.0, -1.0):
-        first = turn @ np.vstack([A, sign * b])
+        first = rotation @ np.vstack([A, sign * b])
         u, _, vt = np.linalg.svd(np.column_stack([first, np.cross(first[:, 0], first[:, 1])]))
         R = u @ vt
         T = rigid(R, _shift(flat @ R.T, xy)) @ invert(fit_rigid(corners, flat))
@@ -116,20 +116,20 @@ def _homography(plane: Float, xy: Float) -> Float | None:
         return None
 
 
-def _turn_to(sight: Float) -> Float:
+def _rotation_to(line_of_sight: Float) -> Float:
     """The least rotation (3, 3) that takes the z axis to the direction of a vector (3,) before the camera."""
-    x, y, z = sight / np.linalg.norm(sight)
+    x, y, z = line_of_sight / np.linalg.norm(line_of_sight)
     cross = np.array([[0.0, 0.0, x], [0.0, 0.0, y], [-x, -y, 0.0]])
     return np.eye(3) + cross + cross @ cross / (1.0 + z)
 
 
-def _shift(turned: Float, xy: Float) -> Float:
+def _shift(rotated: Float, xy: Float) -> Float:
     """Where the origin (3,) of turned points (N, 3) is, which are seen at (N, 2): linear least squares."""
     rows = np.zeros((2 * len(xy), 3))
     rows[::2, 0] = rows[1::2, 1] = 1.0
     rows[:, 2] = -xy.ravel()
     return np.asarray(
-        np.linalg.lstsq(rows, (xy * turned[:, 2:] - turned[:, :2]).ravel(), rcond=None)[0], np.float64
+        np.linalg.lstsq(rows, (xy * rotated[:, 2:] - rotated[:, :2]).ravel(), rcond=None)[0], np.float64
     )
 
 
@@ -143,8 +143,8 @@ def poses_of_beads(sighted: Sequence[Sighted], features: Features, cameras: Came
         if np.linalg.norm(np.cross(own[1] - own[0], own[2] - own[0])) < 1e-4:  # [m^2]: nearly in one line
             continue
         wanted = _sides(own)
-        for chosen in list(product(*(range(len(places[bead])) for bead in triple)))[:_COMBINATIONS]:
-            points = np.array([places[bead][k] for bead, k in zip(triple, chosen, strict=True)])
+        for associated in list(product(*(range(len(places[bead])) for bead in triple)))[:_COMBINATIONS]:
+            points = np.array([places[bead][k] for bead, k in zip(triple, associated, strict=True)])
             off = np.abs(_sides(points) - wanted)
             if (off < _DISTANCE_M + _DISTANCE_SHARE * wanted).all():
                 poses.append((float(off.sum()), fit_rigid(points, own)))
@@ -159,8 +159,8 @@ def _points(sighted: Sequence[Sighted], bead: int, cameras: CameraArrays) -> Flo
         return np.empty((0, 3))
     choices = list(product(*(range(len(seen.uv)) for seen in views)))[:_COMBINATIONS]
     uv = np.full((len(cameras.scale), len(choices), 2), np.nan)
-    for seen, chosen in zip(views, np.array(choices, np.int64).T, strict=True):
-        uv[seen.camera] = seen.uv[chosen, 0]
+    for seen, associated in zip(views, np.array(choices, np.int64).T, strict=True):
+        uv[seen.camera] = seen.uv[associated, 0]
     found = triangulate(cameras, uv, _SIGMA_PX)
     return found.points_m[found.residual_px < _MISS_PX]
 

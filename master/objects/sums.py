@@ -15,7 +15,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from master.fabrik.intersection import RAYS
 
-_FRESH, _FRESH_PX = 0.7, 0.1  # as in `master.fabrik.carry`
+_INDEPENDENT_SHARE, _INDEPENDENT_PX = 0.7, 0.1  # as in `master.fabrik.propagate`
 _SOFT_2 = 9.0  # square of the deviation in sigmas at which a feature counts half ... a quarter
 
 
@@ -39,15 +39,15 @@ class Observations:
     sigma_px: Float
     t_sigma_s: Float
 
-    def some(self, chosen: Bool) -> "Observations":
+    def some(self, associated: Bool) -> "Observations":
         """Those of a mask (n,)."""
         return Observations(
-            self.camera[chosen],
-            self.point[chosen],
-            self.tau_s[chosen],
-            self.uv[chosen],
-            self.sigma_px[chosen],
-            self.t_sigma_s[chosen],
+            self.camera[associated],
+            self.point[associated],
+            self.tau_s[associated],
+            self.uv[associated],
+            self.sigma_px[associated],
+            self.t_sigma_s[associated],
         )
 
 
@@ -64,15 +64,15 @@ class Sums:
             points: How many points the object has.
         """
         variance = seen.sigma_px**2
-        fresh = np.minimum(_FRESH * variance, _FRESH_PX**2)
-        stays = variance - fresh + floor_2
+        independent = np.minimum(_INDEPENDENT_SHARE * variance, _INDEPENDENT_PX**2)
+        correlated = variance - independent + floor_2
         _, first, group = np.unique(seen.camera * points + seen.point, return_index=True, return_inverse=True)
         # What the surest sighting keeps is kept by all; others have more that is new.
-        self._stays = np.full(len(first), np.inf)
-        np.minimum.at(self._stays, group, stays)
-        kept = self._stays[group]
-        self._fresh = fresh + stays - kept
-        self._total = kept + self._fresh
+        self._correlated = np.full(len(first), np.inf)
+        np.minimum.at(self._correlated, group, correlated)
+        kept = self._correlated[group]
+        self._independent = independent + correlated - kept
+        self._total = kept + self._independent
         self._of_group = np.zeros((len(first), len(group)))
         self._of_group[group, np.arange(len(group))] = 1.0
         self._group_size = self._of_group.sum(axis=1)
@@ -108,11 +108,11 @@ class Sums:
             lag_2: As of `weigh`.
         """
         size = rows.shape[2]
-        w = weight / (self._fresh + lag_2)
+        w = weight / (self._independent + lag_2)
         weighted = rows * w[:, None, None]
         both = weighted.reshape(-1, size).T @ rows.reshape(-1, size)
         light = self._of_group @ weight / self._group_size
-        down = self._of_group @ w + light / self._stays
+        down = self._of_group @ w + light / self._correlated
         sums = (self._of_group @ weighted.reshape(len(rows), -1)) / np.sqrt(down)[:, None]
         sums = sums.reshape(-1, size)
         both -= sums.T @ sums

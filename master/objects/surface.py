@@ -4,7 +4,7 @@ An object is a union of boxes, closed cylinders and balls, each convex. Outside 
 least of theirs, exactly; inside of two at once it is that of the one whose surface is farther, which is a bound.
 
 A body of round cones is a union of balls along its bones, so its distance to a surface is the least of "distance of the
-middle less radius" along the bone (`nearest_to_cones`). For one convex part that is a convex function of the place on
+middle less radius" along the bone (`nearest_to_capsules`). For one convex part that is a convex function of where on
 the bone, which a search on a grid and a second on the cell around its best narrows to a 256th of the bone.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.geometry import invert
 from common.object_profile import Shape
-from common.round_cones import Cones
+from common.tapered_capsules import Capsules
 from master.objects.parts import Parts, by_kind
 
 _STEPS = 17
@@ -38,7 +38,7 @@ class Nearest:
     along: Float
 
 
-class _Placed:
+class _PosedSurface:
     """All parts of one kind, each where it is on the object."""
 
     def __init__(self, shapes: Sequence[Shape], parts: Parts) -> None:
@@ -70,7 +70,7 @@ class Surface:
 
     def __init__(self, parts: Sequence[Shape]) -> None:
         """Take the parts of its shape; none: it has no surface."""
-        self._kinds = [_Placed(shapes, kind) for shapes, kind in by_kind(parts)]
+        self._kinds = [_PosedSurface(shapes, kind) for shapes, kind in by_kind(parts)]
 
     def __bool__(self) -> bool:
         """Whether there is any."""
@@ -96,15 +96,15 @@ class Surface:
             best = np.minimum(best, kind.parts.distances(kind.own(points)).min(axis=0))
         return best
 
-    def nearest_to_cones(self, cones: Cones) -> Nearest:
+    def nearest_to_capsules(self, capsules: Capsules) -> Nearest:
         """Where the surface is nearest to each of N round cones, object frame."""
-        rows: Int = np.arange(len(cones.start_m))
-        along, grows = cones.stop_m - cones.start_m, cones.stop_radius_m - cones.start_radius_m
+        rows: Int = np.arange(len(capsules.start_m))
+        along, scale_up = capsules.stop_m - capsules.start_m, capsules.stop_radius_m - capsules.start_radius_m
 
         def least(share: Float) -> tuple[Int, Float]:
             """Which of the balls at places (N, S) on the bones is the nearest, and how near (N,)."""
-            middle = cones.start_m[:, None] + share[..., None] * along[:, None]
-            radius = cones.start_radius_m[:, None] + share * grows[:, None]
+            middle = capsules.start_m[:, None] + share[..., None] * along[:, None]
+            radius = capsules.start_radius_m[:, None] + share * scale_up[:, None]
             gap = self.distances(middle.reshape(-1, 3)).reshape(share.shape) - radius
             best: Int = gap.argmin(axis=1)
             return best, gap[rows, best]
@@ -113,8 +113,8 @@ class Surface:
         low, high = _GRID[np.maximum(best - 1, 0)], _GRID[np.minimum(best + 1, _STEPS - 1)]
         share = low[:, None] + (high - low)[:, None] * _GRID
         best, gap = least(share)
-        chosen = share[rows, best]
-        return Nearest(gap, self.nearest(cones.start_m + chosen[:, None] * along)[1], chosen)
+        associated = share[rows, best]
+        return Nearest(gap, self.nearest(capsules.start_m + associated[:, None] * along)[1], associated)
 
     def hides(self, eye: Float, points: Float) -> Bool:
         """(...) whether the object itself is between an eye (3,) [m] and points (..., 3) [m], object frame."""

@@ -23,8 +23,8 @@ from common.errors import CalibrationError
 from common.geometry import invert, matrix_to_quaternion, quaternion_to_matrix
 from common.messages import ObjectPose, ObjectSource, TrackerPose
 from common.object_profile import ObjectProfile
-from master.objects.course import HELD_S
 from master.objects.line import SolvedObject
+from master.objects.trajectory import HELD_S
 
 LEAP_M, LEAP_M_S, LEAP_S = 0.08, 8.0, 0.15  # a leap: farther and faster than that; and how long it is doubted
 _UNKNOWN_M, _UNKNOWN_RAD = (
@@ -100,15 +100,15 @@ class TrackerLine:
 
     def _measured(self, t_ns: int, message: TrackerPose) -> ObjectPose | None:
         """The object's pose; None: the device has lost itself, or what it says cannot be."""
-        place, turn = message.position_m, message.orientation_wxyz
-        if np.isnan(place).any() or np.isnan(turn).any():
+        place, quaternion = message.position_m, message.orientation_wxyz
+        if np.isnan(place).any() or np.isnan(quaternion).any():
             self.counts["lost"] += 1
             return None
-        if abs(float(np.linalg.norm(turn)) - 1.0) > _UNIT_WITHIN:
+        if abs(float(np.linalg.norm(quaternion)) - 1.0) > _UNIT_WITHIN:
             self.counts["broken"] += 1
             return None
         T = np.eye(4)
-        T[:3, :3], T[:3, 3] = quaternion_to_matrix(turn), place
+        T[:3, :3], T[:3, 3] = quaternion_to_matrix(quaternion), place
         T = self._T_rig_tracking @ T @ self._T_device_object
         if self._leaps(t_ns, T[:3, 3]):
             self.counts["leap"] += 1
@@ -153,9 +153,11 @@ class TrackerLine:
         last = self._last
         since_s = 0.0 if last is None else 1e-9 * (t_ns - last.t_ns)
         if last is None or not 0.0 <= since_s <= HELD_S:
-            place, turn, cov = _NOWHERE
+            place, quaternion, cov = _NOWHERE
             source = ObjectSource.NONE
-            return ObjectPose(self.name, t_ns, place, turn, cov, float("nan"), source, False, 0, 1, True)
+            return ObjectPose(
+                self.name, t_ns, place, quaternion, cov, float("nan"), source, False, 0, 1, True
+            )
         spread = np.repeat([_WANDERS_M_S * since_s, _WANDERS_RAD_S * since_s], 3) ** 2
         return replace(
             last,
@@ -177,8 +179,8 @@ def covariance_of(profile: ObjectProfile) -> Float:
     how = profile.provenance.get("T_object_tracker")
     told = {} if how is None else how.residual
     place_m = np.hypot(told.get("position_mm", 0.0), told.get("position_sigma_mm", 0.0)) * 1e-3
-    turn_rad = np.radians(np.hypot(told.get("turn_deg", 0.0), told.get("turn_sigma_deg", 0.0)))
+    rotation_rad = np.radians(np.hypot(told.get("rotation_deg", 0.0), told.get("rotation_sigma_deg", 0.0)))
     # The figures are of the whole offset: a third of its square belongs to each axis.
     place_m = place_m / np.sqrt(3.0) if place_m > 0.0 else _UNKNOWN_M
-    turn_rad = turn_rad / np.sqrt(3.0) if turn_rad > 0.0 else _UNKNOWN_RAD
-    return np.diag(np.repeat([place_m, turn_rad], 3) ** 2)
+    rotation_rad = rotation_rad / np.sqrt(3.0) if rotation_rad > 0.0 else _UNKNOWN_RAD
+    return np.diag(np.repeat([place_m, rotation_rad], 3) ** 2)

@@ -18,7 +18,7 @@ from common.arrays import Float, Int
 from common.camera_model import CameraModel
 from common.messages import MarkerDetections, TagDetections
 from master.fabrik.blob_bias import LensShift
-from master.fabrik.carry import HISTORY, SIGHTINGS
+from master.fabrik.propagate import HISTORY, OBSERVATIONS
 from master.fabrik.sync import SILENT_FRAMES
 from master.objects.features import Features
 
@@ -27,7 +27,7 @@ _DEADLINE, _TAG_DEADLINE = 1.25, 2.25  # periods
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sighting:
+class ImageObservation:
     """What one camera saw of the object in one frame, by markers or by tags; K points that it looked for.
 
     Attributes:
@@ -35,7 +35,7 @@ class Sighting:
         ready_t_ns: When the frame was handed to its slave.
         point: (K,) rows of `Features.points`.
         uv: (K, 2) [px] as from a lens that keeps blobs in their place; NaN: not seen.
-        rival_uv: (K, 2) [px] second places; NaN: none.
+        alt_uv: (K, 2) [px] second places; NaN: none.
         t_ns: (K,) when the rows were exposed [ns], from the first frame of all.
         sigma_px: (K,), t_sigma_s: the same for all.
         area_px2: (K,) of blobs; NaN: a corner.
@@ -45,7 +45,7 @@ class Sighting:
     ready_t_ns: int
     point: Int
     uv: Float
-    rival_uv: Float
+    alt_uv: Float
     t_ns: Float
     sigma_px: Float
     t_sigma_s: float
@@ -66,11 +66,11 @@ class Window:
 
     t_ns: int
     origin_ns: int
-    views: tuple[tuple[tuple[Sighting, ...], tuple[Sighting, ...]], ...]
+    views: tuple[tuple[tuple[ImageObservation, ...], tuple[ImageObservation, ...]], ...]
     ready_t_ns: int
     period_ns: int
 
-    def near(self, camera: int, kind: int) -> Sighting | None:
+    def near(self, camera: int, kind: int) -> ImageObservation | None:
         """The sighting that tells what a camera sees at the instant; None: it did not look."""
         views = self.views[camera][kind]
         if not views or abs(views[0].centre_ns - self.t_ns) > _DEADLINE * self.period_ns:
@@ -127,7 +127,7 @@ class Windows:
         line = self._seen[c][tags]
         if line and centre_ns <= line[-1].centre_ns:
             return []  # a restarted slave's first clock estimate may step back
-        line.append(self._sighting(message, c, t_ns, centre_ns))
+        line.append(self._observation(message, c, t_ns, centre_ns))
         self._frame(c, centre_ns, tags)
         return self._emit(flush=False)
 
@@ -160,17 +160,17 @@ class Windows:
     def _silent(self, c: int) -> bool:
         return self._waiting[c] >= SILENT_FRAMES * len(self._names)
 
-    def _sighting(
+    def _observation(
         self, message: MarkerDetections | TagDetections, c: int, t_ns: int, centre_ns: int
-    ) -> Sighting:
+    ) -> ImageObservation:
         assert self._origin_ns is not None
         if isinstance(message, TagDetections):
             point, uv, sigma = self._corners(message)
-            area, rival = np.full(len(point), np.nan), np.full((len(point), 2), np.nan)
+            area, alternative = np.full(len(point), np.nan), np.full((len(point), 2), np.nan)
         else:
             rows = self._features.rows
             point, sigma, area = np.arange(len(rows)), message.sigma_px[rows], message.area[rows]
-            both = np.stack([message.uv[rows], message.rival_uv[rows]])
+            both = np.stack([message.uv[rows], message.alt_uv[rows]])
             if self._shift[c].any and len(rows):
                 # Of a rival the area is not told: about that of the marker.
                 both = (
@@ -178,13 +178,13 @@ class Windows:
                     .centres(both.reshape(1, -1, 2), np.tile(area, 2)[None])[0]
                     .reshape(both.shape)
                 )
-            uv, rival = both
-        return Sighting(
+            uv, alternative = both
+        return ImageObservation(
             centre_ns=centre_ns,
             ready_t_ns=message.ready_t_ns,
             point=point,
             uv=uv,
-            rival_uv=rival,
+            alt_uv=alternative,
             t_ns=(t_ns - self._origin_ns) + self._cameras[c].row_time_ns * uv[:, 1],
             sigma_px=sigma,
             t_sigma_s=message.t_sigma_ns * 1e-9,
@@ -234,7 +234,7 @@ class Windows:
 
     def _at(self, t_ns: int, period_ns: int) -> Window:
         assert self._origin_ns is not None
-        reach_ns = round((SIGHTINGS + 0.25) * period_ns)
+        reach_ns = round((OBSERVATIONS + 0.25) * period_ns)
         views = tuple(
             (_around(markers, t_ns, reach_ns), _around(tags, t_ns, reach_ns)) for markers, tags in self._seen
         )
@@ -244,14 +244,14 @@ class Windows:
         return Window(t_ns, self._origin_ns, views, max(ready, default=t_ns), period_ns)
 
 
-def _line() -> deque[Sighting]:
+def _line() -> deque[ImageObservation]:
     return deque(maxlen=HISTORY)
 
 
-def _around(line: deque[Sighting], t_ns: int, reach_ns: int) -> tuple[Sighting, ...]:
+def _around(line: deque[ImageObservation], t_ns: int, reach_ns: int) -> tuple[ImageObservation, ...]:
     """Up to four sightings about an instant, the nearest first; of those after it one, or two where none is before."""
     known = list(line)
     before = sum(s.centre_ns < t_ns for s in known)
-    chosen = known[max(before - SIGHTINGS, 0) : max(before + 1, 2)]
-    near = [s for s in chosen if abs(s.centre_ns - t_ns) <= reach_ns]
-    return tuple(sorted(near, key=lambda s: abs(s.centre_ns - t_ns))[:SIGHTINGS])
+    associated = known[max(before - OBSERVATIONS, 0) : max(before + 1, 2)]
+    near = [s for s in associated if abs(s.centre_ns - t_ns) <= reach_ns]
+    return tuple(sorted(near, key=lambda s: abs(s.centre_ns - t_ns))[:OBSERVATIONS])

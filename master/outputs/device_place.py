@@ -2,7 +2,7 @@
 
     R_rig_forearm = R_rig_palm R_forearm_palm^T,  T_rig_camera = [R_rig_forearm, wrist] T_camera_palm^-1
 
-with `T_camera_palm` of a straight wrist (`common.wrist_bend`). A bend that nobody tells counts as none.
+with `T_camera_palm` of a straight wrist (`common.wrist_joint`). A bend that nobody tells counts as none.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ import numpy as np
 from common.arrays import Float
 from common.geometry import invert, quaternion_to_matrix
 from common.hand_model import WRIST, HandModel
-from common.wrist_bend import forearm_palm
+from common.wrist_joint import forearm_palm
 from master.outputs.poses import Poses
 
 _CORNERS = 24
@@ -30,13 +30,13 @@ class DevicePlace:
         wrist_m: (T, 3) the wrist [m], rig frame.
         R_rig_palm: (T, 3, 3).
         R_rig_forearm: (T, 3, 3).
-        bend_rad, sigma_rad: (T, 2) flexion and deviation of the wrist, as the poses have them; NaN: nobody tells.
+        wrist_angles_rad, sigma_rad: (T, 2) flexion and deviation of the wrist, as in the poses; NaN: nobody tells.
     """
 
     wrist_m: Float
     R_rig_palm: Float
     R_rig_forearm: Float
-    bend_rad: Float
+    wrist_angles_rad: Float
     sigma_rad: Float
 
     @classmethod
@@ -46,9 +46,9 @@ class DevicePlace:
         R = np.full((len(poses), 3, 3), np.nan)
         R[known] = quaternion_to_matrix(poses.orientation_wxyz[known, WRIST]) @ hand.rest_rotation[WRIST].T
         wrist_m = np.where(known[:, None], poses.position_m[:, WRIST], np.nan)
-        bend = np.nan_to_num(poses.wrist_bend_rad)
-        forearm = R @ np.swapaxes(forearm_palm(bend), 1, 2)
-        return cls(wrist_m, R, forearm, poses.wrist_bend_rad, poses.wrist_bend_sigma_rad)
+        wrist_angles = np.nan_to_num(poses.wrist_angles_rad)
+        forearm = R @ np.swapaxes(forearm_palm(wrist_angles), 1, 2)
+        return cls(wrist_m, R, forearm, poses.wrist_angles_rad, poses.wrist_angles_sigma_rad)
 
     def cameras(self, T_camera_palm: Float) -> Float:
         """Poses (T, 4, 4) of the device's camera, camera -> rig, from its file's T_camera_palm (4, 4)."""
@@ -64,8 +64,8 @@ class DevicePlace:
 
     def doubt_m(self, length_m: float) -> Float:
         """Rings (T, K, 3) [m] about the ends of `arm_m`: where these are at 2 sigma of the bend; NaN: not known."""
-        turn = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
-        around = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-        bends = self.bend_rad[:, None] + _SIGMAS * self.sigma_rad[:, None] * around
-        forearm = self.R_rig_palm[:, None] @ np.swapaxes(forearm_palm(bends), 2, 3)
+        angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
+        around = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        wrist_angles = self.wrist_angles_rad[:, None] + _SIGMAS * self.sigma_rad[:, None] * around
+        forearm = self.R_rig_palm[:, None] @ np.swapaxes(forearm_palm(wrist_angles), 2, 3)
         return self.wrist_m[:, None] + length_m * (forearm @ _ELBOW)

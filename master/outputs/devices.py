@@ -9,7 +9,7 @@ from typing import Generic, Protocol, TypeVar
 from common.bus import Bus
 from common.messages import TrackerPose
 
-TakenT = TypeVar("TakenT")
+ReceivedT = TypeVar("ReceivedT")
 TakenT_co = TypeVar("TakenT_co", covariant=True)
 
 
@@ -21,14 +21,14 @@ class Taking(Protocol[TakenT_co]):
         ...
 
 
-class DevicePoses(Generic[TakenT]):
+class DevicePoses(Generic[ReceivedT]):
     """A source of messages that publishes poses of trackers as they pass. The bus belongs to the caller."""
 
-    def __init__(self, source: Taking[TakenT], bus: Bus) -> None:
+    def __init__(self, source: Taking[ReceivedT], bus: Bus) -> None:
         """Stand between a source and who reads it."""
         self._source, self._bus = source, bus
 
-    def get(self, timeout_s: float) -> TakenT | None:
+    def get(self, timeout_s: float) -> ReceivedT | None:
         """The next message; one of a tracker is on the bus, too, stream `device`.
 
         Raises:

@@ -137,9 +137,12 @@ def _header(
         :_MOST_FIGURES
     ]
     many = len(shown) > 8
-    worn = [wrist.rig] if wrist is not None and wrist.in_rig else []
-    count = len(rig.cameras) + len(worn)
-    rigs, cameras = f"rig {' and '.join([rig.name, *worn])}", f"{count} camera{'s' if count > 1 else ''}"
+    wrist_rigs = [wrist.rig] if wrist is not None and wrist.in_rig else []
+    count = len(rig.cameras) + len(wrist_rigs)
+    rigs, cameras = (
+        f"rig {' and '.join([rig.name, *wrist_rigs])}",
+        f"{count} camera{'s' if count > 1 else ''}",
+    )
     hand = f"hand {model.profile.name} ({model.profile.side})"
     watched = f"{rigs} · {cameras}"
     if len(watched) > _HALF_LINE:
@@ -167,12 +170,12 @@ def _hand(
         told.draw_strip(figure, poses.t_ns, row)
     at = np.where(poses.valid[row][:, None], poses.position_m[row], np.nan)
     if wrist is None or wrist.in_rig:
-        turned = axis_rotation(0, _PITCH) @ axis_rotation(1, _YAW * model.side_sign)  # thumb to the eye
+        rotated = axis_rotation(0, _PITCH) @ axis_rotation(1, _YAW * model.side_sign)  # thumb to the eye
     else:
-        turned = axis_rotation(0, _WRIST_PITCH) @ axis_rotation(2, _WRIST_YAW * model.side_sign)
+        rotated = axis_rotation(0, _WRIST_PITCH) @ axis_rotation(2, _WRIST_YAW * model.side_sign)
     shown = [at] if wrist is None else [at, wrist.reach_m(poses, row)]
     t_ns = int(poses.t_ns[row])
-    view = fit_view(np.concatenate(shown if told is None else [*shown, told.points_m(t_ns)]), turned, box)
+    view = fit_view(np.concatenate(shown if told is None else [*shown, told.points_m(t_ns)]), rotated, box)
     axes = figure.add_axes(box)
     axes.set_axis_off()
     axes.set_xlim(0, view.width_px)
@@ -212,8 +215,8 @@ def _hand(
 def fit_view(at: Float, rotation: Float, box: tuple[float, float, float, float] = _HAND_BOX) -> View:
     """The view in which the points (N, 3) [m] fill the hand's box."""
     width, height = round(box[2] * WIDTH_PX), round(box[3] * HEIGHT_PX)
-    turned = at @ rotation.T
-    low, high = np.nanmin(turned, axis=0), np.nanmax(turned, axis=0)
+    rotated = at @ rotation.T
+    low, high = np.nanmin(rotated, axis=0), np.nanmax(rotated, axis=0)
     margin_m = 0.027  # of flesh around the joints
     span = high - low + 2 * margin_m
     scale = _FILL * min(width / span[0], height / span[1])

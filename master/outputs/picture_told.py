@@ -14,7 +14,7 @@ from common.geometry import quaternion_to_matrix, rigid, transform
 from common.messages import Gesture
 from common.object_profile import BoxShape, CylinderShape, ObjectProfile, Shape, tag_corners
 from master.outputs.hand_render import View
-from master.outputs.object_look import OBJECT_RGB, ObjectLook
+from master.outputs.object_appearance import OBJECT_RGB, ObjectAppearance
 from master.outputs.palette import GESTURE_RGB
 from master.outputs.picture_panels import INK, PAPER, style, unit
 from master.outputs.told_files import Contacts, ObjectPoses
@@ -137,10 +137,10 @@ class ToldPicture:
         axes.set_xlim(0.0, span)
         axes.axvline((int(t_ns[row]) - first) * 1e-9, color=INK, lw=1.0, alpha=0.7)
 
-    def _placed(self, t_ns: int) -> list[tuple[ObjectProfile, Float, ObjectLook]]:
+    def _placed(self, t_ns: int) -> list[tuple[ObjectProfile, Float, ObjectAppearance]]:
         """Objects whose place is known at an instant: file, pose (4, 4), how well."""
         profiles: Mapping[str, ObjectProfile] = {one.name: one for one in self.profiles}
-        found: list[tuple[ObjectProfile, Float, ObjectLook]] = []
+        found: list[tuple[ObjectProfile, Float, ObjectAppearance]] = []
         for poses in self.objects:
             row = int(_nearest(poses.t_ns, np.array([t_ns]))[0]) if len(poses) else -1
             if (
@@ -149,9 +149,11 @@ class ToldPicture:
                 or np.isnan(poses.position_m[row]).any()
             ):
                 continue
-            tracked = ObjectLook.HIDDEN if poses.occluded[row] else ObjectLook.WHOLE
+            tracked = ObjectAppearance.HIDDEN if poses.occluded[row] else ObjectAppearance.WHOLE
             T = rigid(quaternion_to_matrix(poses.orientation_wxyz[row]), poses.position_m[row])
-            found.append((profiles[poses.object], T, tracked if poses.tracked[row] else ObjectLook.HELD))
+            found.append(
+                (profiles[poses.object], T, tracked if poses.tracked[row] else ObjectAppearance.HELD)
+            )
         return found
 
 

@@ -96,13 +96,13 @@ class WristPicture:
         arm, ring = view.project(place.arm_m(_FOREARM_M)[0]), view.project(place.doubt_m(_FOREARM_M)[0])
         axes.plot(arm[:, 0], arm[:, 1], color=colour, lw=3.0, ls=(0, (4, 1.5)), zorder=4)
         axes.plot(ring[:, 0], ring[:, 1], color=colour, lw=1.0, zorder=4)
-        flexion, deviation = np.degrees(place.bend_rad[0])
-        bend = (
+        flexion, deviation = np.degrees(place.wrist_angles_rad[0])
+        wrist_angles = (
             f"wrist bent {flexion:+.0f}°, {deviation:+.0f}°"
             if np.isfinite(flexion)
             else "bend of the wrist not known"
         )
-        return Line2D([], [], color=colour, lw=3.0, ls=(0, (4, 1.5)), label=f"forearm, {bend}")
+        return Line2D([], [], color=colour, lw=3.0, ls=(0, (4, 1.5)), label=f"forearm, {wrist_angles}")
 
     def draw_camera(self, figure: Figure, poses: Poses, row: int, truth: PosesTruth | None) -> None:
         """The camera's view, lower left: its frame, the hand and the laser points as it should see them."""

@@ -28,10 +28,10 @@ class Poses:
         inside_volume: (T, 26).
         latency_ns: (T,) [ns]; 0 in an offline run.
         laser_m: (T, 5, 3) laser points of a wrist device [m], frame of its camera.
-        level: (T, 5) `Level` codes: what a wrist device solved each finger from.
+        solver_mode: (T, 5) `SolverMode` codes: what a wrist device solved each finger from.
         ambiguous: (T, 5) another pose of that finger explains what was seen as well.
         palm_world_wxyz, palm_world_sigma_rad: (T, 4), (T, 2) palm in the world of a wrist device's IMU; NaN: none.
-        wrist_bend_rad, wrist_bend_sigma_rad: (T, 2) of the wrist, where a device sits on the forearm; NaN: none.
+        wrist_angles_rad, wrist_angles_sigma_rad: (T, 2) of the wrist, where a device sits on the forearm; NaN: none.
     """
 
     hand: str
@@ -50,12 +50,12 @@ class Poses:
     inside_volume: Bool
     latency_ns: Int
     laser_m: Float
-    level: Code
+    solver_mode: Code
     ambiguous: Bool
     palm_world_wxyz: Float
     palm_world_sigma_rad: Float
-    wrist_bend_rad: Float
-    wrist_bend_sigma_rad: Float
+    wrist_angles_rad: Float
+    wrist_angles_sigma_rad: Float
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit together.
@@ -132,11 +132,11 @@ def record(marker_count: int) -> np.dtype[np.void]:
             ("inside_volume", "?", (j,)),
             ("latency_ns", "<i8"),
             ("laser_m", "<f8", (FINGER_COUNT, 3)),
-            ("level", "u1", (FINGER_COUNT,)),
+            ("solver_mode", "u1", (FINGER_COUNT,)),
             ("ambiguous", "?", (FINGER_COUNT,)),
             ("palm_world_wxyz", "<f8", (4,)),
             ("palm_world_sigma_rad", "<f8", (2,)),
-            ("wrist_bend_rad", "<f8", (2,)),
-            ("wrist_bend_sigma_rad", "<f8", (2,)),
+            ("wrist_angles_rad", "<f8", (2,)),
+            ("wrist_angles_sigma_rad", "<f8", (2,)),
         ]
     )

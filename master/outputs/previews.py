@@ -24,7 +24,7 @@ class PictureAsker:
         cameras: Iterable[str],
         verb: str = "preview",
         period_s: float = PERIOD_S,
-        say: Callable[[str], None] = _log.info,
+        notify: Callable[[str], None] = _log.info,
     ) -> None:
         """Begin to ask.
 
@@ -35,7 +35,7 @@ class PictureAsker:
             period_s: From one question to the next.
             say: Told once when a camera does not answer, and again after it was there.
         """
-        self._bus, self._verb, self._period_s, self._say = bus, verb, period_s, say
+        self._bus, self._verb, self._period_s, self._notify = bus, verb, period_s, notify
         self._closing = threading.Event()
         self._threads = [
             threading.Thread(target=self._work, args=(camera,), name=f"{verb} {camera}", daemon=True)
@@ -60,5 +60,5 @@ class PictureAsker:
                 silent = False
             except BusError as error:
                 if not silent and not self._closing.is_set():
-                    self._say(f"no picture of camera {camera} yet: {error}")
+                    self._notify(f"no picture of camera {camera} yet: {error}")
                 silent = True

@@ -49,7 +49,7 @@ _Kind = TypeVar("_Kind", bound=Message)
 
 
 @dataclass(frozen=True, slots=True)
-class _Feeds:
+class _Subscribers:
     """What comes from the bus."""
 
     hands: Subscription
@@ -58,7 +58,7 @@ class _Feeds:
     pictures: Subscription
 
     @classmethod
-    def of(cls, bus: Bus) -> "_Feeds":
+    def of(cls, bus: Bus) -> "_Subscribers":
         return cls(
             bus.subscribe("hand", depth=_DEPTH),
             tuple(bus.subscribe(stream, depth=_DEPTH) for stream in ("object", "contact", "gesture")),
@@ -67,8 +67,8 @@ class _Feeds:
         )
 
     def close(self) -> None:
-        for feed in (self.hands, *self.told, self.reports, self.pictures):
-            feed.close()
+        for subscriber in (self.hands, *self.told, self.reports, self.pictures):
+            subscriber.close()
 
 
 def run_viewer(
@@ -104,14 +104,14 @@ def run_viewer(
     if (mode == "save") != (path is not None):
         raise ValueError(f"mode {mode!r} with path {path}: a path belongs to mode 'save' and only to it")
     with ExitStack() as stack:
-        feeds = _Feeds.of(bus)
-        stack.callback(feeds.close)
+        subscribers = _Subscribers.of(bus)
+        stack.callback(subscribers.close)
         recording, alive = stack.enter_context(_opened(mode, path, web_port, on_ready))
         recording.send_blueprint(blueprint(setups, live=mode != "save", with_truth=False))
         scene = RerunScene(recording, setups)
         asker = PictureAsker(bus, tuple(dict.fromkeys(name for one in setups for name in one.camera_names)))
         stack.callback(asker.close)
-        return _pump(scene, recording, feeds, lambda: alive() and not stop.is_set())
+        return _pump(scene, recording, subscribers, lambda: alive() and not stop.is_set())
 
 
 def write_rrd(
@@ -157,22 +157,29 @@ def write_rrd(
             scene.log_image(camera, image, t_ns)
 
 
-def _pump(scene: RerunScene, recording: rr.RecordingStream, feeds: _Feeds, go_on: Callable[[], bool]) -> int:
+def _pump(
+    scene: RerunScene, recording: rr.RecordingStream, subscribers: _Subscribers, go_on: Callable[[], bool]
+) -> int:
     """Move messages from the bus to the scene while `go_on`, and the last ones after it."""
     shown, flush_ns, going = 0, now_ns(), True
     at_ns: int | None = None  # newest time of the master, on whose clock the timeline is
     while going:
         going = go_on()
         # Before the poses: a report or picture never overtakes a pose sent before it.
-        reports, pictures = _waiting(feeds.reports, Health), _waiting(feeds.pictures, Preview)
+        reports, pictures = _waiting(subscribers.reports, Health), _waiting(subscribers.pictures, Preview)
         for health in reports:
             at_ns = health.t_ns if health.source == MASTER else at_ns
-        for poses in _by_hand(_drain(feeds.hands)):
+        for poses in _by_hand(_drain(subscribers.hands)):
             scene.log_poses(poses)
             shown += len(poses)
             at_ns = scene.last_t_ns
         scene.log_told(
-            [one for feed in feeds.told for one in _waiting(feed, Message) if isinstance(one, Told)]
+            [
+                one
+                for subscriber in subscribers.told
+                for one in _waiting(subscriber, Message)
+                if isinstance(one, Told)
+            ]
         )
         if at_ns is not None:  # the slaves' clocks are their own: what they send stands at the master's time
             for health in reports:
@@ -186,10 +193,10 @@ def _pump(scene: RerunScene, recording: rr.RecordingStream, feeds: _Feeds, go_on
     return shown
 
 
-def _waiting(feed: Subscription, kind: type[_Kind]) -> list[_Kind]:
+def _waiting(subscriber: Subscription, kind: type[_Kind]) -> list[_Kind]:
     """The messages that have arrived."""
     received: list[_Kind] = []
-    while (message := feed.get(0.0)) is not None:
+    while (message := subscriber.get(0.0)) is not None:
         if isinstance(message, kind):
             received.append(message)
     return received

@@ -7,7 +7,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from common.messages import Source
-from master.outputs.object_look import OBJECT_RGB, ObjectLook
+from master.outputs.object_appearance import OBJECT_RGB, ObjectAppearance
 from master.outputs.palette import SOURCE_MEANING, SOURCE_RGB
 from master.rig_setup import RigSetup
 
@@ -22,7 +22,7 @@ _PLOTS: tuple[tuple[str, str, tuple[float, float] | None, bool], ...] = (
     (_RATE, "plots/rate_hz", None, False),
     ("Error against the truth [mm]", "plots/error_mm", (0.0, 20.0), True),
     ("Fingers to object [mm]", "plots/contact_mm", (-10.0, 60.0), True),
-    ("Bend of the wrist [deg]", "plots/wrist_bend_deg", (-60.0, 60.0), True),
+    ("Bend of the wrist [deg]", "plots/wrist_angles_deg", (-60.0, 60.0), True),
     ("PIP flexion (thumb: MCP) [deg]", "plots/pip_deg", (-10.0, 120.0), True),
     ("Marker: raw to filtered [mm]", "plots/jitter_mm", (0.0, 5.0), True),
     ("Joints tracked; markers, or laser points, seen", "plots/seen", (0.0, 30.0), True),
@@ -32,7 +32,7 @@ _TABS = 4  # the last so many share one place
 _BACKGROUND = rrb.Background(color=(22, 24, 28))
 # Beside and above the hand, which is 0.3-0.5 m in front of the cameras; they stay in the picture on the left.
 _EYE_M, _TARGET_M = (0.21, -0.12, 0.0), (0.012, 0.018, 0.36)
-_BESIDE_M = 0.45  # cameras farther from the hand than that stand around it: the eye steps back, to 1.5 of the farthest
+_AROUND_M = 0.45  # cameras farther from the hand than that stand around it: the eye steps back, to 1.5 of the farthest
 # Of a wrist device: from above the palm and behind the camera, beside the forearm, towards the fingers.
 _WRIST_EYE_M, _WRIST_TARGET_M = (0.17, -0.17, -0.10), (0.0, 0.035, 0.12)
 _CAMERAS_A_ROW = 4
@@ -55,7 +55,7 @@ def blueprint(setups: Sequence[RigSetup], *, live: bool, with_truth: bool) -> rr
     cameras = {name: camera for setup in setups for name, camera in setup.cameras.items()}
     rate_hz = max(camera.frame_rate_hz for camera in cameras.values())  # of the fastest
     with_markers = any(setup.has_markers for setup in setups)
-    with_bend = any(setup.has_markers and setup.wrist is not None for setup in setups)
+    with_wrist = any(setup.has_markers and setup.wrist is not None for setup in setups)
     hidden = [f"- {WORLD}/hand/{setup.hand.profile.name}/uncertainty" for setup in setups]
     span = rrb.VisibleTimeRange(
         TIMELINE,
@@ -81,14 +81,14 @@ def blueprint(setups: Sequence[RigSetup], *, live: bool, with_truth: bool) -> rr
         )
         for name in cameras
     ]
-    left_out = {name for name, there in (
-        ("plots/jitter_mm", with_markers), ("plots/error_mm", with_truth), ("plots/wrist_bend_deg", with_bend),
+    rejected = {name for name, there in (
+        ("plots/jitter_mm", with_markers), ("plots/error_mm", with_truth), ("plots/wrist_angles_deg", with_wrist),
         ("plots/contact_mm", any(setup.objects for setup in setups)),
     ) if not there}  # fmt: skip
     rows = [
         (n, p, (0.0, 1.25 * rate_hz) if n == _RATE else r, several)
         for n, p, r, several in _PLOTS
-        if p not in left_out
+        if p not in rejected
     ]
     plots = [
         rrb.TimeSeriesView(
@@ -125,7 +125,7 @@ def _eye_of(setups: Sequence[RigSetup]) -> tuple[float, float, float]:
     target, eye = np.array(_TARGET_M), np.array(_EYE_M)
     models = [model for setup in setups if setup.has_markers for model in setup.models.values()]
     reach = max(float(np.linalg.norm(model.centre - target)) for model in models)
-    if reach > _BESIDE_M:
+    if reach > _AROUND_M:
         eye = target + 1.5 * reach * (eye - target) / np.linalg.norm(eye - target)
     x, y, z = (float(value) for value in eye)
     return x, y, z
@@ -146,8 +146,8 @@ def legend() -> str:
         "- **small dim / large bright markers**: before / after the filter\n"
         + "".join(
             f"- **object** rgb{OBJECT_RGB[look]}: {look.value}\n"
-            for look in ObjectLook
-            if look is not ObjectLook.GONE
+            for look in ObjectAppearance
+            if look is not ObjectAppearance.GONE
         )
         + "- **red, yellow spots on it**: where a finger touches it, or is nearer than 3 cm, with the distance in mm\n"
         "- **pink line**: a pinch; **yellow circle**: a dial, by how much it was turned; **blue arrow**: pointing\n"

@@ -25,7 +25,7 @@ from master.outputs.rerun_states import States
 _DIAL_M, _RAY_M, _LINE_M = 0.045, 0.35, 0.0012
 _ARC_STEP_RAD = np.deg2rad(4.0)
 _TAP_NS = 500_000_000
-_BESIDE_M = np.array([0.0, -0.02, 0.0])  # of a name: above what it names
+_LABEL_M = np.array([0.0, -0.02, 0.0])  # of a name: above what it names
 
 
 class GesturesLayer:
@@ -55,15 +55,15 @@ class GesturesLayer:
                 self._states.log(f"{one.hand}/tap", one.began_t_ns, one.name)
                 self._states.log(f"{one.hand}/tap", one.t_ns, None)
             else:
-                self._lasting(root, one, at)
+                self._held(root, one, at)
             if one.phase != "update":
                 self._states.at(one.t_ns)
                 self._rec.log(
                     rr.new_entity_path([EVENTS, one.hand]),
-                    rr.TextLog(f"{one.phase} {one.kind}: {said(one)}", level="INFO"),
+                    rr.TextLog(f"{one.phase} {one.kind}: {label_of(one)}", level="INFO"),
                 )
 
-    def _lasting(self, root: str, one: Gesture, at: Float) -> None:
+    def _held(self, root: str, one: Gesture, at: Float) -> None:
         path, colour = f"{root}/{'ray' if one.kind == 'point' else one.kind}", GESTURE_RGB[one.kind]
         if one.phase == "end":
             self._states.log(f"{one.hand}/{one.kind}", one.t_ns, None)
@@ -74,7 +74,7 @@ class GesturesLayer:
             self._states.log(f"{one.hand}/{one.kind}", one.t_ns, one.name)
             self._states.at(one.t_ns)
         if one.kind == "pose":
-            self._name(path, one.name, at[5] + _BESIDE_M, colour)
+            self._name(path, one.name, at[5] + _LABEL_M, colour)
         elif one.kind == "pinch":
             self._pinch(path, one, at, colour)
         elif one.kind == "dial" and np.isfinite(one.direction).all() and np.isfinite(one.origin_m).all():
@@ -99,7 +99,7 @@ class GesturesLayer:
         closed = 0.35 + 0.65 * (one.strength if isfinite(one.strength) else 0.0)
         bright = [round(part * closed) for part in colour]
         line = rr.LineStrips3D(
-            [strip], radii=2 * _LINE_M, colors=[bright], labels=[said(one)], show_labels=True
+            [strip], radii=2 * _LINE_M, colors=[bright], labels=[label_of(one)], show_labels=True
         )
         self._rec.log(path, line)
 
@@ -109,10 +109,10 @@ class GesturesLayer:
         self._rec.log(path, thin)
         if not isfinite(one.angle_rad):
             return
-        turned = _DIAL_M * arc(one.direction, one.angle_rad) + one.origin_m
-        strip = np.concatenate([one.origin_m[None], turned, one.origin_m[None]])
+        rotated = _DIAL_M * arc(one.direction, one.angle_rad) + one.origin_m
+        strip = np.concatenate([one.origin_m[None], rotated, one.origin_m[None]])
         thick = rr.LineStrips3D(
-            [strip], radii=2.0 * _LINE_M, colors=[colour], labels=[said(one)], show_labels=True
+            [strip], radii=2.0 * _LINE_M, colors=[colour], labels=[label_of(one)], show_labels=True
         )
         self._rec.log(f"{path}/turned", thick)
 
@@ -127,7 +127,7 @@ def arc(axis: Float, angle_rad: float) -> Float:
     return np.cos(angles) * first + np.sin(angles) * np.cross(axis, first)
 
 
-def said(one: Gesture) -> str:
+def label_of(one: Gesture) -> str:
     """A gesture in words."""
     if one.kind == "pinch":
         return f"{one.name} {one.distance_m * 1e3:.0f} mm" if isfinite(one.distance_m) else one.name

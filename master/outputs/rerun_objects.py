@@ -1,7 +1,7 @@
 """What objects add to the viewer's scene: where each is and how well that is known, and where fingers touch it.
 
 world/objects/OBJECT                 its place; nothing below it while nobody knows where it is
-world/objects/OBJECT/shape/...       boxes, cylinders, balls of its file, coloured by `object_look`
+world/objects/OBJECT/shape/...       boxes, cylinders, balls of its file, coloured by `object_appearance`
 world/objects/OBJECT/beads, /tags    what it is seen by
 world/contact/HAND/OBJECT/points     where it is nearest to each finger: red touched, yellow within 3 cm
 world/contact/HAND/OBJECT/gaps       from the fingertip to there, with the distance of the skin
@@ -22,7 +22,7 @@ from common.hand_model import FINGERS
 from common.messages import Contact, ObjectPose
 from common.object_profile import BoxShape, CylinderShape, ObjectProfile, Shape
 from common.tag_family import tag_image
-from master.outputs.object_look import OBJECT_RGB, ObjectLook
+from master.outputs.object_appearance import OBJECT_RGB, ObjectAppearance
 from master.outputs.palette import TOUCH_RGB, Rgb, pack, series_rgb
 from master.outputs.rerun_blueprint import WORLD
 from master.outputs.rerun_columns import Columns, seen
@@ -40,7 +40,7 @@ class _Shown:
     """How an object is shown now."""
 
     profile: ObjectProfile | None
-    look: ObjectLook | None = None
+    look: ObjectAppearance | None = None
 
 
 class ObjectsLayer:
@@ -65,7 +65,7 @@ class ObjectsLayer:
                 self._shown.setdefault(name, _Shown(None)),
             )
             for pose in own:
-                if (look := ObjectLook.of(pose)) != shown.look:
+                if (look := ObjectAppearance.of(pose)) != shown.look:
                     self._states.at(pose.t_ns)
                     self._dress(root, shown, look)
                     shown.look = look
@@ -124,9 +124,9 @@ class ObjectsLayer:
         )
         self._rows.send(path, t_ns, columns, shown.sum(axis=1))
 
-    def _dress(self, root: str, shown: _Shown, look: ObjectLook) -> None:
+    def _dress(self, root: str, shown: _Shown, look: ObjectAppearance) -> None:
         """Show the object as it is known now, from the time that is set on."""
-        if look is ObjectLook.GONE:
+        if look is ObjectAppearance.GONE:
             self._rec.log(root, rr.Clear(recursive=True))
             return
         profile, colour = shown.profile, OBJECT_RGB[look]
@@ -135,7 +135,7 @@ class ObjectsLayer:
             return
         for kind, part in _parts(profile.shape, colour).items():
             self._rec.log(f"{root}/shape/{kind}", part)
-        if shown.look not in (None, ObjectLook.GONE):
+        if shown.look not in (None, ObjectAppearance.GONE):
             return  # what it is seen by stays as it is
         if profile.markers:
             beads = list(profile.markers.values())
@@ -162,26 +162,26 @@ def _parts(shapes: Sequence[Shape], colour: Rgb) -> dict[str, rr.AsComponents]:
     balls = [one for one in shapes if not isinstance(one, BoxShape | CylinderShape)]
     parts: dict[str, rr.AsComponents] = {}
     if boxes:
-        at, turned = _placed(boxes)
+        at, orientation = _placed(boxes)
         sizes = [one.size_m for one in boxes]
         parts["boxes"] = rr.Boxes3D(
-            sizes=sizes, centers=at, quaternions=turned, colors=[colour], fill_mode="solid"
+            sizes=sizes, centers=at, quaternions=orientation, colors=[colour], fill_mode="solid"
         )
     if cylinders:
-        at, turned = _placed(cylinders)
+        at, orientation = _placed(cylinders)
         parts["cylinders"] = rr.Cylinders3D(
             lengths=[one.length_m for one in cylinders],
             radii=[one.radius_m for one in cylinders],
             centers=at,
-            quaternions=turned,
+            quaternions=orientation,
             colors=[colour],
             fill_mode="solid",
         )
     if balls:
-        at, turned = _placed(balls)
+        at, orientation = _placed(balls)
         radii = [one.radius_m for one in balls]
         parts["balls"] = rr.Ellipsoids3D(
-            radii=radii, centers=at, quaternions=turned, colors=[colour], fill_mode="solid"
+            radii=radii, centers=at, quaternions=orientation, colors=[colour], fill_mode="solid"
         )
     return parts
 

@@ -86,15 +86,15 @@ class RerunScene:
             self._log_volume(self._first.rig.volume)
         for name, model in self._models.items():
             self._log_camera(name, model)
-        worn = {
+        wrist_models = {
             name: setup.wrist.optics
             for setup in setups
             if setup.wrist is not None
             for name in setup.wrist_cameras
         }
-        for name in worn.keys() - self._models.keys():
-            self._log_lens(name, worn[name])  # beside markers; where it is changes
-        self._images = CameraImages(recording, self._models | worn)
+        for name in wrist_models.keys() - self._models.keys():
+            self._log_lens(name, wrist_models[name])  # beside markers; where it is changes
+        self._images = CameraImages(recording, self._models | wrist_models)
         for hand, setup in self._setups.items():
             group = self._group(hand)
             if setup.wrist is not None and setup.wrist_rig is not None:
@@ -133,10 +133,10 @@ class RerunScene:
     def log_detections(self, detections: Iterable[Detections]) -> None:
         """Log what one camera saw, in its image; frames in the order of time."""
         frames = list(detections)
-        triples = [frame for frame in frames if isinstance(frame, WristDetections)]
+        cycles = [frame for frame in frames if isinstance(frame, WristDetections)]
         for hand, device in self._devices.items():
-            if triples and triples[0].camera in self._setups[hand].wrist_cameras:
-                device.log_detections(triples)
+            if cycles and cycles[0].camera in self._setups[hand].wrist_cameras:
+                device.log_detections(cycles)
         markers = [frame for frame in frames if isinstance(frame, MarkerDetections)]
         if not markers:
             return
@@ -151,7 +151,7 @@ class RerunScene:
 
     def log_health(self, health: Health, t_ns: int) -> None:
         """Plot every count and gauge of a process at `t_ns` [ns] of the timeline."""
-        for name, value in [*health.counts.items(), *health.gauges.items()]:
+        for name, value in [*health.counts.items(), *health.metrics.items()]:
             path = rr.new_entity_path(["plots", "health", health.source, name])
             self._rows.scalars(path, np.array([t_ns], np.int64), np.array([float(value)]))
 

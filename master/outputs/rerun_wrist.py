@@ -13,7 +13,7 @@ move with the device, which the solved palm and the wrist's bend place (`device_
 
 world/hand/HAND/forearm              from the wrist towards the elbow
 world/hand/HAND/forearm_doubt        a ring: where its far end is at 2 sigma of the bend
-plots/wrist_bend_deg/...             flexion and deviation
+plots/wrist_angles_deg/...             flexion and deviation
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ from master.wrist_setup import WristSetup
 
 _FAN_LINE_M, _BONE_M = 0.0003, 0.0025
 _FOREARM_M = 0.16  # of it, as long as a hand
-_BENDS = ("flexion", "deviation")
+_WRIST_ANGLES = ("flexion", "deviation")
 _POINT_M = 0.0025
 _UPRIGHT = 0.98  # cosine of 11 degrees off the vertical
 _DETECTED_PX, _POINT_PX = 4.0, 3.0
@@ -69,8 +69,8 @@ class WristLayer:
         self._laser, self._group = f"{WORLD}/laser{group}", group
         self._level_world: Float | None = None
         self._camera, self._model = camera, setup.optics
-        for i, name in enumerate(_BENDS if in_rig else ()):
-            self._rows.name(f"plots/wrist_bend_deg{group}/{name}", name, series_rgb(i))
+        for i, name in enumerate(_WRIST_ANGLES if in_rig else ()):
+            self._rows.name(f"plots/wrist_angles_deg{group}/{name}", name, series_rgb(i))
         lines = fan(setup.laser_m, spread)
         recording.log(
             f"{self._laser}/fan",
@@ -118,9 +118,9 @@ class WristLayer:
         colour = int(pack([SOURCE_RGB[Source.WRIST]])[0])
         self._rows.lines(f"{root}/forearm", t, place.arm_m(_FOREARM_M), colour, _BONE_M)
         self._rows.lines(f"{root}/forearm_doubt", t, place.doubt_m(_FOREARM_M), colour, _FAN_LINE_M)
-        for i, name in enumerate(_BENDS):
+        for i, name in enumerate(_WRIST_ANGLES):
             self._rows.scalars(
-                f"plots/wrist_bend_deg{self._group}/{name}", t, np.degrees(place.bend_rad[:, i])
+                f"plots/wrist_angles_deg{self._group}/{name}", t, np.degrees(place.wrist_angles_rad[:, i])
             )
 
     def _log_held(self, poses: Poses) -> None:
@@ -133,8 +133,8 @@ class WristLayer:
         )
         if self._level_world is None:
             self._level_world = _level(world_camera[0])
-        turned = matrix_to_quaternion(self._level_world @ world_camera)
-        columns = rr.Transform3D.columns(quaternion=turned[:, [1, 2, 3, 0]])
+        orientation = matrix_to_quaternion(self._level_world @ world_camera)
+        columns = rr.Transform3D.columns(quaternion=orientation[:, [1, 2, 3, 0]])
         self._rows.send(WORLD, poses.t_ns[known], columns, None)
 
     def log_detections(self, frames: Sequence[WristDetections]) -> None:

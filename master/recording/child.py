@@ -30,7 +30,7 @@ class RecorderProcess:
         path: Path,
         files: RigFiles,
         endpoint: str,
-        say: Callable[[str], None],
+        notify: Callable[[str], None],
         ended: Callable[[], None] = lambda: None,
     ) -> None:
         """Start it.
@@ -42,7 +42,7 @@ class RecorderProcess:
             say: Told each line that it says.
             ended: Called, on another thread, once it is gone.
         """
-        self._say, self._ended, self._path = say, ended, path
+        self._notify, self._ended, self._path = notify, ended, path
         self._name = f"recorder-{os.getpid()}"
         self._process = subprocess.Popen(
             _command(path, files, endpoint, self._name),
@@ -67,7 +67,7 @@ class RecorderProcess:
             if self._process.poll() is not None:
                 self._thread.join(1.0)
                 raise RecordingError(
-                    f"{self._path}: the recorder ended at once: {self._last or 'it said nothing'}"
+                    f"{self._path}: the recorder ended at once: {self._last or 'it printed nothing'}"
                 )
             if time.monotonic() > deadline:
                 self.close()
@@ -85,14 +85,14 @@ class RecorderProcess:
             code = self._process.wait()
         self._thread.join(1.0)
         if code:
-            self._say(f"the recording is not whole: {self._last}")
+            self._notify(f"the recording is not whole: {self._last}")
 
     def _listen(self) -> None:
         assert self._process.stdout is not None  # it is a pipe
         with self._process.stdout:
             for line in self._process.stdout:
                 self._last = line.strip()
-                self._say(self._last)
+                self._notify(self._last)
         self._ended()
 
 

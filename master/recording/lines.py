@@ -102,7 +102,7 @@ def raw_lines(recording: MessageRecording) -> list[str]:
     last: dict[str, Health] = {}
     for one in recording.read(["health"]) if folders else ():
         told = one.message
-        if isinstance(told, Health) and (told.source in last or told.gauges.get("raw.on")):
+        if isinstance(told, Health) and (told.source in last or told.metrics.get("raw.on")):
             last[told.source] = told
     return [
         f"raw frames of {name}: {last[name].counts.get('raw.frames', 0)} in {folder},"
@@ -115,11 +115,11 @@ def raw_lines(recording: MessageRecording) -> list[str]:
 
 def events_of(recording: MessageRecording) -> list[str]:
     """What happened while it was recorded that a replay cannot repeat, or that is missing from it."""
-    watch = EventWatch(recording.begin_t_ns)
+    watch = EventMonitor(recording.begin_t_ns)
     return [line for one in recording.read(["health"]) for line in watch.push(one.t_ns, one.message)]
 
 
-class EventWatch:
+class EventMonitor:
     """Tells from the reports of master and recorder what happened. Holds what they said last."""
 
     def __init__(self, begin_t_ns: int) -> None:

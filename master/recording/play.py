@@ -26,7 +26,7 @@ from master.outputs.files import RunFiles
 from master.outputs.sink import Sink
 from master.recording.files import recorded_setups
 from master.recording.player import Passed, Player
-from master.recording.tap import Tap
+from master.recording.probe import Probe
 
 _REPORT_S = 1.0
 
@@ -57,7 +57,7 @@ def run_play(
     settings: PlaySettings,
     bus: Bus | None,
     stop: threading.Event,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
     show: Callable[[float, float], None] = lambda _position_s, _length_s: None,
 ) -> Passed:
     """Play until the end, or until stopped.
@@ -78,7 +78,7 @@ def run_play(
         PhalanxError: The stretch or speed is none.
     """
     recording = open_messages(settings.path)
-    _check(recording, settings, say)
+    _check(recording, settings, notify)
     setups = recorded_setups(recording)
     with ExitStack() as stack:
         sinks: list[Sink] = [] if bus is None else [BusSink(bus)]
@@ -88,9 +88,9 @@ def run_play(
             objects = [one.name for setup in setups for one in setup.objects]
             sinks.append(RunFiles(settings.out / "poses.npz", counts, objects))
             stack.callback(sinks[-1].close)
-        tap = None if bus is None else Tap(bus, SystemClock())
-        if tap is not None:
-            stack.callback(tap.close)
+        probe = None if bus is None else Probe(bus, SystemClock())
+        if probe is not None:
+            stack.callback(probe.close)
 
         def again(stream: str, name: str, message: Message) -> None:
             if bus is not None:
@@ -109,22 +109,22 @@ def run_play(
                 to_ns=at(settings.to_s),
                 solved=settings.solved,
                 again=again,
-                taken=(lambda _message: None) if tap is None else tap.show,
-                say=say,
+                observed=(lambda _message: None) if probe is None else probe.show,
+                notify=notify,
             )
         except ValueError as error:
             raise PhalanxError(f"{settings.path}: {error}") from error
-        host = _Host(player, recording, bus, tap, stop, show)
+        host = _Host(player, recording, bus, probe, stop, show)
         stack.callback(host.close)
         passed = player.run()
         while settings.loop and not stop.is_set():
-            say("again from the beginning")
+            notify("again from the beginning")
             passed = player.run()
         show(host.position_s, host.length_s)
         return passed
 
 
-def _check(recording: MessageRecording, settings: PlaySettings, say: Callable[[str], None]) -> None:
+def _check(recording: MessageRecording, settings: PlaySettings, notify: Callable[[str], None]) -> None:
     """Refuse what cannot be played, and say what has to be known of what can.
 
     Raises:
@@ -137,11 +137,11 @@ def _check(recording: MessageRecording, settings: PlaySettings, say: Callable[[s
     if not recording.counts.get(wanted):
         raise RecordingError(f"{recording.path}: nothing to play: it has no messages of stream {wanted!r}")
     if recording.cut:
-        say("the recording was not ended: it is played up to the cut")
+        notify("the recording was not ended: it is played up to the cut")
     if recording.broken:
-        say(f"{recording.broken} chunks or files of the recording are broken and left out")
+        notify(f"{recording.broken} chunks or files of the recording are broken and left out")
     if recording.about.get("wire") != str(WIRE_VERSION):
-        say(
+        notify(
             f"recorded with wire version {recording.about.get('wire', '?')}, this program speaks {WIRE_VERSION}:"
             " messages that it does not know are left out"
         )
@@ -155,11 +155,11 @@ class _Host:
         player: Player,
         recording: MessageRecording,
         bus: Bus | None,
-        tap: Tap | None,
+        probe: Probe | None,
         stop: threading.Event,
         show: Callable[[float, float], None],
     ) -> None:
-        self._player, self._bus, self._tap, self._stop, self._show = player, bus, tap, stop, show
+        self._player, self._bus, self._probe, self._stop, self._show = player, bus, probe, stop, show
         self._begin_ns = recording.begin_t_ns
         self.length_s = (recording.end_t_ns - recording.begin_t_ns) * 1e-9
         self._session = secrets.randbits(63)
@@ -182,15 +182,15 @@ class _Host:
 
     def health(self) -> Health:
         """How it is, as the master's report: also play.position_s, .length_s, .speed and .paused (0, 1)."""
-        gauges = {
+        metrics = {
             "play.position_s": round(self.position_s, 3),
             "play.length_s": round(self.length_s, 3),
             "play.speed": self._player.speed,
             "play.paused": float(self._player.paused),
             "poses_per_s": round(self._rate, 2),
         }
-        counts = {"poses": self._player.poses} | ({} if self._tap is None else self._tap.counts)
-        return Health(MASTER, self._session, now_ns(), counts, gauges, *program())
+        counts = {"poses": self._player.poses} | ({} if self._probe is None else self._probe.counts)
+        return Health(MASTER, self._session, now_ns(), counts, metrics, *program())
 
     def answer(self, command: Command) -> Health:
         """Obey "report", "pause", "resume", "seek" {"t_s": 12.5}, "speed" {"factor": 2.0}, "tap" or "stop".
@@ -204,7 +204,7 @@ class _Host:
             "resume": self._player.resume,
             "seek": lambda: self._player.seek(self._begin_ns + round(_number(command, "t_s") * 1e9)),
             "speed": lambda: self._player.set_speed(_number(command, "factor")),
-            "tap": lambda: None if self._tap is None else self._tap.lease(),
+            "tap": lambda: None if self._probe is None else self._probe.lease(),
             "stop": self._stop.set,
         }
         if command.verb not in verbs:

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from common.errors import PhalanxError
-from master.master_bus import carry_bus
+from master.master_bus import host_bus
 from master.options import HERE_BUS, BusEnd, MessageFile
 from master.recording.lines import ProgressLine, bar
 from master.recording.play import PlaySettings, run_play
@@ -57,9 +57,9 @@ def play(
         done = position_s / length_s if length_s > 0.0 else 1.0
         line.show(f"{bar(done)} {position_s:.1f} of {length_s:.1f} s")
 
-    connection = None if no_bus else carry_bus(bus)
+    connection = None if no_bus else host_bus(bus)
     try:
-        passed = run_play(settings, connection, stop, _player_says, show)
+        passed = run_play(settings, connection, stop, _player_status, show)
     finally:
         if connection is not None:
             connection.close()
@@ -86,5 +86,5 @@ def _speed(text: str) -> float:
     return factor
 
 
-def _player_says(line: str) -> None:
+def _player_status(line: str) -> None:
     typer.echo(f"play: {line}")

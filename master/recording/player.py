@@ -1,4 +1,4 @@
-"""Plays a recording: what the master took goes through the very same `World` again, at any speed, from any moment.
+"""Plays a recording: what the master took goes through the very same `Dispatcher` again, at any speed, from any moment.
 
 What comes out depends on nothing but the messages and their order, so that every pass over the same stretch tells the
 same, bit for bit, however fast; a `Backlog` among them says what the live master left out, and so does the player. To
@@ -16,22 +16,22 @@ from common.errors import PhalanxError
 from common.messages import Backlog, Contact, Gesture, HandPose, Message, Told
 from common.recording import MessageRecording, Recorded
 from master.app import Solved
-from master.hurry import Hurry, Shedding
-from master.link_senders import Taken
+from master.dispatcher import Dispatcher
+from master.link_senders import SensorMessage
+from master.load_shedding import LoadShedding, Shedding
 from master.outputs.sink import Sink
 from master.recording.clock import ReplayClock
 from master.recording.digest import ToldDigest
-from master.recording.lines import EventWatch
+from master.recording.lines import EventMonitor
 from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from master.tuning import LivePipeline
-from master.world import World
 
 SETTLE_NS = 2_000_000_000
 GAP_NS = 600_000_000_000  # longer than that nobody waits for the next message
 _STEP_S = 60.0  # of a wait, whatever the speed; a change ends it
 SOLVED = ("hand", "object", "contact", "gesture")
-BESIDE = ("health", "checklist", "preview", "still")  # told again as they were told
+AUXILIARY = ("health", "checklist", "preview", "still")  # told again as they were told
 _OWN = frozenset({"master", "recorder"})  # whose reports are not: the player is the master now
 
 
@@ -55,14 +55,16 @@ class Passed:
         return self.digest.counts["poses"] / max(self.seconds, 1e-9)
 
 
-def world_of(setups: Sequence[RigSetup], hurry: Hurry) -> World:
-    """The world as a live master builds it, which leaves out instants as `hurry` says.
+def world_of(setups: Sequence[RigSetup], load_shedding: LoadShedding) -> Dispatcher:
+    """The world as a live master builds it, which leaves out instants as `load_shedding` says.
 
     Raises:
         CalibrationError: The files do not fit together.
     """
     stages = StageTimes()
-    return World(setups, [LivePipeline(setup, stages, Shedding(hurry)) for setup in setups], stages)
+    return Dispatcher(
+        setups, [LivePipeline(setup, stages, Shedding(load_shedding)) for setup in setups], stages
+    )
 
 
 class Player:
@@ -82,8 +84,8 @@ class Player:
         to_ns: int | None = None,
         solved: bool = False,
         again: Callable[[str, str, Message], None] = lambda _stream, _name, _message: None,
-        taken: Callable[[Message], None] = lambda _message: None,
-        say: Callable[[str], None] = lambda _line: None,
+        observed: Callable[[Message], None] = lambda _message: None,
+        notify: Callable[[str], None] = lambda _line: None,
     ) -> None:
         """Stand at the beginning.
 
@@ -102,7 +104,7 @@ class Player:
             ValueError: The speed is none, or the stretch is empty.
         """
         self._recording, self._setups, self._sinks, self._solved = recording, setups, sinks, solved
-        self._again, self._taken, self._say = again, taken, say
+        self._again, self._observed, self._notify = again, observed, notify
         self.first_ns = recording.begin_t_ns if from_ns is None else max(from_ns, recording.begin_t_ns)
         self.last_ns = recording.end_t_ns if to_ns is None else min(to_ns, recording.end_t_ns)
         if self.first_ns > self.last_ns:
@@ -111,7 +113,7 @@ class Player:
         self._changed = threading.Condition()
         self._jump: int | None = None
         self._stopped = False
-        self._said: set[str] = set()
+        self._notified: set[str] = set()
         self._unsolved: set[tuple[str, str]] = set()
         self.poses = 0
         self.at_ns = self.first_ns
@@ -189,27 +191,27 @@ class Player:
 
     def _pass(self, start_ns: int, digest: ToldDigest) -> bool:
         """Play from `start_ns`; False: not to the end."""
-        hurry = Hurry()
-        world = None if self._solved else world_of(self._setups, hurry)
-        events = EventWatch(self._recording.begin_t_ns)
+        load_shedding = LoadShedding()
+        dispatcher = None if self._solved else world_of(self._setups, load_shedding)
+        events = EventMonitor(self._recording.begin_t_ns)
         with self._changed:
             self._clock.seek(start_ns, now_ns())  # to build a world took its time
-        streams = (*BESIDE, *(SOLVED if self._solved else ("taken",)))
+        streams = (*AUXILIARY, *(SOLVED if self._solved else ("taken",)))
         for one in self._recording.read(streams, start_ns - SETTLE_NS, self.last_ns):
             silent = one.t_ns < start_ns
             if not silent and not self._due(one.t_ns):
                 return False
             if one.stream == "health":
                 self._tell_events(events.push(one.t_ns, one.message))
-                if events.restarted and world is not None:
-                    hurry = Hurry()
-                    world = world_of(self._setups, hurry)
+                if events.restarted and dispatcher is not None:
+                    load_shedding = LoadShedding()
+                    dispatcher = world_of(self._setups, load_shedding)
             if isinstance(one.message, Backlog):
-                hurry.leave_out = one.message.leave_out
-            told = self._told(world, one)
+                load_shedding.reject = one.message.reject
+            told = self._told(dispatcher, one)
             if not silent:
                 self._write(told, digest)
-                self._beside(one)
+                self._auxiliary(one)
                 self.at_ns = one.t_ns
             else:
                 for _ in told:
@@ -231,27 +233,27 @@ class Player:
                 self._changed.wait(None if wait_s is None else min(wait_s, _STEP_S))
             return False
 
-    def _told(self, world: World | None, one: Recorded) -> Iterable[Told]:
+    def _told(self, dispatcher: Dispatcher | None, one: Recorded) -> Iterable[Told]:
         """What a message tells: the world makes it, or it was told live."""
         if one.stream in SOLVED:
             return (cast(Told, one.message),)
-        if one.stream != "taken" or world is None or isinstance(one.message, Backlog):
+        if one.stream != "taken" or dispatcher is None or isinstance(one.message, Backlog):
             return ()
-        return self._solve(world, cast(Taken, one.message), one.name)
+        return self._solve(dispatcher, cast(SensorMessage, one.message), one.name)
 
-    def _solve(self, world: World, message: Taken, name: str) -> Iterable[Told]:
+    def _solve(self, dispatcher: Dispatcher, message: SensorMessage, name: str) -> Iterable[Told]:
         """What the world makes of a message.
 
         Nothing of one that it cannot solve, which the recording may hold.
         """
         try:
-            return [_plain(solved) for solved in world.push(message)]
+            return [_plain(solved) for solved in dispatcher.push(message)]
         except PhalanxError:
             raise
         except Exception as error:  # noqa: BLE001 -- a file may hold whatever makes the solver raise
             kind = type(error).__name__
             if (name, kind) not in self._unsolved:
-                self._say(f"messages of {name} cannot be solved and are left out: {kind}: {error}")
+                self._notify(f"messages of {name} cannot be solved and are left out: {kind}: {error}")
             self._unsolved.add((name, kind))
             return ()
 
@@ -262,17 +264,17 @@ class Player:
                 sink.write(message)
             self.poses += isinstance(message, HandPose)
 
-    def _beside(self, one: Recorded) -> None:
+    def _auxiliary(self, one: Recorded) -> None:
         if one.stream == "taken":
-            self._taken(one.message)
-        elif one.stream in BESIDE and one.name not in _OWN:
+            self._observed(one.message)
+        elif one.stream in AUXILIARY and one.name not in _OWN:
             self._again(one.stream, one.name, one.message)
 
     def _tell_events(self, lines: Sequence[str]) -> None:
         for line in lines:
-            if line not in self._said:  # not again with every jump
-                self._said.add(line)
-                self._say(line)
+            if line not in self._notified:  # not again with every jump
+                self._notified.add(line)
+                self._notify(line)
 
 
 def _plain(solved: Solved) -> Told:

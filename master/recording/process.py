@@ -18,10 +18,10 @@ from common.machine import program
 from common.messages import Command, Health
 from common.recording import MessageWriter
 from master.outputs.previews import PictureAsker
-from master.recording.feed import Feed, MasterClock, TapLease
 from master.recording.files import carried_files, rigs_text
 from master.recording.raw import RawAsker, raw_text
 from master.recording.recorder import MessageRecorder, Progress
+from master.recording.subscriber import MasterClock, ProbeLease, StreamSubscriber
 from master.rig import RigFiles
 
 NAME = "recorder"
@@ -67,7 +67,7 @@ def run_recorder(
     settings: RecordSettings,
     connect: Callable[[threading.Event], Bus | None],
     stop: threading.Event,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
     show: Callable[[Progress, int], None],
 ) -> Progress:
     """Record until stopped, until the length is reached, or until the disk is full.
@@ -94,7 +94,7 @@ def run_recorder(
     raw = RawAsker(
         settings.path.stem,
         cameras if settings.raw else (),
-        say,
+        notify,
         lambda told: recorder.offer("health", told, clock.now_ns()),
     )
     about = {"rigs": rigs_text(settings.files.rigs)}
@@ -102,7 +102,7 @@ def run_recorder(
         about["raw"] = raw_text(settings.path.stem, cameras)
     writer = MessageWriter(settings.path, carried, about)
     recorder = MessageRecorder(writer, settings.path.absolute().parent, settings.reserve_bytes)
-    run = _Run(settings, cameras, clock, recorder, raw, stop, say, show)
+    run = _Run(settings, cameras, clock, recorder, raw, stop, notify, show)
     try:
         while not run.over and (bus := connect(stop)) is not None:
             try:
@@ -127,22 +127,22 @@ class _Run:
         recorder: MessageRecorder,
         raw: RawAsker,
         stop: threading.Event,
-        say: Callable[[str], None],
+        notify: Callable[[str], None],
         show: Callable[[Progress, int], None],
     ) -> None:
-        self._settings, self._recorder, self._stop, self._say, self._show = (
+        self._settings, self._recorder, self._stop, self._notify, self._show = (
             settings,
             recorder,
             stop,
-            say,
+            notify,
             show,
         )
         self._cameras, self._raw = cameras, raw
         self._session = secrets.randbits(63)
         self._clock = clock
         self._gone_lost = self._gone_dropped = 0
-        self._lease: TapLease | None = None
-        self._feed: Feed | None = None
+        self._lease: ProbeLease | None = None
+        self._subscriber: StreamSubscriber | None = None
         self._master: int | None = None
         self._reloads = 0
 
@@ -160,9 +160,9 @@ class _Run:
             BusError: The master refuses to be tapped.
         """
         with ExitStack() as stack:
-            self._feed = Feed(bus, self._settings.streams, self._recorder, self._clock)
-            stack.callback(self._close_feed, self._feed)
-            self._lease = TapLease(bus, self._feed, self._clock)
+            self._subscriber = StreamSubscriber(bus, self._settings.streams, self._recorder, self._clock)
+            stack.callback(self._close_subscriber, self._subscriber)
+            self._lease = ProbeLease(bus, self._subscriber, self._clock)
             bus.serve(NAME, self.answer)
             bus.announce(NAME)
             if self._settings.ready_as is not None:
@@ -185,13 +185,13 @@ class _Run:
         """
         now = self._recorder.progress()
         counts = now.counts | {"dropped": self._dropped(now), "lost": self._lost()}
-        gauges = {
+        metrics = {
             "recorder.seconds": round(now.seconds, 3),
             "recorder.megabytes": round(now.written_bytes * 1e-6, 3),
             "recorder.megabytes_per_s": round(now.bytes_per_s * 1e-6, 3),
             "recorder.free_gb": round(now.free_bytes * 1e-9, 3),
         }
-        return Health(NAME, self._session, self._clock.now_ns(), counts, gauges, *program())
+        return Health(NAME, self._session, self._clock.now_ns(), counts, metrics, *program())
 
     def answer(self, command: Command) -> Health:
         """Obey "report" or "stop".
@@ -205,7 +205,7 @@ class _Run:
             self._stop.set()
         return self.health()
 
-    def _keep(self, bus: Bus, lease: TapLease) -> None:
+    def _keep(self, bus: Bus, lease: ProbeLease) -> None:
         missed, due_ns = 0, now_ns()
         while not self.over and missed < _TRIES:
             if now_ns() < due_ns:
@@ -224,30 +224,33 @@ class _Run:
             bus.publish("health", NAME, self.health())
             self._show(self._recorder.progress(), self._lost())
         if missed:
-            self._say("the master is gone; waiting for it")
+            self._notify("the master is gone; waiting for it")
 
     def _look(self, told: Health) -> None:
         """Say what the player of this file has to know, and keep in the file where a master was started anew."""
         if told.session != self._master:
             self._recorder.offer("health", told, self._clock.now_ns())
             if self._master is None:
-                self._say(f"recording into {self._settings.path}")
+                self._notify(f"recording into {self._settings.path}")
             else:
-                self._say("the master was started again; recording goes on")
+                self._notify("the master was started again; recording goes on")
             self._master, self._reloads = told.session, told.counts.get("reload.applied", 0)
         if told.counts.get("reload.applied", 0) != self._reloads:
             self._reloads = told.counts.get("reload.applied", 0)
-            self._say("files of the rig were changed: from here on a replay is not what was told live")
+            self._notify("files of the rig were changed: from here on a replay is not what was told live")
 
     def _lost(self) -> int:
         return self._gone_lost + (0 if self._lease is None else self._lease.lost)
 
     def _dropped(self, now: Progress) -> int:
-        feed = {} if self._feed is None else self._feed.dropped
-        return self._gone_dropped + sum(now.dropped.values()) + sum(feed.values())
+        subscriber = {} if self._subscriber is None else self._subscriber.dropped
+        return self._gone_dropped + sum(now.dropped.values()) + sum(subscriber.values())
 
-    def _close_feed(self, feed: Feed) -> None:
+    def _close_subscriber(self, subscriber: StreamSubscriber) -> None:
         # One that owns us has stopped, and all that it said is to be kept; another one goes on without us.
-        feed.close(_DRAIN_S if self._settings.ready_as is None else _OWNED_DRAIN_S)
-        self._gone_lost, self._gone_dropped = self._lost(), self._gone_dropped + sum(feed.dropped.values())
-        self._lease = self._feed = None
+        subscriber.close(_DRAIN_S if self._settings.ready_as is None else _OWNED_DRAIN_S)
+        self._gone_lost, self._gone_dropped = (
+            self._lost(),
+            self._gone_dropped + sum(subscriber.dropped.values()),
+        )
+        self._lease = self._subscriber = None

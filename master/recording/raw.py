@@ -41,7 +41,7 @@ class RawAsker:
         self,
         stem: str,
         cameras: Sequence[str],
-        say: Callable[[str], None],
+        notify: Callable[[str], None],
         keep: Callable[[Health], None],
         period_s: float = _PERIOD_S,
     ) -> None:
@@ -62,7 +62,7 @@ class RawAsker:
                 refuse_strange(raw_name(stem, camera), "--raw: folder")
         except CalibrationError as error:
             raise RecordingError(f"{error}: name the recording otherwise") from error
-        self._stem, self._say, self._keep, self._period_s = stem, say, keep, period_s
+        self._stem, self._notify, self._keep, self._period_s = stem, notify, keep, period_s
         self._cameras = [_Camera(name) for name in cameras]
         self._closing = threading.Event()
         self._threads: list[threading.Thread] = []
@@ -113,12 +113,12 @@ class RawAsker:
                 self._refused(camera, bus, error)
             elif not camera.silent:
                 camera.silent = True
-                self._say(f"camera {camera.name} does not answer; its raw frames begin when it does")
+                self._notify(f"camera {camera.name} does not answer; its raw frames begin when it does")
             return
         camera.here, camera.silent, camera.ended = True, False, told.counts.get("raw.ended", 0)
         if not camera.begun:
             camera.begun = True
-            self._say(f"camera {camera.name}: raw frames into {self._folder(camera)}")
+            self._notify(f"camera {camera.name}: raw frames into {self._folder(camera)}")
             self._keep(told)
 
     def _refused(self, camera: _Camera, bus: Bus, error: BusError) -> None:
@@ -129,7 +129,7 @@ class RawAsker:
             return
         camera.refused = True
         verb = "ended" if camera.begun else "not recorded"
-        self._say(f"camera {camera.name}: raw frames {verb}: {error}")
+        self._notify(f"camera {camera.name}: raw frames {verb}: {error}")
 
     def _was_away(self, camera: _Camera, bus: Bus) -> bool:
         """Whether it ended its recording for want of us, not for a fault of its own."""
@@ -143,13 +143,13 @@ class RawAsker:
         try:
             told = bus.ask(Command(camera.name, "raw_stop"), _STOP_S)
         except BusError as error:
-            self._say(f"camera {camera.name}: raw frames end within {LEASE_S:g} s by themselves: {error}")
+            self._notify(f"camera {camera.name}: raw frames end within {LEASE_S:g} s by themselves: {error}")
             return
         self._keep(told)
         frames, dropped = told.counts.get("raw.frames", 0), told.counts.get("raw.dropped", 0)
-        self._say(
+        self._notify(
             f"camera {camera.name}: {frames} raw frames, {dropped} dropped, in {self._folder(camera)}"
-            f" ({told.gauges.get('raw.megabytes', 0.0):.1f} MB)"
+            f" ({told.metrics.get('raw.megabytes', 0.0):.1f} MB)"
         )
 
 

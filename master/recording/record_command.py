@@ -84,9 +84,9 @@ def record(
         if owned is None:
             line.show(progress_text(now, lost, seconds))
 
-    end = run_recorder(settings, lambda stop: _master_bus(bus, stop), stop, _recorder_says, show)
+    end = run_recorder(settings, lambda stop: _master_bus(bus, stop), stop, _recorder_status, show)
     dropped = sum(end.dropped.values())
-    _recorder_says(
+    _recorder_status(
         f"recorded {end.seconds:.2f} s, {sum(end.counts.values())} messages, {dropped} dropped,"
         f" {end.written_bytes * 1e-6:.2f} MB in {file}"
     )
@@ -94,7 +94,9 @@ def record(
 
 def _master_bus(endpoint: str, stop: threading.Event) -> Bus | None:
     """The bus as the master sees it, once one listens there; None when stopped before."""
-    return bus_of_master(endpoint, stop, lambda _error: _recorder_says(f"waiting for a master at {endpoint}"))
+    return bus_of_master(
+        endpoint, stop, lambda _error: _recorder_status(f"waiting for a master at {endpoint}")
+    )
 
 
 def _stop_with_input(stop: threading.Event) -> None:
@@ -103,5 +105,5 @@ def _stop_with_input(stop: threading.Event) -> None:
     stop.set()
 
 
-def _recorder_says(line: str) -> None:
+def _recorder_status(line: str) -> None:
     typer.echo(f"recorder: {line}")

@@ -24,7 +24,7 @@ DEPTH = 20_000  # messages that may wait for the disk: some seconds
 PICTURES = 100  # and no picture is taken where so many wait: they would fill the memory
 RESERVE_BYTES = 200_000_000  # a system without any room left cannot even be logged in to
 _RATE_S = 0.9
-_LOOK_S = 0.25  # so often the disk is looked at, and what waits in a chunk given to it
+_POLL_S = 0.25  # so often the disk is looked at, and what waits in a chunk given to it
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +132,7 @@ class MessageRecorder:
         looked = 0.0
         while not (self._closing.is_set() and self._waiting.empty()):
             try:
-                if time.monotonic() - looked > _LOOK_S:
+                if time.monotonic() - looked > _POLL_S:
                     looked = time.monotonic()
                     self._look()
                 self._write_next()
@@ -149,7 +149,7 @@ class MessageRecorder:
 
     def _write_next(self) -> None:
         try:
-            stream, message, t_ns = self._waiting.get(timeout=_LOOK_S)
+            stream, message, t_ns = self._waiting.get(timeout=_POLL_S)
         except queue.Empty:
             self._writer.flush()  # nothing comes: what is there need not wait for company
             return

@@ -39,12 +39,12 @@ def send(
     names = [] if only is None else [name.strip() for name in only.split(",") if name.strip()]
     refuse_unknown(names)  # now, not when a master is there
     stop = stop_on_signals()
-    connection = bus_of_master(bus, stop, lambda error: _say(f"waiting for a master: {error}"), site)
+    connection = bus_of_master(bus, stop, lambda error: _print(f"waiting for a master: {error}"), site)
     if connection is None:
         return
     try:
         _refuse_second(connection)
-        run_sender(connection, settings, path, names, stop, _say)
+        run_sender(connection, settings, path, names, stop, _print)
     finally:
         connection.close()
 
@@ -62,5 +62,5 @@ def _refuse_second(connection: ZenohBus) -> None:
         )
 
 
-def _say(line: str) -> None:
+def _print(line: str) -> None:
     typer.echo(f"outputs: {line}")

@@ -18,7 +18,7 @@ FIRST_RETRY_S, LAST_RETRY_S = 1.0, 10.0
 _JOIN_S = 3.0  # an output that hangs is left to the end of the process
 
 
-class Tally:
+class Counters:
     """What one output did since the process began; outlives the output's being switched off.
 
     Attributes:
@@ -43,12 +43,12 @@ class OutputLine:
         self,
         name: str,
         make: Callable[[], Sink],
-        tally: Tally,
-        say: Callable[[str], None],
+        counters: Counters,
+        notify: Callable[[str], None],
         clock: Clock | None = None,
     ) -> None:
         """Begin at once; `make` opens the sink and is called on the line's own thread, again after each failure."""
-        self._name, self._make, self._tally, self._say = name, make, tally, say
+        self._name, self._make, self._counters, self._notify = name, make, counters, notify
         self._clock: Clock = SystemClock() if clock is None else clock
         self._queue: deque[Told] = deque()
         self._changed = threading.Condition()
@@ -72,11 +72,11 @@ class OutputLine:
         """Queue one message; never waits. The oldest makes room, or the message is lost while the output is closed."""
         with self._changed:
             if self._sink is None:
-                self._tally.dropped += 1
+                self._counters.dropped += 1
                 return
             if len(self._queue) >= DEPTH:
                 self._queue.popleft()
-                self._tally.dropped += 1
+                self._counters.dropped += 1
             self._queue.append(message)
             self._changed.notify()
 
@@ -87,7 +87,7 @@ class OutputLine:
             self._changed.notify()
         self._thread.join(_JOIN_S)
         if self._thread.is_alive():
-            self._say(f"{self._name}: hangs and was left behind")
+            self._notify(f"{self._name}: hangs and was left behind")
 
     def _work(self) -> None:
         try:
@@ -107,9 +107,9 @@ class OutputLine:
         except (PhalanxError, OSError) as error:
             self._failed(error)
             return
-        if self._tally.trouble:
-            self._say(f"{self._name}: open again")
-        self._tally.trouble, self._wait_s = "", FIRST_RETRY_S
+        if self._counters.trouble:
+            self._notify(f"{self._name}: open again")
+        self._counters.trouble, self._wait_s = "", FIRST_RETRY_S
 
     def _pause(self) -> None:
         """Wait until it is worth another try."""
@@ -129,28 +129,28 @@ class OutputLine:
             try:
                 sink.write(message)
             except (PhalanxError, OSError) as error:
-                self._tally.dropped += len(messages) - number
+                self._counters.dropped += len(messages) - number
                 self._shut()
                 self._failed(error)
                 return
-            self._tally.sent += 1
+            self._counters.sent += 1
 
     def _shut(self) -> None:
         sink, self._sink = self._sink, None
         if sink is None:
             return
         with self._changed:
-            self._tally.dropped += len(self._queue)
+            self._counters.dropped += len(self._queue)
             self._queue.clear()
         try:
             sink.close()
         except (PhalanxError, OSError) as error:
-            self._say(f"{self._name}: closing: {error}")
+            self._notify(f"{self._name}: closing: {error}")
 
     def _failed(self, error: Exception) -> None:
         """Count it, and say it once: the same trouble again is not news."""
-        self._tally.failed += 1
+        self._counters.failed += 1
         text = str(error)
-        if text != self._tally.trouble:
-            self._say(f"{self._name}: {text}; tried again")
-        self._tally.trouble = text
+        if text != self._counters.trouble:
+            self._notify(f"{self._name}: {text}; tried again")
+        self._counters.trouble = text

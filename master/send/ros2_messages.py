@@ -22,10 +22,10 @@ POSES, STATES, FLAGS = (
     "std_msgs/msg/UInt8MultiArray",
 )
 POSE, TRANSFORMS = "geometry_msgs/msg/PoseWithCovarianceStamped", "tf2_msgs/msg/TFMessage"
-_BENDS = ("abduction", "flexion", "pip", "dip")
-_THUMB_BENDS = ("cmc_abduction", "cmc_flexion", "mcp", "ip")
+_ANGLES = ("abduction", "flexion", "pip", "dip")
+_THUMB_ANGLES = ("cmc_abduction", "cmc_flexion", "mcp", "ip")
 ANGLES = tuple(
-    f"{finger}_{bend}" for finger in FINGERS for bend in (_THUMB_BENDS if finger == "thumb" else _BENDS)
+    f"{finger}_{angle}" for finger in FINGERS for angle in (_THUMB_ANGLES if finger == "thumb" else _ANGLES)
 )
 _LAST_NS = 2**31 * 1_000_000_000 - 1  # ROS's seconds have 32 bits
 _STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -56,7 +56,7 @@ def hand_messages(pose: HandPose, wall_ns: int) -> list[tuple[Topic, memoryview]
     valid = (
         pose.valid & np.isfinite(pose.position_m).all(axis=1) & np.isfinite(pose.orientation_wxyz).all(axis=1)
     )
-    places, turns = pose.position_m.tolist(), pose.orientation_wxyz[:, [1, 2, 3, 0]].tolist()
+    places, quaternions = pose.position_m.tolist(), pose.orientation_wxyz[:, [1, 2, 3, 0]].tolist()
     flags = np.where(pose.tracked & valid, 2, np.where(valid, 1, 0)).astype(np.uint8)
     layout = _TYPES["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
     out = [
@@ -64,7 +64,7 @@ def hand_messages(pose: HandPose, wall_ns: int) -> list[tuple[Topic, memoryview]
         _cdr(f"/phalanx/{hand}/joint_states", STATES, _states(pose, header)),
     ]
     if valid.all():
-        poses = [_pose(places[j], turns[j]) for j in range(len(JOINTS))]
+        poses = [_pose(places[j], quaternions[j]) for j in range(len(JOINTS))]
         out.append(_cdr(f"/phalanx/{hand}/joint_poses", POSES, _TYPES[POSES](header=header, poses=poses)))
     frames = [
         _TYPES["geometry_msgs/msg/TransformStamped"](
@@ -72,7 +72,7 @@ def hand_messages(pose: HandPose, wall_ns: int) -> list[tuple[Topic, memoryview]
             child_frame_id=f"{hand}/{JOINTS[j]}",
             transform=_TYPES["geometry_msgs/msg/Transform"](
                 translation=_TYPES["geometry_msgs/msg/Vector3"](*places[j]),
-                rotation=_TYPES["geometry_msgs/msg/Quaternion"](*turns[j]),
+                rotation=_TYPES["geometry_msgs/msg/Quaternion"](*quaternions[j]),
             ),
         )
         for j in np.flatnonzero(valid).tolist()
@@ -87,20 +87,22 @@ def object_messages(pose: ObjectPose, wall_ns: int) -> list[tuple[Topic, memoryv
     if not (np.isfinite(pose.position_m).all() and np.isfinite(pose.orientation_wxyz).all()):
         return []
     name, header = ros_name(pose.object), _header(wall_ns)
-    place, turn = pose.position_m.tolist(), pose.orientation_wxyz[[1, 2, 3, 0]].tolist()
+    place, quaternion = pose.position_m.tolist(), pose.orientation_wxyz[[1, 2, 3, 0]].tolist()
     covariance: Float = np.ascontiguousarray(pose.cov).ravel()
     if not np.isfinite(covariance).all():
         covariance = np.zeros(36)  # ROS: all zero is "not known"
     told = _TYPES[POSE](
         header=header,
-        pose=_TYPES["geometry_msgs/msg/PoseWithCovariance"](pose=_pose(place, turn), covariance=covariance),
+        pose=_TYPES["geometry_msgs/msg/PoseWithCovariance"](
+            pose=_pose(place, quaternion), covariance=covariance
+        ),
     )
     frame = _TYPES["geometry_msgs/msg/TransformStamped"](
         header=header,
         child_frame_id=f"object/{name}",
         transform=_TYPES["geometry_msgs/msg/Transform"](
             translation=_TYPES["geometry_msgs/msg/Vector3"](*place),
-            rotation=_TYPES["geometry_msgs/msg/Quaternion"](*turn),
+            rotation=_TYPES["geometry_msgs/msg/Quaternion"](*quaternion),
         ),
     )
     return [
@@ -128,10 +130,10 @@ def _header(wall_ns: int) -> object:
     return _TYPES["std_msgs/msg/Header"](stamp=stamp, frame_id=FRAME)
 
 
-def _pose(place: list[float], turn: list[float]) -> object:
+def _pose(place: list[float], quaternion: list[float]) -> object:
     return _TYPES["geometry_msgs/msg/Pose"](
         position=_TYPES["geometry_msgs/msg/Point"](*place),
-        orientation=_TYPES["geometry_msgs/msg/Quaternion"](*turn),
+        orientation=_TYPES["geometry_msgs/msg/Quaternion"](*quaternion),
     )
 
 

@@ -16,12 +16,12 @@ from common.bus import Bus, Subscription
 from common.calibration import load
 from common.clock import Clock, SystemClock
 from common.errors import BusError, PhalanxError
+from common.file_monitor import MonitoredFiles
 from common.machine import program
 from common.messages import Command, Health, Message, Told
 from common.output_settings import OutputSettings, default_outputs
 from common.streams import MASTER
-from common.watching import WatchedFiles
-from master.send.line import OutputLine, Tally
+from master.send.line import Counters, OutputLine
 from master.send.outputs import OUTPUTS, switched_on, who_reads
 from master.send.times import MasterTimes
 
@@ -55,7 +55,7 @@ class Sender:
         self,
         settings: OutputSettings,
         only: Collection[str],
-        say: Callable[[str], None],
+        notify: Callable[[str], None],
         clock: Clock | None = None,
     ) -> None:
         """Switch on what the settings have on, or, whatever they say, exactly what `only` names.
@@ -64,12 +64,12 @@ class Sender:
             PhalanxError: `only` names an output that there is not.
         """
         refuse_unknown(only)
-        self._settings, self._say = settings, say
+        self._settings, self._notify = settings, notify
         self._clock: Clock = SystemClock() if clock is None else clock
         self._only = frozenset(only)
         self._session = secrets.randbits(63)
         self.times = MasterTimes()
-        self.tallies = {name: Tally() for name in OUTPUTS}
+        self.counters_by_name = {name: Counters() for name in OUTPUTS}
         self._lines: dict[str, OutputLine] = {}
         self._received = 0
         self._lock = threading.RLock()  # commands come on a thread of the bus
@@ -106,11 +106,11 @@ class Sender:
             elif on:
                 make, settings = OUTPUTS[name].make, self._settings
                 self._lines[name] = OutputLine(
-                    name, lambda: make(settings, self.times), self.tallies[name], self._say
+                    name, lambda: make(settings, self.times), self.counters_by_name[name], self._notify
                 )
         if line is not None and not on:
             line.close()
-            self.tallies[name].trouble = ""
+            self.counters_by_name[name].trouble = ""
 
     def use(self, settings: OutputSettings) -> None:
         """Other settings from now on: what is on and is set otherwise is made anew; a changed `on` switches.
@@ -127,7 +127,7 @@ class Sender:
             on = is_on[name] if switched else name in self.on
             self.switch(name, on=False)
             self.switch(name, on=on)
-            self._say(f"{name}: {self.where(name)}" if on else f"{name}: off")
+            self._notify(f"{name}: {self.where(name)}" if on else f"{name}: off")
 
     def push(self, message: Told) -> None:
         """Give a message to every output that is on and takes it; never waits."""
@@ -140,16 +140,16 @@ class Sender:
     def health(self, lost: int = 0) -> Health:
         """The report of this moment; `lost`: messages that this process was too slow to take from the bus."""
         counts = {"received": self._received, "lost": lost}
-        gauges: dict[str, float] = {}
+        metrics: dict[str, float] = {}
         with self._lock:
-            for name, tally in self.tallies.items():
+            for name, counters in self.counters_by_name.items():
                 line = self._lines.get(name)
-                counts[f"sent.{name}"] = tally.sent
-                counts[f"failed.{name}"] = tally.failed
-                counts[f"dropped.{name}"] = tally.dropped
-                gauges[f"on.{name}"] = float(line is not None)
-                gauges[f"open.{name}"] = float(line is not None and line.open)
-        return Health(NAME, self._session, self._clock.now_ns(), counts, gauges, *program())
+                counts[f"sent.{name}"] = counters.sent
+                counts[f"failed.{name}"] = counters.failed
+                counts[f"dropped.{name}"] = counters.dropped
+                metrics[f"on.{name}"] = float(line is not None)
+                metrics[f"open.{name}"] = float(line is not None and line.open)
+        return Health(NAME, self._session, self._clock.now_ns(), counts, metrics, *program())
 
     def obey(self, command: Command) -> None:
         """Do what a command says, but for `stop`.
@@ -165,7 +165,7 @@ class Sender:
                     f'{command.verb}: body {command.body!r}: {error}; write {{"output": "osc"}}'
                 ) from error
             self.switch(body.output, on=command.verb == "on")
-            self._say(f"{body.output}: {self.where(body.output) if command.verb == 'on' else 'off'}")
+            self._notify(f"{body.output}: {self.where(body.output) if command.verb == 'on' else 'off'}")
         elif command.verb not in ("report", "stop"):
             raise PhalanxError(f"unknown verb {command.verb!r}; there are on, off, report, stop")
 
@@ -177,35 +177,35 @@ class Sender:
             line.close()
 
 
-class Beside:
+class Housekeeping:
     """What goes on beside the sending, on a thread of its own: file, report, echoes of the master's clock.
 
     Holds the bus and the file, which belong to the caller.
     """
 
-    def __init__(self, sender: Sender, bus: Bus, path: Path, feeds: Collection[Subscription]) -> None:
-        self._sender, self._bus, self._path, self._feeds = sender, bus, path, feeds
-        self._watched = WatchedFiles()
-        self._watched.changed([path])  # as it was read
+    def __init__(self, sender: Sender, bus: Bus, path: Path, subscribers: Collection[Subscription]) -> None:
+        self._sender, self._bus, self._path, self._subscribers = sender, bus, path, subscribers
+        self._monitored = MonitoredFiles()
+        self._monitored.changed([path])  # as it was read
         self._clock = SystemClock()
 
-    def step(self, say: Callable[[str], None]) -> None:
+    def step(self, notify: Callable[[str], None]) -> None:
         """Once: use the file if it changed, ask the master for its time, publish the report.
 
         Raises:
             BusError: The bus is closed.
         """
-        if self._watched.changed([self._path]):
+        if self._monitored.changed([self._path]):
             try:
                 self._sender.use(settings_of(self._path))
             except PhalanxError as error:
-                say(f"{error}; the settings stay as they were")
+                notify(f"{error}; the settings stay as they were")
         self._echo()
         self._bus.publish("health", NAME, self.health())
 
     def health(self) -> Health:
         """The report, with what was lost on the way here."""
-        return self._sender.health(sum(feed.dropped for feed in self._feeds))
+        return self._sender.health(sum(subscriber.dropped for subscriber in self._subscribers))
 
     def _echo(self) -> None:
         asked_ns = self._clock.now_ns()
@@ -222,7 +222,7 @@ def run_sender(
     path: Path,
     only: Collection[str],
     stop: threading.Event,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
 ) -> None:
     """Send until `stop` is set or the command `stop` comes. The bus belongs to the caller.
 
@@ -230,52 +230,54 @@ def run_sender(
         BusError: The bus is closed.
         PhalanxError: `only` names an output that there is not.
     """
-    feeds = [bus.subscribe(stream, depth=_DEPTH) for stream in STREAMS]
-    sender = Sender(settings, only, say)
-    beside = Beside(sender, bus, path, feeds)
+    subscribers = [bus.subscribe(stream, depth=_DEPTH) for stream in STREAMS]
+    sender = Sender(settings, only, notify)
+    housekeeping = Housekeeping(sender, bus, path, subscribers)
 
     def obey(command: Command) -> Health:
         sender.obey(command)
         if command.verb == "stop":
             stop.set()
-        return beside.health()
+        return housekeeping.health()
 
     bus.serve(NAME, obey)
     bus.announce(NAME)
     for name in sender.on:
-        say(f"{name}: {sender.where(name)}")
+        notify(f"{name}: {sender.where(name)}")
     if not sender.on:
-        say(f"all outputs are off; switch them on in {path}, or name them: --only osc,vmc")
-    thread = threading.Thread(target=lambda: _beside(beside, stop, say), name="outputs report", daemon=True)
+        notify(f"all outputs are off; switch them on in {path}, or name them: --only osc,vmc")
+    thread = threading.Thread(
+        target=lambda: _report_until(housekeeping, stop, notify), name="outputs report", daemon=True
+    )
     thread.start()
     try:
         while not stop.is_set():
-            _drain(feeds, sender)
+            _drain(subscribers, sender)
     finally:
         stop.set()
         thread.join(2.0)
         sender.close()
-        for feed in feeds:
-            feed.close()
+        for subscriber in subscribers:
+            subscriber.close()
 
 
-def _beside(beside: Beside, stop: threading.Event, say: Callable[[str], None]) -> None:
+def _report_until(housekeeping: Housekeeping, stop: threading.Event, notify: Callable[[str], None]) -> None:
     while not stop.wait(1.0):
         try:
-            beside.step(say)
+            housekeeping.step(notify)
         except BusError:
             return  # closing
 
 
-def _drain(feeds: list[Subscription], sender: Sender) -> None:
+def _drain(subscribers: list[Subscription], sender: Sender) -> None:
     """Hand on all that has come; wait for a hand, which the others come with, if there is nothing."""
-    hands, *others = feeds
+    hands, *others = subscribers
     message = hands.get(_POLL_S)
     while message is not None:
         _push(sender, message)
         message = hands.get(0.0)
-    for feed in others:
-        while (message := feed.get(0.0)) is not None:
+    for subscriber in others:
+        while (message := subscriber.get(0.0)) is not None:
             _push(sender, message)
 
 

@@ -10,7 +10,7 @@ from common.arrays import Bool, Float
 from common.geometry import quaternion_to_matrix
 from common.messages import HandPose, Told
 from common.output_settings import VmcOutput
-from common.wrist_bend import forearm_palm
+from common.wrist_joint import forearm_palm
 from master.send.osc_packets import Blank, BlankBundle, floats, ints
 from master.send.sides import Side, side_of
 from master.send.times import Times
@@ -61,8 +61,8 @@ class VmcSink:
         wall_ns = self._times.wall_ns(message.t_ns)
         since = floats([1e-9 * (message.t_ns - self._began_ns)])
         self._udp.send(self._state.filled(wall_ns, np.concatenate([_LOADED, since, _ORIGIN])))
-        place, turn = self._rows(message, side)
-        rows: Float = np.concatenate([place, turn], axis=1)
+        place, quaternion = self._rows(message, side)
+        rows: Float = np.concatenate([place, quaternion], axis=1)
         known: Bool = np.asarray(np.isfinite(rows).all(axis=1))
         self._udp.send(self._bones[side].filled(wall_ns, floats(rows).ravel(), known))
 
@@ -73,10 +73,10 @@ class VmcSink:
     def _rows(self, pose: HandPose, side: Side) -> tuple[Float, Float]:
         """Positions (16, 3) [m] and rotations xyzw (16, 4), as the settings want the hand's own bone."""
         bones = self._maps[side].bones(pose)
-        place, turn = bones.position_m, bones.rotation_xyzw
+        place, quaternion = bones.position_m, bones.rotation_xyzw
         place[0] = (self._settings.forearm_m if side == "right" else -self._settings.forearm_m, 0.0, 0.0)
         if self._settings.hand == "rest":
-            turn[0] = _STILL
-        elif self._settings.hand == "bend":
-            turn[0] = self._maps[side].bent(forearm_palm(pose.wrist_bend_rad))
-        return place, turn
+            quaternion[0] = _STILL
+        elif self._settings.hand == "wrist":
+            quaternion[0] = self._maps[side].flexed(forearm_palm(pose.wrist_angles_rad))
+        return place, quaternion

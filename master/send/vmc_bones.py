@@ -112,7 +112,7 @@ class BoneMap:
         position[1:] = (link + parent[:, :1] * twice + cross(axis, twice)) * [1.0, 1.0, -1.0]
         return Bones(position, mirrored_xyzw(local))
 
-    def bent(self, R_forearm_palm: Float) -> Float:
+    def flexed(self, R_forearm_palm: Float) -> Float:
         """Rotation xyzw (4,) of the hand's bone for a wrist bent by `R_forearm_palm` (3, 3), Unity's axes."""
         C = self._rest[0] @ _JOINT_PALM  # palm axes of the T-pose -> avatar
         return mirrored_xyzw(matrix_to_quaternion(C @ R_forearm_palm @ C.T))

@@ -21,20 +21,20 @@ from master.listening import (
     write_private,
 )
 from master.web import object_json, webxr_json
-from master.web.server import Guard, WebServer
+from master.web.server import RequestFilter, WebServer
 
 KEY_FILE = "web.key"
 _KEY_BYTES = 10  # 80 bits: who guesses has to ask us each time
 
 
-def guard_of(settings: WebOutput, environment: Mapping[str, str]) -> Guard:
+def request_filter_of(settings: WebOutput, environment: Mapping[str, str]) -> RequestFilter:
     """What stands before the page: nothing on this machine, key and TLS elsewhere.
 
     Raises:
         PhalanxError: Key or certificate cannot be read or written.
     """
     if is_loopback(settings.host):
-        return Guard()
+        return RequestFilter()
     folder = private_folder(environment)
     if not (folder / KEY_FILE).exists():
         write_private(folder / KEY_FILE, secrets.token_hex(_KEY_BYTES).encode())
@@ -42,14 +42,14 @@ def guard_of(settings: WebOutput, environment: Mapping[str, str]) -> Guard:
     if len(key) < 2 * _KEY_BYTES or not key.isalnum():
         raise PhalanxError(f"{folder / KEY_FILE}: not a key; delete it, and a new one is made")
     tls = None if is_open(environment) else page_certificate(folder, settings.host).context
-    return Guard(key, tls)
+    return RequestFilter(key, tls)
 
 
 def address_of(settings: WebOutput, environment: Mapping[str, str]) -> str:
     """What to open in a browser, by blanks: with the key, where one is needed."""
-    guard = guard_of(settings, environment)
-    asked = "" if guard.key is None else f"?key={guard.key}"
-    scheme = "http" if guard.tls is None else "https"
+    request_filter = request_filter_of(settings, environment)
+    asked = "" if request_filter.key is None else f"?key={request_filter.key}"
+    scheme = "http" if request_filter.tls is None else "https"
     return " ".join(f"{scheme}://{place}:{settings.port}/{asked}" for place in places_of(settings.host))
 
 
@@ -66,8 +66,8 @@ class WebSink:
         Raises:
             PhalanxError: The address cannot be had, three.js is not installed, or key or certificate cannot be used.
         """
-        guard = guard_of(settings, os.environ if environment is None else environment)
-        self.server = WebServer(settings.host, settings.port, guard=guard)
+        request_filter = request_filter_of(settings, os.environ if environment is None else environment)
+        self.server = WebServer(settings.host, settings.port, request_filter=request_filter)
 
     def write(self, message: Told) -> None:
         """Offer a hand or an object to every client; costs nothing while there is none. Others are left alone.

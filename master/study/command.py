@@ -11,7 +11,7 @@ import typer
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.errors import CalibrationError
 from master.options import CALIB_JSON, Calibration
-from master.study.line import Level
+from master.study.line import SolverMode
 from master.study.one import CAUSES, Condition, Task
 from master.study.one import Resume as From
 from master.study.paper import BLOCKS, PARTICIPANTS
@@ -43,8 +43,8 @@ Causes = Annotated[
         " where does the error come from?"
     ),
 ]
-LevelOf = Annotated[
-    Level | None,
+ModeOf = Annotated[
+    SolverMode | None,
     typer.Option(
         help="Fingers from the laser alone, from laser and fingertip, or from what there is; default: the rig's."
     ),
@@ -85,7 +85,7 @@ def study(
     seed: Seed = 1,
     known: KnownOf = "calibrated",
     causes: Causes = False,
-    level: LevelOf = None,
+    solver_mode: ModeOf = None,
     rig: Rig = "wrist",
     hand: Hand = None,
     calibration: Calibration = CALIB_JSON,
@@ -110,7 +110,7 @@ def study(
 
       phalanx-master evaluate study --causes --out out/study                   where errors come from
 
-      phalanx-master evaluate study --level fk --resume detections --out out/study     solve again
+      phalanx-master evaluate study --solver-mode fk --resume detections --out out/study     solve again
 
       phalanx-master evaluate study --participants 2 --blocks 2 --known all --out out/small
 
@@ -119,14 +119,16 @@ def study(
     from master.study.run import Study, finish, recorded, simulate
 
     if recordings:
-        result = recorded(recordings, lambda name: _hand(hand, calibration, name), level, out, _progress())
+        result = recorded(
+            recordings, lambda name: _hand(hand, calibration, name), solver_mode, out, _progress()
+        )
     else:
         if hand is not None:
             raise CalibrationError("--hand: is for recordings; simulated people have hands of their own")
         judged: Condition = (known, "detected")
         conditions = tuple(dict.fromkeys((judged, *CAUSES))) if causes else (judged,)
         device = _device(rig, calibration)
-        task = Task(*device, seed, blocks, conditions, level, step, guided, out, resume, keep)
+        task = Task(*device, seed, blocks, conditions, solver_mode, step, guided, out, resume, keep)
         workers = jobs or min(os.cpu_count() or 1, participants)
         people = f"{participants} participants x {blocks} blocks x 6 poses"
         typer.echo(f"study: {people}, {workers} at a time, into {out}", err=True)

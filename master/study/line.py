@@ -25,7 +25,7 @@ from master.outputs.poses import Poses
 from master.rig_setup import RigSetup
 from master.solve import solve
 
-Level = Literal["fk", "ik", "auto"]
+SolverMode = Literal["fk", "ik", "auto"]
 Inputs = Literal["detected", "exact"]
 LASER_SIGMA_PX, TIP_SIGMA_PX = 0.2, 2.0  # claimed of exact places: what a good detection claims of itself
 _GROUPS = slice(1, 6)  # rows of the truth's line: palm, thumb ... little, thenar
@@ -104,7 +104,7 @@ def write_exact(folder: Path, camera: str, out: Path) -> None:
         raise RecordingError(f"{out}: cannot write: {error.strerror}") from error
 
 
-def solved(folder: Path, hand: HandProfile, detections: Path, level: Level | None) -> Poses:
+def solved(folder: Path, hand: HandProfile, detections: Path, solver_mode: SolverMode | None) -> Poses:
     """Solve detections of a recording as `phalanx-master solve` does; poses.npz and summary.json go beside them.
 
     Raises:
@@ -113,8 +113,8 @@ def solved(folder: Path, hand: HandProfile, detections: Path, level: Level | Non
     """
     recording = open_recording(folder)
     rig = recording.manifest.wrist_rig()
-    if level is not None:
-        rig = replace(rig, level=level)
+    if solver_mode is not None:
+        rig = replace(rig, solver_mode=solver_mode)
     setup = RigSetup.of(rig, recording.manifest.cameras, HandModel.of(hand))
     solve(recording, setup, detections, detections)
     poses = load_poses(detections / "poses.npz")

@@ -14,9 +14,9 @@ from common.calibration import CameraCalibration, HandProfile, RigCalibration, l
 from common.errors import FitError, RecordingError
 from common.frame_recording import open_recording
 from common.geometry import transform
-from master.calibrate.wrist.wearer import calibrate_wearer
-from master.recorded import recorded_triples
-from master.study.line import Inputs, Level, claim, detect, solved, write_exact
+from master.calibrate.wrist.subject import calibrate_subject
+from master.recorded import recorded_cycles
+from master.study.line import Inputs, SolverMode, claim, detect, solved, write_exact
 from master.study.participant import Known, Participant, about, participant
 from master.study.session import TRIAL_S, record_guided, record_trials
 from master.study.trials import Trial, trials_of
@@ -34,7 +34,7 @@ CAUSES: tuple[Condition, ...] = (
 GUIDED, TRIALS = "guided", "trials"  # recordings
 KNOWN: tuple[Known, ...] = get_args(Known)
 INPUTS: tuple[Inputs, ...] = get_args(Inputs)
-DONE, RIG, HAND, SAID = "made.json", "rig.json", "hand.json", "calibration.json"
+DONE, RIG, HAND, CALIBRATED = "made.json", "rig.json", "hand.json", "calibration.json"
 _KNUCKLES_M = np.array([0.0, 0.0, 0.08])  # palm frame
 
 
@@ -47,7 +47,7 @@ class Task:
         seed: Of the study.
         blocks: How often the six poses are made.
         conditions: What is known and from what inputs fingers are solved, in which all trials are judged.
-        level: Of the master; None: what the rig file says.
+        solver_mode: Of the master; None: what the rig file says.
         step: Pixels between the rays that shade skin.
         guided: Triples of the guided motion.
         out: Folder of the study.
@@ -63,7 +63,7 @@ class Task:
     seed: int
     blocks: int
     conditions: tuple[Condition, ...]
-    level: Level | None
+    solver_mode: SolverMode | None
     step: int
     guided: int
     out: Path
@@ -78,15 +78,15 @@ class Calibrated(Struct, frozen=True, kw_only=True):
     Attributes:
         said: Its report; where it was refused, why, and the rig file's palm pose and the measured bones are used.
         refused: Whether it was.
-        turn_deg, shift_mm: How far the palm's pose is from the truth, at the knuckles.
-        nominal_turn_deg, nominal_shift_mm: The same of the rig file.
+        rotation_deg, shift_mm: How far the palm's pose is from the truth, at the knuckles.
+        nominal_rotation_deg, nominal_shift_mm: The same of the rig file.
     """
 
-    said: tuple[str, ...]
+    report: tuple[str, ...]
     refused: bool
-    turn_deg: float
+    rotation_deg: float
     shift_mm: float
-    nominal_turn_deg: float
+    nominal_rotation_deg: float
     nominal_shift_mm: float
 
 
@@ -126,13 +126,13 @@ def run_participant(task: Task, number: int) -> Outcome:
                 write_exact(folder / TRIALS, camera, there)
             elif not (there / f"detections_{camera}.npz").exists():
                 detect(folder / TRIALS, camera, folder / known / HAND, there)
-            poses = solved(folder / TRIALS, hand, there, task.level)
+            poses = solved(folder / TRIALS, hand, there, task.solver_mode)
             opened = open_recording(folder / TRIALS)
             trials[name_of((known, inputs))] = trials_of(opened, camera, who.name, poses)
     if not task.keep:
         for recording in (GUIDED, TRIALS):
             shutil.rmtree(folder / recording / camera, ignore_errors=True)
-    calibrated = load(folder / "calibrated" / SAID, Calibrated) if "calibrated" in asked else None
+    calibrated = load(folder / "calibrated" / CALIBRATED, Calibrated) if "calibrated" in asked else None
     return Outcome(
         participant=who.name, reflectance=round(who.reflectance, 3), calibrated=calibrated, trials=trials
     )
@@ -199,7 +199,7 @@ def _knowledge(
             rig, hand = who.rig, who.hand
         elif known == "calibrated":
             rig, hand, told = _calibrated(task, who, folder / GUIDED, there)
-            save(there / SAID, told)
+            save(there / CALIBRATED, told)
         save(there / RIG, rig)
         save(there / HAND, hand)
     return load(there / RIG, RigCalibration), load(there / HAND, HandProfile)
@@ -214,18 +214,18 @@ def _calibrated(
     save(there / "measured.json", hand)
     detect(guided, task.camera.name, there / "measured.json", there)
     try:
-        found = calibrate_wearer(list(recorded_triples(there, task.camera.name)), rig, task.camera, hand)
-        rig, hand, said = found.rig, found.hand, tuple(found.report)
+        found = calibrate_subject(list(recorded_cycles(there, task.camera.name)), rig, task.camera, hand)
+        rig, hand, report = found.rig, found.hand, tuple(found.report)
     except FitError as error:
-        said, refused = (str(error),), True
-    turn, shift = _off(rig, who.rig)
-    nominal_turn, nominal_shift = _off(task.rig, who.rig)
+        report, refused = (str(error),), True
+    rotation, shift = _off(rig, who.rig)
+    nominal_rotation, nominal_shift = _off(task.rig, who.rig)
     told = Calibrated(
-        said=said,
+        report=report,
         refused=refused,
-        turn_deg=round(turn, 3),
+        rotation_deg=round(rotation, 3),
         shift_mm=round(shift, 3),
-        nominal_turn_deg=round(nominal_turn, 3),
+        nominal_rotation_deg=round(nominal_rotation, 3),
         nominal_shift_mm=round(nominal_shift, 3),
     )
     return rig, hand, told

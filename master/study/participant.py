@@ -3,7 +3,7 @@
 Each is drawn from the study's seed and a number. What is known of somebody before a trial is one of
 
 - **all**: the exact bones, and exactly how the device sits (never the skin, which no file describes);
-- **calibrated**: bones as a hand calibration measures them, and what `master.calibrate.wrist.wearer` makes of the
+- **calibrated**: bones as a hand calibration measures them, and what `master.calibrate.wrist.subject` makes of the
   guided motion this person performed;
 - **nothing**: the hand that the rig names, and the pose of the palm in the rig's file.
 """
@@ -24,7 +24,7 @@ from master.calibrate.tree_files import provenance
 Known = Literal["all", "calibrated", "nothing"]
 
 BONE_SHARE = 0.08  # of each bone's length, either way
-TURN_RAD, SHIFT_M = np.radians(3.0), 2e-3  # of the device, about and along each axis, either way
+ROTATION_RAD, SHIFT_M = np.radians(3.0), 2e-3  # of the device, about and along each axis, either way
 REFLECTANCE_SHARE = 0.2
 # What `calibrate hand` reaches at 1 mm of noise (docs/calibrate.md): fingers from knuckle to cap, and bones alone.
 FINGER_SIGMA_M, BONE_SIGMA_M = 0.43e-3, 0.9e-3
@@ -64,19 +64,21 @@ def participant(study_seed: int, number: int, rig: RigCalibration, hand: HandPro
     Fingers bend as the Digits paper says (preset D), up to how people stray from it.
     """
     rng = np.random.default_rng([study_seed, _STREAM, number])
-    usual = replace(hand, couplings="D", limits_rad="D")
+    typical = replace(hand, couplings="D", limits_rad="D")
     bones = 1.0 + rng.uniform(-BONE_SHARE, BONE_SHARE, (5, 3))
     palm = 1.0 + float(rng.uniform(-BONE_SHARE, BONE_SHARE))
-    turn, shift = rng.uniform(-TURN_RAD, TURN_RAD, 3), rng.uniform(-SHIFT_M, SHIFT_M, 3)
+    rotation, shift = rng.uniform(-ROTATION_RAD, ROTATION_RAD, 3), rng.uniform(-SHIFT_M, SHIFT_M, 3)
     reflectance = 1.0 + float(rng.uniform(-REFLECTANCE_SHARE, REFLECTANCE_SHARE))
-    lengths = _lengths(usual)
+    lengths = _lengths(typical)
     wrong = _bone_errors(rng) / lengths
     return Participant(
         number=number,
         seed=1000 * study_seed + number,
-        hand=with_bones(usual, palm, bones),
-        measured=_measured(with_bones(usual, palm * (1.0 + PALM_SIGMA * float(rng.normal())), bones + wrong)),
-        rig=turned(rig, turn, shift),
+        hand=with_bones(typical, palm, bones),
+        measured=_measured(
+            with_bones(typical, palm * (1.0 + PALM_SIGMA * float(rng.normal())), bones + wrong)
+        ),
+        rig=rotated(rig, rotation, shift),
         reflectance=reflectance,
     )
 
@@ -84,7 +86,7 @@ def participant(study_seed: int, number: int, rig: RigCalibration, hand: HandPro
 def about(rig: RigCalibration) -> RigCalibration:
     """The rig file with what its maker knows: how differently people wear the device (standard deviations)."""
     known = {
-        "turn_sigma_deg": round(float(np.degrees(TURN_RAD) / np.sqrt(3.0)), 4),
+        "rotation_sigma_deg": round(float(np.degrees(ROTATION_RAD) / np.sqrt(3.0)), 4),
         "shift_sigma_mm": round(float(1e3 * SHIFT_M / np.sqrt(3.0)), 4),
     }
     how = provenance("study", (), known, "how the device sits on the wrists of people")
@@ -110,10 +112,10 @@ def with_bones(hand: HandProfile, palm: float, bones: Float) -> HandProfile:
     return replace(hand, rest_joints=rest, radius_m=radius)
 
 
-def turned(rig: RigCalibration, turn_rad: Float, shift_m: Float) -> RigCalibration:
+def rotated(rig: RigCalibration, rotation_rad: Float, shift_m: Float) -> RigCalibration:
     """The rig with a device that is turned (3,) about the wrist joint and shifted (3,), in the camera's axes."""
     pose = np.array(rig.T_camera_palm, dtype=np.float64)
-    pose[:3, :3] = rotation_vector_to_matrix(turn_rad) @ pose[:3, :3]
+    pose[:3, :3] = rotation_vector_to_matrix(rotation_rad) @ pose[:3, :3]
     pose[:3, 3] += shift_m
     return replace(rig, T_camera_palm=_matrix(pose))
 

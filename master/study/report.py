@@ -11,7 +11,7 @@ import numpy as np
 from common.arrays import Float
 from common.errors import RecordingError
 from common.hand_model import FINGERS
-from common.messages import Level
+from common.messages import SolverMode
 from common.replacing import replacing
 from common.sim.motion import POSES
 from master.study import paper
@@ -91,7 +91,7 @@ def lines_of(result: Result) -> list[str]:
     lines += ["", *_reach_lines(cells, poses), "", *_icc_lines(again)]
     if len(result.trials) > 1:
         lines += ["", *_cause_lines(result)]
-    lines += ["", *_level_lines(result)]
+    lines += ["", *_mode_lines(result)]
     if result.calibrated:
         lines += ["", *_calibration_lines(result.calibrated)]
     return [*lines, "", *_verdict(cells, again)]
@@ -136,8 +136,8 @@ def _named(row: Cell | Repeated) -> dict[str, object]:
 def _error_row(finger: str, cells: list[Cell]) -> str:
     texts = [_error_text(cell) for cell in cells]
     low_high = paper.MEAN_RANGE_DEG.get(finger)
-    said = f"{low_high[0]}–{low_high[1]}" if low_high else f"< {paper.MEAN_LIMIT_DEG:g}"
-    return f"| {finger} | " + " | ".join(texts) + f" | {said} |"
+    report = f"{low_high[0]}–{low_high[1]}" if low_high else f"< {paper.MEAN_LIMIT_DEG:g}"
+    return f"| {finger} | " + " | ".join(texts) + f" | {report} |"
 
 
 def _error_text(cell: Cell) -> str:
@@ -160,8 +160,8 @@ def _reach_lines(cells: list[Cell], poses: list[str]) -> list[str]:
         lines.append(
             f"| {finger} | " + " | ".join(f"{cell.told} / {cell.tip} of {cell.trials}" for cell in own) + " |"
         )
-    blind = [cell for cell in cells if cell.blind]
-    told = ", ".join(f"{cell.finger} {_LETTER[cell.pose]} {cell.blind}" for cell in blind) or "none"
+    unseen = [cell for cell in cells if cell.unseen]
+    told = ", ".join(f"{cell.finger} {_LETTER[cell.pose]} {cell.unseen}" for cell in unseen) or "none"
     return [*lines, "", f"Trials in which a finger was tracked and neither was in sight: {told}."]
 
 
@@ -206,22 +206,22 @@ def _cause_lines(result: Result) -> list[str]:
     return lines
 
 
-def _level_lines(result: Result) -> list[str]:
+def _mode_lines(result: Result) -> list[str]:
     """Mean error of the tracked fingers by what they were solved from, and whether that left a choice."""
-    kinds = (("laser alone (fk)", Level.FK, False), ("laser and tip (ik)", Level.IK, False))
+    kinds = (("laser alone (fk)", SolverMode.FK, False), ("laser and tip (ik)", SolverMode.IK, False))
     lines = [
         "By level, of the same condition: mean absolute error in degrees (trials).",
         "",
         "| solved from | " + " | ".join(FINGERS) + " |",
         "|---|" + "--:|" * len(FINGERS),
     ]
-    for name, level, ambiguous in (*kinds, ("laser and tip, ambiguous", Level.IK, True)):
+    for name, solver_mode, ambiguous in (*kinds, ("laser and tip, ambiguous", SolverMode.IK, True)):
         texts: list[str] = []
         for f in range(len(FINGERS)):
             error = [
                 abs(one.pip_deg[f] - one.truth_deg[f])
                 for one in result.trials[result.judged]
-                if one.tracked[f] and one.level[f] == level and one.ambiguous[f] is ambiguous
+                if one.tracked[f] and one.solver_mode[f] == solver_mode and one.ambiguous[f] is ambiguous
             ]
             texts.append(f"{np.mean(error):.1f} ({len(error)})" if error else "none")
         lines.append(f"| {name} | " + " | ".join(texts) + " |")
@@ -229,9 +229,9 @@ def _level_lines(result: Result) -> list[str]:
 
 
 def _calibration_lines(calibrated: Mapping[str, Calibrated]) -> list[str]:
-    turns = np.array([(one.nominal_turn_deg, one.turn_deg) for one in calibrated.values()])
+    rotations = np.array([(one.nominal_rotation_deg, one.rotation_deg) for one in calibrated.values()])
     shifts = np.array([(one.nominal_shift_mm, one.shift_mm) for one in calibrated.values()])
-    before, after = (f"{_rms(turns[:, k]):.1f}° and {_rms(shifts[:, k]):.1f} mm" for k in (0, 1))
+    before, after = (f"{_rms(rotations[:, k]):.1f}° and {_rms(shifts[:, k]):.1f} mm" for k in (0, 1))
     lines = [
         f"How far the palm's pose is off (shift at the knuckles): rms {before} in the rig file, {after} calibrated.",
         "",
@@ -239,10 +239,10 @@ def _calibration_lines(calibrated: Mapping[str, Calibrated]) -> list[str]:
         "|---|--:|--:|---|",
     ]
     for name, one in calibrated.items():
-        note = f"refused: {one.said[0]}" if one.refused else ""
+        note = f"refused: {one.report[0]}" if one.refused else ""
         lines.append(
-            f"| {name} | {one.nominal_turn_deg:.1f}°, {one.nominal_shift_mm:.1f} mm"
-            f" | {one.turn_deg:.1f}°, {one.shift_mm:.1f} mm | {note} |"
+            f"| {name} | {one.nominal_rotation_deg:.1f}°, {one.nominal_shift_mm:.1f} mm"
+            f" | {one.rotation_deg:.1f}°, {one.shift_mm:.1f} mm | {note} |"
         )
     return lines
 

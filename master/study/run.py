@@ -9,7 +9,7 @@ from pathlib import Path
 from common.calibration import HandProfile
 from common.errors import RecordingError
 from common.frame_recording import open_recording
-from master.study.line import Level, detect, solved
+from master.study.line import SolverMode, detect, solved
 from master.study.one import Condition, Outcome, Task, name_of, run_participant
 from master.study.plot import draw_study
 from master.study.report import Result, lines_of, write_study
@@ -64,7 +64,7 @@ def simulate(study: Study, progress: Callable[[int, int, str], None]) -> Result:
             "participants": study.participants,
             "blocks": task.blocks,
             "rig": task.rig.name,
-            "level": task.level or task.rig.level,
+            "solver_mode": task.solver_mode or task.rig.solver_mode,
             "step": task.step,
             "guided": task.guided,
         },
@@ -81,7 +81,7 @@ def simulate(study: Study, progress: Callable[[int, int, str], None]) -> Result:
 def recorded(
     folders: Sequence[Path],
     hand: Callable[[str], tuple[Path, HandProfile]],
-    level: Level | None,
+    solver_mode: SolverMode | None,
     out: Path,
     progress: Callable[[int, int, str], None],
 ) -> Result:
@@ -90,7 +90,7 @@ def recorded(
     Args:
         folders: Recordings of wrist devices, with truth and the poses' names (`trials_of`).
         hand: Gives file and content of the hand that a rig names.
-        level: Of the master; None: what the recording's rig says.
+        solver_mode: Of the master; None: what the recording's rig says.
         out: Folder for detections and poses.
         progress: As of `simulate`.
 
@@ -112,12 +112,12 @@ def recorded(
                 f"{folder}/truth.npz: missing: a study needs the true angles of every triple"
             )
         detect(folder, rig.cameras[0], file, there)
-        poses = solved(folder, profile, there, level)
+        poses = solved(folder, profile, there, solver_mode)
         trials += trials_of(recording, rig.cameras[0], name, poses)
         progress(done + 1, len(folders), name)
     return Result(
         title="Study of recordings",
-        settings={"recordings": [str(folder) for folder in folders], "level": level},
+        settings={"recordings": [str(folder) for folder in folders], "solver_mode": solver_mode},
         judged=DETECTED,
         trials={DETECTED: trials},
         calibrated={},

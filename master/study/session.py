@@ -16,7 +16,7 @@ from common.errors import RecordingError
 from common.hand_model import HandModel
 from common.sim.motion import POSES, REST
 from common.sim.record import FIRST_NS
-from common.sim.wrist.motion import WEARER_S, GuidedWearer, Stations
+from common.sim.wrist.motion import SUBJECT_S, GuidedSubject, Stations
 from common.sim.wrist.record import record_wrist
 from common.sim.wrist.scene import WristScene
 from master.study.participant import Participant
@@ -88,7 +88,7 @@ def record_trials(
 
 
 def record_guided(folder: Path, who: Participant, camera: CameraCalibration, count: int, step: int) -> None:
-    """Render the guided motion of `calibrate wearer` in `count` triples, evenly over it; arguments as above.
+    """Render the guided motion of `calibrate subject` in `count` triples, evenly over it; arguments as above.
 
     The motion is slow: within a triple the hand is taken to stand still.
 
@@ -96,10 +96,10 @@ def record_guided(folder: Path, who: Participant, camera: CameraCalibration, cou
         RecordingError, CalibrationError: As of `record_trials`.
     """
     model = HandModel.of(who.hand)
-    motion = GuidedWearer(model, who.seed)
+    motion = GuidedSubject(model, who.seed)
     scene = WristScene(who.rig, {camera.name: camera}, model, motion, "indoor", who.seed, who.reflectance)
-    instants: list[float] = (np.arange(count) * (WEARER_S / count)).tolist()
-    record_wrist(folder, scene, poses_s=instants, step=step)
+    epochs: list[float] = (np.arange(count) * (SUBJECT_S / count)).tolist()
+    record_wrist(folder, scene, poses_s=epochs, step=step)
 
 
 def write_trials(path: Path, held: list[Held]) -> None:

@@ -33,7 +33,7 @@ class Cell:
     reached: int
     told: int
     tip: int
-    blind: int
+    unseen: int
     mean_deg: float
     sd_deg: float
 
@@ -126,7 +126,7 @@ def _cell(trials: list[Trial], finger: int, pose: str) -> Cell:
         reached=count,
         told=sum(one.laser_seen[finger] for one in own),
         tip=sum(one.tip_seen[finger] for one in own),
-        blind=sum(
+        unseen=sum(
             one.tracked[finger] and not (one.laser_seen[finger] or one.tip_seen[finger]) for one in own
         ),
         mean_deg=float(error.mean()) if shown and count else float("nan"),

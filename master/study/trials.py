@@ -29,11 +29,11 @@ class Trial(Struct, frozen=True, kw_only=True):
             an angle. Of the thumb the MCP. NaN (null in a file): no angle at all.
         truth_deg: Mean true angle over the triples that pip_deg is of.
         tracked: In at least half of its triples a laser point or fingertip told the finger.
-        level: The highest `Level` that half of the tracked triples have.
+        solver_mode: The highest `SolverMode` that half of the tracked triples have.
         ambiguous: In at least half of the tracked triples another pose explained as much.
         laser_seen, tip_seen: In at least half of its triples at least 2 mm of laser line, the fingertip, are in sight
             by the truth.
-        triples: How many were held.
+        cycles: How many were held.
     """
 
     participant: str
@@ -42,11 +42,11 @@ class Trial(Struct, frozen=True, kw_only=True):
     pip_deg: Five
     truth_deg: Five
     tracked: Flags
-    level: tuple[int, ...]
+    solver_mode: tuple[int, ...]
     ambiguous: Flags
     laser_seen: Flags
     tip_seen: Flags
-    triples: int
+    cycles: int
 
 
 def trials_of(recording: FrameRecording, camera: str, name: str, poses: Poses) -> list[Trial]:
@@ -72,7 +72,7 @@ def trials_of(recording: FrameRecording, camera: str, name: str, poses: Poses) -
     angle = at_rows(np.degrees(poses.angles_rad[:, :, 2]), row)
     joints = np.stack([poses.tracked[:, list(chain[1:])].any(axis=1) for chain in FINGER_JOINTS], axis=1)
     tracked = (at_rows(joints.astype(np.float64), row) == 1.0) & np.isfinite(angle)
-    level = np.nan_to_num(at_rows(poses.level.astype(np.float64), row))
+    solver_mode = np.nan_to_num(at_rows(poses.solver_mode.astype(np.float64), row))
     ambiguous = at_rows(poses.ambiguous.astype(np.float64), row) == 1.0
     line = clear_line(truth)
     out: list[Trial] = []
@@ -84,7 +84,7 @@ def trials_of(recording: FrameRecording, camera: str, name: str, poses: Poses) -
                 f" {one.to_ns} ns"
             )
         found = [
-            _finger(angle[own, f], np.degrees(truth.pip_rad[own, f]), tracked[own, f], level[own, f])
+            _finger(angle[own, f], np.degrees(truth.pip_rad[own, f]), tracked[own, f], solver_mode[own, f])
             for f in range(5)
         ]
         sure = tracked[own]
@@ -96,11 +96,11 @@ def trials_of(recording: FrameRecording, camera: str, name: str, poses: Poses) -
                 pip_deg=tuple(round(angle, 3) for angle, _, _ in found),
                 truth_deg=tuple(round(true, 3) for _, true, _ in found),
                 tracked=_most(sure),
-                level=tuple(rank for _, _, rank in found),
+                solver_mode=tuple(rank for _, _, rank in found),
                 ambiguous=_most(ambiguous[own] & sure, sure),
                 laser_seen=_most(line[own]),
                 tip_seen=_most(truth.tip_visible[own]),
-                triples=len(own),
+                cycles=len(own),
             )
         )
     return out
@@ -179,12 +179,12 @@ def _pose_of(label: str) -> str | None:
     return LETTERS.get(letter) if rest else None
 
 
-def _finger(angle: Float, true: Float, tracked: Bool, level: Float) -> tuple[float, float, int]:
+def _finger(angle: Float, true: Float, tracked: Bool, solver_mode: Float) -> tuple[float, float, int]:
     """Median angle, mean truth [deg] and level of one finger in the triples (n,) of a trial."""
     own = tracked if tracked.any() else np.isfinite(angle)
     if not own.any():
         return float("nan"), float(true.mean()), 0
-    return float(np.median(angle[own])), float(true[own].mean()), int(np.median(level[own]))
+    return float(np.median(angle[own])), float(true[own].mean()), int(np.median(solver_mode[own]))
 
 
 def _most(flags: Bool, of: Bool | None = None) -> Flags:

@@ -5,7 +5,7 @@ hand, an object) and no more: who reads too slowly skips, delays nobody, and cos
 
 A browser lets any page of any site open a WebSocket to this machine, so a request whose `Origin` is not this very
 server is refused, and so is one that calls this server by a foreign name (a site may point its own name at 127.0.0.1).
-Where other machines reach it, it wants to be shown a key, and is encrypted (`Guard`, docs/security.md).
+Where other machines reach it, it wants to be shown a key, and is encrypted (`RequestFilter`, docs/security.md).
 """
 
 import asyncio
@@ -53,7 +53,7 @@ _HEADERS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Guard:
+class RequestFilter:
     """What stands before a server that other machines reach.
 
     Attributes:
@@ -97,14 +97,16 @@ class WebServer:
     Holds the listening socket, the thread with its loop, the newest texts on their way to it, and a mailbox per client.
     """
 
-    def __init__(self, host: str, port: int, *, clients: int = CLIENTS, guard: Guard | None = None) -> None:
+    def __init__(
+        self, host: str, port: int, *, clients: int = CLIENTS, request_filter: RequestFilter | None = None
+    ) -> None:
         """Listen at once, behind the guard; `port` 0 takes any that is free.
 
         Raises:
             PhalanxError: The address cannot be had, or three.js is not installed.
         """
         self._files = _files()
-        self._clients, self._guard = clients, guard or Guard()
+        self._clients, self._request_filter = clients, request_filter or RequestFilter()
         self._mailboxes: dict[ServerConnection, Mailbox] = {}
         self._names = _own_names(host)
         self._lock = threading.Lock()
@@ -166,8 +168,8 @@ class WebServer:
         async with serve(
             self._client,
             sock=self._socket,
-            ssl=self._guard.tls,
-            ssl_handshake_timeout=None if self._guard.tls is None else OPEN_S,
+            ssl=self._request_filter.tls,
+            ssl_handshake_timeout=None if self._request_filter.tls is None else OPEN_S,
             open_timeout=OPEN_S,
             process_request=self._answer,
             compression=None,  # it costs more than it saves on the machine itself
@@ -218,8 +220,8 @@ class WebServer:
         if path in self._files:
             kind, body = self._files[path]
             answer = _response(HTTPStatus.OK, kind, body)
-            if self._guard.key is not None:
-                answer.headers["Set-Cookie"] = self._cookie(self._guard.key)
+            if self._request_filter.key is not None:
+                answer.headers["Set-Cookie"] = self._cookie(self._request_filter.key)
             return answer
         if path != PATH:
             return _refusal(HTTPStatus.NOT_FOUND, f"{path}: there are {', '.join([*self._files, PATH])}")
@@ -229,20 +231,20 @@ class WebServer:
 
     def _knows(self, request: Request) -> bool:
         """Whether the request shows the key, where there is one."""
-        if self._guard.key is None:
+        if self._request_filter.key is None:
             return True
         shown = parse_qs(urlsplit(request.path).query).get("key", [])
         for value in request.headers.get_all("Cookie"):
             shown += [
                 one.partition("=")[2] for one in value.split("; ") if one.startswith(f"{self._name()}=")
             ]
-        return any(hmac.compare_digest(one.encode(), self._guard.key.encode()) for one in shown)
+        return any(hmac.compare_digest(one.encode(), self._request_filter.key.encode()) for one in shown)
 
     def _name(self) -> str:
         return f"phalanx-hands-{self.port}"  # cookies know no port
 
     def _cookie(self, key: str) -> str:
-        secure = "; Secure" if self._guard.tls is not None else ""
+        secure = "; Secure" if self._request_filter.tls is not None else ""
         return f"{self._name()}={key}; Path=/; Max-Age={_COOKIE_S}; HttpOnly; SameSite=Strict{secure}"
 
 

@@ -33,7 +33,7 @@ _SOURCES = tuple(source.name.lower() for source in Source)
 _OBJECT_SOURCES = tuple(source.name.lower() for source in ObjectSource)
 _POINT_SIGNS: dict[Frame, Float] = {"webxr": np.array([1.0, -1.0, -1.0]), "rig": np.ones(3)}
 # x, y, z, w of the message: which of w, x, y, z it is, and with which sign.
-_TURN_ORDER: dict[Frame, tuple[list[int], Float]] = {
+_QUATERNION_ORDER: dict[Frame, tuple[list[int], Float]] = {
     "webxr": ([0, 3, 2, 1], np.array([1.0, -1.0, 1.0, -1.0])),
     "rig": ([1, 2, 3, 0], np.ones(4)),
 }
@@ -93,12 +93,12 @@ class ObjectJson(Struct, frozen=True, tag_field="type", tag="object"):
 def webxr_json(pose: HandPose, frame: Frame = "webxr") -> bytes:
     """The pose as JSON (`HandJson`), without line feeds; what is not known is null, never NaN."""
     points = _points(pose.position_m[1:], frame)
-    turns = _turns(pose.orientation_wxyz[1:], frame)
+    rotations = _quaternions(pose.orientation_wxyz[1:], frame)
     sigma_mm: Float = np.sqrt(np.einsum("jii->j", pose.cov_m2[1:]) / 3.0) * 1e3
     columns = zip(
         WEBXR_JOINTS,
         points,
-        turns,
+        rotations,
         np.round(pose.radius_m[1:], 6).tolist(),
         pose.valid[1:].tolist(),
         pose.tracked[1:].tolist(),
@@ -123,7 +123,7 @@ def object_json(pose: ObjectPose, frame: Frame = "webxr") -> bytes:
             t_ns=pose.t_ns,
             latency_ms=round(pose.latency_ns / 1e6, 3),
             position=_points(pose.position_m[None], frame)[0],
-            orientation=_turns(pose.orientation_wxyz[None], frame)[0],
+            orientation=_quaternions(pose.orientation_wxyz[None], frame)[0],
             tracked=pose.tracked,
             source=_OBJECT_SOURCES[pose.source],
         )
@@ -137,12 +137,12 @@ def _points(position_m: Float, frame: Frame) -> list[Triple | None]:
     return [tuple(row) if _known(row) else None for row in rows]
 
 
-def _turns(orientation_wxyz: Float, frame: Frame) -> list[Four | None]:
+def _quaternions(orientation_wxyz: Float, frame: Frame) -> list[Four | None]:
     """Quaternions (N, 4), w x y z, to the rig frame, as x y z w to the frame of the message."""
-    order, signs = _TURN_ORDER[frame]
-    turns = orientation_wxyz[:, order] * signs
-    turns = np.where(turns[:, 3:] < 0.0, -turns, turns)
-    return [tuple(row) if _known(row) else None for row in (np.round(turns, 6) + 0.0).tolist()]
+    order, signs = _QUATERNION_ORDER[frame]
+    rotations = orientation_wxyz[:, order] * signs
+    rotations = np.where(rotations[:, 3:] < 0.0, -rotations, rotations)
+    return [tuple(row) if _known(row) else None for row in (np.round(rotations, 6) + 0.0).tolist()]
 
 
 def _known(row: list[float]) -> bool:

@@ -21,7 +21,7 @@ from common.json_file import decode_json
 from slave.cameras.source import Frame
 from slave.cameras.synthetic import SyntheticCamera
 
-LOOK_NS = 100_000_000
+POLL_NS = 100_000_000
 _LOG = logging.getLogger(__name__)
 Byte = Annotated[int, Meta(ge=0, le=255)]
 
@@ -109,7 +109,7 @@ class FaultyCamera:
             RuntimeError: Its driver is to raise something that no driver of ours raises.
         """
         while (frame := self._source.read()) is not None:
-            if frame.ready_t_ns - self._looked_ns >= LOOK_NS:
+            if frame.ready_t_ns - self._looked_ns >= POLL_NS:
                 self._looked_ns = frame.ready_t_ns
                 try:
                     self._look()

@@ -23,8 +23,8 @@ from common.arrays import Image
 from common.calibration import CameraCalibration
 from common.clock import Clock
 from common.errors import CameraError
+from slave.cameras.frame_observer import FrameObserver
 from slave.cameras.grey import Pixels
-from slave.cameras.passing import Passing
 from slave.cameras.picamera2_frames import Timeline
 from slave.cameras.picamera2_library import open_library
 from slave.cameras.picamera2_modes import choose_mode, choose_raw_mode, read_modes, view_text
@@ -38,7 +38,7 @@ from slave.cameras.picamera2_settings import (
     wanted_settings,
 )
 from slave.cameras.picamera2_streams import Streams
-from slave.cameras.picamera2_sync import SyncWatch, wait_in_step
+from slave.cameras.picamera2_sync import SyncMonitor, wait_in_step
 from slave.cameras.settings import as_values, change, demand, differences
 from slave.cameras.source import Frame
 
@@ -79,9 +79,9 @@ class Picamera2Camera:
         self._timeline = Timeline(calibration.frame_rate_hz, clock)
         self._lores: Image | None = None
         self._closed = self._lost = False
-        self._metadata = Passing[Mapping[str, object]]()
+        self._metadata = FrameObserver[Mapping[str, object]]()
         self._sync = (
-            SyncWatch(self._where, client=options.sync == "client") if options.sync != "off" else None
+            SyncMonitor(self._where, client=options.sync == "client") if options.sync != "off" else None
         )
         self._library, self._enums = open_library(options.index)
         try:

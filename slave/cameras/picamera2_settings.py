@@ -175,7 +175,7 @@ def wanted_settings(
 def read_figures(metadata: Mapping[str, object]) -> dict[str, float]:
     """What the metadata of a frame says of the settings, by the names of `common.camera_settings`, and more."""
     found: dict[str, float] = {}
-    for name, gauges in (
+    for name, metrics in (
         ("ExposureTime", ("exposure_us",)),
         ("AnalogueGain", ("analogue_gain",)),
         ("DigitalGain", ("digital_gain",)),
@@ -184,8 +184,8 @@ def read_figures(metadata: Mapping[str, object]) -> dict[str, float]:
         ("SensorTemperature", ("sensor_celsius",)),
     ):
         values = as_values(metadata.get(name))
-        if values is not None and len(values) == len(gauges):
-            found |= dict(zip(gauges, values, strict=True))
+        if values is not None and len(values) == len(metrics):
+            found |= dict(zip(metrics, values, strict=True))
     duration = as_values(metadata.get("FrameDuration"))
     if duration is not None and duration[0] > 0.0:
         found["frame_rate_hz"] = 1e6 / duration[0]

@@ -30,7 +30,7 @@ LOG_FRAMES = 120
 _LOG = logging.getLogger(__name__)
 
 
-class SyncWatch:
+class SyncMonitor:
     """Push machine for a camera's metadata. Holds whether it is in step, and how far off the last message found it."""
 
     def __init__(self, where: str, *, client: bool) -> None:
@@ -85,13 +85,13 @@ class SyncWatch:
             self.error_us = 0.0
         if not isinstance(duration, (int, float)):
             return
-        last, usual = self._durations
+        last, typical = self._durations
         if duration == last:
-            usual = float(duration)
-        off_us = usual - duration if usual else 0.0
+            typical = float(duration)
+        off_us = typical - duration if typical else 0.0
         if abs(off_us) >= LEAST_US:
             self.error_us, self._since_error = off_us, 0
-        self._durations = (float(duration), usual)
+        self._durations = (float(duration), typical)
 
     def _why(self, metadata: Mapping[str, object]) -> str:
         if not metadata.get("SyncReady"):
@@ -137,9 +137,9 @@ def wait_in_step(
         if stopped():
             raise CameraError(f"{where}: stopped while it waited for {other}")
         if clock.now_ns() > end_ns:
-            heard = "no server was heard" if timer is None else f"{timer} us were left"
+            received = "no server was heard" if timer is None else f"{timer} us were left"
             raise CameraError(
-                f"{where}: --sync {role}: not in step after {timeout_s:g} s, {heard}. "
+                f"{where}: --sync {role}: not in step after {timeout_s:g} s, {received}. "
                 "Exactly one camera of the rig is the server, all have the same frame_rate_hz, clients start "
                 "first, and UDP multicast 239.255.255.250:10000 must pass between the machines"
             )

@@ -12,10 +12,10 @@ from common.errors import CameraError
 from slave.cameras.grey import Pixels
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
-from slave.cameras.reopening import ReopeningCamera
+from slave.cameras.reconnecting import ReconnectingCamera
 from slave.cameras.source import FrameSource
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
-from slave.service import AWAY_S, Away, nobody
+from slave.service import LOST_PATIENCE_S, ConnectionLost, nobody
 
 CAMERAS = "picamera2[:INDEX] | v4l2[:DEVICE]"
 DRIVERS = ("picamera2", "v4l2")
@@ -75,7 +75,7 @@ def open_real(
     stop: threading.Event | None,
     *,
     wrist: bool = False,
-    away: Away = nobody,
+    connection_lost: ConnectionLost = nobody,
 ) -> FrameSource | None:
     """Open the camera that `--camera DRIVER[:PLACE]` names.
 
@@ -103,12 +103,14 @@ def open_real(
     if kind == "picamera2":
         pi = Picamera2Options(_index(place), options.sync, options.sync_timeout, pixels=pixels)
         if options.sync != "off":  # the others may have to be started first
-            away = partial(away, patience_s=AWAY_S + options.sync_timeout)
-            away("opens the camera, in step with others")
-        return lasting(lambda file: Picamera2Camera(file, pi, clock, stop), camera, clock, stop, away)
+            connection_lost = partial(connection_lost, patience_s=LOST_PATIENCE_S + options.sync_timeout)
+            connection_lost("opens the camera, in step with others")
+        return persistent(
+            lambda file: Picamera2Camera(file, pi, clock, stop), camera, clock, stop, connection_lost
+        )
     if kind == "v4l2":
         usb = V4l2Options(_path(place), _controls(options.control), tuple(options.allow_missing), pixels)
-        return lasting(lambda file: V4l2Camera(file, usb, clock), camera, clock, stop, away)
+        return persistent(lambda file: V4l2Camera(file, usb, clock), camera, clock, stop, connection_lost)
     return None
 
 
@@ -126,19 +128,21 @@ def _pixels(kind: str, as_luma: bool, wrist: bool) -> Pixels:
     return Pixels.COLOUR
 
 
-def lasting(
+def persistent(
     opener: Callable[[CameraCalibration], FrameSource],
     camera: CameraCalibration,
     clock: Clock,
     stop: threading.Event | None,
-    away: Away,
+    connection_lost: ConnectionLost,
 ) -> FrameSource:
     """Open a camera that is opened again whenever it is lost, until `stop` is set; None: losing it is an error.
 
     Raises:
         CameraError: It cannot be opened the first time.
     """
-    return opener(camera) if stop is None else ReopeningCamera(opener, camera, clock, stop, away)
+    return (
+        opener(camera) if stop is None else ReconnectingCamera(opener, camera, clock, stop, connection_lost)
+    )
 
 
 def _index(place: str) -> int:

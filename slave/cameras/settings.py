@@ -69,7 +69,9 @@ def differences(wanted: Iterable[Setting], got: Mapping[str, object]) -> list[st
     found: list[str] = []
     for setting in wanted:
         if setting.name not in got:
-            found.append(f"{setting.name}: wanted {_say(setting.wanted, setting.unit)}, not read back at all")
+            found.append(
+                f"{setting.name}: wanted {_text_of(setting.wanted, setting.unit)}, not read back at all"
+            )
             continue
         values = as_values(got[setting.name])
         near = (
@@ -78,9 +80,9 @@ def differences(wanted: Iterable[Setting], got: Mapping[str, object]) -> list[st
             and all(abs(a - b) <= setting.tolerance for a, b in zip(values, setting.wanted, strict=True))
         )
         if not near:
-            say = got[setting.name] if values is None else _say(values, setting.unit)
+            text = got[setting.name] if values is None else _text_of(values, setting.unit)
             found.append(
-                f"{setting.name}: wanted {_say(setting.wanted, setting.unit)} ({setting.source}), got {say}, "
+                f"{setting.name}: wanted {_text_of(setting.wanted, setting.unit)} ({setting.source}), got {text}, "
                 f"allowed are {_number(setting.tolerance)}{_space(setting.unit)} off"
             )
     return found
@@ -120,7 +122,7 @@ def change(
         raise CameraError(f"{error}; the settings before are back") from error
 
 
-def _say(values: Sequence[float], unit: str) -> str:
+def _text_of(values: Sequence[float], unit: str) -> str:
     return ", ".join(_number(value) for value in values) + _space(unit)
 
 

@@ -58,8 +58,8 @@ class ForeignClock:
         if before is not None and abs(offset_ns - before) > STEP_NS:
             self.steps += 1
             if self._age_ns is not None:
-                usual_ns = now_ns - self._age_ns
-                t_ns = min(t_ns, stamp_ns - before, key=lambda t: abs(t - usual_ns))
+                typical_ns = now_ns - self._age_ns
+                t_ns = min(t_ns, stamp_ns - before, key=lambda t: abs(t - typical_ns))
         self._age_ns = now_ns - t_ns
         return t_ns
 

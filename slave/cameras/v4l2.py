@@ -35,8 +35,8 @@ from common.camera_settings import same_exposed
 from common.clock import Clock
 from common.errors import CameraError
 from slave.cameras import v4l2_abi as abi
+from slave.cameras.frame_observer import FrameObserver
 from slave.cameras.grey import Pixels
-from slave.cameras.passing import Passing
 from slave.cameras.settings import change
 from slave.cameras.source import Frame
 from slave.cameras.stamps import ForeignClock, clock_of, system_clock
@@ -102,7 +102,7 @@ class V4l2Camera:
         self._streaming = False
         self._settings: V4l2Settings | None = None
         self._rate_hz = 0.0
-        self._times = Passing[tuple[int, int]]()  # number and time of frames
+        self._times = FrameObserver[tuple[int, int]]()  # number and time of frames
         self.broken = 0
         self._device: abi.Device | None = self._open(open_device)
         try:

@@ -234,25 +234,25 @@ def _exposure(camera: CameraCalibration, control: Control) -> Setting:
 
 def _check_needs(controls: Mapping[str, Control], given: Mapping[str, int], allowed: set[str]) -> None:
     """Every value that the image depends on is known, or its absence was allowed."""
-    say: list[str] = []
+    notes: list[str] = []
     for need, ways in NEEDS.items():
         have = [way for way in ways if all(name in controls for name in way)]
         set_already = any(all(name in given or name == EXPOSURE for name in way) for way in have)
         if not have and need not in allowed:
-            say.append(
+            notes.append(
                 f"it has no {need} control for {FILE_KEYS[need]} of the camera file: allow that with "
                 f"--allow-missing {need}"
             )
         elif have and not set_already:
             choice = " and ".join(f"--control {name}=N" for name in have[0])
             ranges = ", ".join(controls[name].text() for name in have[0])
-            say.append(f"its {need} is a code of its maker: give {choice}, {ranges}")
+            notes.append(f"its {need} is a code of its maker: give {choice}, {ranges}")
     if "focus_absolute" in controls and "focus_absolute" not in given:
-        say.append(
+        notes.append(
             f"it has a focus motor: give --control focus_absolute=N, {controls['focus_absolute'].text()}"
         )
-    if say:
-        raise CameraError("; ".join(say))
+    if notes:
+        raise CameraError("; ".join(notes))
 
 
 def write(device: Device, controls: Mapping[str, Control], settings: Iterable[Setting]) -> None:

@@ -10,8 +10,8 @@ from typing import TypeVar
 
 from common.calibration import CameraCalibration
 from common.errors import CameraError
+from slave.cameras.frame_observer import FrameObserver
 from slave.cameras.grey import Pixels
-from slave.cameras.passing import Passing
 from slave.cameras.settings import change, demand, differences
 from slave.cameras.v4l2_abi import Device
 from slave.cameras.v4l2_controls import (
@@ -82,7 +82,9 @@ class V4l2Settings:
             settle()
         demand("it", self._wanted, read_back(self._device, self._controls, self._wanted), FIX)
 
-    def tune(self, old: CameraCalibration, new: CameraCalibration, frames: Passing[tuple[int, int]]) -> None:
+    def tune(
+        self, old: CameraCalibration, new: CameraCalibration, frames: FrameObserver[tuple[int, int]]
+    ) -> None:
         """Change the exposure of the running camera; see `Tunable.tune`.
 
         Args:
@@ -120,7 +122,7 @@ class V4l2Settings:
         with self._asking:
             self._device = None
 
-    def _apply(self, camera: CameraCalibration, frames: Passing[tuple[int, int]]) -> None:
+    def _apply(self, camera: CameraCalibration, frames: FrameObserver[tuple[int, int]]) -> None:
         period_us = 1e6 / camera.frame_rate_hz
         if camera.exposure_us >= period_us:
             raise CameraError(

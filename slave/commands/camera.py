@@ -12,8 +12,8 @@ from common.errors import CameraError
 from slave.cameras import real
 from slave.cameras.source import FrameSource
 from slave.commands.options import add_place, add_simulated, epoch_of, number, world_of
-from slave.lights.opening import CHOICES, SYNTHETIC, choose, limits_for, open_guarded
-from slave.service import Away, nobody
+from slave.lights.factory import CHOICES, SYNTHETIC, choose, limits_for, open_guarded
+from slave.service import ConnectionLost, nobody
 
 if TYPE_CHECKING:
     from slave.cameras.synthetic import LitBy
@@ -44,7 +44,7 @@ def open_lit(
     clock: Clock,
     true_clock: Clock,
     stop: threading.Event | None = None,
-    away: Away = nobody,
+    connection_lost: ConnectionLost = nobody,
 ) -> FrameSource:
     """Open the camera, and the lights of a wrist device, which are dark before it is opened.
 
@@ -65,7 +65,7 @@ def open_lit(
     """
     lights = choose(options.lights, rig, str(options.camera))
     if lights is None or (lights == SYNTHETIC and options.scene == "board"):  # a simulated board is not lit
-        return _open(options, rig, camera, clock, true_clock, stop, away)
+        return _open(options, rig, camera, clock, true_clock, stop, connection_lost)
     from slave.lights.controller import StrobeController
     from slave.lights.simulated import SimulatedStrobe
     from slave.lights.strobed import StrobedCamera, schedule_of
@@ -75,13 +75,13 @@ def open_lit(
         strobe = SimulatedStrobe(schedule, limits)
         source = _open(options, rig, camera, clock, true_clock, stop, nobody, strobe)
         return StrobedCamera(source, camera, rig, strobe)
-    guard = open_guarded(lights, rig)
+    interlock = open_guarded(lights, rig)
     try:
-        source = _open(options, rig, camera, clock, true_clock, stop, away)
+        source = _open(options, rig, camera, clock, true_clock, stop, connection_lost)
     except Exception:
-        guard.close()
+        interlock.close()
         raise
-    return StrobedCamera(source, camera, rig, StrobeController(schedule, guard, clock))
+    return StrobedCamera(source, camera, rig, StrobeController(schedule, interlock, clock))
 
 
 def _open(
@@ -91,10 +91,18 @@ def _open(
     clock: Clock,
     true_clock: Clock,
     stop: threading.Event | None,
-    away: Away,
+    connection_lost: ConnectionLost,
     lights: "LitBy | None" = None,
 ) -> FrameSource:
-    found = real.open_real(options.camera, options, camera, clock, stop, wrist=rig.kind == "wrist", away=away)
+    found = real.open_real(
+        options.camera,
+        options,
+        camera,
+        clock,
+        stop,
+        wrist=rig.kind == "wrist",
+        connection_lost=connection_lost,
+    )
     if found is not None:
         return found
     kind, _, folder = str(options.camera).partition(":")
@@ -103,7 +111,7 @@ def _open(
 
         return ReplayCamera(Path(folder), options.name, paced=True, clock=clock)
     if kind == "synthetic" and not folder:
-        return _open_synthetic(options, rig, camera, clock, true_clock, stop, away, lights)
+        return _open_synthetic(options, rig, camera, clock, true_clock, stop, connection_lost, lights)
     raise CameraError(f"--camera {options.camera}: no such driver; there are {CAMERAS}")
 
 
@@ -114,7 +122,7 @@ def _open_synthetic(
     clock: Clock,
     true_clock: Clock,
     stop: threading.Event | None,
-    away: Away,
+    connection_lost: ConnectionLost,
     lights: "LitBy | None",
 ) -> FrameSource:
     from slave.cameras.synthetic import SyntheticCamera
@@ -137,6 +145,10 @@ def _open_synthetic(
 
     frozen = Frozen()
 
-    return real.lasting(
-        lambda file: FaultyCamera(draw(file), file, options.faults, frozen), camera, clock, stop, away
+    return real.persistent(
+        lambda file: FaultyCamera(draw(file), file, options.faults, frozen),
+        camera,
+        clock,
+        stop,
+        connection_lost,
     )

@@ -73,7 +73,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
     )
 
 
-def run(options: argparse.Namespace, say: Callable[[str], None], aside: Callable[[str], None]) -> int:
+def run(options: argparse.Namespace, notify: Callable[[str], None], aside: Callable[[str], None]) -> int:
     """Find them, write the camera file, and say what collides with what.
 
     Raises:
@@ -91,9 +91,9 @@ def run(options: argparse.Namespace, say: Callable[[str], None], aside: Callable
             auto=options.auto,
             like=options.like,
             hand=options.hand,
-            say=aside,
+            notify=aside,
         )
-    say(report(table))
+    notify(report(table))
     return 0
 
 

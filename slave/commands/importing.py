@@ -50,7 +50,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
     )
 
 
-def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
+def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     """Import them.
 
     Raises:
@@ -67,8 +67,8 @@ def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     if not options.paths and not named:
         raise RecordingError("import: name a video or a folder of pictures for each camera")
     wish = Wish(options.calibration, options.paths, named, options.rig, options.times)
-    import_pictures(wish, options.output, say)
-    say(f"recording in {options.output}")
+    import_pictures(wish, options.output, notify)
+    notify(f"recording in {options.output}")
     return 0
 
 

@@ -20,7 +20,7 @@ from slave.commands.options import (
     secrets_of,
     world_of,
 )
-from slave.imu import opening
+from slave.imu import factory
 from slave.service import Service
 from slave.stopping import stop_by_signal
 
@@ -47,7 +47,7 @@ EXAMPLES = """\
 def add_options(command: argparse.ArgumentParser) -> None:
     """The options of `imu`."""
     add_place(command, "IMU of this slave, that of the rig (default: imu)", default="imu")
-    opening.add_options(command)
+    factory.add_options(command)
     _add_csv(command.add_argument_group("a recording (--csv)").add_argument)
     add_link(command)
     add_simulated(command.add_argument_group("synthetic IMU").add_argument)
@@ -72,14 +72,14 @@ def _add_csv(add: Callable[..., argparse.Action]) -> None:
     )
 
 
-def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
+def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     """Send samples until it is told to end, or take in a recording.
 
     Raises:
         PhalanxError: A file, the IMU, a key or the network is not as it must be.
     """
     if options.csv is not None:
-        return _take_in(options, say)
+        return _take_in(options, notify)
     from slave.imu.live import run_live
     from slave.imu.synthetic import SyntheticImu
     from slave.simulated import imu_of
@@ -89,13 +89,13 @@ def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     if rig.imu is None or options.name != rig.imu.name:
         has = "it has none" if rig.imu is None else f"its IMU is {rig.imu.name!r}"
         raise CalibrationError(f"rig {rig.name!r} has no IMU {options.name!r}; {has}")
-    orientation = opening.orientation_of(rig.imu)
+    orientation = factory.orientation_of(rig.imu)
     true_clock = SystemClock()
     clock = clock_of(options, true_clock)
     key, access = secrets_of(options)
 
     def tell(line: str) -> None:
-        say(f"{options.name}: {line}")
+        notify(f"{options.name}: {line}")
 
     service = Service(os.environ, noun="samples")
     with stop_by_signal() as stop:
@@ -104,16 +104,18 @@ def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
             imu = imu_of(options.imu, *world_of(options, rig), options.scene, options.seed)
             source: ImuSource = SyntheticImu(imu, epoch_ns, clock, stop)
         else:
-            source = opening.open_real(options.name, options.imu, rig.imu.rate_hz, clock, stop, service.away)
+            source = factory.open_real(
+                options.name, options.imu, rig.imu.rate_hz, clock, stop, service.connection_lost
+            )
         uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
         run_live(options.name, source, orientation, uplink, clock, stop, tell, service, access)
     return 0
 
 
-def _take_in(options: argparse.Namespace, say: Callable[[str], None]) -> int:
+def _take_in(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     from common.imu_csv import read_csv
     from slave.imu.importing import import_table
 
     units = {what: unit for what in (TIME, GYRO, ACCEL, MAG) if (unit := getattr(options, f"{what}_unit"))}
-    import_table(read_csv(options.csv, units, options.rate_hz), options.name, options.out, say)
+    import_table(read_csv(options.csv, units, options.rate_hz), options.name, options.out, notify)
     return 0

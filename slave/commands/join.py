@@ -27,7 +27,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
     )
 
 
-def run(options: argparse.Namespace, say: Callable[[str], None], aside: Callable[[str], None]) -> int:
+def run(options: argparse.Namespace, notify: Callable[[str], None], aside: Callable[[str], None]) -> int:
     """Join them.
 
     Raises:
@@ -40,5 +40,5 @@ def run(options: argparse.Namespace, say: Callable[[str], None], aside: Callable
             aside(f"{done} of {total} frames")
 
     counts = join_recordings(options.recordings, options.output, options.by_wall_clock, progress)
-    say(f"{options.output}: " + ", ".join(f"{name} {count} frames" for name, count in counts.items()))
+    notify(f"{options.output}: " + ", ".join(f"{name} {count} frames" for name, count in counts.items()))
     return 0

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from common.calibration import CameraCalibration, load
 from common.errors import LightsError
 from slave.commands.options import add_rig, camera_path, positive, rig_of
-from slave.lights.opening import SWITCHED, open_guarded
+from slave.lights.factory import SWITCHED, open_guarded
 from slave.stopping import stop_by_signal
 
 PURPOSE = "budget and test of laser and LEDs"
@@ -31,8 +31,8 @@ def add_options(command: argparse.ArgumentParser) -> None:
     act.add_argument("--off", action="store_true", help="switch both off")
 
 
-def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
-    """Say the budget; switch lights only where that is asked for.
+def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
+    """Notify the budget; switch lights only where that is asked for.
 
     Raises:
         PhalanxError: A file is missing or broken, or the lights cannot be opened or switched.
@@ -42,18 +42,18 @@ def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     rig = rig_of(options)
     camera = load(camera_path(options, rig.cameras[0]), CameraCalibration)
     if not (options.blink or options.off):
-        say(budget(rig, camera))
+        notify(budget(rig, camera))
         return 0
     if options.lights is None:
         raise LightsError(f"--blink and --off need the lights: --lights {SWITCHED}")
     with stop_by_signal() as stop:
-        guard = open_guarded(options.lights, rig)  # dark from here on
+        interlock = open_guarded(options.lights, rig)  # dark from here on
         try:
             if options.blink:
-                say(budget(rig, camera))
-                blink(guard, rig, camera, stop, options.blink)
+                notify(budget(rig, camera))
+                blink(interlock, rig, camera, stop, options.blink)
         finally:
-            guard.close()
-    events = ", ".join(f"{event} {count}" for event, count in guard.events().items())
-    say(events if options.blink else "dark")
+            interlock.close()
+    events = ", ".join(f"{event} {count}" for event, count in interlock.events().items())
+    notify(events if options.blink else "dark")
     return 0

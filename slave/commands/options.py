@@ -64,7 +64,7 @@ def add_simulated(add: Callable[..., argparse.Action]) -> None:
         default="standard",
         metavar="NAME",
         help=f"standard | lights | poses | hand-routine | object | leap:FILE.npz | {BOTH} | board | card; before a "
-        f"wrist device standard | curl | wearer | poses | spread | random | {BOTH}, each with @dark | @indoor | "
+        f"wrist device standard | curl | subject | poses | spread | random | {BOTH}, each with @dark | @indoor | "
         "@bright | @sun, or board",
     )
     add("--seed", type=int, default=7)

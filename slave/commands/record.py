@@ -25,7 +25,7 @@ from slave.commands.options import (
     skew_of,
     world_of,
 )
-from slave.imu import opening
+from slave.imu import factory
 from slave.stopping import stop_by_signal
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
         nargs="?",
         const="synthetic",
         metavar="DRIVER",
-        help=f"what the rig's IMU says, too, as imu.csv: {opening.REAL}; without a driver, that of a synthetic camera",
+        help=f"what the rig's IMU says, too, as imu.csv: {factory.REAL}; without a driver, that of a synthetic camera",
     )
     command.add_argument(
         "--every-frame",
@@ -82,7 +82,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
     )
 
 
-def run(options: argparse.Namespace, say: Callable[[str], None], aside: Callable[[str], None]) -> int:
+def run(options: argparse.Namespace, notify: Callable[[str], None], aside: Callable[[str], None]) -> int:
     """Record until the length is reached, or it is told to end.
 
     Raises:
@@ -97,20 +97,20 @@ def run(options: argparse.Namespace, say: Callable[[str], None], aside: Callable
     imu = None
     if options.imu == "synthetic":
         imu = imu_of(str(options.camera), *world_of(options, scene.rig), options.scene, options.seed)
-    with _imu_beside(options, scene, aside) as beside:
-        done, failure = _record(options, scene, manifest, beside)
-        if beside is not None and done.frames:
-            beside.keep()
+    with _imu_recorder(options, scene, aside) as imu_recorder:
+        done, failure = _record(options, scene, manifest, imu_recorder)
+        if imu_recorder is not None and done.frames:
+            imu_recorder.keep()
     if imu is not None and done.frames:
         add_imu(options.output, imu, options.scene_epoch_ns, scene.clock)
     os.sync()  # what was said to be recorded is there, also when the power goes now
-    if failure is None and beside is not None:
-        failure = beside.failure
+    if failure is None and imu_recorder is not None:
+        failure = imu_recorder.failure
     if failure is not None:
         raise failure
     if not done.frames:
         raise CameraError(f"camera {options.name!r} gave no frame; nothing was recorded")
-    say(f"{options.name}: recorded in {options.output}")
+    notify(f"{options.name}: recorded in {options.output}")
     return 0
 
 
@@ -147,7 +147,7 @@ def _manifest(options: argparse.Namespace, scene: _Scene) -> "Manifest":
 
 
 def _record(
-    options: argparse.Namespace, scene: _Scene, manifest: "Manifest", beside: "ImuRecorder | None"
+    options: argparse.Namespace, scene: _Scene, manifest: "Manifest", imu_recorder: "ImuRecorder | None"
 ) -> "tuple[Progress, PhalanxError | None]":
     """Record the camera to its end; how much that is, and what has ended it before its time."""
     from slave.progress import Length, ProgressDisplay
@@ -166,8 +166,8 @@ def _record(
             round(options.queue_mb * 1e6),
         )
         try:
-            if beside is not None:
-                beside.start(options.output)
+            if imu_recorder is not None:
+                imu_recorder.start(options.output)
             with stop_by_signal() as stop:
                 feed(source, recorder, stop)
         finally:
@@ -180,7 +180,7 @@ def _record(
 
 
 @contextmanager
-def _imu_beside(
+def _imu_recorder(
     options: argparse.Namespace, scene: _Scene, aside: Callable[[str], None]
 ) -> "Generator[ImuRecorder | None, None, None]":
     """A real IMU of the rig that is recorded with a camera, if one is asked for."""
@@ -192,12 +192,12 @@ def _imu_beside(
     imu = scene.rig.imu
     if imu is None:
         raise CalibrationError(f"rig {scene.rig.name!r}: imu: missing; there is none to record")
-    orientation, stop = opening.orientation_of(imu), threading.Event()
-    beside = ImuRecorder(
-        opening.open_real(imu.name, options.imu, imu.rate_hz, scene.clock, stop), orientation, stop
+    orientation, stop = factory.orientation_of(imu), threading.Event()
+    imu_recorder = ImuRecorder(
+        factory.open_real(imu.name, options.imu, imu.rate_hz, scene.clock, stop), orientation, stop
     )
     try:
-        yield beside
+        yield imu_recorder
     finally:
-        counts = beside.close()
+        counts = imu_recorder.close()
         aside(", ".join(f"{event} {count}" for event, count in counts.items()))

@@ -101,7 +101,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
     )
 
 
-def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
+def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     """Detect and send until it is told to end.
 
     Raises:
@@ -122,11 +122,11 @@ def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     key, access = secrets_of(options)
     raw = _raw_settings(options, true_clock)
     engine = (wrist_engine if files.rig.kind == "wrist" else marker_engine).engine_named(options.engine)
-    source = open_lit(options, files.rig, files.camera, clock, true_clock, stop, service.away)
+    source = open_lit(options, files.rig, files.camera, clock, true_clock, stop, service.connection_lost)
     uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
 
     def tell(line: str) -> None:
-        say(f"{options.name}: {line}")
+        notify(f"{options.name}: {line}")
 
     run_live(
         options.name,

@@ -19,9 +19,9 @@ from slave.commands.options import (
     secrets_of,
     world_of,
 )
-from slave.objects import opening
+from slave.objects import factory
 from slave.objects.source import TrackerSource
-from slave.service import Away, Service
+from slave.service import ConnectionLost, Service
 from slave.stopping import stop_by_signal
 
 PURPOSE = "send where a Vive tracker is"
@@ -41,12 +41,12 @@ def add_options(command: argparse.ArgumentParser) -> None:
     """The options of `tracker`."""
     command.add_argument("name", metavar="NAME", help="the `tracker` of an object of the rig")
     add_rig(command)
-    opening.add_options(command)
+    factory.add_options(command)
     add_link(command)
     add_simulated(command.add_argument_group("synthetic tracker").add_argument)
 
 
-def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
+def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     """Send poses until it is told to end.
 
     Raises:
@@ -56,17 +56,17 @@ def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     from slave.uplink import Uplink
 
     rig = rig_of(options)
-    profile = opening.object_with(options.calibration, rig, options.name)
+    profile = factory.object_with(options.calibration, rig, options.name)
     true_clock = SystemClock()
     clock = clock_of(options, true_clock)
     key, access = secrets_of(options)
 
     def tell(line: str) -> None:
-        say(f"{options.name}: {line}")
+        notify(f"{options.name}: {line}")
 
     service = Service(os.environ, noun="poses")
     with stop_by_signal() as stop:
-        source = _open(options, rig, profile, clock, true_clock, stop, service.away)
+        source = _open(options, rig, profile, clock, true_clock, stop, service.connection_lost)
         try:
             uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
         except PhalanxError:
@@ -84,11 +84,11 @@ def _open(
     clock: SkewedClock,
     true_clock: SystemClock,
     stop: threading.Event,
-    away: Away,
+    connection_lost: ConnectionLost,
 ) -> TrackerSource:
     if options.device != "synthetic":
         named = options.device, options.serial, options.program
-        return opening.open_real(options.name, *named, clock, stop, away)
+        return factory.open_real(options.name, *named, clock, stop, connection_lost)
     from slave.objects.synthetic import SyntheticTracker
     from slave.simulated import tracker_of
 

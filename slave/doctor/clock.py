@@ -24,8 +24,8 @@ def check_clock(system: System, master: str | None) -> Iterator[Finding]:
         return
     fields = asked.out.strip().split(",")
     if asked.code != 0 or len(fields) != FIELDS:
-        said = (asked.error or asked.out).strip().splitlines()[-1:] or ["no answer"]
-        yield warn("clock", f"chronyd: {said[0]}", "sudo systemctl enable --now chrony")
+        stated = (asked.error or asked.out).strip().splitlines()[-1:] or ["no answer"]
+        yield warn("clock", f"chronyd: {stated[0]}", "sudo systemctl enable --now chrony")
         return
     try:
         offset_s, rms_s = float(fields[OFFSET_S]), float(fields[RMS_S])
@@ -40,21 +40,25 @@ def _tracking(fields: list[str], offset_s: float, rms_s: float, master: str | No
     if fields[LEAP] == "Not synchronised":
         fix = "is the master's machine on, with `local stratum 8` and `allow` in its chrony.conf? `chronyc sources`"
         return warn("clock", "chrony has found no time yet", fix)
-    said = f"{offset_s * 1e6:+.0f} µs off {who} (stratum {fields[STRATUM]}), {rms_s * 1e6:.0f} µs in the mean"
+    stated = (
+        f"{offset_s * 1e6:+.0f} µs off {who} (stratum {fields[STRATUM]}), {rms_s * 1e6:.0f} µs in the mean"
+    )
     if abs(offset_s) > FAR_S:
-        return warn("clock", said, "wait some minutes; then `chronyc sources -v`, or `sudo chronyc makestep`")
+        return warn(
+            "clock", stated, "wait some minutes; then `chronyc sources -v`, or `sudo chronyc makestep`"
+        )
     if master is not None and who != master:
         return warn(
-            "clock", f"{said}; not by {master}", "see /etc/chrony/conf.d/phalanx.conf, `chronyc sources`"
+            "clock", f"{stated}; not by {master}", "see /etc/chrony/conf.d/phalanx.conf, `chronyc sources`"
         )
-    return ok("clock", said)
+    return ok("clock", stated)
 
 
 def _without_chrony(system: System) -> Finding:
     asked = system.run(("timedatectl", "show", "--property=NTP", "--property=NTPSynchronized"), 5.0)
     if asked.code is None or asked.code != 0:
         return unseen("clock", "neither chronyc nor timedatectl answers")
-    said = pairs(asked.out)
-    if said.get("NTPSynchronized") == "yes":
+    stated = pairs(asked.out)
+    if stated.get("NTPSynchronized") == "yes":
         return warn("clock", "by NTP, but how far off is not known without chrony", INSTALL)
     return fail("clock", "nothing keeps it", INSTALL)

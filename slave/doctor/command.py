@@ -75,16 +75,16 @@ def _slave(options: argparse.Namespace, system: System, name: str) -> "argparse.
         if options.camera is None:
             return unseen("camera", f"no {ETC}/{name}.env: give --camera, and --rig, --calibration")
         return _parsed(["run", "--name", name, *told], name)
-    said = pairs(text)
+    stated = pairs(text)
     try:
-        words = shlex.split(said.get("PHALANX_OPTIONS", ""))
+        words = shlex.split(stated.get("PHALANX_OPTIONS", ""))
     except ValueError as error:
         return fail(
             "options", f"{ETC}/{name}.env: PHALANX_OPTIONS: {error}", "phalanx deploy writes it again"
         )
-    if said.get("PHALANX_COMMAND") != "run":
+    if stated.get("PHALANX_COMMAND") != "run":
         told = []
-    return _parsed([said.get("PHALANX_COMMAND", ""), *words, *told], name)
+    return _parsed([stated.get("PHALANX_COMMAND", ""), *words, *told], name)
 
 
 def _parsed(words: Sequence[str], name: str) -> "argparse.Namespace | Finding":

@@ -32,7 +32,7 @@ def check_host(system: System) -> Iterator[Finding]:
     yield _release(system)
     yield _board(system)
     yield _python()
-    yield from _gauges(system)
+    yield from _metrics(system)
     yield _memory_limit(system)
     yield _throttled(system)
 
@@ -48,9 +48,9 @@ def _bits() -> Finding:
 
 def _release(system: System) -> Finding:
     text = system.text("/etc/os-release") or ""
-    said = dict(re.findall(r'^(\w+)="?([^"\n]*)"?$', text, re.MULTILINE))
-    name = said.get("PRETTY_NAME", "unknown")
-    if said.get("VERSION_CODENAME") in RELEASES:
+    stated = dict(re.findall(r'^(\w+)="?([^"\n]*)"?$', text, re.MULTILINE))
+    name = stated.get("PRETTY_NAME", "unknown")
+    if stated.get("VERSION_CODENAME") in RELEASES:
         return ok("system", name)
     return warn(
         "system", f"{name}: not tried with it", f"Raspberry Pi OS or Debian {' or '.join(sorted(RELEASES))}"
@@ -69,20 +69,20 @@ def _python() -> Finding:
     return ok("Python", f"{version} in {sys.prefix}")
 
 
-def _gauges(system: System) -> Iterator[Finding]:
+def _metrics(system: System) -> Iterator[Finding]:
     folder = system.path(STATE) if system.path(STATE).is_dir() else system.root
-    gauges = Machine(folder, system.environment).gauges()
-    free_mb = gauges.get("disk_free_mb")
+    metrics = Machine(folder, system.environment).metrics()
+    free_mb = metrics.get("disk_free_mb")
     if free_mb is None:
         yield unseen("disk", f"{folder}: not known")
     elif free_mb < FEW_MB:
-        say = fail if free_mb < NO_MB else warn
-        yield say(
+        level = fail if free_mb < NO_MB else warn
+        yield level(
             "disk", f"{free_mb:.0f} MB free", "delete recordings or old releases in /opt/phalanx/releases"
         )
     else:
         yield ok("disk", f"{free_mb / 1000.0:.1f} GB free")
-    now, limit = gauges.get("temperature_c"), gauges.get("temperature_limit_c")
+    now, limit = metrics.get("temperature_c"), metrics.get("temperature_limit_c")
     if now is None or limit is None:
         yield unseen("temperature", "no sensor with a limit")
     elif now >= limit:
@@ -116,9 +116,9 @@ def _throttled(system: System) -> Finding:
     before = [text for bit, text in BITS.items() if flags >> (bit + SINCE) & 1 and text not in now]
     if not now and not before:
         return ok("throttling", "none since the start")
-    said = [*(f"{text} now" for text in now), *(f"{text} since the start" for text in before)]
+    stated = [*(f"{text} now" for text in now), *(f"{text} since the start" for text in before)]
     fix = SUPPLY if flags & (1 | 1 << SINCE) else COOL
-    return warn("throttling", ", ".join(said), fix)
+    return warn("throttling", ", ".join(stated), fix)
 
 
 def _flags(system: System) -> int | None:
@@ -126,5 +126,5 @@ def _flags(system: System) -> int | None:
     asked = system.run(("vcgencmd", "get_throttled"), 5.0)
     if asked.code == 0 and (found := re.search(r"throttled=(0x[0-9a-fA-F]+)", asked.out)):
         return int(found[1], 16)
-    told = Machine(system.root, system.environment).gauges().get("throttled")
+    told = Machine(system.root, system.environment).metrics().get("throttled")
     return None if told is None else int(told)

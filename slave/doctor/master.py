@@ -15,7 +15,7 @@ from slave.doctor.system import System
 from slave.link import SlaveLink
 
 LISTEN_S = 1.0  # the beacon comes four times a second and more
-NOT_HEARD = (
+NOT_RECEIVED = (
     "is phalanx-master running, with --beacon of this network? Are both in one network, and does its wireless router "
     "let clients talk to each other? UDP port {} must pass"
 )
@@ -55,9 +55,9 @@ def _listen(link: SlaveLink, port: int, bind: str, addresses: set[str]) -> Findi
                 continue
             datagram, address = arrived
             before = link.refused.total()
-            link.hear_beacon(datagram, address, time.monotonic_ns())
+            link.receive_beacon(datagram, address, time.monotonic_ns())
             if link.refused.total() == before:
-                return _heard(address[0], addresses)
+                return _received(address[0], addresses)
     finally:
         beacons.close()
     refused = {str(reason.value): count for reason, count in link.refused.items()}
@@ -66,12 +66,12 @@ def _listen(link: SlaveLink, port: int, bind: str, addresses: set[str]) -> Findi
             "beacon", "a master of another version of the wire", "install the same version on both sides"
         )
     if refused:
-        said = ", ".join(f"{reason} {count}" for reason, count in refused.items())
-        return fail("beacon", f"heard, but not of this rig: {said}", "compare rig.key of both sides")
-    return fail("beacon", f"none in {LISTEN_S:g} s on UDP port {port}", NOT_HEARD.format(port))
+        stated = ", ".join(f"{reason} {count}" for reason, count in refused.items())
+        return fail("beacon", f"heard, but not of this rig: {stated}", "compare rig.key of both sides")
+    return fail("beacon", f"none in {LISTEN_S:g} s on UDP port {port}", NOT_RECEIVED.format(port))
 
 
-def _heard(address: str, expected: set[str]) -> Finding:
+def _received(address: str, expected: set[str]) -> Finding:
     if expected and address not in expected:
         return warn("beacon", f"from {address}, which is not the master named", "is a second master running?")
     return ok("beacon", f"from {address}, of this rig")

@@ -46,14 +46,14 @@ def check_programs(system: System, extra: Sequence[str]) -> Iterator[Finding]:
         )
     names = ("libstdc++", *NEEDED, *extra)
     asked = system.run((str(python), "-c", PROBE, *names), TIMEOUT_S)
-    said = pairs(asked.out, " ")
+    stated = pairs(asked.out, " ")
     for name in names:
         fix = FIXES.get(
             name, f"install again: the service's environment {where} lacks it, or has it for another Python"
         )
-        if name not in said:
+        if name not in stated:
             end = asked.error.strip().splitlines()[-1:] or [f"it ended with {asked.code}"]
             yield fail(name, f"crashed while it was imported {where}: {end[0]}", fix)
             return
-        found, _, text = said[name].partition(" ")
+        found, _, text = stated[name].partition(" ")
         yield ok(name, text or "there") if found == "yes" else fail(name, f"{text} ({where})", fix)

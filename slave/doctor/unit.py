@@ -33,21 +33,21 @@ def check_unit(system: System, name: str) -> Unit:
     asked = system.run(("systemctl", "show", unit, *(f"--property={one}" for one in ASKED)), 10.0)
     if asked.code != 0:
         return Unit(unseen(check, f"{unit}: systemd does not answer here"), False)
-    said = pairs(asked.out)
-    if said.get("LoadState") != "loaded":
+    stated = pairs(asked.out)
+    if stated.get("LoadState") != "loaded":
         install = "phalanx-slave install --master HOST, or phalanx deploy from the PC"
         return Unit(warn(check, f"{unit}: not installed", install), False)
-    state, status = said.get("ActiveState", ""), said.get("ExecMainStatus", "")
-    restarts, words = said.get("NRestarts", "0"), said.get("StatusText", "")
+    state, status = stated.get("ActiveState", ""), stated.get("ExecMainStatus", "")
+    restarts, words = stated.get("NRestarts", "0"), stated.get("StatusText", "")
     log = f"journalctl -u {unit} -n 50"
     if state == "active":
         if restarts != "0":
             return Unit(warn(check, f"{words}; restarted {restarts} times since it was started", log), True)
-        if said.get("UnitFileState") != "enabled":
+        if stated.get("UnitFileState") != "enabled":
             return Unit(warn(check, f"{words}; not started at boot", f"sudo systemctl enable {unit}"), True)
         return Unit(ok(check, words or "active"), True)
     if state == "inactive":
         return Unit(fail(check, f"{unit}: stopped", f"sudo systemctl start {unit}"), False)
     why, fix = BEFORE.get(status, (words or f"it ended with {status}", log))
-    runs = state == "activating" and said.get("SubState") == "start"
+    runs = state == "activating" and stated.get("SubState") == "start"
     return Unit(fail(check, f"{state}, {restarts} restarts: {why}", fix), runs)

@@ -49,7 +49,7 @@ class Wish:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Taken:
+class _Imported:
     """What one camera took: numbers of its frames, what they are called in the recording, and when they were taken."""
 
     source: Source
@@ -58,7 +58,7 @@ class _Taken:
     simultaneous: bool
 
 
-def import_pictures(wish: Wish, out: Path, say: Callable[[str], None]) -> dict[str, int]:
+def import_pictures(wish: Wish, out: Path, notify: Callable[[str], None]) -> dict[str, int]:
     """Write the recording; a former import in the same folder is replaced, nothing else is.
 
     Returns:
@@ -81,24 +81,24 @@ def import_pictures(wish: Wish, out: Path, say: Callable[[str], None]) -> dict[s
         raise RecordingError(f"--camera {unknown[0]}: rig {rig.name!r} has {', '.join(rig.cameras)}")
     sources = [Source(camera, path) for camera, path in wish.named.items()]
     if paths:
-        sources += sources_of(paths, rig, say)
+        sources += sources_of(paths, rig, notify)
     if twice := {s.camera for s in sources if [o.camera for o in sources].count(s.camera) > 1}:
         raise RecordingError(f"--camera {min(twice)}: is given twice")
     if absent := [name for name in rig.cameras if all(source.camera != name for source in sources)]:
-        say(f"rig {rig.name!r} has {', '.join(absent)}, too, of which there is nothing")
+        notify(f"rig {rig.name!r} has {', '.join(absent)}, too, of which there is nothing")
     rig = _only(rig, sources)
     cameras: dict[str, CameraCalibration] = {}
     for source in sources:
         file = wish.calibration / "cameras" / f"{source.camera}.json"
         cameras[source.camera] = load(file, CameraCalibration)
-    taken = [_taken(s, cameras[s.camera], wish, say) for s in sources]
-    own = [one.source for one in taken if one.simultaneous]
-    if own and len(own) < len(taken):
+    imported = [_imported(s, cameras[s.camera], wish, notify) for s in sources]
+    own = [one.source for one in imported if one.simultaneous]
+    if own and len(own) < len(imported):
         raise RecordingError(
             f"{own[0].path}: no table of times, but others have one: give one for every camera"
         )
     if len(own) > 1:
-        say(
+        notify(
             "the first frames of all cameras are taken as simultaneous; where they are not, give their --times"
         )
     _clear(out)
@@ -112,8 +112,8 @@ def import_pictures(wish: Wish, out: Path, say: Callable[[str], None]) -> dict[s
             name: load(wish.calibration / "objects" / f"{name}.json", ObjectProfile) for name in rig.objects
         },
     )
-    _write(out, manifest, taken)
-    return {one.source.camera: len(one.timed.number) for one in taken}
+    _write(out, manifest, imported)
+    return {one.source.camera: len(one.timed.number) for one in imported}
 
 
 def _only(rig: RigCalibration, sources: Sequence[Source]) -> RigCalibration:
@@ -123,7 +123,9 @@ def _only(rig: RigCalibration, sources: Sequence[Source]) -> RigCalibration:
     return msgspec.structs.replace(rig, cameras=names, T_rig_camera=places)
 
 
-def _taken(source: Source, camera: CameraCalibration, wish: Wish, say: Callable[[str], None]) -> _Taken:
+def _imported(
+    source: Source, camera: CameraCalibration, wish: Wish, notify: Callable[[str], None]
+) -> _Imported:
     """Numbers, names and times of the frames of one camera, said in a line.
 
     Raises:
@@ -137,20 +139,20 @@ def _taken(source: Source, camera: CameraCalibration, wish: Wish, say: Callable[
         raise RecordingError(f"{source.path}: cannot read: {error.strerror}") from error
     except PictureError as error:
         raise RecordingError(f"{source.path}: {error}") from error
-    beside = (
+    sidecar = (
         source.path.with_suffix(".csv") if source.is_video else source.path.parent / f"{source.path.name}.csv"
     )
-    table = wish.times or (beside if beside.is_file() else None)
+    table = wish.times or (sidecar if sidecar.is_file() else None)
     timed = own if table is None else by_table(table, read_times(table, source.camera), number)
     if timed is None:
         raise RecordingError(
             f"{source.path}: has no times and no frame rate; give --times FILE.csv (frame,time)"
         )
     seconds = 1e-9 * float(timed.t_ns[-1] - timed.t_ns[0])
-    say(
+    notify(
         f"{source.camera}: {source.path}: {len(timed.number)} frames in {seconds:.2f} s ({timed.note}){faults}"
     )
-    return _Taken(source, files, timed, table is None)
+    return _Imported(source, files, timed, table is None)
 
 
 _Read = tuple[Int, Mapping[int, str], Timed | None, str]
@@ -210,18 +212,18 @@ def _check_size(source: Source, found: tuple[int, int], size: tuple[int, int], w
         )
 
 
-def _write(out: Path, manifest: Manifest, taken: Sequence[_Taken]) -> None:
+def _write(out: Path, manifest: Manifest, imported: Sequence[_Imported]) -> None:
     """The manifest, the pictures under their names in the recording, and then the rows, by time."""
-    first = min(int(one.timed.t_ns[0]) for one in taken)  # tables may count from any instant
+    first = min(int(one.timed.t_ns[0]) for one in imported)  # tables may count from any instant
     rows: list[FrameRow] = []
-    for one in taken:
+    for one in imported:
         shift = int(one.timed.t_ns[0]) if one.simultaneous else first  # or all begin at 0
         for number, t_ns in zip(one.timed.number.tolist(), one.timed.t_ns.tolist(), strict=True):
             file = one.files[number]
             rows.append(FrameRow(one.source.camera, number, t_ns - shift, Illumination.NONE, file))
     writer = RecordingWriter(out, manifest)
     try:
-        for one in taken:
+        for one in imported:
             _place(out, one)
         for row in sorted(rows, key=lambda row: (row.t_ns, row.camera)):
             writer.refer(row)
@@ -229,7 +231,7 @@ def _write(out: Path, manifest: Manifest, taken: Sequence[_Taken]) -> None:
         writer.close()
 
 
-def _place(out: Path, one: _Taken) -> None:
+def _place(out: Path, one: _Imported) -> None:
     """Give the video or the pictures of a camera their names in the recording.
 
     Raises:

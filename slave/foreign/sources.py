@@ -71,7 +71,7 @@ def found_in(paths: Sequence[Path]) -> list[Path]:
     return found
 
 
-def sources_of(paths: Sequence[Path], rig: RigCalibration, say: Callable[[str], None]) -> list[Source]:
+def sources_of(paths: Sequence[Path], rig: RigCalibration, notify: Callable[[str], None]) -> list[Source]:
     """The camera of each: that of its name, or, where no name is a camera's, in the order of the rig.
 
     Raises:
@@ -96,7 +96,7 @@ def sources_of(paths: Sequence[Path], rig: RigCalibration, say: Callable[[str], 
             f" {rig.name!r} ({cameras}); {fix}"
         )
     found = [Source(camera, path) for camera, path in zip(rig.cameras, paths, strict=True)]
-    say(
+    notify(
         "no name is that of a camera; in the order of the rig: "
         + ", ".join(f"{s.camera} = {s.path}" for s in found)
     )

@@ -8,17 +8,17 @@ import numpy as np
 from common.arrays import Float
 from common.errors import RecordingError
 from common.imu_csv import Table
-from common.imu_csv_columns import TURN
+from common.imu_csv_columns import QUATERNION
 from common.imu_fusion import OrientationFilter
 from common.imu_recording import IMU, write_imu
 from common.imu_score import TiltErrors
 from common.messages import ImuSample
 
 _GAP = 1.5  # periods
-_NO_TURN = np.full(4, np.nan)
+_NO_QUATERNION = np.full(4, np.nan)
 
 
-def import_table(table: Table, source: str, folder: Path | None, say: Callable[[str], None]) -> None:
+def import_table(table: Table, source: str, folder: Path | None, notify: Callable[[str], None]) -> None:
     """Make the orientation of every sample, say what the recording has, and write imu.csv.
 
     Args:
@@ -41,7 +41,7 @@ def import_table(table: Table, source: str, folder: Path | None, say: Callable[[
     for k, t_ns in enumerate(table.t_ns.tolist()):
         try:
             sample = ImuSample(
-                source, 0, k, t_ns, table.gyro_rad_s[k], table.accel_m_s2[k], table.mag_ut[k], _NO_TURN
+                source, 0, k, t_ns, table.gyro_rad_s[k], table.accel_m_s2[k], table.mag_ut[k], _NO_QUATERNION
             )
         except ValueError as error:
             raise RecordingError(f"sample {k + 1}, at {1e-9 * t_ns:.3f} s: {error}") from error
@@ -49,50 +49,52 @@ def import_table(table: Table, source: str, folder: Path | None, say: Callable[[
         sigma_rad.append(fusion.tilt_sigma_rad)
         rest_s += period_s if fusion.at_rest else 0.0
     for what, names in table.columns.items():
-        say(f"{what + ':':12s} {names}{' in ' + table.units[what] if what in table.units else ''}")
+        notify(f"{what + ':':12s} {names}{' in ' + table.units[what] if what in table.units else ''}")
     gaps = step_s > _GAP * period_s
     longest = f", the longest {step_s.max():.3f} s" if gaps.any() else ""
-    say(
+    notify(
         f"samples:     {len(samples)} in {float(step_s.sum()):.2f} s, {1.0 / period_s:.1f} Hz; "
         f"{int(gaps.sum())} gaps{longest}; {table.incomplete} rows with NaN, {table.late} not after the last, left out"
     )
     bias = np.degrees(fusion.bias_rad_s)
-    say(f"bias:        {bias[0]:.3f}, {bias[1]:.3f}, {bias[2]:.3f} deg/s; at rest for {rest_s:.1f} s")
-    _say_orientation(
-        np.array([one.orientation_wxyz for one in samples]), np.array(sigma_rad), fusion, table, say
+    notify(f"bias:        {bias[0]:.3f}, {bias[1]:.3f}, {bias[2]:.3f} deg/s; at rest for {rest_s:.1f} s")
+    _send_orientation(
+        np.array([one.orientation_wxyz for one in samples]), np.array(sigma_rad), fusion, table, notify
     )
     if fusion.counts:
-        say("filter:      " + ", ".join(f"{name} {count}" for name, count in sorted(fusion.counts.items())))
+        notify(
+            "filter:      " + ", ".join(f"{name} {count}" for name, count in sorted(fusion.counts.items()))
+        )
     if folder is not None:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise RecordingError(f"{folder}: cannot be made: {error.strerror}") from error
         write_imu(folder, samples)
-        say(f"written:     {folder / IMU}")
+        notify(f"written:     {folder / IMU}")
 
 
-def _say_orientation(
-    found: Float, sigma_rad: Float, fusion: OrientationFilter, table: Table, say: Callable[[str], None]
+def _send_orientation(
+    found: Float, sigma_rad: Float, fusion: OrientationFilter, table: Table, notify: Callable[[str], None]
 ) -> None:
     """How it lies at the end, how unsure that is, and how right the tilt is where there is a truth."""
     known = np.isfinite(found).all(axis=1)
     if not known.any():
-        say("orientation: never known: too short, or forces are missing")
+        notify("orientation: never known: too short, or forces are missing")
         return
     last = ", ".join(f"{value:.4f}" for value in found[known][-1])
-    say(
+    notify(
         f"orientation: known for {100 * known.mean():.1f} % of the samples, wxyz {last} at the end; "
         f"tilt to {np.degrees(sigma_rad[known][-1]):.2f} deg per axis, heading drifted by "
         f"{np.degrees(fusion.heading_sigma_rad):.1f} deg (one sigma)"
     )
     errors = TiltErrors.of(found, table.truth_wxyz, sigma_rad)
-    if TURN not in table.columns:
+    if QUATERNION not in table.columns:
         return
     if not len(errors.sigma_rad):
-        say("inclination: no sample has both an orientation and the table's quaternion")
+        notify("inclination: no sample has both an orientation and the table's quaternion")
         return
-    say(
-        f"inclination: {errors.rms_deg:.2f} deg rms against {table.columns[TURN]}, taken for true (z axis up), "
+    notify(
+        f"inclination: {errors.rms_deg:.2f} deg rms against {table.columns[QUATERNION]}, taken for true (z axis up), "
         f"{len(errors.sigma_rad)} samples; stated {errors.stated_deg:.2f}, {100 * errors.within:.1f} % within 95 %"
     )

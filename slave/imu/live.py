@@ -10,13 +10,13 @@ from common.clock import Clock
 from common.keys import Access
 from common.zenoh_bus import ZenohBus
 from slave.app import Barrier, Sender, nothing
+from slave.imu.counters import Orientation, SampleCounters
 from slave.imu.source import ImuSource
-from slave.imu.tally import Orientation, SampleTally
 from slave.report import Reporter
 from slave.service import Service
 from slave.uplink import Uplink
 
-LOOK_S = 0.5e-3  # between two samples it is looked whether the master has started
+CHECK_S = 0.5e-3  # between two samples it is looked whether the master has started
 
 
 def wait_for_start(
@@ -36,7 +36,7 @@ def wait_for_start(
         ImuError: The IMU is gone.
     """
     while not stop.is_set():
-        if barrier.wait_for_start(LOOK_S):
+        if barrier.wait_for_start(CHECK_S):
             return True
         if (sample := source.read()) is None:
             return False
@@ -54,7 +54,7 @@ def wait_for_start(
 def run(
     source: ImuSource,
     sender: Sender,
-    tally: SampleTally,
+    counters: SampleCounters,
     stop: threading.Event,
     orientation: Orientation | None = None,
     alive: Callable[[], None] = nothing,
@@ -69,12 +69,12 @@ def run(
     """
     while not stop.is_set() and (sample := source.read()) is not None:
         try:
-            turned = sample if orientation is None else orientation.push(sample)
-            sender.send(replace(turned, session=sender.session))
-            tally.sample(sample.seq)
+            levelled = sample if orientation is None else orientation.push(sample)
+            sender.send(replace(levelled, session=sender.session))
+            counters.sample(sample.seq)
             alive()
         except Exception as error:  # noqa: BLE001 - one sample; it is counted and logged
-            tally.failed(sample.seq, error)
+            counters.failed(sample.seq, error)
 
 
 def run_live(
@@ -84,7 +84,7 @@ def run_live(
     uplink: Uplink,
     clock: Clock,
     stop: threading.Event,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
     service: Service,
     access: Access,
 ) -> None:
@@ -104,20 +104,20 @@ def run_live(
     Raises:
         ImuError: The IMU is gone.
     """
-    tally = SampleTally(source, orientation)
+    counters = SampleCounters(source, orientation)
     reporter = Reporter(
-        name, uplink, tally, clock, lambda endpoint: ZenohBus(None, endpoint, access), stop.set
+        name, uplink, counters, clock, lambda endpoint: ZenohBus(None, endpoint, access), stop.set
     )
     try:
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
-        say("ready, waiting for the master")
+        notify("ready, waiting for the master")
         service.ready(lambda: uplink.started)
-        if wait_for_start(source, uplink, stop, orientation, service.waiting, tally.failed):
-            run(source, uplink, tally, stop, orientation, service.working)
+        if wait_for_start(source, uplink, stop, orientation, service.waiting, counters.failed):
+            run(source, uplink, counters, stop, orientation, service.working)
     finally:
         service.stopping()
         reporter.close()
         uplink.close()
         source.close()
-    say(f"{tally.counts()['samples']} samples, sent {uplink.counts['sent']}")
+    notify(f"{counters.counts()['samples']} samples, sent {uplink.counts['sent']}")

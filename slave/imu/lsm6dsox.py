@@ -147,7 +147,7 @@ class Lsm6dsoxImu:
         counts = {**self._slots.counts, **self._counts}
         return {"broken": sum(v for k, v in counts.items() if k.startswith("broken.")), **counts}
 
-    def gauges(self) -> Mapping[str, float]:
+    def metrics(self) -> Mapping[str, float]:
         """`temperature_c` of the part."""
         return {"temperature_c": self._temperature_c}
 

@@ -8,8 +8,8 @@ from typing import TextIO
 
 from common.errors import ImuError, PhalanxError, RecordingError
 from common.imu_recording import HEADERS, IMU, row
+from slave.imu.counters import Orientation, SampleCounters
 from slave.imu.source import ImuSource
-from slave.imu.tally import Orientation, SampleTally
 
 
 class ImuRecorder:
@@ -27,7 +27,7 @@ class ImuRecorder:
             stop: Ends the stream of the source; set by `close`.
         """
         self._source, self._orientation, self._stop = source, orientation, stop
-        self._tally = SampleTally(source, orientation)
+        self._counters = SampleCounters(source, orientation)
         self._file: TextIO | None = None
         self._kept = False
         self.failure: PhalanxError | None = None
@@ -67,7 +67,7 @@ class ImuRecorder:
                 with suppress(OSError):  # the folder is not empty
                     Path(file.name).unlink()
                     Path(file.name).parent.rmdir()
-        return self._tally.counts()
+        return self._counters.counts()
 
     def _work(self) -> None:
         try:
@@ -75,7 +75,7 @@ class ImuRecorder:
                 sample = sample if self._orientation is None else self._orientation.push(sample)
                 if (file := self._file) is not None:
                     csv.writer(file, lineterminator="\n").writerow(row(sample))
-                    self._tally.sample(sample.seq)
+                    self._counters.sample(sample.seq)
         except ImuError as error:
             self.failure = error
         except OSError as error:

@@ -26,13 +26,13 @@ class ImuSource(Protocol):
 
 
 @runtime_checkable
-class Telling(Protocol):
+class Reporting(Protocol):
     """An IMU that has more to tell than its samples; asked by the thread of the reports."""
 
     def counts(self) -> Mapping[str, int]:
         """Event -> how often since it was opened."""
         ...
 
-    def gauges(self) -> Mapping[str, float]:
+    def metrics(self) -> Mapping[str, float]:
         """Quantity with its unit -> value now."""
         ...

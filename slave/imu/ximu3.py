@@ -131,7 +131,7 @@ class Ximu3Imu:
         self._came: deque[Data] = deque()
         self._answers: deque[Answer] = deque()
         self._counts: Counter[str] = Counter()
-        self._gauges: dict[str, float] = {}
+        self._metrics: dict[str, float] = {}
         self._bytes = self._silent = 0
         self._seq = -1
         self._stamp_us: int | None = None
@@ -171,16 +171,16 @@ class Ximu3Imu:
         counts = dict(self._counts)
         return {"broken": sum(v for k, v in counts.items() if k.startswith("broken.")), **counts}
 
-    def gauges(self) -> Mapping[str, float]:
+    def metrics(self) -> Mapping[str, float]:
         """`temperature_c`, `battery_percent`, as they were last told."""
-        return dict(self._gauges)
+        return dict(self._metrics)
 
     def _begin(self) -> None:
         pong = self._ask("ping", None)
         if pong is None:
-            heard = f", though {self._bytes} bytes came" if self._bytes else ""
+            received = f", though {self._bytes} bytes came" if self._bytes else ""
             raise ImuError(
-                f"{self._place.path}: no x-IMU3 answers{heard}: is it switched on, is it another device, or has it "
+                f"{self._place.path}: no x-IMU3 answers{received}: is it switched on, is it another device, or has it "
                 "another baud rate (behind @)? `phalanx-slave imu --list` says what is there"
             )
         told = [str(pong.fields.get(part, "?")) for part in ("name", "sn", "interface")]
@@ -198,10 +198,10 @@ class Ximu3Imu:
             raise ImuError(f"{self._place.path}: the x-IMU3 does not answer to {key}={value}")
         if answer.value == value:
             return
-        said = answer.fields.get("error", f"it has {answer.value}")
+        text = answer.fields.get("error", f"it has {answer.value}")
         if key in NEEDED:
-            raise ImuError(f"{self._place.path}: the x-IMU3 refused {key}={value}: {said}")
-        _LOG.warning("%s: the x-IMU3 refused %s=%s: %s", self._place.path, key, value, said)
+            raise ImuError(f"{self._place.path}: the x-IMU3 refused {key}={value}: {text}")
+        _LOG.warning("%s: the x-IMU3 refused %s=%s: %s", self._place.path, key, value, text)
 
     def _ask(self, key: str, value: bool | int | None) -> Answer | None:
         """What it answers to a command; None: nothing, though asked repeatedly."""
@@ -252,9 +252,9 @@ class Ximu3Imu:
                 mag = np.array(message.values) * TESLA_UNIT_UT
                 self._mag = np.where(np.isfinite(mag), mag, np.nan)
             case Kind.TEMPERATURE:
-                self._gauge("temperature_c", message.values[0])
+                self._metric("temperature_c", message.values[0])
             case Kind.BATTERY:
-                self._gauge("battery_percent", message.values[0])
+                self._metric("battery_percent", message.values[0])
             case Kind.NOTIFICATION | Kind.ERROR if self._counts[f"imu.{message.kind.name.lower()}"] <= LOGGED:
                 _LOG.warning(
                     "%s: the x-IMU3 says: %s", self._place.path, message.text.decode(errors="replace")
@@ -277,9 +277,9 @@ class Ximu3Imu:
         mag, self._mag = self._mag, _NONE[0]
         return ImuSample(self._name, 0, self._seq, t_ns, gyro, accel, mag, _NONE[1])
 
-    def _gauge(self, name: str, value: float) -> None:
+    def _metric(self, name: str, value: float) -> None:
         if math.isfinite(value):
-            self._gauges[name] = value
+            self._metrics[name] = value
 
     @contextmanager
     def _errors(self, what: str) -> Generator[None]:

@@ -6,7 +6,7 @@ import sys
 from slave.install.probe import OLDEST, judge, probe
 
 
-def say(line: str) -> None:
+def print_line(line: str) -> None:
     """One line, at once: the PC shows it while the next step runs. The PC may be gone; the installation goes on."""
     try:
         print(line, flush=True)
@@ -18,7 +18,9 @@ def refuse(action: str) -> int:
     """Say what an old Python needs to be told, in its own words: the installer itself it cannot read."""
     facts = probe()
     why = judge(facts)
-    say(json.dumps({"result": {**facts, "why_not": why}}) if action == "probe" else f"phalanx-slave: {why}")
+    print_line(
+        json.dumps({"result": {**facts, "why_not": why}}) if action == "probe" else f"phalanx-slave: {why}"
+    )
     return 0 if action == "probe" else 1
 
 
@@ -28,7 +30,7 @@ def main() -> int:
         return refuse("".join(sys.argv[1:2]))
     from slave.install import command
 
-    return command.main(sys.argv[1:], say)
+    return command.main(sys.argv[1:], print_line)
 
 
 if __name__ == "__main__":

@@ -14,11 +14,11 @@ from slave.install.errors import InstallError
 
 LOCKED = "opt"
 WAIT_S = 600
-_LOOK_S = 1.0
+_POLL_S = 1.0
 
 
 @contextlib.contextmanager
-def alone(root: Path, say: Callable[[str], None], sleep: Callable[[float], None]) -> Generator[None]:
+def alone(root: Path, notify: Callable[[str], None], sleep: Callable[[float], None]) -> Generator[None]:
     """Hold the machine below `root` for oneself.
 
     Args:
@@ -38,8 +38,10 @@ def alone(root: Path, say: Callable[[str], None], sleep: Callable[[float], None]
                 break
             except BlockingIOError:
                 if look == 0:
-                    say(f"another installation runs on this machine: waiting for its end, at most {WAIT_S} s")
-                sleep(_LOOK_S)
+                    notify(
+                        f"another installation runs on this machine: waiting for its end, at most {WAIT_S} s"
+                    )
+                sleep(_POLL_S)
         else:
             raise InstallError(
                 f"another installation still runs on this machine after {WAIT_S} s; to see it there: "

@@ -9,7 +9,7 @@ _ALL = "[all]"  # lines before may be for one model only
 def with_block(text: str, lines: Sequence[str]) -> str:
     """`text` with a block of those `lines` that it does not say itself; without a block if it says all of them."""
     plain = without_block(text)
-    own = _said_to_all(plain)
+    own = _shown_to_all(plain)
     missing = [line for line in lines if line not in own]
     if not missing:
         return plain
@@ -32,14 +32,14 @@ def without_block(text: str) -> str:
     return "".join(kept)
 
 
-def _said_to_all(text: str) -> set[str]:
+def _shown_to_all(text: str) -> set[str]:
     """Lines that hold on every model; of a setting that is said twice, the last one."""
-    said: dict[str, str] = {}
+    stated: dict[str, str] = {}
     everyone = True
     for line in (line.strip() for line in text.splitlines()):
         if line.startswith("["):
             everyone = line == _ALL
         elif everyone and line and not line.startswith("#"):
             key = line if line.startswith(("dtoverlay=", "dtparam=")) else line.partition("=")[0]
-            said[key] = line
-    return set(said.values())
+            stated[key] = line
+    return set(stated.values())

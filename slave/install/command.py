@@ -23,11 +23,11 @@ from slave.install.removal import packages, uninstall
 from slave.install.systemd import Systemd
 from slave.install.wanted import ETC
 
-Say = Callable[[str], None]
+Notify = Callable[[str], None]
 _LEFT_S = 3600.0  # no installation takes so long
 
 
-def run(options: argparse.Namespace, say: Say, systemd: Systemd | None = None) -> int:
+def run(options: argparse.Namespace, notify: Notify, systemd: Systemd | None = None) -> int:
     """Install, take back, or remove; the exit code: 0 done, 1 something the user can mend.
 
     Args:
@@ -35,18 +35,18 @@ def run(options: argparse.Namespace, say: Say, systemd: Systemd | None = None) -
         say: Told one line a step.
         systemd: The machine's services; None: those of this machine.
     """
-    machine = steps.Machine(options.root, systemd or Systemd(), say, options.ready_s, options.settle_s)
+    machine = steps.Machine(options.root, systemd or Systemd(), notify, options.ready_s, options.settle_s)
     os.umask(0o022)  # the slave, who is not root, runs what is installed
     try:
         if os.geteuid() != 0 and options.root == Path("/") and not options.dry_run:
             raise InstallError("only root can install a service: sudo phalanx-slave install ...")
         done = _act(options, machine)
     except InstallError as error:
-        return _end(options, say, {"error": str(error)}, f"phalanx-slave: {error}", 1)
+        return _end(options, notify, {"error": str(error)}, f"phalanx-slave: {error}", 1)
     except OSError as error:
         text = f"{error.filename or options.root}: {error.strerror or error}"
-        return _end(options, say, {"error": text}, f"phalanx-slave: {text}", 1)
-    return _end(options, say, done, str(done.get("text", "done")), 0)
+        return _end(options, notify, {"error": text}, f"phalanx-slave: {text}", 1)
+    return _end(options, notify, done, str(done.get("text", "done")), 0)
 
 
 def _act(options: argparse.Namespace, machine: steps.Machine) -> dict[str, object]:
@@ -113,7 +113,7 @@ def _prepare(options: argparse.Namespace, picamera2: bool, machine: steps.Machin
     wanted = missing_packages(facts["packages"], picamera2)
     if options.no_apt or options.dry_run:
         for name in wanted:
-            machine.say(f"not installed: {name}")
+            machine.notify(f"not installed: {name}")
         return
     packages(wanted, machine)
 
@@ -133,12 +133,12 @@ def _start_s(systemd: Systemd) -> float | None:
     return max((one for one in took if one is not None), default=None)
 
 
-def _end(options: argparse.Namespace, say: Say, result: dict[str, object], text: str, code: int) -> int:
-    say(json.dumps({"result": result}) if options.json else text)
+def _end(options: argparse.Namespace, notify: Notify, result: dict[str, object], text: str, code: int) -> int:
+    notify(json.dumps({"result": result}) if options.json else text)
     return code
 
 
-def main(arguments: list[str], say: Say, systemd: Systemd | None = None) -> int:
+def main(arguments: list[str], notify: Notify, systemd: Systemd | None = None) -> int:
     """`python3 -m slave.install ACTION ...`: what the PC runs before a slave is installed.
 
     `install` is `phalanx-slave install`; `probe [CAMERA [--no-apt]]` says what the machine is like; `packages NAME...`
@@ -150,19 +150,19 @@ def main(arguments: list[str], say: Say, systemd: Systemd | None = None) -> int:
         facts = probe(camera=camera)
         why_not = judge(facts, camera, "--no-apt" not in rest[1:])
         found = {"why_not": why_not, "start_s": _start_s(systemd or Systemd())}
-        say(json.dumps({"result": facts | found}))
+        notify(json.dumps({"result": facts | found}))
         return 0
     if action == "packages":
         try:
-            packages(rest, steps.Machine(Path("/"), Systemd(), say, READY_S, SETTLE_S))
+            packages(rest, steps.Machine(Path("/"), Systemd(), notify, READY_S, SETTLE_S))
         except InstallError as error:
-            say(json.dumps({"result": {"error": str(error)}}))
+            notify(json.dumps({"result": {"error": str(error)}}))
             return 1
-        say(json.dumps({"result": {}}))
+        notify(json.dumps({"result": {}}))
         return 0
     if action != "install":
         sys.stderr.write("python3 -m slave.install install|probe|packages ...; `install --help` says more\n")
         return 0 if action in ("-h", "--help") else 2
     parser = argparse.ArgumentParser("slave.install", description=PURPOSE)
     add_install(parser)
-    return run(parser.parse_args(rest), say, systemd)
+    return run(parser.parse_args(rest), notify, systemd)

@@ -157,19 +157,19 @@ def _sender(name: str, rig: dict[str, Any], options: argparse.Namespace) -> Send
     place = ["--name", name, "--rig", options.rig, "--calibration", CALIBRATION]
     names = _names(rig)  # what is said of another machine's camera is not for this one
     more = [word for text in _all_of(name, options.more, names) for word in _split(text)]
-    worn = rig.get("kind") == "wrist"
-    if options.role is not None and (options.role == "wrist") != worn:
+    is_wrist = rig.get("kind") == "wrist"
+    if options.role is not None and (options.role == "wrist") != is_wrist:
         raise InstallError(f"--role {options.role}: rig {options.rig!r} is one of kind {rig.get('kind')!r}")
     stop_post: list[str] = []
     if name in rig["cameras"]:
         camera = _of(name, options.cameras, names) or "picamera2"
         words = [*place, "--camera", camera]
-        if worn and options.lights is not None:
+        if is_wrist and options.lights is not None:
             words += ["--lights", options.lights]
             if options.lights.partition(":")[0] in ("gpio", "i2c"):
                 stop_post = ["lights", "--rig", options.rig, "--calibration", CALIBRATION]
                 stop_post += ["--lights", options.lights, "--off"]
-        elif worn and not camera.startswith(("synthetic", "replay")):
+        elif is_wrist and not camera.startswith(("synthetic", "replay")):
             raise InstallError(
                 f"rig {options.rig!r} is a wrist device: say who switches its lights, --lights DRIVER"
             )

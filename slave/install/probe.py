@@ -49,7 +49,7 @@ def probe(root: Path = Path("/"), camera: str = "") -> dict[str, Any]:
         "os": release.get("PRETTY_NAME", "unknown"),
         "codename": release.get("VERSION_CODENAME", ""),
         "user": pwd.getpwuid(os.geteuid()).pw_name,
-        "root": os.geteuid() == 0 or _says(["sudo", "-n", "true"]) is not None,
+        "root": os.geteuid() == 0 or _output_of(["sudo", "-n", "true"]) is not None,
         "packages": [name for name in PACKAGES if _has_package(name)],
         "video": sorted({_text(path).strip() for path in (root / "sys/class/video4linux").glob("*/name")}),
         "cameras": _cameras() if camera.startswith("picamera2") else None,
@@ -117,20 +117,20 @@ def _os_release(root: Path) -> dict[str, str]:
 
 
 def _has_package(name: str) -> bool:
-    said = _says(["dpkg-query", "-W", "-f=${db:Status-Status}", name])
-    return said is not None and said.strip() == "installed"
+    stated = _output_of(["dpkg-query", "-W", "-f=${db:Status-Status}", name])
+    return stated is not None and stated.strip() == "installed"
 
 
 def _cameras() -> list[str] | None:
     """What libcamera finds; None where picamera2 is not installed, so that nobody knows."""
-    said = _says(["/usr/bin/python3", "-c", _FIND_CAMERAS])
-    for line in (said or "").splitlines():
+    stated = _output_of(["/usr/bin/python3", "-c", _FIND_CAMERAS])
+    for line in (stated or "").splitlines():
         if line.startswith("CAMERAS "):
             return [str(model) for model in json.loads(line.removeprefix("CAMERAS "))]
     return None
 
 
-def _says(command: list[str]) -> str | None:
+def _output_of(command: list[str]) -> str | None:
     """What a command says; None: it is not there, failed, or takes too long."""
     try:
         done = subprocess.run(

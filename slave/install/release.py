@@ -32,7 +32,7 @@ _UNPACKED = 1.4  # what is compiled and what a disk rounds up, share of what is 
 _SPARE_MB = 50.0
 _PIP_S = 1500.0  # under emulation, too
 # What a slave loads; its service may not write, so what is not compiled now is compiled at each start.
-_LOADS = "import slave.__main__, slave.live, slave.uplink, slave.imu.live, slave.imu.opening, slave.simulated"
+_LOADS = "import slave.__main__, slave.live, slave.uplink, slave.imu.live, slave.imu.factory, slave.simulated"
 _LOADS_S = 300.0
 _SCRIPT = """\
 #!{python}
@@ -96,7 +96,7 @@ class Source:
         return f"{versions[-1]}-{digest.hexdigest()[:8]}"
 
 
-def make(root: Path, name: str, source: Source, say: Callable[[str], None]) -> bool:
+def make(root: Path, name: str, source: Source, notify: Callable[[str], None]) -> bool:
     """Make the release `name` if it is not there whole; whether it had to be made.
 
     Raises:
@@ -108,9 +108,9 @@ def make(root: Path, name: str, source: Source, say: Callable[[str], None]) -> b
     releases.mkdir(parents=True, exist_ok=True)
     for left in releases.glob(".new-*"):
         shutil.rmtree(left, ignore_errors=True)
-    _check_room(releases, source)
+    _check_space(releases, source)
     fresh = releases / f".new-{name}"
-    say(f"making release {name}")
+    notify(f"making release {name}")
     try:
         venv.EnvBuilder(system_site_packages=True, symlinks=True, with_pip=False).create(fresh)
         if source.wheels is not None:
@@ -148,7 +148,7 @@ def remove(root: Path, name: str) -> None:
     shutil.rmtree(left, ignore_errors=True)
 
 
-def _check_room(releases: Path, source: Source) -> None:
+def _check_space(releases: Path, source: Source) -> None:
     """Raises InstallError: there is too little."""
     if source.wheels is not None:
         sizes = [zipfile.ZipFile(wheel).infolist() for wheel in source.wheels.glob("*.whl")]

@@ -48,10 +48,10 @@ def _remove(machine: Machine, dry_run: bool) -> list[str]:
     if dry_run or not there:
         return there
     if units:
-        machine.say(f"stopping {', '.join(units)}")
+        machine.notify(f"stopping {', '.join(units)}")
         run(["systemctl", "disable", "--now", "--quiet", *units])
     for path in there:
-        machine.say(f"removing {'our lines of ' if path == BOOT else ''}/{path}")
+        machine.notify(f"removing {'our lines of ' if path == BOOT else ''}/{path}")
         target = root / path
         if path == BOOT:
             write(root, BOOT, File(without_block(text).encode(errors="surrogateescape"), 0o755))
@@ -83,7 +83,7 @@ def packages(names: list[str], machine: Machine) -> None:
     if not names:
         return
     command = ["apt-get", "install", "-y", "-q", "--no-install-recommends", *names]
-    machine.say(" ".join(command))
+    machine.notify(" ".join(command))
     try:
         run_command(["env", "DEBIAN_FRONTEND=noninteractive", "apt-get", "update", "-q"], 300.0)
         run_command(["env", "DEBIAN_FRONTEND=noninteractive", *command], 1200.0)

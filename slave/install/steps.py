@@ -50,7 +50,7 @@ class Machine:
 
     root: Path
     systemd: Systemd
-    say: Callable[[str], None]
+    notify: Callable[[str], None]
     ready_s: float
     settle_s: float
 
@@ -68,7 +68,7 @@ class Machine:
         Raises:
             InstallError: Somebody else does, and has no end.
         """
-        return alone(self.root, self.say, self.systemd.sleep)
+        return alone(self.root, self.notify, self.systemd.sleep)
 
 
 @dataclass(slots=True)
@@ -104,7 +104,7 @@ def install(plan: Plan, source: Source, name: str, machine: Machine, dry_run: bo
     with contextlib.nullcontext() if dry_run else machine.alone():
         notes = Transaction(machine.root)
         if notes.is_open and not dry_run:
-            machine.say("an installation before was cut off: taking it back")
+            machine.notify("an installation before was cut off: taking it back")
             _take_back(machine)
         record = Record.read(machine.root)
         files = wanted_files(plan, machine.root, record)
@@ -113,18 +113,18 @@ def install(plan: Plan, source: Source, name: str, machine: Machine, dry_run: bo
         outcome = _difference(plan, files, name, machine)
         if dry_run:
             for path in outcome.changed:
-                machine.say(f"would {'remove' if files.get(path, path) is None else 'write'} /{path}")
+                machine.notify(f"would {'remove' if files.get(path, path) is None else 'write'} /{path}")
             return outcome
         if not outcome.changed and not outcome.restarted:
             _enable(plan.senders, machine)
             return outcome
-        made = release.make(machine.root, name, source, machine.say)
+        made = release.make(machine.root, name, source, machine.notify)
         before = _current(machine.root)
         notes.begin([path for path in outcome.changed if path != CURRENT], outcome.restarted)
         try:
             _apply(plan, files, name, outcome, machine)
         except (InstallError, OSError) as error:
-            machine.say("taking it back")
+            machine.notify("taking it back")
             _undo(machine, plan.senders, name if made else None)
             raise InstallError(f"{error}; everything is as before") from error
         notes.end()
@@ -181,7 +181,7 @@ def _apply(plan: Plan, files: dict[str, File | None], name: str, outcome: Outcom
     for path in outcome.changed:
         if path == CURRENT:
             continue
-        machine.say(f"{'writing' if files[path] is not None else 'removing'} /{path}")
+        machine.notify(f"{'writing' if files[path] is not None else 'removing'} /{path}")
         file = files[path]
         if file is None:
             if path.endswith(".env"):
@@ -199,19 +199,19 @@ def _apply(plan: Plan, files: dict[str, File | None], name: str, outcome: Outcom
         _follow_clock(machine)
     _enable(plan.senders, machine)
     if outcome.restarted:
-        machine.say(f"starting {', '.join(outcome.restarted)}")
+        machine.notify(f"starting {', '.join(outcome.restarted)}")
         run(["systemctl", "restart", "--no-block", *outcome.restarted])
     try:
         machine.systemd.wait_ready(limits, machine.settle_s)
     except NotReadyError as error:
         if not outcome.reboot:
             raise
-        machine.say(f"not ready before the machine is restarted, for config.txt has changed: {error}")
+        machine.notify(f"not ready before the machine is restarted, for config.txt has changed: {error}")
 
 
 def _finish(machine: Machine, name: str, before: str | None) -> None:
     for gone in release.prune(machine.root, name, before):
-        machine.say(f"removed release {gone}")
+        machine.notify(f"removed release {gone}")
 
 
 def _undo(machine: Machine, senders: tuple[Sender, ...], fresh: str | None) -> None:
@@ -225,7 +225,7 @@ def _undo(machine: Machine, senders: tuple[Sender, ...], fresh: str | None) -> N
     try:
         _take_back(machine, {sender.name for sender in senders})
     except (InstallError, OSError) as error:
-        machine.say(f"what was before does not run either: {error}")
+        machine.notify(f"what was before does not run either: {error}")
     if fresh is not None and _current(machine.root) != fresh:
         release.remove(machine.root, fresh)
 
@@ -261,7 +261,7 @@ def _follow_clock(machine: Machine) -> None:
     try:
         machine.systemd.run(["systemctl", "try-reload-or-restart", "chrony.service"])
     except InstallError as error:
-        machine.say(f"the clock does not follow the master yet: {error}")
+        machine.notify(f"the clock does not follow the master yet: {error}")
 
 
 def _current(root: Path) -> str | None:

@@ -45,7 +45,7 @@ class UnitState:
     result: str
     status: int
     start_s: float | None = None
-    says: str = ""
+    output: str = ""
 
 
 Run = Callable[[Sequence[str]], str]
@@ -64,8 +64,8 @@ def run_command(command: Sequence[str], deadline_s: float = _COMMAND_S) -> str:
     except subprocess.TimeoutExpired as error:
         raise InstallError(f"{' '.join(command[:3])}: no end after {deadline_s:.0f} s") from error
     if done.returncode != 0:
-        said = [line.strip() for line in (done.stderr or done.stdout).splitlines() if line.strip()]
-        raise InstallError(f"{' '.join(command[:3])}: {said[-1] if said else f'exit {done.returncode}'}")
+        lines = [line.strip() for line in (done.stderr or done.stdout).splitlines() if line.strip()]
+        raise InstallError(f"{' '.join(command[:3])}: {lines[-1] if lines else f'exit {done.returncode}'}")
     return done.stdout
 
 
@@ -129,8 +129,8 @@ class Systemd:
                     raise NotReadyError(f"{unit} ends again and again: {self._why(unit, state, since)}")
                 if not state.active:
                     steady.pop(unit, None)
-                    asked = (unit, state.pid, state.says)
-                    if asked not in patient and (found := _ASKS.search(state.says)):
+                    asked = (unit, state.pid, state.output)
+                    if asked not in patient and (found := _ASKS.search(state.output)):
                         patient.add(asked)  # once: it does not live on what it said long ago
                         ends[unit] = max(ends[unit], self._now() + float(found[1]))
                 elif unit not in steady or steady[unit][0] != state.pid:
@@ -163,4 +163,4 @@ class Systemd:
         own = [line for line in lines if line.startswith("phalanx-slave:")]
         errors = [line for line in lines if "Error" in line]
         ended = f"result {state.result}, status {state.status}" if state.status else "it says nothing"
-        return (own or errors or lines or [state.says or ended])[-1][:300]
+        return (own or errors or lines or [state.output or ended])[-1][:300]

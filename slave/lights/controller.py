@@ -12,7 +12,7 @@ from collections import Counter
 
 from common.clock import Clock
 from common.errors import LightsError
-from slave.lights.guard import Guard
+from slave.lights.interlock import Interlock
 from slave.lights.schedule import Pulse, StrobeSchedule
 
 FAILED_NS = 500_000_000  # after a driver has failed, no light for so long; then it is tried again
@@ -31,7 +31,7 @@ class Strober:
             late: pulses ended at once, as the driver took too long.
     """
 
-    def __init__(self, schedule: StrobeSchedule, guard: Guard, clock: Clock) -> None:
+    def __init__(self, schedule: StrobeSchedule, interlock: Interlock, clock: Clock) -> None:
         """Begin dark.
 
         Args:
@@ -39,11 +39,11 @@ class Strober:
             guard: The lights.
             clock: That of the frames' stamps.
         """
-        self._schedule, self._guard, self._clock = schedule, guard, clock
+        self._schedule, self._interlock, self._clock = schedule, interlock, clock
         self._on: Pulse | None = None
         self._number = -1
         self._rest_until_ns: int | None = None
-        self._said_ns: int | None = None
+        self._logged_ns: int | None = None
         self.counts: Counter[str] = Counter(dict.fromkeys(EVENTS, 0))
 
     def step(self) -> int | None:
@@ -56,22 +56,22 @@ class Strober:
         except LightsError as error:
             self._rest_until_ns = now_ns + FAILED_NS
             self._on = None
-            self._say(now_ns, error)
+            self._log_fault(now_ns, error)
             return self._rest_until_ns
 
     def dark(self) -> None:
         """End what is on, now: the camera has stopped, or all ends."""
         self._on = None
         try:
-            self._guard.end()
+            self._interlock.end()
         except LightsError as error:
-            self._say(self._clock.now_ns(), error)
+            self._log_fault(self._clock.now_ns(), error)
 
     def _step(self, now_ns: int) -> int | None:
         if self._on is not None:
             if now_ns < self._on.off_ns:
                 return self._on.off_ns
-            self._guard.end()
+            self._interlock.end()
             self._on = None
         if self._number < 0:
             self._number = self._schedule.before(now_ns)
@@ -83,11 +83,11 @@ class Strober:
         if pulse is None or now_ns < pulse.on_ns:
             return None if pulse is None else pulse.on_ns
         self._number = pulse.number
-        if not self._guard.begin(pulse.lit, pulse.off_ns - now_ns):
+        if not self._interlock.begin(pulse.lit, pulse.off_ns - now_ns):
             return pulse.off_ns
         if self._clock.now_ns() > pulse.latest_ns:
             self.counts["late"] += 1
-            self._guard.end()
+            self._interlock.end()
         else:
             self._on = pulse
         return pulse.off_ns
@@ -96,22 +96,22 @@ class Strober:
         """The frames are counted anew."""
         self._number = -1
 
-    def _say(self, now_ns: int, error: LightsError) -> None:
-        if self._said_ns is None or now_ns - self._said_ns >= LOG_EVERY_NS:
-            self._said_ns = now_ns
+    def _log_fault(self, now_ns: int, error: LightsError) -> None:
+        if self._logged_ns is None or now_ns - self._logged_ns >= LOG_EVERY_NS:
+            self._logged_ns = now_ns
             _LOG.warning("lights: %s", error)
 
 
-def told(guard: Guard, strober: Strober, schedule: StrobeSchedule) -> dict[str, int]:
+def told(interlock: Interlock, strober: Strober, schedule: StrobeSchedule) -> dict[str, int]:
     """`lights.<event>` -> how often, of all three."""
-    own = {**guard.events(), **strober.counts, "restarts": schedule.restarts}
+    own = {**interlock.events(), **strober.counts, "restarts": schedule.restarts}
     return {f"lights.{event}": count for event, count in own.items()}
 
 
 class StrobeController:
     """Keeps a camera lit, on a thread of its own. Holds the strober and its schedule under one lock."""
 
-    def __init__(self, schedule: StrobeSchedule, guard: Guard, clock: Clock) -> None:
+    def __init__(self, schedule: StrobeSchedule, interlock: Interlock, clock: Clock) -> None:
         """Start the thread.
 
         Args:
@@ -119,8 +119,8 @@ class StrobeController:
             guard: The lights; closed by `close`.
             clock: That of the frames' stamps.
         """
-        self._schedule, self._guard, self._clock = schedule, guard, clock
-        self._strober = Strober(schedule, guard, clock)
+        self._schedule, self._interlock, self._clock = schedule, interlock, clock
+        self._strober = Strober(schedule, interlock, clock)
         self._news = threading.Condition()
         self._closed = False
         self._thread = threading.Thread(target=self._work, name="strobe", daemon=True)
@@ -148,7 +148,7 @@ class StrobeController:
 
     def counts(self) -> dict[str, int]:
         """`lights.<event>` -> how often."""
-        return told(self._guard, self._strober, self._schedule)
+        return told(self._interlock, self._strober, self._schedule)
 
     def close(self) -> None:
         """Go dark, end the thread, give the lights back. Safe to call twice.
@@ -161,7 +161,7 @@ class StrobeController:
             self._strober.dark()
             self._news.notify_all()
         self._thread.join()
-        self._guard.close()
+        self._interlock.close()
 
     def _work(self) -> None:
         with self._news:

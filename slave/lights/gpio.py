@@ -6,8 +6,8 @@ seen, and read back.
 
 A slave that is killed or stopped during a pulse darkens nothing, and what a pin does whose process is gone is the
 matter of the chip's driver: it may become an input, or keep its level. So a second process inherits the request, is
-told of every pulse, and sets the lines dark when one lasts too long or the first process is gone (`gpio_heir`). Nothing
-is lit without it. Against a kernel that is dead, or a kill of both, only wires help: a pull-down resistor, and a
+told of every pulse, and sets the lines dark when one lasts too long or the first process is gone (`gpio_watchdog`).
+None is lit without it. Against a kernel that is dead, or a kill of both, only wires help: a pull-down resistor, and a
 monostable in series (docs/safety.md).
 """
 
@@ -23,14 +23,14 @@ from typing import TYPE_CHECKING
 
 from common.errors import LightsError
 from common.frame_recording import Illumination
-from slave.lights.gpio_heir import DARK, LIT
+from slave.lights.gpio_watchdog import DARK, LIT
 
 if TYPE_CHECKING:
     from gpiod import LineRequest
 
 CONSUMER = "phalanx strobe"
-HEIR = Path(__file__).with_name("gpio_heir.py")
-HEIR_S = 5.0  # it has one call to make
+WATCHDOG = Path(__file__).with_name("gpio_watchdog.py")
+WATCHDOG_S = 5.0  # it has one call to make
 INSTALL = (
     "--lights gpio needs the library gpiod 2: pip install 'phalanx-hand[wrist]', or on Raspberry Pi OS"
     " `sudo apt install python3-libgpiod` and a virtual environment made with --system-site-packages"
@@ -82,7 +82,7 @@ class GpioLights:
         self._longest_s = longest_s
         self._gpiod = _library()
         self._closed = False
-        self._heir: subprocess.Popen[bytes] | None = None
+        self._watchdog: subprocess.Popen[bytes] | None = None
         self._request: LineRequest | None = self._requested()
         self._reopened = 0
 
@@ -99,12 +99,12 @@ class GpioLights:
             self._reopened += 1
         shines = lit in (Illumination.LASER, Illumination.LED)
         if shines:
-            self._tell_heir(LIT)
+            self._notify_watchdog(LIT)
         value = self._gpiod.line.Value
         lights = (Illumination.LASER, Illumination.LED)
         wanted = [value.ACTIVE if lit is light else value.INACTIVE for light in lights]
         places, request = [self._laser.place, self._led.place], self._request
-        assert request is not None  # `_tell_heir` raises where it has lost it
+        assert request is not None  # `_notify_watchdog` raises where it has lost it
         try:
             request.set_values(dict(zip(places, wanted, strict=True)))
             got = request.get_values(places)
@@ -117,7 +117,7 @@ class GpioLights:
                 f" {_levels(got)}: something else drives them, or they are shorted"
             )
         if not shines:
-            self._tell_heir(DARK)
+            self._notify_watchdog(DARK)
 
     def off(self) -> None:
         """Set both lines dark."""
@@ -136,17 +136,17 @@ class GpioLights:
         """`reopened`: how often the chip was lost and came back."""
         return {"reopened": self._reopened}
 
-    def _tell_heir(self, what: bytes) -> None:
+    def _notify_watchdog(self, what: bytes) -> None:
         """Before a light goes on, and after it went off."""
-        heir = self._heir
-        assert heir is not None  # there is one wherever there is a request
-        assert heir.stdin is not None
+        watchdog = self._watchdog
+        assert watchdog is not None  # there is one wherever there is a request
+        assert watchdog.stdin is not None
         try:
-            os.write(heir.stdin.fileno(), what)
+            os.write(watchdog.stdin.fileno(), what)
         except OSError as error:  # it has ended, or is stopped and its pipe is full
             self._lose()
             raise LightsError(
-                f"{self._chip}: the process {heir.pid} that darkens the lines when this one cannot does not listen"
+                f"{self._chip}: the process {watchdog.pid} that darkens the lines when this one cannot does not listen"
                 f" ({error.strerror}); it is started anew"
             ) from error
 
@@ -154,13 +154,13 @@ class GpioLights:
         request, self._request = self._request, None
         if request is not None:
             request.release()
-        heir, self._heir = self._heir, None
-        if heir is not None:
+        watchdog, self._watchdog = self._watchdog, None
+        if watchdog is not None:
             try:
-                heir.communicate(timeout=HEIR_S)  # ends its input, and waits: then the lines are free
+                watchdog.communicate(timeout=WATCHDOG_S)  # ends its input, and waits: then the lines are free
             except subprocess.TimeoutExpired:
-                heir.kill()
-                heir.wait()
+                watchdog.kill()
+                watchdog.wait()
 
     def _requested(self) -> "LineRequest":
         settings, line = self._gpiod.LineSettings, self._gpiod.line
@@ -178,8 +178,8 @@ class GpioLights:
         except (OSError, ValueError) as error:
             raise LightsError(self._why(error)) from error
         try:
-            heir = subprocess.Popen(
-                [sys.executable, "-I", str(HEIR), str(request.fd), str(self._longest_s)],
+            watchdog = subprocess.Popen(
+                [sys.executable, "-I", str(WATCHDOG), str(request.fd), str(self._longest_s)],
                 stdin=subprocess.PIPE,
                 bufsize=0,
                 pass_fds=(request.fd,),
@@ -188,9 +188,9 @@ class GpioLights:
         except OSError as error:
             request.release()
             raise LightsError(f"{self._chip}: no second process can be started: {error.strerror}") from error
-        assert heir.stdin is not None
-        os.set_blocking(heir.stdin.fileno(), False)  # nobody waits for it while a light is on
-        self._heir = heir
+        assert watchdog.stdin is not None
+        os.set_blocking(watchdog.stdin.fileno(), False)  # nobody waits for it while a light is on
+        self._watchdog = watchdog
         return request
 
     def _why(self, error: OSError | ValueError) -> str:

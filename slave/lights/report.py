@@ -7,7 +7,7 @@ from common.clock import SystemClock
 from common.errors import LightsError
 from common.frame_recording import Illumination
 from common.strobe_calibration import Limit, StrobeCalibration, limits_of
-from slave.lights.guard import Guard
+from slave.lights.interlock import Interlock
 from slave.lights.schedule import CYCLE
 from slave.lights.strobed import check_pulses, schedule_of
 
@@ -48,7 +48,11 @@ def budget(rig: RigCalibration, camera: CameraCalibration) -> str:
 
 
 def blink(
-    guard: Guard, rig: RigCalibration, camera: CameraCalibration, stop: threading.Event, seconds: float
+    interlock: Interlock,
+    rig: RigCalibration,
+    camera: CameraCalibration,
+    stop: threading.Event,
+    seconds: float,
 ) -> int:
     """Laser and LEDs in turn as before a camera of that rate, through the guard; the number of pulses.
 
@@ -63,14 +67,14 @@ def blink(
     frame = 0
     while next_ns < end_ns and not stop.is_set():
         lit = CYCLE[frame % len(CYCLE)]
-        if lit is not Illumination.AMBIENT and guard.begin(lit, length_ns):
+        if lit is not Illumination.AMBIENT and interlock.begin(lit, length_ns):
             stop.wait(length_ns * 1e-9)
-            guard.end()
+            interlock.end()
         frame, next_ns = frame + 1, max(next_ns + period_ns, clock.now_ns())
         stop.wait((next_ns - clock.now_ns()) * 1e-9)
-    if guard.counts["pulses"] == 0 and not stop.is_set():
+    if interlock.counts["pulses"] == 0 and not stop.is_set():
         raise LightsError("no pulse was allowed: the limits of the rig file refuse them all")
-    return guard.counts["pulses"]
+    return interlock.counts["pulses"]
 
 
 def _powers(strobe: StrobeCalibration, duty: float) -> list[str]:

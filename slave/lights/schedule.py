@@ -23,8 +23,8 @@ LEAST = 9  # stamps before anything is predicted
 AHEAD = 9  # periods after the last stamp: a frame is handed over late, and some may be lost
 OFF_LINE = 0.25  # periods; a stamp farther from the line belongs to another one
 FORGOTTEN = 90  # periods without a frame, after which a new line is begun
-SIGMAS = 3.0  # of the prediction that must fit into `GUARD_NS`
-GUARD_NS = 200_000  # a light is on from so long before an exposure to so long after it at least
+SIGMAS = 3.0  # of the prediction that must fit into `INTERLOCK_NS`
+INTERLOCK_NS = 200_000  # a light is on from so long before an exposure to so long after it at least
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +92,7 @@ class StrobeSchedule:
     @property
     def length_ns(self) -> int:
         """Of a pulse as planned [ns]."""
-        return self._lead_ns + 2 * self._half_ns + GUARD_NS
+        return self._lead_ns + 2 * self._half_ns + INTERLOCK_NS
 
     @property
     def ready(self) -> bool:
@@ -145,7 +145,9 @@ class StrobeSchedule:
             if lit is not Illumination.AMBIENT:
                 middle_ns = round(self._line.at(k)) + self._offset_ns
                 start_ns, stop_ns = middle_ns - self._half_ns, middle_ns + self._half_ns
-                return Pulse(k, lit, start_ns - self._lead_ns, start_ns - GUARD_NS // 2, stop_ns + GUARD_NS)
+                return Pulse(
+                    k, lit, start_ns - self._lead_ns, start_ns - INTERLOCK_NS // 2, stop_ns + INTERLOCK_NS
+                )
         return None
 
     def _fitted(self) -> _Line | None:
@@ -162,6 +164,6 @@ class StrobeSchedule:
         rms = float(np.sqrt(((t - at_first - slope * k) ** 2).sum() / (len(k) - 2)))
         farthest = k[-1] + AHEAD - middle
         sigma = rms * float(np.sqrt(1.0 / len(k) + farthest**2 / spread))
-        if SIGMAS * sigma > GUARD_NS or abs(slope / self._nominal_ns - 1.0) > OFF_LINE / AHEAD:
+        if SIGMAS * sigma > INTERLOCK_NS or abs(slope / self._nominal_ns - 1.0) > OFF_LINE / AHEAD:
             return None
         return _Line(first_number, first_ns, at_first, slope)

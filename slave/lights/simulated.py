@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from common.strobe_calibration import StrobeCalibration
 from slave.lights.controller import Strober, told
-from slave.lights.guard import Guard
+from slave.lights.interlock import Interlock
 from slave.lights.schedule import StrobeSchedule
 from slave.lights.synthetic import Lit, SyntheticLights, Timeline
 
@@ -40,17 +40,19 @@ class SimulatedStrobe:
         self._schedule, self._late_ns = schedule, late_ns
         self._clock = _SetClock()
         self._timeline = Timeline()
-        self._guard = Guard(SyntheticLights(self._timeline, self._clock), strobe, self._clock, watch=False)
-        self._strober = Strober(schedule, self._guard, self._clock)
+        self._interlock = Interlock(
+            SyntheticLights(self._timeline, self._clock), strobe, self._clock, watch=False
+        )
+        self._strober = Strober(schedule, self._interlock, self._clock)
         self._again_ns: int | None = None
 
     def during(self, start_ns: int, stop_ns: int) -> Lit:
         """What is on from `start_ns` to `stop_ns` [ns], which is not before the times asked for until now."""
         while self._again_ns is not None and self._again_ns <= stop_ns:
-            self._watched(self._again_ns)
+            self._monitored(self._again_ns)
             self._clock.t_ns = max(self._again_ns, self._clock.t_ns)
             self._ask()
-        self._watched(stop_ns)
+        self._monitored(stop_ns)
         self._clock.t_ns = max(stop_ns, self._clock.t_ns)
         return self._timeline.during(start_ns, stop_ns)
 
@@ -74,20 +76,20 @@ class SimulatedStrobe:
 
     def counts(self) -> dict[str, int]:
         """`lights.<event>` -> how often."""
-        return told(self._guard, self._strober, self._schedule)
+        return told(self._interlock, self._strober, self._schedule)
 
     def close(self) -> None:
         """Go dark. Safe to call twice."""
         self._strober.dark()
-        self._guard.close()
+        self._interlock.close()
 
     def _ask(self) -> None:
         again_ns = self._strober.step()
         self._again_ns = None if again_ns is None else again_ns + self._late_ns()
 
-    def _watched(self, until_ns: int) -> None:
+    def _monitored(self, until_ns: int) -> None:
         """What the watchdog does until then."""
-        while (left_s := self._guard.look()) is not None:
+        while (left_s := self._interlock.look()) is not None:
             at_ns = self._clock.t_ns + max(round(left_s * 1e9), 1)
             if at_ns > until_ns:
                 return

@@ -9,7 +9,7 @@ from common.errors import CalibrationError, CameraError
 from common.strobe_calibration import StrobeCalibration
 from slave.cameras.settings import Tunable
 from slave.cameras.source import Frame, FrameSource
-from slave.lights.schedule import CYCLE, GUARD_NS, StrobeSchedule
+from slave.lights.schedule import CYCLE, INTERLOCK_NS, StrobeSchedule
 
 
 class Controller(Protocol):
@@ -127,7 +127,7 @@ def check_pulses(rig: RigCalibration, camera: CameraCalibration) -> StrobeCalibr
         )
     strobe, where = rig.strobe, f"camera {camera.name!r}: exposure_us {camera.exposure_us:g}"
     period_us = 1e6 / camera.frame_rate_hz
-    pulse_us = strobe.lead_us + _exposed_us(camera) + GUARD_NS * 1e-3
+    pulse_us = strobe.lead_us + _exposed_us(camera) + INTERLOCK_NS * 1e-3
     if pulse_us > period_us:
         raise CalibrationError(
             f"{where} and row_time_us {camera.row_time_us:g} ({_rows_us(camera):.0f} us for all rows): with"

@@ -18,7 +18,7 @@ from slave.markers.autocolour_surroundings import (
     RESTING_SKIN,
     SHIFT_PX,
     SHIFT_SHARE,
-    SKIN_BESIDE,
+    SKIN_AROUND,
     background_of,
     skin_of,
     spread,
@@ -28,14 +28,14 @@ from slave.markers.autocolour_things import Surroundings, Thing, coloured, hsv_o
 from slave.markers.classify import HUES
 from slave.markers.colours import (
     AROUND,
-    HUE_APART,
     HUE_GROW,
+    HUE_SEPARATION,
     PALE,
     RIM,
     ColourRow,
     circular_median,
-    hue_apart,
     hue_distance,
+    hue_separation,
     rows_of,
 )
 
@@ -45,21 +45,21 @@ SMOOTH = 2.5  # hues: standard deviation with which the hues of things are smoot
 SEEN_SHARE = 0.1  # of the frames in which a paint must be seen,
 SEEN_LEAST = 4  # and at least so many
 SIZE_SHARE = 0.25  # of the typical area of all; a smaller thing is the fringe of another
-RIVAL = 0.5  # a further hue seen this often, relative to the rarest paint, leaves a doubt
-TWIN_SIZE, TWIN_SHARE = (
+ALTERNATIVE = 0.5  # a further hue seen this often, relative to the rarest paint, leaves a doubt
+AMBIGUOUS_SIZE, AMBIGUOUS_SHARE = (
     0.3,
     0.4,
 )  # a second thing this large, in this share of the frames: two paints of one hue
 BACKGROUND_FRAMES = 12  # from which the background's share is counted
 UNUSUAL = 0.55, 0.4  # of a thing's median saturation and value; below is rim or highlight, not paint
 
-Say = Callable[[str], None]
-Namer = Callable[[Sequence["Paint"], Float], tuple[str, ...]]
+Notify = Callable[[str], None]
+Namer = Callable[[Sequence["MarkerColour"], Float], tuple[str, ...]]
 """(M paints, centroids (F, M, 2) [px] NaN where not seen) -> their names. Raises FitError when not certain."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Paint:
+class MarkerColour:
     """One paint: its hue and the thing of it in every frame where it was seen, the largest."""
 
     hue: float
@@ -85,7 +85,7 @@ class Paint:
 
 
 def calibrate_moving(
-    images: Sequence[Image], names: tuple[str, ...], namer: Namer, say: Say = lambda _text: None
+    images: Sequence[Image], names: tuple[str, ...], namer: Namer, notify: Notify = lambda _text: None
 ) -> list[ColourRow]:
     """Ranges and collisions of all markers, in the order of `names`.
 
@@ -105,18 +105,18 @@ def calibrate_moving(
         )
     background = background_of(images)
     around = surroundings_of(images, background, skin_of(images, background))
-    say(f"skin: hue {around.skin.hue:.0f}, saturation {around.skin.saturation[0]:.0f}.."
+    notify(f"skin: hue {around.skin.hue:.0f}, saturation {around.skin.saturation[0]:.0f}.."
         f"{around.skin.saturation[1]:.0f}; {len(around.clutter)} coloured things stand still")  # fmt: skip
     things = [things_of(image, k, around) for k, image in enumerate(images)]
-    paints = find_paints(things, len(names), around)
-    for paint in paints:
-        rests = "" if paint.moved else "; it rests, skin around it tells that it is paint"
-        say(f"paint of hue {paint.hue:.0f}: in {len(paint.things)} of {len(images)} frames{rests}")
-    named = namer(paints, places(paints, len(images)))
+    colours = find_colours(things, len(names), around)
+    for colour in colours:
+        at_rest = "" if colour.moved else "; it rests, skin around it tells that it is paint"
+        notify(f"paint of hue {colour.hue:.0f}: in {len(colour.things)} of {len(images)} frames{at_rest}")
+    named = namer(colours, places(colours, len(images)))
     if sorted(named) != sorted(names):
         raise ValueError(f"the namer gave {named}, the rig has {names}")
-    of = dict(zip(named, paints, strict=True))
-    skin, rest, frames = _others(images, things, paints, around)
+    of = dict(zip(named, colours, strict=True))
+    skin, rest, frames = _others(images, things, colours, around)
     return rows_of({name: pixels_of(of[name]) for name in names}, skin, rest, frames)
 
 
@@ -125,7 +125,7 @@ def frames_for(pixels: int) -> int:
     return int(np.clip(PIXELS_MOST // pixels, FRAMES_LEAST, FRAMES_MOST))
 
 
-def find_paints(things: Sequence[Sequence[Thing]], count: int, around: Surroundings) -> list[Paint]:
+def find_colours(things: Sequence[Sequence[Thing]], count: int, around: Surroundings) -> list[MarkerColour]:
     """The `count` paints among the things of every frame, by hue.
 
     Raises:
@@ -133,55 +133,57 @@ def find_paints(things: Sequence[Sequence[Thing]], count: int, around: Surroundi
     """
     frames = len(things)
     least = max(SEEN_LEAST, SEEN_SHARE * frames)
-    every = [paint for paint in _by_hue(things) if len(paint.things) >= least]
-    beside = [paint for paint in every if paint.skin >= SKIN_BESIDE]
-    typical = float(np.median([paint.area for paint in beside])) if beside else 0.0
-    beside = [paint for paint in beside if paint.area >= SIZE_SHARE * typical]
-    moving = [paint for paint in beside if paint.moved]
+    every = [colour for colour in _by_hue(things) if len(colour.things) >= least]
+    near_skin = [colour for colour in every if colour.skin >= SKIN_AROUND]
+    typical = float(np.median([colour.area for colour in near_skin])) if near_skin else 0.0
+    near_skin = [colour for colour in near_skin if colour.area >= SIZE_SHARE * typical]
+    moving = [colour for colour in near_skin if colour.moved]
     # A paint that rested all the time looks like clutter but for the skin around it. It is taken when it is needed.
     resting = [
-        paint for paint in beside if not paint.moved and paint.skin >= RESTING_SKIN and not around.wooden
+        colour
+        for colour in near_skin
+        if not colour.moved and colour.skin >= RESTING_SKIN and not around.wooden
     ]
-    found = sorted(moving, key=lambda paint: -len(paint.things))
+    found = sorted(moving, key=lambda colour: -len(colour.things))
     if len(found) < count:
-        found += sorted(resting, key=lambda paint: -len(paint.things))
-    hues = ", ".join(f"{paint.hue:.0f}" for paint in sorted(found, key=lambda paint: paint.hue)) or "none"
+        found += sorted(resting, key=lambda colour: -len(colour.things))
+    hues = ", ".join(f"{colour.hue:.0f}" for colour in sorted(found, key=lambda colour: colour.hue)) or "none"
     if len(found) < count:
         raise FitError(
             f"{len(found)} paints move with the hand (hues {hues}), the rig has {count} markers: show the open hand, "
             f"back to the camera, all markers in view, and move it by more than its width"
             f"{_why_fewer(every, around)}"
         )
-    _refuse_twins(things, found[:count])
-    if len(found) > count and len(found[count].things) >= RIVAL * len(found[count - 1].things):
+    _refuse_ambiguous(things, found[:count])
+    if len(found) > count and len(found[count].things) >= ALTERNATIVE * len(found[count - 1].things):
         raise FitError(
             f"{len(found)} colours move with the hand (hues {hues}), the rig has {count} markers: take off or cover "
             f"what else is coloured (sleeve, ring, nails), or give clicks"
         )
-    return sorted(found[:count], key=lambda paint: paint.hue)
+    return sorted(found[:count], key=lambda colour: colour.hue)
 
 
-def places(paints: Sequence[Paint], frames: int) -> Float:
+def places(colours: Sequence[MarkerColour], frames: int) -> Float:
     """Centroids (F, M, 2) [px] of the paints; NaN where one was not seen."""
-    uv = np.full((frames, len(paints), 2), np.nan)
-    for m, paint in enumerate(paints):
-        for thing in paint.things:
+    uv = np.full((frames, len(colours), 2), np.nan)
+    for m, colour in enumerate(colours):
+        for thing in colour.things:
             uv[thing.frame, m] = thing.u, thing.v
     return uv
 
 
-def pixels_of(paint: Paint) -> Image:
+def pixels_of(colour: MarkerColour) -> Image:
     """(N, 3) HSV of a paint's pixels in all frames, without mixed rims and highlights."""
     chosen: list[Image] = []
-    for thing in paint.things:
+    for thing in colour.things:
         saturation, value = np.median(thing.hsv[:, 1]), np.median(thing.hsv[:, 2])
-        pure = hue_distance(thing.hsv[:, 0], paint.hue) <= HUE_GROW
+        pure = hue_distance(thing.hsv[:, 0], colour.hue) <= HUE_GROW
         pure &= (thing.hsv[:, 1] >= UNUSUAL[0] * saturation) & (thing.hsv[:, 2] >= UNUSUAL[1] * value)
         chosen.append(thing.hsv[pure])
     return np.concatenate(chosen)
 
 
-def _by_hue(things: Sequence[Sequence[Thing]]) -> list[Paint]:
+def _by_hue(things: Sequence[Sequence[Thing]]) -> list[MarkerColour]:
     """All things by the peaks of their smoothed hues; of each peak the largest thing per frame."""
     flat = [thing for row in things for thing in row]
     if not flat:
@@ -195,15 +197,15 @@ def _by_hue(things: Sequence[Sequence[Thing]]) -> list[Paint]:
     for k in np.argsort(-density, kind="stable"):
         if density[k] < 1.0:
             break
-        if all(hue_apart(k, p) >= HUE_APART for p in peaks):
+        if all(hue_separation(k, p) >= HUE_SEPARATION for p in peaks):
             peaks.append(int(k))
     peaks = [p for p in peaks if density[p] >= max(density[p - 1], density[(p + 1) % HUES])]
     nearest = np.argmin([hue_distance(hue, p) for p in peaks], axis=0)
-    paints: list[Paint] = []
+    colours: list[MarkerColour] = []
     for n, peak in enumerate(peaks):
         mine = [
             thing for thing, k in zip(flat, nearest, strict=True)
-            if k == n and hue_apart(thing.hue, peak) <= HUE_GROW
+            if k == n and hue_separation(thing.hue, peak) <= HUE_GROW
         ]  # fmt: skip
         best: dict[int, Thing] = {}
         for thing in mine:
@@ -211,33 +213,33 @@ def _by_hue(things: Sequence[Sequence[Thing]]) -> list[Paint]:
                 best[thing.frame] = thing
         if best:
             middle = circular_median(np.array([thing.hue for thing in best.values()]))
-            paints.append(Paint(middle, tuple(best.values())))
-    return paints
+            colours.append(MarkerColour(middle, tuple(best.values())))
+    return colours
 
 
-def _refuse_twins(things: Sequence[Sequence[Thing]], paints: Sequence[Paint]) -> None:
-    for paint in paints:
+def _refuse_ambiguous(things: Sequence[Sequence[Thing]], colours: Sequence[MarkerColour]) -> None:
+    for colour in colours:
         double = 0
-        for largest in paint.things:
+        for largest in colour.things:
             others = [
                 t for t in things[largest.frame]
-                if t is not largest and t.area > TWIN_SIZE * largest.area
-                and hue_apart(t.hue, paint.hue) < HUE_APART
+                if t is not largest and t.area > AMBIGUOUS_SIZE * largest.area
+                and hue_separation(t.hue, colour.hue) < HUE_SEPARATION
             ]  # fmt: skip
             double += bool(others)
-        if double > TWIN_SHARE * len(paint.things):
+        if double > AMBIGUOUS_SHARE * len(colour.things):
             raise FitError(
-                f"two things of hue {paint.hue:.0f} move with the hand in {double} of {len(paint.things)} frames: "
+                f"two things of hue {colour.hue:.0f} move with the hand in {double} of {len(colour.things)} frames: "
                 f"two paints look the same (repaint one), or clothing has a paint's colour (cover it)"
             )
 
 
-def _why_fewer(every: Sequence[Paint], around: Surroundings) -> str:
+def _why_fewer(every: Sequence[MarkerColour], around: Surroundings) -> str:
     """What of the rest might have been a paint, for the message."""
     reasons = ""
-    if bare := [f"{paint.hue:.0f}" for paint in every if paint.skin < SKIN_BESIDE]:
+    if bare := [f"{colour.hue:.0f}" for colour in every if colour.skin < SKIN_AROUND]:
         reasons += f"; hue {', '.join(bare)} has no skin beside it"
-    if still := [f"{thing.hue:.0f}" for thing in around.clutter if thing.skin >= SKIN_BESIDE]:
+    if still := [f"{thing.hue:.0f}" for thing in around.clutter if thing.skin >= SKIN_AROUND]:
         reasons += f"; what is coloured beside skin with hue {', '.join(still)} never moved"
     desk = np.flatnonzero((around.floor > PALE) & (around.floor < 256.0))
     if len(desk):
@@ -248,21 +250,26 @@ def _why_fewer(every: Sequence[Paint], around: Surroundings) -> str:
 
 
 def _others(
-    images: Sequence[Image], things: Sequence[Sequence[Thing]], paints: Sequence[Paint], around: Surroundings
+    images: Sequence[Image],
+    things: Sequence[Sequence[Thing]],
+    colours: Sequence[MarkerColour],
+    around: Surroundings,
 ) -> tuple[Image, Image, int]:
     """HSV pixels of skin near the paint and of the background, and from how many frames."""
     skins: list[Image] = []
     grounds: list[Image] = []
     chosen = spread(len(images), BACKGROUND_FRAMES)
-    largest = max(thing.area for paint in paints for thing in paint.things)
+    largest = max(thing.area for colour in colours for thing in colour.things)
     for k in chosen:
         hsv = hsv_of(images[k])
-        paint = np.zeros(hsv.shape[:2], np.uint8)
+        colour = np.zeros(hsv.shape[:2], np.uint8)
         for thing in things[k]:
-            if any(hue_apart(thing.hue, p.hue) <= HUE_GROW for p in paints):
-                paint.reshape(-1)[thing.pixels] = 1
-        paint |= _scraps(hsv, around, largest)
-        rim, near = (cv2.dilate(paint, np.ones((2 * r + 1, 2 * r + 1), np.uint8)) != 0 for r in (RIM, AROUND))
+            if any(hue_separation(thing.hue, p.hue) <= HUE_GROW for p in colours):
+                colour.reshape(-1)[thing.pixels] = 1
+        colour |= _scraps(hsv, around, largest)
+        rim, near = (
+            cv2.dilate(colour, np.ones((2 * r + 1, 2 * r + 1), np.uint8)) != 0 for r in (RIM, AROUND)
+        )
         skins.append(hsv[near & ~rim & around.skin.mask(hsv)])
         grounds.append(hsv[~np.asarray(rim)])
     return np.concatenate(skins), np.concatenate(grounds), len(chosen)
@@ -274,10 +281,10 @@ def _scraps(hsv: Image, around: Surroundings, largest: int) -> Image:
         coloured(hsv, around).astype(np.uint8), connectivity=8
     )
     skin = cv2.morphologyEx(around.skin.mask(hsv).astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
-    beside = np.asarray(cv2.dilate(skin, np.ones((5, 5), np.uint8)) != 0)
+    near_skin = np.asarray(cv2.dilate(skin, np.ones((5, 5), np.uint8)) != 0)
     for thing in around.clutter:
         labels.reshape(-1)[thing.pixels] = 0
-    touching = np.bincount(labels[beside], minlength=len(stats)) > 0
+    touching = np.bincount(labels[near_skin], minlength=len(stats)) > 0
     touching &= stats[:, cv2.CC_STAT_AREA] <= largest
     touching[0] = False
     return touching[np.asarray(labels, np.int64)].astype(np.uint8)

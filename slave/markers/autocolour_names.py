@@ -22,7 +22,7 @@ from common.arrays import Float, Int
 from common.calibration import HandProfile, HsvRange
 from common.errors import CalibrationError, FitError
 from common.hand_model import HandModel
-from slave.markers.autocolour import Namer, Paint, Say
+from slave.markers.autocolour import MarkerColour, Namer, Notify
 from slave.markers.classify import HUES
 
 Complex = npt.NDArray[np.complex128]
@@ -40,7 +40,7 @@ _OPEN = (
 CLICK_REACH = 6.0  # px between a click and the nearest pixel of its paint
 
 
-def by_hand(profile: HandProfile, names: tuple[str, ...], say: Say = lambda _text: None) -> Namer:
+def by_hand(profile: HandProfile, names: tuple[str, ...], notify: Notify = lambda _text: None) -> Namer:
     """Names from the picture of an open hand, its back to the camera.
 
     Raises:
@@ -48,10 +48,10 @@ def by_hand(profile: HandProfile, names: tuple[str, ...], say: Say = lambda _tex
         FitError: When called: too few or too many markers, or the frames do not tell.
     """
     if len(names) == 1:
-        return lambda paints, uv: names
+        return lambda colours, uv: names
     pattern = pattern_of(profile, names)
 
-    def name(paints: Sequence[Paint], uv: Float) -> tuple[str, ...]:
+    def name(colours: Sequence[MarkerColour], uv: Float) -> tuple[str, ...]:
         if not LEAST <= len(names) <= MOST:
             raise FitError(
                 f"{len(names)} markers cannot be named from the shape of the hand, only {LEAST} to {MOST}: give "
@@ -74,7 +74,7 @@ def by_hand(profile: HandProfile, names: tuple[str, ...], say: Say = lambda _tex
             raise FitError(
                 f"the frames disagree about the names ({share:.0%} of {len(votes)} votes for the best order): {_OPEN}"
             )
-        say(f"names by the shape of the hand: {share:.0%} of {len(votes)} votes")
+        notify(f"names by the shape of the hand: {share:.0%} of {len(votes)} votes")
         return tuple(names[int(k)] for k in orders[best])
 
     return name
@@ -130,7 +130,10 @@ def _unit(z: Complex) -> Complex:
 
 
 def by_hues(
-    markers: Mapping[str, HsvRange] | None, names: tuple[str, ...], where: str, say: Say = lambda _text: None
+    markers: Mapping[str, HsvRange] | None,
+    names: tuple[str, ...],
+    where: str,
+    notify: Notify = lambda _text: None,
 ) -> Namer:
     """Names from the hues of a camera file, of another camera or from before the lamp was changed.
 
@@ -145,11 +148,11 @@ def by_hues(
     middle = {name: _middle(markers[name]) for name in names}
     around = sorted(names, key=lambda name: middle[name])
 
-    def name(paints: Sequence[Paint], uv: Float) -> tuple[str, ...]:
+    def name(colours: Sequence[MarkerColour], uv: Float) -> tuple[str, ...]:
         del uv
-        order = sorted(range(len(paints)), key=lambda k: paints[k].hue)
+        order = sorted(range(len(colours)), key=lambda k: colours[k].hue)
         old = np.array([middle[name] for name in around])
-        new = np.array([paints[k].hue for k in order])
+        new = np.array([colours[k].hue for k in order])
         shifts = [(np.roll(old, s) - new + HUES / 2) % HUES - HUES / 2 for s in range(len(old))]
         misfit = np.array([float(np.square(shift).sum()) for shift in shifts])
         best = int(np.argmin(misfit))
@@ -159,31 +162,31 @@ def by_hues(
                 f"{where}: its hues fit in two orders alike: the light is too different; give clicks, or leave the "
                 f"names to the shape of the hand"
             )
-        say(f"names by the hues of {where}: the farthest is {worst:.0f} away")
+        notify(f"names by the hues of {where}: the farthest is {worst:.0f} away")
         named = dict(zip(order, np.roll(np.array(around), best).tolist(), strict=True))
-        return tuple(str(named[k]) for k in range(len(paints)))
+        return tuple(str(named[k]) for k in range(len(colours)))
 
     return name
 
 
-def checked(namer: Namer, shape: Namer, say: Say = lambda _text: None) -> Namer:
+def checked(namer: Namer, shape: Namer, notify: Notify = lambda _text: None) -> Namer:
     """Names of `namer`, refused where the shape of the hand is certain of others.
 
     Raises:
         FitError: When called: they disagree.
     """
 
-    def name(paints: Sequence[Paint], uv: Float) -> tuple[str, ...]:
-        named = namer(paints, uv)
+    def name(colours: Sequence[MarkerColour], uv: Float) -> tuple[str, ...]:
+        named = namer(colours, uv)
         try:
-            shaped = shape(paints, uv)
+            shaped = shape(colours, uv)
         except FitError as error:
-            say(f"names not checked by the shape of the hand: {error}")
+            notify(f"names not checked by the shape of the hand: {error}")
             return named
         if named != shaped:
             wrong = ", ".join(
                 f"hue {p.hue:.0f}: {a} or {b}"
-                for p, a, b in zip(paints, named, shaped, strict=True)
+                for p, a, b in zip(colours, named, shaped, strict=True)
                 if a != b
             )
             raise FitError(
@@ -204,13 +207,13 @@ def by_clicks(clicks: Mapping[str, tuple[float, float]], names: tuple[str, ...],
         width: Of the image [px].
     """
 
-    def name(paints: Sequence[Paint], uv: Float) -> tuple[str, ...]:
+    def name(colours: Sequence[MarkerColour], uv: Float) -> tuple[str, ...]:
         del uv
         of: dict[int, str] = {}
         for marker in names:
             away: list[float] = []
-            for paint in paints:
-                first = [thing.pixels for thing in paint.things if thing.frame == 0]
+            for colour in colours:
+                first = [thing.pixels for thing in colour.things if thing.frame == 0]
                 v, u = np.divmod(first[0], width) if first else (np.array([np.inf]), np.array([np.inf]))
                 away.append(float(np.hypot(u - clicks[marker][0], v - clicks[marker][1]).min()))
             best = int(np.argmin(away))
@@ -219,7 +222,7 @@ def by_clicks(clicks: Mapping[str, tuple[float, float]], names: tuple[str, ...],
             if best in of:
                 raise FitError(f"clicks.{marker}: on the same paint as clicks.{of[best]}")
             of[best] = marker
-        return tuple(of[k] for k in range(len(paints)))
+        return tuple(of[k] for k in range(len(colours)))
 
     return name
 

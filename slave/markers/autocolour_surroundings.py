@@ -41,7 +41,7 @@ HUE_NEAR = 3  # hues of one tint
 SHIFT_PX, SHIFT_SHARE = 2.0, 0.05  # a thing that went farther, plus this share of its size, has moved
 WHOLE = 0.95  # of the area: a thing half covered shifts its centroid, but gets smaller
 MOVED_FRAMES = 3
-SKIN_BESIDE = 0.08  # share of skin around a paint in a typical frame; painted caps have 0.12 and more
+SKIN_AROUND = 0.08  # share of skin around a paint in a typical frame; painted caps have 0.12 and more
 RESTING_SKIN = 0.5  # share of skin around a thing that never moved, from which it is painted on the hand
 SKIN_DESK = 0.2  # share of the background that has the colour of skin, from which skin proves nothing: wood
 
@@ -97,7 +97,7 @@ def surroundings_of(images: Sequence[Image], background: Image, skin: Skin) -> S
         if _moved(thing, images):
             continue
         resting = thing.skin >= RESTING_SKIN or (
-            thing.skin >= SKIN_BESIDE and _uncovered(thing, images, background, skin)
+            thing.skin >= SKIN_AROUND and _uncovered(thing, images, background, skin)
         )
         if wooden or not resting:
             clutter.append(thing)

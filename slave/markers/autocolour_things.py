@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from common.arrays import Bool, Float, Image, Int
 from slave.markers.classify import HUES
-from slave.markers.colours import HUE_GROW, SMALLEST, circular_median, hue_apart, hue_distance
+from slave.markers.colours import HUE_GROW, SMALLEST, circular_median, hue_distance, hue_separation
 
 SKIN_VALUE = 60
 SKIN_HALF_WIDTH = 12  # in hue; nearer than this no paint can be told from skin
@@ -111,7 +111,7 @@ def coloured(hsv: Image, around: Surroundings) -> Bool:
 
 def hides(thing: Thing, clutter: Thing) -> bool:
     """Whether `thing` is the clutter, or a part of it."""
-    if hue_apart(thing.hue, clutter.hue) > HUE_GROW:
+    if hue_separation(thing.hue, clutter.hue) > HUE_GROW:
         return False
     inside = np.isin(thing.pixels, clutter.pixels, assume_unique=True)
     return float(inside.mean()) > COVERED

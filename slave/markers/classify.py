@@ -6,7 +6,7 @@ the camera file by running OpenCV's own conversion over all 2^24 colours, so a l
 costs the same for one colour and for eight (Bruce, Balch, Veloso, CMVision, 2000, do the same with one table
 per axis; a packed table also carries ranges that are no boxes).
 
-Under another light the same table is looked up at other colours (`ColourTable.relit`): a slave has one for as long as
+Under another light the same table is read at other colours (`ColourTable.white_balanced`): a slave has one as long as
 its colours are the same, whatever the light does.
 """
 
@@ -72,7 +72,7 @@ class ColourTable:
         """What each byte of blue, green and red (3, 256) adds to the place of a pixel in `entries`."""
         return self._places
 
-    def relit(self, tables: Image) -> "ColourTable":
+    def white_balanced(self, tables: Image) -> "ColourTable":
         """The table for pictures whose bytes must be mapped before these ranges hold, about 1 ms; shares the entries.
 
         Colours that belong to one marker before belong to one marker after: no ranges can come to overlap.

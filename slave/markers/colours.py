@@ -22,7 +22,7 @@ from slave.markers.classify import HUES, in_range
 
 HUE_GROW = 10  # how far the hue of one paint wanders between its lit and its shadow side
 HUE_MARGIN = 14  # widest half range; other paints and skin narrow it
-HUE_APART = 8  # two paints nearer than this look the same
+HUE_SEPARATION = 8  # two paints nearer than this look the same
 SATURATION_SHARE = 0.45  # of the paint's median: a rim pixel is about half paint
 SATURATION_LEAST = 50
 VALUE_SHARE = 0.3  # of the paint's median: the shadow side belongs to the cap
@@ -89,7 +89,7 @@ def rows_of(paint: Mapping[str, Image], skin: Image, background: Image, frames: 
         FitError: Two paints have the same hue.
     """
     hue = {name: circular_median(pixels[:, 0]) for name, pixels in paint.items()}
-    _refuse_twins(hue)
+    _refuse_ambiguous(hue)
     skin_hue = circular_median(skin[:, 0]) if len(skin) else None
     rows: list[ColourRow] = []
     for name, pixels in paint.items():
@@ -166,7 +166,7 @@ def circular_median(hues: Image) -> float:
     return float((mean + np.median(offset)) * HUES / (2.0 * np.pi) % HUES)
 
 
-def hue_apart(a: float, b: float) -> float:
+def hue_separation(a: float, b: float) -> float:
     """Distance of two hues on the circle of 180."""
     return min((a - b) % HUES, (b - a) % HUES)
 
@@ -177,10 +177,10 @@ def hue_distance(hues: npt.NDArray[np.number], hue: float) -> Float:
     return np.minimum(d, HUES - d)
 
 
-def _refuse_twins(hue: Mapping[str, float]) -> None:
+def _refuse_ambiguous(hue: Mapping[str, float]) -> None:
     names = sorted(hue, key=lambda name: hue[name])
     for a, b in zip(names, names[1:] + names[:1], strict=True):
-        if a != b and hue_apart(hue[a], hue[b]) < HUE_APART:
+        if a != b and hue_separation(hue[a], hue[b]) < HUE_SEPARATION:
             raise FitError(
                 f"markers {a} and {b} have nearly the same hue ({hue[a]:.0f}, {hue[b]:.0f}): repaint one"
             )

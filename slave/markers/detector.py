@@ -19,7 +19,7 @@ import numpy as np
 
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, HsvRange
-from slave.markers.beside import Beside
+from slave.markers.ambiguity import ColourAmbiguityMonitor
 from slave.markers.blobs import Blob, with_fragments
 from slave.markers.centroid import PAD, Measured
 from slave.markers.classify import ColourTable, table_of
@@ -48,8 +48,8 @@ SMEARED = 2.0  # px of way during the exposure from which an edge is no edge
 DIGITS = 6  # of what is reported: what comes after them differs between processors
 NOT_SEEN = (math.nan,) * 11  # what is reported of a marker
 NEAR = 3.0  # sides of the marker: a rival so near may be taken for it in the next frame
-RIVALS = 2  # that are measured in one frame
-RIVAL = 0.3  # of the marker's area: a smaller blob is no rival, nor one as much larger
+ALTERNATIVES = 2  # that are measured in one frame
+ALTERNATIVE = 0.3  # of the marker's area: a smaller blob is no rival, nor one as much larger
 JUDGED = (
     6  # frames: a clear marker that is tracked is judged in one of so many, and stays what it was between
 )
@@ -66,7 +66,7 @@ class Detections:
         quality: (M,) 0..1, the probability that it is a marker.
         sigma_px: (M,) standard deviation per axis of `uv` as an estimate of the centroid of all that the camera
             would see of the whole cap: noise, doubt of occlusion, size, motion.
-        rival_uv: (M, 2) centroid of a second blob of the colour that may be the marker instead [px]; in a frame with
+        alt_uv: (M, 2) centroid of a second blob of the colour that may be the marker instead [px]; in a frame with
             many only as the scan saw it, to a pixel or so; NaN: none.
         clarity: (M,) 0..1, how far `colour` is that of the paint alone: 1 is a whole, clear marker.
         colour: (M, 3) mean of the core in linear light 0..1: blue, green, red.
@@ -76,7 +76,7 @@ class Detections:
     area: Float
     quality: Float
     sigma_px: Float
-    rival_uv: Float
+    alt_uv: Float
     clarity: Float
     colour: Float
 
@@ -91,7 +91,7 @@ class MarkerDetector:
     Attributes:
         windows_only: Only windows of tracked markers are scanned, and strips for lost ones; the first frame is scanned
             whole. May change between two frames.
-        beside: Things of a marker's colour that are none, as far as scans saw them.
+        ambiguity: Things of a marker's colour that are none, as far as scans saw them.
         evidence: Marker row -> what its quality was made of, of those that were judged in the last frame.
     """
 
@@ -136,7 +136,7 @@ class MarkerDetector:
         self._lonely = [True] * len(markers)  # no other blob might have been it when it was found
         self._gains = (1.0, 1.0, 1.0)  # of the light against calibration, blue first
         self.windows_only = False
-        self.beside = Beside(markers)
+        self.ambiguity = ColourAmbiguityMonitor(markers)
         self.evidence: dict[int, Evidence] = {}
 
     def fresh(self, seeds: Mapping[str, tuple[float, float]] | None = None) -> "MarkerDetector":
@@ -168,26 +168,26 @@ class MarkerDetector:
         scanned = self._look(image, t_ns, windows)
         blobs = scanned.blobs
         chosen = self._decide(scanned, windows)
-        self.beside.push(blobs, chosen)
+        self.ambiguity.push(blobs, chosen)
         self._seeds = {}
         rows = list(chosen)
-        rivals: dict[int, Blob] = {}
+        alternatives: dict[int, Blob] = {}
         doubt: dict[int, float] = {}
         for m in rows:
             if len(blobs[m]) > 1:
                 chosen[m], doubt[m] = with_fragments(chosen[m], blobs[m], *self._known(m, t_ns))
-                rival = self._rival(m, chosen[m], blobs, windows[m])
-                if rival is not None:
-                    rivals[m] = rival
+                alternative = self._alternative(m, chosen[m], blobs, windows[m])
+                if alternative is not None:
+                    alternatives[m] = alternative
         # A rival costs as much as a marker, so a frame full of them is not measured through.
-        closely = sorted(rivals, key=lambda m: -rivals[m].area)[:RIVALS]
-        asked = [(m, chosen[m]) for m in rows] + [(m, rivals[m]) for m in closely]
+        closely = sorted(alternatives, key=lambda m: -alternatives[m].area)[:ALTERNATIVES]
+        asked = [(m, chosen[m]) for m in rows] + [(m, alternatives[m]) for m in closely]
         alone = [len(blobs[m]) == 1 or _alone(blob, blobs[m]) for m, blob in asked]
         bits = [self._table.bits[m] for m, _ in asked]
         measured = self._engine.measure(image, self._table, bits, [blob for _, blob in asked], alone)
         for m, seen in zip(closely, measured[len(rows) :], strict=True):
             if seen is not None:
-                rivals[m] = rivals[m]._replace(u=seen.u, v=seen.v)
+                alternatives[m] = alternatives[m]._replace(u=seen.u, v=seen.v)
         seen_as = {
             m: seen
             for m, seen in zip(rows, measured, strict=False)
@@ -199,7 +199,7 @@ class MarkerDetector:
         for m, seen in seen_as.items():
             before = self._tracks[m] if windows[m] is not None else None
             reports[m] = self._report(
-                m, before, seen, outlines.get(m), chosen[m], rivals.get(m), t_ns, doubt.get(m, 0.0)
+                m, before, seen, outlines.get(m), chosen[m], alternatives.get(m), t_ns, doubt.get(m, 0.0)
             )
         values: list[float] = []
         for m in range(len(self._names)):
@@ -228,7 +228,7 @@ class MarkerDetector:
         """Go on with the tracks of another detector, of the markers that both seek."""
         self._seeds = {}
         if other._names == self._names:
-            self._tracks, self._scanner, self.beside = other._tracks, other._scanner, other.beside
+            self._tracks, self._scanner, self.ambiguity = other._tracks, other._scanner, other.ambiguity
             self._last_ns, self._frame, self._outlines = other._last_ns, other._frame, other._outlines
             self._quality, self._lonely = other._quality, other._lonely
             return
@@ -258,16 +258,16 @@ class MarkerDetector:
         seen: Measured,
         outline: Outline | None,
         blob: Blob,
-        rival: Blob | None,
+        alternative: Blob | None,
         t_ns: int,
         doubt: float,
     ) -> tuple[float, ...]:
         """What is reported of one marker, whose track was `before` if it was alive; it goes on."""
-        other = (math.nan, math.nan) if rival is None else (rival.u, rival.v)
+        other = (math.nan, math.nan) if alternative is None else (alternative.u, alternative.v)
         support = 0.0 if outline is None or seen.contrast >= CLEAR_CONTRAST else outline.support
         near = math.hypot(other[0] - seen.u, other[1] - seen.v) < NEAR * math.sqrt(blob.area)  # NaN is not
         if before is None:
-            self._lonely[m] = rival is None
+            self._lonely[m] = alternative is None
         clear = seen.contrast >= CLEAR_CONTRAST and not (seen.cut or seen.thin)
         if before is None or not clear or near or m % JUDGED == self._frame % JUDGED:
             self.evidence[m] = evidence_of(
@@ -284,7 +284,7 @@ class MarkerDetector:
             shape, x, y = Ellipse(before.xx, before.xy, before.yy), u - seen.left, v - seen.top
             whole = centre_of(seen.window, shape, x, y)
             if whole is not None and explained(before.hidden(seen.area), shape, whole.u - x, whole.v - y):
-                u, v, area = seen.left + whole.u, seen.top + whole.v, before.usual
+                u, v, area = seen.left + whole.u, seen.top + whole.v, before.typical
                 sigma = math.hypot(COVERED_PX, whole.rms)
         sigma = math.hypot(sigma, doubt)
         clarity = clarity_of(seen, track.whole)
@@ -293,9 +293,9 @@ class MarkerDetector:
         blue, green, red = seen.colour
         return u, v, area, self._quality[m], sigma, *other, clarity, blue, green, red
 
-    def _rival(self, m: int, blob: Blob, blobs: list[list[Blob]], window: Window | None) -> Blob | None:
+    def _alternative(self, m: int, blob: Blob, blobs: list[list[Blob]], window: Window | None) -> Blob | None:
         """The largest other blob of the colour that may be the marker as far as size and motion tell; no rim is."""
-        least, most = RIVAL * blob.area, blob.area / RIVAL
+        least, most = ALTERNATIVE * blob.area, blob.area / ALTERNATIVE
         others = [b for b in blobs[m] if least < b.area < most and not _within(b, blob)]
         if window is not None:
             others = [b for b in others if math.isfinite(window.cost(b))]

@@ -8,7 +8,7 @@ channels (a cap turned from the lamp):
 
 x, the log gains, are solved from all markers of a frame together by weighted least squares. A channel weighs by
 what it can tell: paint is nearly black in one or two channels, and what is seen there is sheen and stray light, which
-come and go with the pose (`STRAY`). A marker that fits badly (half covered, in a coloured shadow) weighs less the
+come and go with the pose (`OUTLIER`). A marker that fits badly (half covered, in a coloured shadow) weighs less the
 worse it fits (Cauchy weights, Holland and Welsch 1977). The estimate follows the solution slowly, and never leaves
 its bounds.
 
@@ -35,7 +35,7 @@ EVERY_NS = 100_000_000  # colours are looked at so often; light has no need of m
 # decides, and a lone marker, which tells of two channels at most, moves the third one little.
 WEAK, WEAK_TOGETHER = 0.3, 0.6
 KNOWN = np.asarray(np.linalg.inv(WEAK**2 * np.eye(3) + WEAK_TOGETHER**2), np.float64)
-STRAY = 0.01  # linear light of sheen and skin on a paint, as it comes and goes
+OUTLIER = 0.01  # linear light of sheen and skin on a paint, as it comes and goes
 UNEVEN = 0.06  # relative: other causes, such as a hue that differs between the lit and the shadow side
 SHADING = 0.35  # relative: the light on one marker against another's
 CLIPPED = 0.9  # linear light; of a brighter mean many pixels are clipped, and it tells no gain
@@ -73,7 +73,7 @@ def fit_gains(colour: Float, reference: Float, weight: Float, known: Float) -> G
         return GainFit(known, misfit)
     now, then = colour[seen], reference[seen]
     shift = np.log(now / then)
-    variance = UNEVEN**2 + (STRAY * np.exp(known) / now) ** 2 + (STRAY / then) ** 2
+    variance = UNEVEN**2 + (OUTLIER * np.exp(known) / now) ** 2 + (OUTLIER / then) ** 2
     variance[now > CLIPPED] += 1.0
     # The inverse of diag(variance) + SHADING^2 for each marker, by Sherman and Morrison.
     sure = 1.0 / variance

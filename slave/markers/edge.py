@@ -75,15 +75,15 @@ def centre_of(share: Float32, shape: Ellipse, u: float, v: float) -> Centre | No
     centre: Float = np.array([u, v])
     own = np.ones(RAYS, np.bool_)
     residual: Float = np.zeros(RAYS)
-    for turn in range(ROUNDS):
+    for iteration in range(ROUNDS):
         away = points - centre
-        bent = away @ inverse
-        level = np.sqrt(np.maximum((away * bent).sum(axis=1), 1e-9))  # 2 on the ellipse
-        slope: Float = bent / level[:, None]
+        inner = away @ inverse
+        level = np.sqrt(np.maximum((away * inner).sum(axis=1), 1e-9))  # 2 on the ellipse
+        slope: Float = inner / level[:, None]
         length = np.sqrt(np.maximum((slope * slope).sum(axis=1), 1e-9))
         residual = (level - 2.0) / length  # distance from the ellipse, outwards positive
         # At first the centre is off by a part of the radius, and the own edge is where the distances are largest.
-        least = -SHORT_PX if turn >= len(KEEP) else float(np.sort(residual)[RAYS - KEEP[turn]])
+        least = -SHORT_PX if iteration >= len(KEEP) else float(np.sort(residual)[RAYS - KEEP[iteration]])
         kept = residual >= least
         if kept.sum() < LEFT * RAYS:
             return None
@@ -93,7 +93,7 @@ def centre_of(share: Float32, shape: Ellipse, u: float, v: float) -> Centre | No
         except np.linalg.LinAlgError:
             return None  # no edge about the centroid: that of a thin crescent lies beside its paint
         centre += shift
-        if turn >= len(KEEP) and float(np.abs(shift).max()) < DONE_PX:
+        if iteration >= len(KEEP) and float(np.abs(shift).max()) < DONE_PX:
             break
         own = kept
     rms = float(np.sqrt(np.mean(np.square(residual[own]))))

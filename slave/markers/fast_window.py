@@ -510,7 +510,7 @@ def _share_out(
     """Fill in the shares; return their moments 1, x, y, xx, xy, yy in pixels of the window."""
     w0, w1, w2, at_zero = np.float32(w[0]), np.float32(w[1]), np.float32(w[2]), np.float32(zero)
     slope, darkest = np.float32(level[1]), np.float32(rules.darkest)
-    nothing, all_paint = np.float32(0.0), np.float32(1.0)
+    nothing, all_inside = np.float32(0.0), np.float32(1.0)
     n, sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     count, first = part.x1 - part.x0, np.float64(part.x0)
     for y in range(part.y0, part.y1):
@@ -528,9 +528,9 @@ def _share_out(
             bright = bright if bright > darkest else darkest
             share = (w0 * blue[p] + w1 * green[p] + w2 * red[p] - at_zero) / bright
             share = share if share > nothing else nothing
-            share = share if share < all_paint else all_paint
+            share = share if share < all_inside else all_inside
             share = share if kind[p] & NEAR else nothing
-            out[p] = all_paint if kind[p] & SOLID else share
+            out[p] = all_inside if kind[p] & SOLID else share
         k, x1, x2 = 0.0, 0.0, 0.0
         for p in range(count):
             here, x = np.float64(out[p]), np.float64(ramp[p])
@@ -553,10 +553,10 @@ def _foreign(x0: int, y0: int, x1: int, y1: int, stride: int, classes: Image) ->
             p = (y + EDGE) * stride + EDGE + x
             if classes[p] == OWN:
                 continue
-            beside = False
+            touches_own = False
             for row in range(p - stride, p + stride + 1, stride):
                 for q in range(row - 1, row + 2):
-                    beside |= classes[q] == OWN
-            rim += beside
-            others += beside & (classes[p] == OTHER)
+                    touches_own |= classes[q] == OWN
+            rim += touches_own
+            others += touches_own & (classes[p] == OTHER)
     return others / max(rim, 1)

@@ -159,13 +159,13 @@ def _best_group(candidates: Sequence[Candidate], links: Sequence[set[int]], amon
     best: list[int] = []
     best_score = -1.0
     for group in _components(links, among):
-        rivals: dict[int, list[int]] = {}
+        alternatives: dict[int, list[int]] = {}
         for i in group:
-            rivals.setdefault(candidates[i].marker, []).append(i)
+            alternatives.setdefault(candidates[i].marker, []).append(i)
         members = [candidates[i] for i in group]
         chosen = [
             some[0] if len(some) == 1 else max(some, key=lambda i: _fit(candidates[i], members))
-            for some in rivals.values()
+            for some in alternatives.values()
         ]
         score = sum(candidates[i].score for i in chosen)
         if score > best_score:

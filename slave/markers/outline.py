@@ -158,14 +158,14 @@ def _fitted(strength: Float32, circle: Float) -> tuple[float, float, float, floa
     """Centre, radius, support and standard deviation of the centre, in radii of the hull, by least squares."""
     covariance: Float = np.eye(3)
     own: Bool = np.zeros(RAYS, np.bool_)
-    for turn in range(ROUNDS):
+    for iteration in range(ROUNDS):
         x, y, radius = circle.tolist()
-        tolerance = TOLERANCE * radius * (2.0 if turn == 0 else 1.0)
+        tolerance = TOLERANCE * radius * (2.0 if iteration == 0 else 1.0)
         near = np.abs(_AT - _distance(circle[None]).T) <= tolerance + _STEP
         at = np.clip(np.where(near, strength, -1.0).argmax(axis=1), 1, RADII - 2)
         before, here, after = strength[_RAY, at - 1], strength[_RAY, at], strength[_RAY, at + 1]
-        bend = np.minimum(before - 2.0 * here + after, -1e-6)  # a parabola through three samples
-        found = _AT[at] + _STEP * np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
+        curvature = np.minimum(before - 2.0 * here + after, -1e-6)  # a parabola through three samples
+        found = _AT[at] + _STEP * np.clip(0.5 * (before - after) / curvature, -0.5, 0.5)
         away_x, away_y = found * _COS - x, found * _SIN - y
         away = np.hypot(away_x, away_y)
         residual = away - radius

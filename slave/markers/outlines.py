@@ -30,7 +30,7 @@ class Outlines:
         self._outlined: set[int] = set()
 
     def push(
-        self, image: Image, seen_as: Mapping[int, Measured], anew: Collection[int]
+        self, image: Image, seen_as: Mapping[int, Measured], reset: Collection[int]
     ) -> dict[int, Outline]:
         """Seek the outlines of one frame, those of the largest first.
 
@@ -47,7 +47,7 @@ class Outlines:
         for m, seen in seen_as.items():
             if seen.area < LEAST_PX2 or seen.cut or seen.thin:
                 continue
-            due = m in self._outlined or m in anew or self._frame % RARELY == m % RARELY
+            due = m in self._outlined or m in reset or self._frame % RARELY == m % RARELY
             if seen.contrast < CLEAR_CONTRAST or (seen.area >= LARGE_PX2 and due):
                 sought.append((seen.area, m))
         found: dict[int, Outline] = {}

@@ -47,7 +47,7 @@ class Evidence(NamedTuple):
     fullness: float
     slender: float
     hue: float
-    rival: float
+    alternative: float
     ragged: float
     cut: float
 
@@ -60,14 +60,14 @@ WEIGHTS = Evidence(
     fullness=8.73,
     slender=-3.23,
     hue=-9.37,
-    rival=-2.44,
+    alternative=-2.44,
     ragged=-2.17,
     cut=-3.00,
 )
 
 
 def evidence_of(
-    seen: Measured, gains: tuple[float, float, float], colour: HsvRange, support: float, rival: bool
+    seen: Measured, gains: tuple[float, float, float], colour: HsvRange, support: float, alternative: bool
 ) -> Evidence:
     """What speaks for one measurement.
 
@@ -91,7 +91,7 @@ def evidence_of(
         fullness=min(seen.area / (4.0 * math.pi * math.sqrt(longest * shortest)), 1.0),
         slender=0.5 * math.log(longest / shortest),
         hue=min(away * away, 1.0),
-        rival=float(rival),
+        alternative=float(alternative),
         ragged=float(seen.thin),
         cut=float(seen.cut),
     )

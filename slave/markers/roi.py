@@ -1,4 +1,4 @@
-"""Say where a tracked marker is expected, and whether a blob there may be it.
+"""Notify where a tracked marker is expected, and whether a blob there may be it.
 
 The region of interest is the marker's last box, moved by its velocity and widened by `roi_margin` of the camera file
 (Kalbfleisch: "40 px at 640x480 was best"), more the longer it was not seen. It decides *which* blob is the marker, and
@@ -15,12 +15,12 @@ HOLD_NS = 500_000_000  # a marker not seen for longer is sought like a new one
 VELOCITY_NS = 100_000_000  # a velocity is trusted no longer than this
 GROWTH_PER_S = 1.0  # of the image width: about 1 m/s at 0.6 m
 WHOLE_LIFE_S = 2.0  # the memory of the marker's whole area
-USUAL_LIFE_S = 0.25  # of its usual one: a finger turns in this time, something passes in front of it faster
+TYPICAL_LIFE_S = 0.25  # of its usual one: a finger turns in this time, something passes in front of it faster
 LARGEST = 4.0  # times the whole area
 SUDDEN = 2.5  # an area that changes by more between two frames is looked at closely
 COVERED = 0.06  # share of the usual area that is missing while something is in front
 COVERING = 0.08  # share of the area that must go from one frame to the next for that to begin, and
-TURNING_PER_S = 5.0  # what a finger that turns away loses: a radian in a fifth of a second
+ROTATING_PER_S = 5.0  # what a finger that turns away loses: a radian in a fifth of a second
 
 
 class Window(NamedTuple):
@@ -73,7 +73,7 @@ class Track(NamedTuple):
     area: float
     seen: float
     whole: float
-    usual: float
+    typical: float
     covered: bool
     xx: float
     xy: float
@@ -111,14 +111,14 @@ class Track(NamedTuple):
 
     def covers(self, area: float, t_ns: int) -> bool:
         """Whether something has come in front of the marker, or still is."""
-        if 1.0 - area / self.usual <= COVERED:
+        if 1.0 - area / self.typical <= COVERED:
             return False
         lost = 1.0 - area / self.seen
-        return self.covered or lost > max(COVERING, TURNING_PER_S * (t_ns - self.t_ns) * 1e-9)
+        return self.covered or lost > max(COVERING, ROTATING_PER_S * (t_ns - self.t_ns) * 1e-9)
 
     def hidden(self, area: float) -> float:
         """Share of the usual area that is missing, 0..1."""
-        return max(0.0, 1.0 - area / self.usual)
+        return max(0.0, 1.0 - area / self.typical)
 
 
 def advance(track: Track | None, seen: Measured, blob: Blob, t_ns: int) -> Track:
@@ -137,11 +137,11 @@ def advance(track: Track | None, seen: Measured, blob: Blob, t_ns: int) -> Track
     du = dv = 0.0
     if dt_s <= VELOCITY_NS * 1e-9:
         du, dv = (u - track.u) / dt_s, (v - track.v) / dt_s
-    keep = math.exp(-dt_s / USUAL_LIFE_S)
-    usual = area + (track.usual - area) * keep
+    keep = math.exp(-dt_s / TYPICAL_LIFE_S)
+    typical = area + (track.typical - area) * keep
     covered = track.covers(area, t_ns)
     if covered:
         xx, xy, yy = track.xx, track.xy, track.yy
     else:
         xx, xy, yy = xx + (track.xx - xx) * keep, xy + (track.xy - xy) * keep, yy + (track.yy - yy) * keep
-    return Track(u, v, du, dv, blob.area, area, whole, usual, covered, xx, xy, yy, width, height, t_ns)
+    return Track(u, v, du, dv, blob.area, area, whole, typical, covered, xx, xy, yy, width, height, t_ns)

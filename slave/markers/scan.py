@@ -60,13 +60,13 @@ class Scanner:
         """Scan frames of this size [px] by `engine`."""
         self._columns, self._rows = width // SCALE, height // SCALE
         self._scan = engine.scan_blobs
-        self._turn = -1  # negative before the first frame
+        self._cycle = -1  # negative before the first frame
         self._strip = 0
 
     @property
     def began(self) -> bool:
         """Whether there was a frame."""
-        return self._turn >= 0
+        return self._cycle >= 0
 
     def whole(self, image: Image, table: ColourTable) -> Scanned:
         """Scan the whole frame (H, W, 3).
@@ -78,13 +78,13 @@ class Scanner:
         missing = [m for m, options in enumerate(blobs) if not options]
         if missing:
             codes = codes.copy()  # the next scan reuses it
-            step, dx, dy = OTHERS[self._turn] if self.began else FINER
-            self._turn = (self._turn + 1) % len(OTHERS)
+            step, dx, dy = OTHERS[self._cycle] if self.began else FINER
+            self._cycle = (self._cycle + 1) % len(OTHERS)
             _, finer = self._scan(image, table, [table.bits[m] for m in missing], step, dx, dy, None)
             for m, options in zip(missing, finer, strict=True):
                 blobs[m] = options
         elif not self.began:
-            self._turn = 0
+            self._cycle = 0
         return Scanned([((0, 0, self._columns, self._rows), codes)], blobs)
 
     def around(
@@ -115,11 +115,11 @@ class Scanner:
         missing = [m for m, options in enumerate(found) if not options]
         for m in missing:
             if m in wanted or m in proposed:
-                step, dx, dy = FINER if m in proposed else OTHERS[self._turn]
+                step, dx, dy = FINER if m in proposed else OTHERS[self._cycle]
                 seen = [self._on_grid(image, table, [table.bits[m]], part, step, dx, dy)[1] for part in parts]
                 found[m] = _gathered(seen, 1)[0]
         if missing:
-            self._turn = (self._turn + 1) % len(OTHERS)
+            self._cycle = (self._cycle + 1) % len(OTHERS)
         return Scanned([(part, codes) for part, codes, _ in scanned], found)
 
     def _search(self, image: Image, table: ColourTable, lost: Sequence[int]) -> dict[int, list[Blob]]:

@@ -24,7 +24,7 @@ LEAST_PX = 0.06  # at any radius
 CLEAR = 15.0  # contrast below which the edge is less sure
 BLUR = 0.04  # px per px of way during the exposure
 COVER = 0.65
-LASTING = 0.3  # how much of a slow loss of area is cover, and not the finger turning away
+PERSISTENT = 0.3  # how much of a slow loss of area is cover, and not the finger turning away
 CUT = 0.3  # of the radius
 THIN = 2.0  # times, for a sliver
 COVERED_PX = 0.15  # a centre found from the edge that is left
@@ -50,7 +50,7 @@ def sigma_of(
     if seen.contrast < CLEAR:
         edge *= CLEAR / max(seen.contrast, 1.0)
     blur = BLUR * math.hypot(track.du, track.dv) * exposure_s
-    hidden = LASTING * (1.0 - seen.area / track.whole) if seen.area < track.whole else 0.0
+    hidden = PERSISTENT * (1.0 - seen.area / track.whole) if seen.area < track.whole else 0.0
     if before is not None and track.covered:
         hidden = max(hidden, before.hidden(seen.area))
     cover = COVER * hidden * radius / (1.0 - min(hidden, 0.8)) if hidden > 0.0 else 0.0

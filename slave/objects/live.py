@@ -10,13 +10,13 @@ from common.clock import Clock
 from common.keys import Access
 from common.zenoh_bus import ZenohBus
 from slave.app import POLL_S, Barrier, Sender, nothing
+from slave.objects.counters import PoseCounters
 from slave.objects.source import TrackerSource
-from slave.objects.tally import PoseTally
 from slave.report import Reporter
 from slave.service import Service
 from slave.uplink import Uplink
 
-LOOK_S = 0.5e-3  # between two poses it is looked whether the master has started
+CHECK_S = 0.5e-3  # between two poses it is looked whether the master has started
 
 
 def wait_for_start(
@@ -34,7 +34,7 @@ def wait_for_start(
         TrackerError: The tracking system is gone.
     """
     while not stop.is_set():
-        if barrier.wait_for_start(POLL_S if recorded else LOOK_S):
+        if barrier.wait_for_start(POLL_S if recorded else CHECK_S):
             return True
         if not recorded and source.read() is None:
             return False
@@ -45,7 +45,7 @@ def wait_for_start(
 def run(
     source: TrackerSource,
     sender: Sender,
-    tally: PoseTally,
+    counters: PoseCounters,
     stop: threading.Event,
     alive: Callable[[], None] = nothing,
 ) -> None:
@@ -56,7 +56,7 @@ def run(
     """
     while not stop.is_set() and (pose := source.read()) is not None:
         sender.send(replace(pose, session=sender.session))
-        tally.pose(pose)
+        counters.pose(pose)
         alive()
 
 
@@ -66,7 +66,7 @@ def run_live(
     uplink: Uplink,
     clock: Clock,
     stop: threading.Event,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
     service: Service,
     access: Access,
     recorded: bool = False,
@@ -87,21 +87,21 @@ def run_live(
     Raises:
         TrackerError: The tracking system is gone.
     """
-    tally = PoseTally(source)
+    counters = PoseCounters(source)
     reporter = Reporter(
-        name, uplink, tally, clock, lambda endpoint: ZenohBus(None, endpoint, access), stop.set
+        name, uplink, counters, clock, lambda endpoint: ZenohBus(None, endpoint, access), stop.set
     )
     try:
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
-        say("ready, waiting for the master")
+        notify("ready, waiting for the master")
         service.ready(lambda: uplink.started)
         if wait_for_start(source, uplink, stop, recorded, service.waiting):
-            run(source, uplink, tally, stop, service.working)
+            run(source, uplink, counters, stop, service.working)
     finally:
         service.stopping()
         reporter.close()
         uplink.close()
         source.close()
-    counts = tally.counts()
-    say(f"{counts['poses']} poses, {counts['nowhere']} of them nowhere, sent {uplink.counts['sent']}")
+    counts = counters.counts()
+    notify(f"{counts['poses']} poses, {counts['nowhere']} of them nowhere, sent {uplink.counts['sent']}")

@@ -100,5 +100,5 @@ def _why(error: Exception) -> str:
             'SteamVR wants a headset: set "requireHmd" to false in its settings and enable the null driver '
             "(docs/tracker.md)"
         )
-    said = f" ({error})" if str(error) else ""
-    return f"no SteamVR answers, {kind}{said}: install SteamVR from Steam, start it, pair the tracker (docs/tracker.md)"
+    text = f" ({error})" if str(error) else ""
+    return f"no SteamVR answers, {kind}{text}: install SteamVR from Steam, start it, pair the tracker (docs/tracker.md)"

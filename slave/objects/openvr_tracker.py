@@ -24,7 +24,7 @@ from slave.objects.openvr_library import Library, VrSystem, connect, load_librar
 
 RATE_HZ = 120.0
 LOST_EVERY = 30  # poses of NaN: four a second suffice
-LOOK_NS = 1_000_000_000  # between two searches for the device
+POLL_NS = 1_000_000_000  # between two searches for the device
 _UNIT_WITHIN = 1e-3
 _NOTHING = (np.full(3, np.nan), np.full(4, np.nan))
 
@@ -94,7 +94,7 @@ class OpenVrTracker:
         """`lost_itself`: asked while it saw no base station; `absent`: while it was switched off."""
         return dict(self._counts)
 
-    def gauges(self) -> Mapping[str, float]:
+    def metrics(self) -> Mapping[str, float]:
         """Nothing."""
         return {}
 
@@ -122,12 +122,12 @@ class OpenVrTracker:
         else:
             self._lost = 0
         self._seq += 1
-        place, turn = _NOTHING if found is None else found
-        return TrackerPose(self._name, 0, self._seq, t_ns, place, turn)
+        place, quaternion = _NOTHING if found is None else found
+        return TrackerPose(self._name, 0, self._seq, t_ns, place, quaternion)
 
     def _found(self, system: VrSystem, now_ns: int) -> int | None:
         """The device's number, which stays while SteamVR runs; searched again once a second until it is there."""
-        if self._index is None and (self._looked_ns is None or now_ns - self._looked_ns >= LOOK_NS):
+        if self._index is None and (self._looked_ns is None or now_ns - self._looked_ns >= POLL_NS):
             self._looked_ns = now_ns
             self._index = self._search(system)
         if self._index is None:
@@ -189,7 +189,7 @@ def matrix34(matrix: object) -> tuple[Float, Float] | None:
     rows = np.array([list(row) for row in getattr(matrix, "m", ())], float)
     if rows.shape != (3, 4) or not np.isfinite(rows).all():
         return None
-    turned = rows[:, :3]
-    if not np.allclose(turned @ turned.T, np.eye(3), atol=_UNIT_WITHIN) or np.linalg.det(turned) < 0.0:
+    axes = rows[:, :3]
+    if not np.allclose(axes @ axes.T, np.eye(3), atol=_UNIT_WITHIN) or np.linalg.det(axes) < 0.0:
         return None
-    return rows[:, 3], matrix_to_quaternion(turned)
+    return rows[:, 3], matrix_to_quaternion(axes)

@@ -72,7 +72,7 @@ class SurviveTracker:
         self._device = SurviveDevice(name, wanted)
         self._came: deque[TrackerPose] = deque()
         self._wanted = wanted
-        self._heard_ns = self._said_ns = clock.now_ns()
+        self._received_ns = self._logged_ns = clock.now_ns()
         self._process, self._terminal = _started(program, options)
 
     def read(self) -> TrackerPose | None:
@@ -84,10 +84,10 @@ class SurviveTracker:
         """
         while not self._stop.is_set() and self._terminal is not None:
             if self._came:
-                self._heard_ns = self._said_ns = self._clock.now_ns()
+                self._received_ns = self._logged_ns = self._clock.now_ns()
                 return self._came.popleft()
             now_ns = self._clock.now_ns()
-            if now_ns - self._heard_ns >= SILENT_NS:
+            if now_ns - self._received_ns >= SILENT_NS:
                 return self._lost(now_ns)
             self._receive(self._terminal)
         return None
@@ -110,7 +110,7 @@ class SurviveTracker:
         """Lines that were broken by reason, clock_steps, gone, others."""
         return dict(self._device.counts)
 
-    def gauges(self) -> Mapping[str, float]:
+    def metrics(self) -> Mapping[str, float]:
         """Nothing."""
         return {}
 
@@ -130,9 +130,9 @@ class SurviveTracker:
 
     def _lost(self, now_ns: int) -> TrackerPose:
         """A pose of NaN: of a time between the last pose and any that may still be on its way."""
-        self._heard_ns = now_ns
-        if now_ns - self._said_ns >= LOG_EVERY_NS:
-            self._said_ns = now_ns
+        self._received_ns = now_ns
+        if now_ns - self._logged_ns >= LOG_EVERY_NS:
+            self._logged_ns = now_ns
             wanted = "any device" if self._wanted is None else self._wanted
             _LOG.warning("%s: no pose of %s; there is %s", self._program, wanted, self._device.there())
         t_ns = now_ns - SILENT_NS // 2

@@ -63,8 +63,8 @@ class SurviveDevice:
         self._seq += 1
         self._last_ns = t_ns
         place = np.full(3, np.nan) if pose is None else np.array(pose.position_m)
-        turn = np.full(4, np.nan) if pose is None else np.array(pose.orientation_wxyz)
-        return TrackerPose(self._name, 0, self._seq, t_ns, place, turn)
+        quaternion = np.full(4, np.nan) if pose is None else np.array(pose.orientation_wxyz)
+        return TrackerPose(self._name, 0, self._seq, t_ns, place, quaternion)
 
     @property
     def last_ns(self) -> int | None:

@@ -55,7 +55,7 @@ class Fault(Enum):
     OVERRUN = "a line without end"
     LENGTH = "not seven numbers"
     NUMBER = "not a number"
-    TURN = "quaternion not of length 1"
+    QUATERNION = "quaternion not of length 1"
     PLACE = "farther than any base station reaches"
 
 
@@ -112,11 +112,11 @@ def _pose(device: str, stamp: bytes, rest: bytes) -> Pose | Fault:
         return Fault.NUMBER
     if any(math.isnan(value) for value in values):  # it writes them when its solver fails
         values = [math.nan] * _SIZE
-    x, y, z, *turn = values
-    place, (qw, qx, qy, qz) = (x, y, z), turn
-    length = math.hypot(*turn)
+    x, y, z, *quaternion = values
+    place, (qw, qx, qy, qz) = (x, y, z), quaternion
+    length = math.hypot(*quaternion)
     if abs(length - 1.0) > UNIT_WITHIN:
-        return Fault.TURN
+        return Fault.QUATERNION
     if math.hypot(*place) > FARTHEST_M:
         return Fault.PLACE
     return Pose(device, t_s, place, (qw / length, qx / length, qy / length, qz / length))

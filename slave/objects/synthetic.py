@@ -45,11 +45,11 @@ class SyntheticTracker:
         t_ns = self._measured_ns(seq)
         pose = self._tracker.pose((self._clock.to_true(t_ns) - self._epoch_ns) * 1e-9)
         place = np.full(3, np.nan) if pose is None else pose[:3, 3]
-        turn = np.full(4, np.nan) if pose is None else matrix_to_quaternion(pose[:3, :3])
+        quaternion = np.full(4, np.nan) if pose is None else matrix_to_quaternion(pose[:3, :3])
         while not (self._closed or self._stop.is_set()):
             if (left_ns := t_ns - self._clock.now_ns()) <= 0:
                 self._next, self._started = seq + 1, True
-                return TrackerPose(self._name, 0, seq, t_ns, place, turn)
+                return TrackerPose(self._name, 0, seq, t_ns, place, quaternion)
             self._stop.wait(left_ns * 1e-9)
         return None
 

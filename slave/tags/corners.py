@@ -180,9 +180,9 @@ def _edges(sides: _Sides) -> _Lines:
     for _ in range(STEPS):
         jacobian, model = _law(p, sides)
         residual = (seen - model).reshape(s, -1)
-        turned = jacobian.transpose(0, 2, 1)
-        normal = turned @ jacobian + RIDGE
-        step = np.linalg.solve(normal, turned @ residual[..., None])[..., 0]
+        transposed = jacobian.transpose(0, 2, 1)
+        normal = transposed @ jacobian + RIDGE
+        step = np.linalg.solve(normal, transposed @ residual[..., None])[..., 0]
         p += np.clip(step, -LARGEST_STEP, LARGEST_STEP)
         p[:, 2:4] = np.clip(p[:, 2:4], -reach[:, None], reach[:, None])
         p[:, 4] = np.clip(p[:, 4], -0.8, 0.8)

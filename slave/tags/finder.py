@@ -90,7 +90,7 @@ class TagFinder:
         self._lens = None if camera.intrinsics is None else CameraModel.of(camera, np.eye(4))
         self._codes = codes_of(objects)
         self._tracks: dict[int, _Track] = {}
-        self._turn = -1  # which part is next; negative before the first frame
+        self._cycle = -1  # which part is next; negative before the first frame
         self._idle = 0
 
     @property
@@ -124,11 +124,11 @@ class TagFinder:
         sought = (self._near(tracks, found, t_ns) if lost or not self._idle else []) + part
         for box in sought:
             self._search(grey[box[1] : box[3], box[0] : box[2]], grey, box, 1, found)
-        if self._turn == len(PARTS) or self._turn < 0:
+        if self._cycle == len(PARTS) or self._cycle < 0:
             half = np.asarray(cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
             self._search(half, grey, (0, 0, 0, 0), 2, found)
-        if self._turn < 0:
-            self._turn = 0
+        if self._cycle < 0:
+            self._cycle = 0
         self._tracks = {n: _advanced(tracks.get(n), uv, t_ns) for n, (uv, _) in found.items()} | {
             n: track for n, track in tracks.items() if n not in found
         }
@@ -155,7 +155,7 @@ class TagFinder:
         corners = refine(grey, begun, codes.cells, self._lens, codes.inner[rows])
         read = codes.read(grey, corners)
         for k, row in enumerate(rows):
-            right = read.which[k] == row and read.turn[k] == 0 and read.fit[k] >= codes.expected
+            right = read.which[k] == row and read.quarter_turns[k] == 0 and read.fit[k] >= codes.expected
             if right and math.isfinite(corners.sigma_px[k]):
                 found[int(codes.ids[row])] = corners.uv[k], float(corners.sigma_px[k])
 
@@ -176,7 +176,7 @@ class TagFinder:
             sure = np.flatnonzero(read.fit >= codes.sure)
             if not len(sure):
                 continue
-            printed = np.array([np.roll(rough.uv[k], -read.turn[k], axis=0) for k in sure])
+            printed = np.array([np.roll(rough.uv[k], -read.quarter_turns[k], axis=0) for k in sure])
             final = refine(grey, printed, codes.cells, self._lens, codes.inner[read.which[sure]])
             fits = read.fit[sure]
             for k in np.argsort(-fits, kind="stable"):
@@ -207,16 +207,16 @@ class TagFinder:
     def _part(self, seen: bool) -> list[Box]:
         """The part of the image that is searched in this frame, if any."""
         height, width = self._size
-        if self._turn < 0:
+        if self._cycle < 0:
             return [(0, 0, width, height)]
         self._idle = (self._idle + 1) % IDLE
         if seen and self._idle:
-            self._turn = self._turn % len(PARTS)
+            self._cycle = self._cycle % len(PARTS)
             return []
-        self._turn = (self._turn + 1) % (len(PARTS) + 1)
-        if self._turn == len(PARTS):
+        self._cycle = (self._cycle + 1) % (len(PARTS) + 1)
+        if self._cycle == len(PARTS):
             return []
-        x, y = PARTS[self._turn]
+        x, y = PARTS[self._cycle]
         left, top = int(x * width), int(y * height)
         return [(left, top, left + math.ceil(PART * width), top + math.ceil(PART * height))]
 

@@ -15,7 +15,7 @@ PROBES = np.array([0.2, 0.35, 0.5, 0.65, 0.8])  # of a side
 PROBE_PX = 2.0  # from the edge
 BRIGHTER = 12.0  # bytes, outside
 AGREEING = 0.8  # share of the probes
-GROWN_PX = 0.7
+MARGIN_PX = 0.7
 MOST = 16  # quads of one search that are looked at, the largest
 
 
@@ -37,22 +37,22 @@ def quads(grey: Image) -> Float:
     found.sort(key=lambda quad: -quad[0])
     if not found:
         return np.zeros((0, 4, 2))
-    return _grown(_dark_inside(grey, _clockwise(np.array([corners for _, corners in found])))[:MOST])
+    return _with_margin(_dark_inside(grey, _clockwise(np.array([corners for _, corners in found])))[:MOST])
 
 
-def _grown(corners: Float) -> Float:
+def _with_margin(corners: Float) -> Float:
     """The same with their sides moved outward: an outline runs through the middles of the outermost dark pixels."""
     along = np.roll(corners, -1, axis=1) - corners
     along /= np.linalg.norm(along, axis=-1, keepdims=True)
     before = np.roll(along, 1, axis=1)
     sine = before[..., 0] * along[..., 1] - before[..., 1] * along[..., 0]
-    return corners + GROWN_PX * (before - along) / np.maximum(sine, 0.3)[..., None]
+    return corners + MARGIN_PX * (before - along) / np.maximum(sine, 0.3)[..., None]
 
 
 def _clockwise(corners: Float) -> Float:
     x, y = corners[..., 0], corners[..., 1]
-    turned = (x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y).sum(axis=1) < 0.0
-    return np.where(turned[:, None, None], corners[:, ::-1], corners)
+    upright = (x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y).sum(axis=1) < 0.0
+    return np.where(upright[:, None, None], corners[:, ::-1], corners)
 
 
 def _dark_inside(grey: Image, corners: Float) -> Float:

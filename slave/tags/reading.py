@@ -30,12 +30,12 @@ class Read:
 
     Attributes:
         which: (N,) index of the tag that fits best.
-        turn: (N,) which of the quad's corners is the first of the print.
+        quarter_turns: (N,) which of the quad's corners is the first of the print.
         fit: (N,) correlation -1..1; NaN: the border is not black.
     """
 
     which: Int
-    turn: Int
+    quarter_turns: Int
     fit: Float
 
 
@@ -61,7 +61,9 @@ class Codes:
         self.cells = code + 2
         whole = np.array([np.pad(tag_bits(family, int(number)), 1) for number in self.ids], np.float64)
         # A quad that begins with corner t of the print shows the print turned t times anticlockwise.
-        self._patterns = np.stack([np.rot90(whole, turn, axes=(1, 2)) for turn in range(4)], axis=1)
+        self._patterns = np.stack(
+            [np.rot90(whole, quarter_turns, axes=(1, 2)) for quarter_turns in range(4)], axis=1
+        )
         self.inner = np.stack([whole[:, 1], whole[:, :, -2], whole[:, -2, ::-1], whole[:, ::-1, 1]], axis=1)
         self.sure, self.expected = SURE[code], EXPECTED[code]
 

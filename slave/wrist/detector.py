@@ -13,16 +13,16 @@ from common.arrays import Float
 from common.messages import WristDetections
 from slave.cameras.source import Frame
 from slave.wrist.background import lit, lit_line
-from slave.wrist.corridors import corridors_of
 from slave.wrist.engine import NUMPY, Engine
 from slave.wrist.fingers import separate
 from slave.wrist.fingertips import NO_TIPS, Fingertips, fingertips
 from slave.wrist.laser import LaserLines, laser_lines
-from slave.wrist.palm_turn import prepare
+from slave.wrist.palm_pose import prepare
 from slave.wrist.postures import postures_of
-from slave.wrist.reach import reach_of
-from slave.wrist.strobe import Strobe, Triple
+from slave.wrist.search_bands import search_bands_of
+from slave.wrist.strobe import Strobe, StrobeCycle
 from slave.wrist.view import WristView
+from slave.wrist.workspace import workspace_of
 
 RECENT = 4  # triples
 
@@ -32,32 +32,32 @@ class WristFound:
     """What was found in one strobed triple.
 
     Attributes:
-        triple: The frames.
+        cycle: The frames.
         laser: Where the laser meets each finger.
         tips: Fingertips.
     """
 
-    triple: Triple
+    cycle: StrobeCycle
     laser: LaserLines
     tips: Fingertips
 
     def message(self, camera: str, session: int) -> WristDetections:
         """What the camera called `camera` of process `session` sends of it."""
-        triple = self.triple
+        cycle = self.cycle
         return WristDetections(
             camera,
             session,
-            triple.laser.seq,
-            triple.laser.t_ns,
-            max(frame.ready_t_ns for frame in (triple.ambient, triple.laser, triple.led)),
+            cycle.laser.seq,
+            cycle.laser.t_ns,
+            max(frame.ready_t_ns for frame in (cycle.ambient, cycle.laser, cycle.led)),
             self.laser.uv,
             self.laser.sigma_px,
             self.laser.length_px,
             self.tips.uv,
             self.tips.sigma_px,
             self.tips.depth,
-            triple.laser.t_sigma_ns,
-            triple.laser.exposure_us,
+            cycle.laser.t_sigma_ns,
+            cycle.laser.exposure_us,
         )
 
 
@@ -88,11 +88,11 @@ class WristDetector:
 
     def push(self, frame: Frame) -> WristFound | None:
         """Take the next frame of the camera; what was found, where it completes a triple."""
-        triple = self._strobe.push(frame)
-        if triple is None:
+        cycle = self._strobe.push(frame)
+        if cycle is None:
             return None
-        found = find(triple, self._view, self._engine)
-        self._found.append((triple.led.t_ns, found.laser.uv, found.tips.uv))
+        found = find(cycle, self._view, self._engine)
+        self._found.append((cycle.led.t_ns, found.laser.uv, found.tips.uv))
         return found
 
     def found(self, t_ns: int) -> tuple[Float, Float] | None:
@@ -113,22 +113,22 @@ def prepared(view: WristView, engine: Engine = NUMPY) -> WristView:
     A triple in which all is dark goes through the whole line, so that the first real one takes no longer than others.
     """
     postures_of(view)
-    for turned in prepare(view):
-        corridors_of(turned)
-        reach_of(turned)
+    for rotated_view in prepare(view):
+        search_bands_of(rotated_view)
+        workspace_of(rotated_view)
     dark = Frame(0, 0, 0, np.zeros((view.optics.height_px, view.optics.width_px), np.uint8))
-    find(Triple(dark, dark, dark), view, engine)
+    find(StrobeCycle(dark, dark, dark), view, engine)
     return view
 
 
-def find(triple: Triple, view: WristView, engine: Engine = NUMPY) -> WristFound:
+def find(cycle: StrobeCycle, view: WristView, engine: Engine = NUMPY) -> WristFound:
     """What one triple shows of the five fingers."""
-    ambient = triple.ambient.image
-    led = lit(triple.led.image, ambient)
+    ambient = cycle.ambient.image
+    led = lit(cycle.led.image, ambient)
     fingers = separate(led, view, engine)
-    laser = laser_lines(lit_line(triple.laser.image, ambient), fingers, view, engine)
+    laser = laser_lines(lit_line(cycle.laser.image, ambient), fingers, view, engine)
     # A bent wrist turns fingers before the camera in ways that no posture of the tables has.
     tips = NO_TIPS
-    if fingers.turn.straight:
-        tips = fingertips(led, triple.led.image, laser.uv, view, engine.candidates)
-    return WristFound(triple, laser, tips)
+    if fingers.palm_pose.straight:
+        tips = fingertips(led, cycle.led.image, laser.uv, view, engine.candidates)
+    return WristFound(cycle, laser, tips)

@@ -6,17 +6,17 @@ from typing import TypeAlias
 
 from common.arrays import Bool, Image, Int
 from slave.engines import engine_of
-from slave.wrist.corridors import Float32
+from slave.wrist.finger_lines import FingerLines, measure
 from slave.wrist.fingertips import Search, candidates
-from slave.wrist.paths import least_paths
-from slave.wrist.pieces import Pieces, measure
 from slave.wrist.runs import Runs, lines
+from slave.wrist.seams import minimum_cost_paths
+from slave.wrist.search_bands import Float32
 from slave.wrist.valleys import energy
 
 Energy: TypeAlias = Callable[[Image, int], Float32]
-LeastPaths: TypeAlias = Callable[[Float32, tuple[int, ...]], Int]
+MinimumCostPaths: TypeAlias = Callable[[Float32, tuple[int, ...]], Int]
 Lines: TypeAlias = Callable[[Image, int], tuple[Runs, Bool]]
-Measure: TypeAlias = Callable[[Runs, Int, int], Pieces]
+Measure: TypeAlias = Callable[[Runs, Int, int], FingerLines]
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,20 +25,20 @@ class Engine:
 
     Attributes:
         energy: Straightened corridors, and how many circles the thumb crosses -> energy (`valleys.energy`).
-        least_paths: As `paths.least_paths`.
+        minimum_cost_paths: As `seams.minimum_cost_paths`.
         lines: As `runs.lines`.
-        measure: As `pieces.measure`.
+        measure: As `finger_lines.measure`.
         candidates: As `fingertips.candidates`.
     """
 
     energy: Energy
-    least_paths: LeastPaths
+    minimum_cost_paths: MinimumCostPaths
     lines: Lines
     measure: Measure
     candidates: Search
 
 
-NUMPY = Engine(energy, least_paths, lines, measure, candidates)
+NUMPY = Engine(energy, minimum_cost_paths, lines, measure, candidates)
 
 
 def engine_named(name: str) -> Engine:

@@ -9,62 +9,62 @@ import numpy as np
 
 from common.arrays import Image, Int
 from slave.markers.fast_compile import compiled
-from slave.wrist import fast_tips, paths, valleys
-from slave.wrist.corridors import MARGIN, Float32
+from slave.wrist import fast_tips, seams, valleys
 from slave.wrist.engine import Engine
 from slave.wrist.fast_lines import lines, measure
+from slave.wrist.search_bands import MARGIN, Float32
 
 
-def least_paths(energy: Float32, widths: tuple[int, ...]) -> Int:
-    """As `paths.least_paths`; of paths of one energy it may take another."""
+def minimum_cost_paths(energy: Float32, widths: tuple[int, ...]) -> Int:
+    """As `seams.minimum_cost_paths`; of paths of one energy it may take another."""
     out = np.empty((len(widths), len(energy)), dtype=np.int64)
-    _least_paths(np.ascontiguousarray(energy), np.array(widths), paths.TURN, out)
+    _minimum_cost_paths(np.ascontiguousarray(energy), np.array(widths), seams.STEP_COST, out)
     return out
 
 
 @compiled
-def _least_paths(energy: Float32, widths: Int, turn: np.float32, out: Int) -> None:
+def _minimum_cost_paths(energy: Float32, widths: Int, step_cost: np.float32, out: Int) -> None:
     stations = len(energy)
     begin = 0
-    for corridor in range(len(widths)):
-        width = widths[corridor]
+    for band in range(len(widths)):
+        width = widths[band]
         cost = energy[:, begin : begin + width].copy()
         for s in range(1, stations):
             before, here = cost[s - 1], cost[s]
             for k in range(2, width - 2):
-                near = min(before[k - 1], before[k + 1]) + turn
-                far = min(before[k - 2], before[k + 2]) + turn + turn
+                near = min(before[k - 1], before[k + 1]) + step_cost
+                far = min(before[k - 2], before[k + 2]) + step_cost + step_cost
                 here[k] += min(before[k], min(near, far))
         k = 2
         for j in range(2, width - 2):
             if cost[stations - 1, j] < cost[stations - 1, k]:
                 k = j
-        out[corridor, stations - 1] = k
+        out[band, stations - 1] = k
         for s in range(stations - 2, -1, -1):
             best, to = cost[s, k], k
             for aside in (-1, 1, -2, 2):
-                other = cost[s, k + aside] + abs(aside) * turn
+                other = cost[s, k + aside] + abs(aside) * step_cost
                 if other < best:
                     best, to = other, k + aside
             k = to
-            out[corridor, s] = k
+            out[band, s] = k
         begin += width
 
 
-def energy(strips: Image, crossed: int) -> Float32:
+def energy(straightened: Image, crossed: int) -> Float32:
     """As `valleys.energy`."""
-    before = np.asarray(cv2.dilate(strips, valleys.BESIDE, anchor=(MARGIN - 1, 0)), np.uint8)
-    behind = np.asarray(cv2.dilate(strips, valleys.BESIDE, anchor=(0, 0)), np.uint8)
-    around = np.asarray(cv2.dilate(strips, valleys.AROUND), np.uint8)
-    out = np.empty(strips.shape, dtype=np.float32)
-    limits = (valleys.DARK, valleys.SKIN, valleys.OPEN, valleys.BEYOND_THUMB)
-    _energy(strips, before, behind, around, valleys.PRIOR, valleys.STARTS[3], crossed, limits, out)
+    before = np.asarray(cv2.dilate(straightened, valleys.SIDE_KERNEL, anchor=(MARGIN - 1, 0)), np.uint8)
+    behind = np.asarray(cv2.dilate(straightened, valleys.SIDE_KERNEL, anchor=(0, 0)), np.uint8)
+    around = np.asarray(cv2.dilate(straightened, valleys.AROUND), np.uint8)
+    out = np.empty(straightened.shape, dtype=np.float32)
+    limits = (valleys.DARK, valleys.SURFACE, valleys.OPEN, valleys.BEYOND_THUMB)
+    _energy(straightened, before, behind, around, valleys.PRIOR, valleys.STARTS[3], crossed, limits, out)
     return out
 
 
 @compiled
 def _energy(
-    strips: Image,
+    straightened: Image,
     before: Image,
     behind: Image,
     around: Image,
@@ -74,13 +74,13 @@ def _energy(
     limits: tuple[float, float, float, float],
     out: Float32,
 ) -> None:
-    dark, skin = np.float32(limits[0]), np.float32(limits[1])
+    dark, surface = np.float32(limits[0]), np.float32(limits[1])
     open_, beyond_thumb = np.float32(limits[2]), np.float32(limits[3])
-    stations, width = strips.shape
+    stations, width = straightened.shape
     for s in range(stations):
         for k in range(width):
             of_thumb = k >= thumb
-            level = np.float32(strips[s, k])
+            level = np.float32(straightened[s, k])
             side = np.float32(behind[s, k] if of_thumb else min(before[s, k], behind[s, k]))
             if side <= dark and not (of_thumb and s < crossed):
                 found = beyond_thumb if of_thumb else open_
@@ -88,7 +88,7 @@ def _energy(
                 above = np.float32(1.0) - max(side - level, np.float32(0.0)) / (side + dark)
                 share = max(above, level / (np.float32(around[s, k]) + dark))
                 cube = share * share * share
-                found = skin * cube * cube
+                found = surface * cube * cube
             out[s, k] = found + prior[k]
 
 
@@ -101,9 +101,9 @@ def prepare() -> None:
     drawn[40:43, 100:400] = 200
     runs, _ = lines(drawn, 0)
     measure(runs, np.zeros(len(runs.column), np.int64), drawn.shape[1])
-    strips = np.zeros((2, len(valleys.PRIOR)), np.uint8)
-    least_paths(energy(strips, 0), (len(valleys.PRIOR),))
+    straightened = np.zeros((2, len(valleys.PRIOR)), np.uint8)
+    minimum_cost_paths(energy(straightened, 0), (len(valleys.PRIOR),))
     fast_tips.prepare()
 
 
-NUMBA = Engine(energy, least_paths, lines, measure, fast_tips.candidates)
+NUMBA = Engine(energy, minimum_cost_paths, lines, measure, fast_tips.candidates)

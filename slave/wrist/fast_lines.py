@@ -1,6 +1,6 @@
 """The laser line as machine code by numba: its runs, how they link up, and the pieces of each finger's.
 
-What it makes is what `runs` and `pieces` make, but for sums added up in another order.
+What it makes is what `runs` and `finger_lines` make, but for sums added up in another order.
 """
 
 import math
@@ -9,8 +9,8 @@ import numpy as np
 
 from common.arrays import Bool, Float, Image, Int
 from slave.markers.fast_compile import compiled
-from slave.wrist import pieces, runs
-from slave.wrist.pieces import Pieces
+from slave.wrist import finger_lines, runs
+from slave.wrist.finger_lines import FingerLines
 from slave.wrist.runs import NO_RUNS, Runs
 
 
@@ -129,13 +129,13 @@ def _link(whole: Int, parts: Float, jump: float, order: Int, line: Int, joins: I
     return number
 
 
-def measure(runs_: Runs, finger: Int, width_px: int) -> Pieces:
-    """As `pieces.measure`."""
+def measure(runs_: Runs, finger: Int, width_px: int) -> FingerLines:
+    """As `finger_lines.measure`."""
     out = np.zeros((6, 5))
-    limits = (pieces.STEEPEST, pieces.LONG, width_px)
+    limits = (finger_lines.STEEPEST, finger_lines.LONG, width_px)
     _measure(runs_.column, runs_.row, runs_.peak, runs_.first, finger, limits, out)
     line, u, v, apart, cut, brightest = out
-    return Pieces(line, np.stack([u, v], axis=-1), apart, cut > 0.0, brightest)
+    return FingerLines(line, np.stack([u, v], axis=-1), apart, cut > 0.0, brightest)
 
 
 @compiled
@@ -204,11 +204,11 @@ def _part(
         if k < left or k == right:  # beyond the last run
             end, aside = (left, 1) if k < left else (right, -1)
             at = end + inner * aside
-            bend = 0.0
+            steepness = 0.0
             if inner:
-                bend = (row[end + limits[1] * aside] - row[at]) / (math.sqrt(5.5) - math.sqrt(2.5))
-                bend = min(max(bend, 0.0), limits[0])
-            u, v = column[end] - 0.5 * aside, row[at] - bend * math.sqrt(2.5)
+                steepness = (row[end + limits[1] * aside] - row[at]) / (math.sqrt(5.5) - math.sqrt(2.5))
+                steepness = min(max(steepness, 0.0), limits[0])
+            u, v = column[end] - 0.5 * aside, row[at] - steepness * math.sqrt(2.5)
             du, dv = u - column[at], v - row[at]
             u, v = (u + column[at]) / 2.0, (v + row[at]) / 2.0
         else:
@@ -216,7 +216,7 @@ def _part(
                 continue
             du, dv = 1.0, row[k + 1] - row[k]
             u, v = column[k] + 0.5, (row[k] + row[k + 1]) / 2.0
-        piece = math.hypot(du, dv)
-        out[0, of] += piece
-        out[1, of] += piece * u
-        out[2, of] += piece * v
+        segment = math.hypot(du, dv)
+        out[0, of] += segment
+        out[1, of] += segment * u
+        out[2, of] += segment * v

@@ -244,21 +244,21 @@ def _postures(
 ) -> int:
     """Postures of index ... little that meet the laser where it is seen and are as bright as they should be."""
     length = table.laser.shape[3]
-    off, share, beside, known = np.empty(length), np.empty(length), np.empty(length), np.empty(length)
-    sure, usual, per_m = limits.aside_m**-2, limits.abduction_sigma**-2, 1.0 / limits.aside_m
+    off, share, lateral, known = np.empty(length), np.empty(length), np.empty(length), np.empty(length)
+    sure, typical, per_m = limits.aside_m**-2, limits.abduction_sigma**-2, 1.0 / limits.aside_m
     least = np.inf
     laser = table.laser[:, :, finger - 1]
     for k in range(length):
         x1, x2 = laser[1, 0, k], laser[2, 0, k]
         x, z = plane[finger, 0] - laser[0, 0, k], plane[finger, 1] - laser[0, 1, k]
-        known[k] = x1 * x1 * sure + usual
+        known[k] = x1 * x1 * sure + typical
         to = x1 * sure / known[k]
         by = x * to
         by = (x - x2 * by * by) * to
         share[k] = by
-        beside[k] = (x - by * (x1 + by * x2)) * per_m
+        lateral[k] = (x - by * (x1 + by * x2)) * per_m
         off[k] = np.inf
-        if abs(by) < limits.most_abduction and abs(beside[k]) < limits.most_aside:
+        if abs(by) < limits.most_abduction and abs(lateral[k]) < limits.most_aside:
             off[k] = abs(by * (laser[1, 1, k] + by * laser[2, 1, k]) - z)
             if off[k] < least:
                 least = off[k]
@@ -273,9 +273,9 @@ def _postures(
         cost = (
             ((off[k] - least) / limits.sigma_m) ** 2
             + (share[k] / limits.abduction_sigma) ** 2
-            + beside[k] ** 2
+            + lateral[k] ** 2
         )
-        aside = beside[k] * limits.aside_m
+        aside = lateral[k] * limits.aside_m
         count = _take(image, gain, table, limits, first + k, share[k], aside, cost, found, count)
         spread = limits.variant / math.sqrt(known[k])
         if spread > limits.variant * limits.unsure:
@@ -429,8 +429,8 @@ def _open(
             u, v = u - end_u, v - end_v
             least = limits.side * math.hypot(u, v)
             for way in range(len(out)):
-                turn = way * (2.0 * math.pi / len(out))
-                if math.cos(turn) * u + math.sin(turn) * v > least:
+                angle = way * (2.0 * math.pi / len(out))
+                if math.cos(angle) * u + math.sin(angle) * v > least:
                     out[way] = 0.0
 
 
@@ -569,9 +569,9 @@ def _ends(found: _Found, count: int, table: Postures, limits: _Limits, circle: F
         row = int(found.row[k])
         size = table.end[row, 0]
         u, v = (x - found.at[k, 0]) / radius, (y - found.at[k, 1]) / radius
-        turned = _turned(found, k, table, limits, u, v, sure)
-        u = (found.at[k, 2] - found.at[k, 0]) / size + turned[0]
-        v = (found.at[k, 3] - found.at[k, 1]) / size + turned[1]
+        rotated = _rotated(found, k, table, limits, u, v, sure)
+        u = (found.at[k, 2] - found.at[k, 0]) / size + rotated[0]
+        v = (found.at[k, 3] - found.at[k, 1]) / size + rotated[1]
         total += weight
         out[0] += weight * u
         out[1] += weight * v
@@ -583,10 +583,10 @@ def _ends(found: _Found, count: int, table: Postures, limits: _Limits, circle: F
 
 
 @compiled
-def _turned(
+def _rotated(
     found: _Found, k: int, table: Postures, limits: _Limits, u: float, v: float, sure: float
 ) -> tuple[float, float]:
-    """As `fingertips._turned`, of one hypothesis."""
+    """As `fingertips._rotated`, of one hypothesis."""
     row, by = int(found.row[k]), found.abduction[k]
     size, uv, twist = table.end[row, 0], table.uv[row], table.twist[row]
     end, apex = limits.end, limits.apex

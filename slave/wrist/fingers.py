@@ -1,7 +1,7 @@
 """Which finger a pixel of the LED image belongs to: seams between neighbouring fingers, which never cross (D4).
 
-How the palm lies in the image is calibrated, and seen where the wrist is bent (`slave.wrist.palm_turn`), so what the
-fingers of this hand can do says in which corridor each of the four seams runs (`slave.wrist.corridors`). Along the
+How the palm lies in the image is calibrated, and seen where the wrist is bent (`slave.wrist.palm_pose`), so what the
+fingers of this hand can do says in which corridor each of the four seams runs (`slave.wrist.search_bands`). Along the
 stations of a corridor a seam is the path of least energy, found by dynamic programming: first the three among index
 ... little, side by side, then the thumb's, which lies over them where they meet. A pixel costs little where it is a
 valley, dark between brighter neighbours: a crease between touching fingers as well as the open gap between spread
@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 
 from common.arrays import Float, Image, Int
-from slave.wrist.corridors import STATION_PX, Corridors, Float32, corridors_of
 from slave.wrist.engine import NUMPY, Engine
-from slave.wrist.palm_turn import PalmTurn, palm_turn
-from slave.wrist.pieces import NONE
+from slave.wrist.finger_lines import NONE
+from slave.wrist.palm_pose import PalmPose, find_palm_pose
+from slave.wrist.search_bands import STATION_PX, Float32, SearchBands, search_bands_of
 from slave.wrist.valleys import DARK, STARTS, WIDTHS
 from slave.wrist.view import WristView
 
@@ -36,74 +36,78 @@ class Fingers:
     """Five regions of the image: thumb, index ... little.
 
     Attributes:
-        corridors: Where the seams were searched.
+        search_bands: Where the seams were searched.
         seams: (4, S) index|middle, middle|ring, ring|little [px, along the row of each station], and the thumb's
             [rad, along the circle of each station].
         shown: Whether the LED image showed a hand; else the seams are those of geometry alone.
-        turn: How the palm lies.
+        palm_pose: How the palm lies.
     """
 
-    corridors: Corridors
+    search_bands: SearchBands
     seams: Float
     shown: bool
-    turn: PalmTurn
+    palm_pose: PalmPose
 
     def finger_of(self, uv: Float) -> Int:
         """Finger (N,), 0 thumb ... 4 little, of pixels (N, 2); -1 where the pixel is NaN."""
-        corridors = self.corridors
-        radius, angle = corridors.polar(uv)
+        search_bands = self.search_bands
+        radius, angle = search_bands.polar(uv)
         steps: Float = STATION_PX * np.arange(self.seams.shape[1], dtype=np.float64)
         finger: Int = np.ones(len(uv), dtype=np.int64)
-        across: list[Float] = [np.interp(uv[:, 1], corridors.row + steps, seam) for seam in self.seams[:3]]
+        across: list[Float] = [np.interp(uv[:, 1], search_bands.row + steps, seam) for seam in self.seams[:3]]
         for seam in across:
-            finger += corridors.thumb_side * (seam - uv[:, 0]) > 0.0
-        finger[angle > np.interp(radius, corridors.radius + steps, self.seams[3])] = 0
+            finger += search_bands.thumb_side * (seam - uv[:, 0]) > 0.0
+        finger[angle > np.interp(radius, search_bands.radius + steps, self.seams[3])] = 0
         finger[np.isnan(radius)] = NONE
         return finger
 
     def polylines(self) -> list[Float]:
         """The four seams as pixels (S, 2), for pictures."""
-        return [self.corridors.pixels(seam, self.seams[seam]) for seam in range(4)]
+        return [self.search_bands.pixels(seam, self.seams[seam]) for seam in range(4)]
 
 
 def separate(led: Image, view: WristView, engine: Engine = NUMPY) -> Fingers:
     """Find the seams in the difference of LED and ambient frame."""
-    turn = palm_turn(led, view)
-    corridors = corridors_of(turn.view)
+    palm_pose = find_palm_pose(led, view)
+    search_bands = search_bands_of(palm_pose.view)
     dark = cv2.erode(led, _CREASE)
-    palm = dark[corridors.palm[:, 1], corridors.palm[:, 0]] if len(corridors.palm) else dark
+    palm = dark[search_bands.palm[:, 1], search_bands.palm[:, 0]] if len(search_bands.palm) else dark
     shown = bool(2 * np.count_nonzero(palm > _SHOWN) > palm.size)
-    strips = cast(
+    straightened = cast(
         Image,
-        cv2.remap(dark, corridors.map_x, corridors.map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
+        cv2.remap(
+            dark, search_bands.map_x, search_bands.map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        ),
     )
-    energy = engine.energy(strips, corridors.thumb_crosses)
-    energy[:, : STARTS[3]] *= corridors.weight
-    paths = engine.least_paths(energy, WIDTHS)
-    _part(paths[:3], strips, energy, corridors, engine)
-    seams = corridors.across(slice(0, 4), paths)
+    energy = engine.energy(straightened, search_bands.thumb_crosses)
+    energy[:, : STARTS[3]] *= search_bands.weight
+    paths = engine.minimum_cost_paths(energy, WIDTHS)
+    _part(paths[:3], straightened, energy, search_bands, engine)
+    seams = search_bands.across(slice(0, 4), paths)
     # Towards the little finger, each seam stays on its own side of the one before it.
-    order = corridors.thumb_side
+    order = search_bands.thumb_side
     np.minimum.accumulate(order * seams[:3], axis=0, out=seams[:3])
     seams[:3] *= order
-    taken = _in_thumbs(corridors, seams[:3])
+    taken = _in_thumbs(search_bands, seams[:3])
     if (np.abs(paths[3] - taken) < _VALLEY).any():  # else it would pay nothing for what is taken
         thumb = energy[:, STARTS[3] :]
         thumb += _TAKEN * (np.abs(np.arange(WIDTHS[3]) - taken[..., None]) < _VALLEY).any(axis=0)
-        seams[3:] = corridors.across(slice(3, 4), engine.least_paths(thumb, WIDTHS[3:]))
-    return Fingers(corridors, seams, shown, turn)
+        seams[3:] = search_bands.across(slice(3, 4), engine.minimum_cost_paths(thumb, WIDTHS[3:]))
+    return Fingers(search_bands, seams, shown, palm_pose)
 
 
-def _part(paths: Int, strips: Image, energy: Float32, corridors: Corridors, engine: Engine) -> None:
+def _part(
+    paths: Int, straightened: Image, energy: Float32, search_bands: SearchBands, engine: Engine
+) -> None:
     """Where a seam and the next one lie in one valley, send the one that is farther out of its corridor to another.
 
     `paths` (3, S) and `energy` are changed.
     """
-    lit = strips[:, : STARTS[3]].max(axis=1) > DARK
-    near = _ONE_VALLEY * np.abs(np.diff(corridors.middle[:3], axis=0))
+    lit = straightened[:, : STARTS[3]].max(axis=1) > DARK
+    near = _ONE_VALLEY * np.abs(np.diff(search_bands.middle[:3], axis=0))
     most = _ONE_VALLEY * np.count_nonzero(lit)
     for seam in range(2):
-        across = corridors.across(slice(0, 3), paths)
+        across = search_bands.across(slice(0, 3), paths)
         same = (np.abs(np.diff(across, axis=0)) < near) & lit
         if not (same.sum(axis=1) >= most)[seam:].any():
             return
@@ -113,19 +117,19 @@ def _part(paths: Int, strips: Image, energy: Float32, corridors: Corridors, engi
         loser = seam + int(off[1] > off[0])
         winner = 2 * seam + 1 - loser
         start = STARTS[loser]
-        strip = energy[:, start : start + WIDTHS[loser]]
-        at = corridors.sample(loser, across[winner])
-        strip += _TAKEN * (np.abs(np.arange(WIDTHS[loser]) - at[:, None]) < _VALLEY)
-        paths[loser] = engine.least_paths(strip, WIDTHS[loser : loser + 1])[0]
+        band_energy = energy[:, start : start + WIDTHS[loser]]
+        at = search_bands.sample(loser, across[winner])
+        band_energy += _TAKEN * (np.abs(np.arange(WIDTHS[loser]) - at[:, None]) < _VALLEY)
+        paths[loser] = engine.minimum_cost_paths(band_energy, WIDTHS[loser : loser + 1])[0]
 
 
-def _in_thumbs(corridors: Corridors, seams: Float) -> Float:
+def _in_thumbs(search_bands: SearchBands, seams: Float) -> Float:
     """Which sample (3, S) of the thumb's corridor each of three seams (3, S) crosses at every circle."""
     count = seams.shape[1]
     steps = STATION_PX * np.arange(count, dtype=np.float64)
-    rows = np.broadcast_to(corridors.row + steps, seams.shape)
-    radius, angle = corridors.polar(np.stack([seams.ravel(), rows.ravel()], axis=-1))
+    rows = np.broadcast_to(search_bands.row + steps, seams.shape)
+    radius, angle = search_bands.polar(np.stack([seams.ravel(), rows.ravel()], axis=-1))
     upward = radius.reshape(seams.shape)[:, ::-1], angle.reshape(seams.shape)[:, ::-1]
-    circles = corridors.radius + steps
+    circles = search_bands.radius + steps
     on_circles: list[Float] = [np.interp(circles, r, a) for r, a in zip(*upward, strict=True)]
-    return corridors.sample(3, np.array(on_circles))
+    return search_bands.sample(3, np.array(on_circles))

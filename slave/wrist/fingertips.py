@@ -74,7 +74,7 @@ LEAST_SHOWN = np.array([0.75, 0.6])
 MOST_MISFIT, LIKELY = 32.0, 0.4  # of one that is less likely to be seen in proportion
 # Standard deviations: edges; of the radius, how far flesh is off its cones, and where on its disk an end is that faces
 # the camera; and the misfit at which they are twice as large.
-PIXEL, FLESH, PULP, DOUBTFUL = 0.7, 0.05, 0.08, 20.0
+PIXEL, SURFACE, PULP, DOUBTFUL = 0.7, 0.05, 0.08, 20.0
 OF_SPREAD = 0.6  # postures that are possible differ by more than the mean of them is off
 
 
@@ -345,9 +345,9 @@ def _open(some: Hypotheses, which: Int, image: LedImage, gain: float) -> Float32
     seen, bound, outside = image.at(uv[:, BONES])
     off = _logarithm(seen, some.table.near[some.rows[which], BONES] * np.float32(gain), bound)
     hidden = (off < HIDDEN) & ~bound & ~outside
-    turn = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
+    angle = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
     way = uv[:, BONES] - uv[:, END, None]
-    along = way @ np.stack([np.cos(turn), np.sin(turn)])
+    along = way @ np.stack([np.cos(angle), np.sin(angle)])
     towards = hidden[..., None] & (along > SIDE * np.linalg.norm(way, axis=-1)[..., None])
     return np.where(towards.any(axis=1), np.float32(0.0), open_)
 
@@ -371,10 +371,10 @@ class Ends(NamedTuple):
 def reported(finger: Int, circle: Circles, misfit: Float, ends: Ends) -> Candidates:
     """Ends of K fingers, by the circles about them."""
     radius = circle.radius
-    flesh = radius * np.sqrt(
-        FLESH**2 + (PULP * np.maximum(ends.facing, 0.0)) ** 2 + (OF_SPREAD * ends.spread) ** 2
+    surface = radius * np.sqrt(
+        SURFACE**2 + (PULP * np.maximum(ends.facing, 0.0)) ** 2 + (OF_SPREAD * ends.spread) ** 2
     )
-    sigma = np.sqrt(PIXEL**2 + flesh**2 + circle.sigma_px**2) * (1.0 + misfit / DOUBTFUL)
+    sigma = np.sqrt(PIXEL**2 + surface**2 + circle.sigma_px**2) * (1.0 + misfit / DOUBTFUL)
     at = circle.middle + ends.towards * radius[:, None]
     return Candidates(finger, at, sigma, radius, misfit, circle.shown, ends.seen)
 
@@ -395,8 +395,8 @@ def _ends(some: Hypotheses, cost: Float32, finger: Int, circle: Circles) -> Ends
     weight = np.exp((np.minimum.reduceat(square, first)[of] - square) * (0.5 / CORRELATED))
     what = np.empty((len(of), 6))
     what[:, 0] = 1.0
-    turned = _turned(some, near, (circle.middle[of] - uv[:, END]) / radius[:, None], sigma[of])
-    what[:, 1:3] = way = (uv[:, APEX] - uv[:, END]) / end[:, :1] + turned
+    rotated = _rotated(some, near, (circle.middle[of] - uv[:, END]) / radius[:, None], sigma[of])
+    what[:, 1:3] = way = (uv[:, APEX] - uv[:, END]) / end[:, :1] + rotated
     what[:, 3] = way[:, 0] ** 2 + way[:, 1] ** 2
     what[:, 4:] = end[:, 1:]
     sums = np.add.reduceat(what * weight[:, None], first)
@@ -405,7 +405,7 @@ def _ends(some: Hypotheses, cost: Float32, finger: Int, circle: Circles) -> Ends
     return Ends(mean[:, :2], np.sqrt(np.maximum(0.5 * variance, 0.0)), mean[:, 3], mean[:, 4])
 
 
-def _turned(some: Hypotheses, which: Int, off: Float, sigma: Float) -> Float:
+def _rotated(some: Hypotheses, which: Int, off: Float, sigma: Float) -> Float:
     """How ends (M, 2) turn about the middles of outlines, which lie `off` (M, 2) by `sigma` (M,), in radii.
 
     An outline lies beside where it should be for abduction, which the laser tells, or for a twist of the finger.

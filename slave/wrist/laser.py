@@ -2,7 +2,7 @@
 
 The line runs from side to side, so each column of the image holds it as short bright runs (`slave.wrist.runs`), one
 per surface. The seams say whose a line is; where they cut one, the cut is moved to the crease. What is left to each
-finger is measured (`slave.wrist.pieces`).
+finger is measured (`slave.wrist.finger_lines`).
 """
 
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ import numpy as np
 
 from common.arrays import Float, Image
 from slave.wrist.engine import NUMPY, Engine
+from slave.wrist.finger_labels import finger_labels
+from slave.wrist.finger_lines import NONE, FingerLines
 from slave.wrist.fingers import Fingers
-from slave.wrist.owners import owners
-from slave.wrist.pieces import NONE, Pieces
-from slave.wrist.reach import reach_of
 from slave.wrist.runs import FLOOR
 from slave.wrist.thumb_line import beyond_ball, on_ball
 from slave.wrist.view import WristView
+from slave.wrist.workspace import workspace_of
 
 _LEAST_M = 2e-3  # of line that must be seen
 # Standard deviations, by what the centroids of simulated hands of several seeds are off by.
@@ -45,40 +45,40 @@ class LaserLines:
 
 def laser_lines(laser: Image, fingers: Fingers, view: WristView, engine: Engine = NUMPY) -> LaserLines:
     """Find the segments in the difference of laser and ambient frame."""
-    reach = reach_of(fingers.turn.view).turned(fingers.turn)
-    runs, on_line = engine.lines(laser, reach.first_row)
+    workspace = workspace_of(fingers.palm_pose.view).at_palm_pose(fingers.palm_pose)
+    runs, on_line = engine.lines(laser, workspace.first_row)
     if not len(runs.row):
         return LaserLines(np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan))
     points: Float = np.stack([runs.column, runs.row], axis=-1, dtype=np.float64)
     finger = fingers.finger_of(points)
     finger[~on_line] = NONE
-    finger = owners(finger, runs, points, reach)
-    finger[~reach.holds(finger, points)] = NONE
-    finger[reach.on_palm(points)] = NONE
-    pieces = engine.measure(runs, finger, view.optics.width_px)
-    uv, length = pieces.uv, pieces.line
-    seen = length * reach.metres_per_px(uv) >= _LEAST_M
-    sigma = _sigma_px(pieces, shown=fingers.shown)
+    finger = finger_labels(finger, runs, points, workspace)
+    finger[~workspace.holds(finger, points)] = NONE
+    finger[workspace.on_palm(points)] = NONE
+    finger_lines = engine.measure(runs, finger, view.optics.width_px)
+    uv, length = finger_lines.uv, finger_lines.line
+    seen = length * workspace.metres_per_px(uv) >= _LEAST_M
+    sigma = _sigma_px(finger_lines, shown=fingers.shown)
     if seen[0]:
         thumb = np.flatnonzero(finger == 0)
-        beyond = reach.beyond_m(points[thumb])
+        beyond = workspace.beyond_m(points[thumb])
         off, doubt = beyond_ball(runs, thumb, beyond)
-        seen[0] = not (reach.bent and on_ball(beyond))
+        seen[0] = not (workspace.flexed and on_ball(beyond))
         uv[0] += off
         sigma[0] = np.hypot(np.hypot(sigma[0], doubt), _THUMB_PX)
     uv[~seen], sigma[~seen], length[~seen] = np.nan, np.nan, np.nan
     return LaserLines(uv, sigma, length)
 
 
-def _sigma_px(pieces: Pieces, *, shown: bool) -> Float:
+def _sigma_px(finger_lines: FingerLines, *, shown: bool) -> Float:
     """Standard deviations (5,) of centroids: of lines whole, in parts, faint, doubtful, and where no seam was seen.
 
     Of a line in parts all but the longest may be another finger's, or what hides the middle of its own.
     """
-    apart = pieces.apart
+    apart = finger_lines.apart
     in_parts = np.where(
-        np.isnan(apart), np.where(pieces.cut, _IN_PARTS_PX, 0.0), np.fmax(apart, _IN_PARTS_PX)
+        np.isnan(apart), np.where(finger_lines.cut, _IN_PARTS_PX, 0.0), np.fmax(apart, _IN_PARTS_PX)
     )
-    in_parts = np.where(pieces.brightest < _FAINT, np.maximum(_FAINT_PX, in_parts), in_parts)
+    in_parts = np.where(finger_lines.brightest < _FAINT, np.maximum(_FAINT_PX, in_parts), in_parts)
     unshown = 0.0 if shown else _UNSHOWN_PX
     return np.sqrt(_LINE_PX**2 + in_parts**2 + unshown**2)

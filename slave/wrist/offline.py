@@ -19,7 +19,7 @@ from common.messages import WristDetections
 from slave.cameras.replay import read_png
 from slave.cameras.source import Frame
 from slave.wrist.detector import WristDetector
-from slave.wrist.strobe import Triple
+from slave.wrist.strobe import StrobeCycle
 from slave.wrist.view import WristView
 
 _LOG = logging.getLogger(__name__)
@@ -86,7 +86,7 @@ class WristRecordingFound:
         parts += [
             f"{event.replace('_', ' ')} {count}"
             for event, count in self.counts.items()
-            if count and event != "triples"
+            if count and event != "cycles"
         ]
         if self.mislabelled:
             parts.append(
@@ -171,18 +171,18 @@ def detect_wrist_recording(
         frame = Frame(row.seq, row.t_ns, row.t_ns, image, row.illumination, exposure_us=own.exposure_us)
         if (seen := detector.push(frame)) is not None:
             found.append(seen.message(camera, session=0))
-            mislabelled += _mislabelled(seen.triple)
+            mislabelled += _mislabelled(seen.cycle)
         progress(i + 1, len(rows))
     detections = RecordedWristDetections.of(found)
     return WristRecordingFound(detections, len(rows), detector.counts, mislabelled)
 
 
-def _mislabelled(triple: Triple) -> int:
+def _mislabelled(cycle: StrobeCycle) -> int:
     """How many of the three frames have a label that is not what the strobe took them for; NONE is no label."""
     taken = (
-        (triple.ambient, Illumination.AMBIENT),
-        (triple.laser, Illumination.LASER),
-        (triple.led, Illumination.LED),
+        (cycle.ambient, Illumination.AMBIENT),
+        (cycle.laser, Illumination.LASER),
+        (cycle.led, Illumination.LED),
     )
     return sum(frame.illumination not in (lit, Illumination.NONE) for frame, lit in taken)
 

@@ -25,8 +25,8 @@ WIDTH = 3  # steps of an edge
 MIDDLE_SIGMA, RADIUS_SIGMA = 0.6, 0.12  # of the radius: how well the middle and the radius are predicted
 EDGE_SIGMA = 0.08  # of the radius: how far skin is off a circle
 WIDTHS = 0.45, 0.25, 0.18  # of the radius: beyond that an edge counts less
-_TURN = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
-WAY: Float = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
+_ANGLES = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
+WAY: Float = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 _DESIGN = np.concatenate([WAY, np.ones((DIRECTIONS, 1))], axis=1)
 _PRODUCTS = (_DESIGN[:, :, None] * _DESIGN[:, None]).reshape(DIRECTIONS, 9)
 _PRIOR_NORMAL = np.diag(EDGE_SIGMA**2 / np.array([MIDDLE_SIGMA, MIDDLE_SIGMA, RADIUS_SIGMA]) ** 2)

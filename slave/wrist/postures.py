@@ -20,10 +20,10 @@ from common.errors import CalibrationError
 from common.fingertips import Fingertips
 from common.geometry import rotation_vector_to_matrix
 from common.hand_model import CHAINS, FINGER_JOINTS
-from common.round_cones import Cones, first_hits, terms
+from common.tapered_capsules import Capsules, first_hits, terms
 from slave.wrist.led_depth import Float32
-from slave.wrist.sweep import NEAREST_M, thumb_postures
 from slave.wrist.view import WristView
+from slave.wrist.workspace_samples import NEAREST_M, thumb_postures
 
 MCP_RAD = np.radians(np.arange(-10.0, 111.0, 6.0))
 PIP_RAD = np.radians(np.arange(0.0, 121.0, 6.0))
@@ -39,13 +39,13 @@ _AROUND = 1.4  # of its radius: where other parts of the finger are looked for
 SOFT = 0.3  # of the light comes from inside the skin and from the skin around, whatever the incidence
 HIDDEN_M = 4e-3  # so far behind the finger's own skin its end still counts as seen
 BEYOND_END = 0.25  # of the last bone: how far its skin goes on beyond its joint
-SKIN_SHARE = 0.8  # of the radius: where the middle of a visible line on a finger is before its axis
+SURFACE_SHARE = 0.8  # of the radius: where the middle of a visible line on a finger is before its axis
 # Samples: the middle of the fingertip, along the bones, the highest joint of the finger in the image; above that; and
 # the end of the finger.
 END, BONES, HIGHEST, ABOVE, APEX = 0, slice(0, 6), 6, slice(7, 13), 13
 SAMPLES = APEX + 1
 _ALONG = ((2, 0.35), (1, 0.75), (1, 0.3), (0, 0.75), (0, 0.5))  # bone, share of it
-_ABOVE = tuple((far, turn) for far in (1.4, 1.9) for turn in (-0.5, 0.0, 0.5))  # of the joint's radius, rad
+_ABOVE = tuple((far, angle) for far in (1.4, 1.9) for angle in (-0.5, 0.0, 0.5))  # of the joint's radius, rad
 _TWIST_RAD = 0.05  # for derivatives
 _CHUNK = 4096
 _ORIGIN = np.zeros(3)
@@ -151,10 +151,10 @@ def _postures(view: WristView, finger: int, angles: Float) -> _OfFinger:
     end = chain[:, 3] + (OVERHANG - 1.0) * radius[3] * along + BALL * dorsal_m * tip[:, :, 1]
     apex = end + radius[3] * along + (1.0 - BALL) * dorsal_m * tip[:, :, 1]
     bones = np.concatenate([chain[:, :3], end[:, None]], axis=1)
-    skin = _skin(bones, radius)
-    laser = _on_plane(view, skin)
+    surface = _surface_lines(bones, radius)
+    laser = _on_plane(view, surface)
     project = view.optics.project
-    points = [skin[k][0] + share * (skin[k][1] - skin[k][0]) for k, share in _ALONG]
+    points = [surface[k][0] + share * (surface[k][1] - surface[k][0]) for k, share in _ALONG]
     above = _above(view, bones, radius, nodes)
     uv = np.stack([project(end), *(project(each) for each in points), *above, project(apex)], axis=1)
     uv = uv.reshape(count, nodes, SAMPLES, 2)
@@ -164,9 +164,9 @@ def _postures(view: WristView, finger: int, angles: Float) -> _OfFinger:
     )
     twist = _twist(view, finger, angles[:, middle], bones, apex, radius)
     size = view.optics.matrix[0, 0] * radius[3] / np.maximum(bones[:, 3, 2], NEAREST_M)
-    turn = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
+    angle = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
     ring = uv[:, middle, END, None] + _AROUND * size[:, None, None] * np.stack(
-        [np.cos(turn), np.sin(turn)], axis=-1
+        [np.cos(angle), np.sin(angle)], axis=-1
     )
     near, first = _drawn(view, bones, radius, np.concatenate([uv[:, middle], ring], axis=1))
     distance = np.linalg.norm(apex, axis=-1)
@@ -191,14 +191,14 @@ def _twist(view: WristView, finger: int, angles: Float, bones: Float, apex: Floa
     straight[..., 1:] = 0.0
     chain = view.model.forward(view.T_camera_palm, straight).position_m[0, CHAINS[finger]]
     axis = chain[1] - chain[0]
-    turn = rotation_vector_to_matrix(_TWIST_RAD * axis / np.linalg.norm(axis))
+    rotation = rotation_vector_to_matrix(_TWIST_RAD * axis / np.linalg.norm(axis))
     moved: list[Float] = []
-    for by in (np.eye(3), turn):
-        turned, tip = ((each - chain[0]) @ by.T + chain[0] for each in (bones, apex))
-        laser = _on_plane(view, _skin(turned, radius)) @ plane_axes(view)[0]
+    for by in (np.eye(3), rotation):
+        rotated, tip = ((each - chain[0]) @ by.T + chain[0] for each in (bones, apex))
+        laser = _on_plane(view, _surface_lines(rotated, radius)) @ plane_axes(view)[0]
         moved.append(
             np.concatenate(
-                [view.optics.project(turned[:, 3]), view.optics.project(tip), laser[:, None]], axis=1
+                [view.optics.project(rotated[:, 3]), view.optics.project(tip), laser[:, None]], axis=1
             )
         )
     return (moved[1] - moved[0]) / _TWIST_RAD
@@ -212,7 +212,7 @@ def _parabola(values: Float) -> Float:
     return np.stack([middle, 0.5 * (high - low), 0.5 * (high + low) - middle], axis=1)
 
 
-def _skin(bones: Float, radius: Float) -> list[tuple[Float, Float]]:
+def _surface_lines(bones: Float, radius: Float) -> list[tuple[Float, Float]]:
     """Start and stop (T, 3) of the line along each bone's skin that faces the camera, of joints (T, 4, 3) [m]."""
     out: list[tuple[Float, Float]] = []
     for k in range(3):
@@ -221,15 +221,17 @@ def _skin(bones: Float, radius: Float) -> list[tuple[Float, Float]]:
         toward = -0.5 * (start + stop)
         toward -= (toward * way).sum(axis=-1, keepdims=True) * way
         toward /= np.maximum(np.linalg.norm(toward, axis=-1, keepdims=True), 1e-9)
-        out.append((start + SKIN_SHARE * radius[k] * toward, stop + SKIN_SHARE * radius[k + 1] * toward))
+        out.append(
+            (start + SURFACE_SHARE * radius[k] * toward, stop + SURFACE_SHARE * radius[k + 1] * toward)
+        )
     return out
 
 
-def _on_plane(view: WristView, skin: list[tuple[Float, Float]]) -> Float:
+def _on_plane(view: WristView, surface: list[tuple[Float, Float]]) -> Float:
     """Where lines along the skin first meet the laser's plane (T, 3) [m], seen from the camera; NaN: nowhere."""
-    best = np.full(skin[0][0].shape, np.nan)
+    best = np.full(surface[0][0].shape, np.nan)
     nearest = np.full(len(best), np.inf)
-    for k, (start, stop) in enumerate(skin):
+    for k, (start, stop) in enumerate(surface):
         before, behind = (point @ view.normal - view.offset_m for point in (start, stop))
         with np.errstate(divide="ignore", invalid="ignore"):
             share = before / (before - behind)
@@ -249,7 +251,10 @@ def _above(view: WristView, bones: Float, radius: Float, nodes: int) -> list[Flo
     highest = np.repeat(np.where(np.isfinite(tops), tops, np.inf)[:, 1:].argmin(axis=-1) + 1, nodes)
     at = np.arange(len(bones))
     middle, size = uv[at, highest], size[at, highest, None]
-    return [middle, *(middle + size * far * np.array([np.sin(turn), -np.cos(turn)]) for far, turn in _ABOVE)]
+    return [
+        middle,
+        *(middle + size * far * np.array([np.sin(angle), -np.cos(angle)]) for far, angle in _ABOVE),
+    ]
 
 
 def _drawn(view: WristView, bones: Float, radius: Float, uv: Float) -> tuple[Float, Float]:
@@ -265,13 +270,13 @@ def _drawn_some(view: WristView, bones: Float, radius: Float, uv: Float) -> tupl
     ray = view.optics.ray(uv)
     count = len(bones)
     near_r, far_r = (np.tile(part, count) for part in (radius[:-1], radius[1:]))
-    cones = Cones(bones[:, :-1].reshape(-1, 3), bones[:, 1:].reshape(-1, 3), near_r, far_r)
-    known = terms(cones, _ORIGIN, np.float64).reshape(12, count, 3)
+    capsules = Capsules(bones[:, :-1].reshape(-1, 3), bones[:, 1:].reshape(-1, 3), near_r, far_r)
+    known = terms(capsules, _ORIGIN, np.float64).reshape(12, count, 3)
     distance = np.stack([first_hits(known[:, :, k, None], np.moveaxis(ray, -1, 0)) for k in range(3)])
     which, distance = distance.argmin(axis=0), distance.min(axis=0)
     hit = np.isfinite(distance)
     body = (3 * np.arange(count, dtype=np.int64)[:, None] + which)[hit]
-    normal = cones.normals(body, ray[hit] * distance[hit][:, None])
+    normal = capsules.normals(body, ray[hit] * distance[hit][:, None])
     near = np.zeros(distance.shape)
     shade = np.sqrt((np.clip(-(normal * ray[hit]).sum(axis=-1), 0.0, 1.0) + SOFT) / (1.0 + SOFT))
     near[hit] = shade / distance[hit]

@@ -142,13 +142,13 @@ def in_lines(runs: Runs) -> Bool:
     around = np.zeros((int(row.max()) + 1) * across)
     np.maximum.at(around, cell, peak)
     near = np.asarray(cv2.dilate(around.reshape(-1, across), _NEAR), np.float64).ravel()[cell]
-    beside = np.zeros(len(joins))
-    np.maximum.at(beside, joins, np.maximum.reduceat(near, runs.first))
+    nearby = np.zeros(len(joins))
+    np.maximum.at(nearby, joins, np.maximum.reduceat(near, runs.first))
     of_column = np.zeros(int(runs.column.max()) + 1)
     np.maximum.at(of_column, runs.column, peak)
     joined = np.bincount(joins, columns, len(joins))
     share = np.where(joined < SHORT, _GLOW_OF_SHORT, _GLOW)
-    line = (brightest >= share * beside) & (joined >= _FEWEST)
+    line = (brightest >= share * nearby) & (joined >= _FEWEST)
     least = np.repeat(np.where(line, _FADED * brightest, np.inf)[joins], columns)
     np.maximum(least, _SECOND * of_column[runs.column], out=least)
     return peak >= least

@@ -3,7 +3,7 @@
 Three frames are a triple if
 
     1. each followed the one before by one period, by time and by counter,
-    2. they show ambient, laser, LED with a margin above 0 (`kinds.evidence`),
+    2. they show ambient, laser, LED with a margin above 0 (`illumination.evidence`),
     3. the triple before them, given or not, had the same place in the cycle, which is three periods long.
 
 Each three frames are looked at by themselves, so that ambient light which is switched costs the triple that it is
@@ -20,16 +20,16 @@ import numpy as np
 
 from common.arrays import Image
 from slave.cameras.source import Frame
-from slave.wrist.kinds import NO_EVIDENCE, brighter, coarse, evidence, unlit
+from slave.wrist.illumination import NO_EVIDENCE, brighter, coarse, evidence, unlit
 
 CYCLE = 3  # periods
 OFF_BEAT = 0.3  # periods; a frame farther from the beat of the camera has no place in the cycle
 FORGOTTEN = 90  # periods without a frame, after which a rate 0.3 % off could have moved the cycle by a frame
-EVENTS = ("triples", "doubled", "gaps", "out_of_step", "unsure", "unlit")
+EVENTS = ("cycles", "doubled", "gaps", "out_of_step", "unsure", "unlit")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Triple:
+class StrobeCycle:
     """Three consecutive frames of one strobe cycle, each of its kind by its content."""
 
     ambient: Frame
@@ -80,7 +80,7 @@ class Strobe:
         self.counts: Counter[str] = Counter(dict.fromkeys(EVENTS, 0))
         self.margin = np.nan
 
-    def push(self, frame: Frame) -> Triple | None:
+    def push(self, frame: Frame) -> StrobeCycle | None:
         """The triple that this frame completes, or None. Never looks at `frame.illumination`."""
         cells = coarse(frame.image)
         last = self._seen[-1] if self._seen else None
@@ -95,7 +95,7 @@ class Strobe:
         follows = abs(periods - 1.0) <= OFF_BEAT and frame.seq == last.latest.seq + 1
         self.counts["gaps"] += not follows
         self._seen = [*self._seen[-2:], _Seen(frame, cells, last.place + round(periods), follows, frame)]
-        return self._triple()
+        return self._completed()
 
     def _begin(self, frame: Frame, cells: Image) -> None:
         """Know of no cycle: the next triple is believed, wherever it is."""
@@ -104,7 +104,7 @@ class Strobe:
         self._at = None
         self._due = CYCLE + 1  # of a stream in order, which begins anywhere, one is complete by then
 
-    def _triple(self) -> Triple | None:
+    def _completed(self) -> StrobeCycle | None:
         """The last three frames, where they are one. No frame is in two."""
         place, before = self._seen[-1].place, self._at
         if before is not None and 0 < place - before < CYCLE:
@@ -121,8 +121,8 @@ class Strobe:
             return None
         in_step = before is None or (place - before) % CYCLE == 0
         self.margin, self._at, self._due = found.margin, place, place + CYCLE
-        self.counts["triples" if in_step else "out_of_step"] += 1
-        return Triple(*(one.frame for one in self._seen)) if in_step else None
+        self.counts["cycles" if in_step else "out_of_step"] += 1
+        return StrobeCycle(*(one.frame for one in self._seen)) if in_step else None
 
     def _instead(self, *, whole: bool) -> str | None:
         """What a cycle is whose last frame is not lit by LEDs, by those of its frames that came."""

@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 
 from common.arrays import Image
-from slave.wrist.corridors import LATERAL, MARGIN, Float32
-from slave.wrist.paths import FENCE
+from slave.wrist.seams import FENCE
+from slave.wrist.search_bands import LATERAL, MARGIN, Float32
 
 DARK = 6.0  # grey levels: what the noise of a difference of two frames leaves
-SKIN = 20.0  # energy of a bright, even surface: no seam crosses a finger
+SURFACE = 20.0  # energy of a bright, even surface: no seam crosses a finger
 OPEN = 1.0  # energy in the dark beside one finger only
 BEYOND_THUMB = 0.2  # energy in the dark beyond the thumb's tip
 ASIDE = 3.0  # energy at the edge of a corridor
@@ -20,27 +20,27 @@ PRIOR = np.concatenate(
     + [np.pad(ACROSS * np.linspace(1.0, 0.0, LATERAL[3]), MARGIN, constant_values=FENCE)]
 ).astype(np.float32)
 AROUND = np.ones((1, 7), dtype=np.uint8)
-BESIDE = np.ones((1, MARGIN), dtype=np.uint8)
+SIDE_KERNEL = np.ones((1, MARGIN), dtype=np.uint8)
 
 
-def energy(strips: Image, crossed: int) -> Float32:
-    """Energy of the straightened corridors (S, K): from 0 in a black valley to `SKIN` on a finger, and `PRIOR`.
+def energy(straightened: Image, crossed: int) -> Float32:
+    """Energy of the straightened corridors (S, K): from 0 in a black valley to `SURFACE` on a finger, and `PRIOR`.
 
     A pixel is as much of a valley as it lies below the darker of its two sides, and below what is brightest right
     beside it. The thumb's seam has the thumb on one side, and on the other perhaps nothing near: only the thumb's side
     counts. Where nothing is lit beside a pixel it is open, except for the thumb's seam on the first `crossed` circles:
     no thumb at all beyond it would mean that the seam lies outside of the thumb.
     """
-    before = cv2.dilate(strips, BESIDE, anchor=(MARGIN - 1, 0))
-    behind = cv2.dilate(strips, BESIDE, anchor=(0, 0))
+    before = cv2.dilate(straightened, SIDE_KERNEL, anchor=(MARGIN - 1, 0))
+    behind = cv2.dilate(straightened, SIDE_KERNEL, anchor=(0, 0))
     thumb = STARTS[3]
     side = cv2.min(before, behind)
     side[:, thumb:] = behind[:, thumb:]
-    level = np.divide(strips, cv2.dilate(strips, AROUND) + np.float32(DARK), dtype=np.float32)
-    above = 1.0 - cv2.subtract(side, strips) / (side + np.float32(DARK))
+    level = np.divide(straightened, cv2.dilate(straightened, AROUND) + np.float32(DARK), dtype=np.float32)
+    above = 1.0 - cv2.subtract(side, straightened) / (side + np.float32(DARK))
     out = np.maximum(above, level)
     out *= out * out
-    out *= SKIN * out  # the sixth power
+    out *= SURFACE * out  # the sixth power
     bare = side <= DARK
     np.putmask(out[:, :thumb], bare[:, :thumb], OPEN)
     np.putmask(out[crossed:, thumb:], bare[crossed:, thumb:], BEYOND_THUMB)

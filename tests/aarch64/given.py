@@ -9,13 +9,13 @@ from bench.aarch64 import frames, scene
 from tests.aarch64.told import opened, others, sealed
 from tests.slave.wrist.wrist_frames import strobed
 
-TRIPLES = 3  # getting into step may take one or two
+CYCLES = 3  # getting into step may take one or two
 
 
 def write(folder: Path) -> bytes:
     """Fill `folder`; return what the sealed datagrams say."""
     frames.write(folder / frames.SIX, scene.rendered()[frames.SIX])
-    lit = strobed("curl", TRIPLES)
+    lit = strobed("curl", CYCLES)
     np.savez(
         folder / "wrist.npz",
         images=np.stack([frame.image for frame in lit]),

@@ -37,7 +37,7 @@ def test_a_slave_on_aarch64_serves_a_master_here(tmp_path: Path) -> None:
         seen = _frames(ingest)
         reports = _reports(health)
         answer = bus.ask(Command("left", "stop"), PATIENCE_S)
-        said, errors = slave.communicate(timeout=PATIENCE_S)
+        output, errors = slave.communicate(timeout=PATIENCE_S)
     finally:
         slave.kill()
         slave.wait()
@@ -51,7 +51,7 @@ def test_a_slave_on_aarch64_serves_a_master_here(tmp_path: Path) -> None:
     assert len(reports) == 3
     assert answer.source == "left"
     assert slave.returncode == 0, errors
-    assert "frames, sent" in said
+    assert "frames, sent" in output
 
 
 def _frames(ingest: Ingest) -> list[MarkerDetections]:

@@ -32,9 +32,9 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Told, Told, bytes]:
         here = subprocess.run(
             [sys.executable, *program], capture_output=True, text=True, cwd=ROOT, check=True
         )
-        said, errors = there.communicate(timeout=600)
+        output, errors = there.communicate(timeout=600)
     assert there.returncode == 0, errors
-    return json.loads(said), json.loads(here.stdout), bodies
+    return json.loads(output), json.loads(here.stdout), bodies
 
 
 def test_it_is_the_other_architecture(both: tuple[Told, Told, bytes]) -> None:
@@ -49,7 +49,7 @@ def test_everything_a_slave_needs_imports(both: tuple[Told, Told, bytes]) -> Non
 
 
 @pytest.mark.parametrize(
-    ("what", "seen", "least"), [("markers", "markers_seen", 40), ("triples", "laser_seen", 6)]
+    ("what", "seen", "least"), [("markers", "markers_seen", 40), ("cycles", "laser_seen", 6)]
 )
 def test_detections_are_equal_bit_by_bit(
     both: tuple[Told, Told, bytes], what: str, seen: str, least: int

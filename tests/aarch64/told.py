@@ -63,12 +63,12 @@ def markers(folder: Path) -> list[MarkerDetections]:
     for k in range(MARKER_FRAMES):
         t_ns = k * FRAME_NS
         found = detector.push(frames.image(k), t_ns)
-        measured = (found.uv, found.area, found.quality, found.sigma_px, found.rival_uv)
+        measured = (found.uv, found.area, found.quality, found.sigma_px, found.alt_uv)
         messages.append(MarkerDetections(frames.camera.name, 7, k, t_ns, t_ns + 1, *measured))
     return messages
 
 
-def triples(folder: Path) -> list[WristDetections]:
+def cycles(folder: Path) -> list[WristDetections]:
     """What a wrist device sees in rendered strobed frames, as messages."""
     rig = load(CALIBRATION / "rigs/wrist.json", RigCalibration)
     camera = load(CALIBRATION / "cameras/wrist.json", CameraCalibration)
@@ -86,8 +86,10 @@ def triples(folder: Path) -> list[WristDetections]:
 
 def others() -> list[Message]:
     """A sample of an IMU, and a report with names, counts and odd floats."""
-    turn = np.array([0.5, -0.5, 0.5, -0.5])
-    sample = ImuSample("imu", 7, 3, -5, np.array([0.1, -0.0, 1e-310]), np.ones(3), np.full(3, np.nan), turn)
+    quaternion = np.array([0.5, -0.5, 0.5, -0.5])
+    sample = ImuSample(
+        "imu", 7, 3, -5, np.array([0.1, -0.0, 1e-310]), np.ones(3), np.full(3, np.nan), quaternion
+    )
     return [sample, Health("left", 2**63 - 1, 2**60, {"frames": 1}, {"rate_hz": 1 / 3}, "pi-left", "1.2")]
 
 
@@ -126,7 +128,7 @@ def _hash(messages: list[MarkerDetections] | list[WristDetections]) -> str:
 
 def told(folder: Path) -> dict[str, object]:
     """All of it; numbers of what was really seen, so that nothing equal can be empty."""
-    seen, strobed = markers(folder), triples(folder)
+    seen, strobed = markers(folder), cycles(folder)
     messages: list[Message] = [*seen, *strobed, *others()]
     theirs = json.loads((folder / "sealed.json").read_text())
     bodies = opened([bytes.fromhex(one) for one in theirs])
@@ -135,7 +137,7 @@ def told(folder: Path) -> dict[str, object]:
         "absent": absent(),
         "markers": _hash(seen),
         "markers_seen": int(sum(np.isfinite(one.uv).all(axis=1).sum() for one in seen)),
-        "triples": _hash(strobed),
+        "cycles": _hash(strobed),
         "laser_seen": int(sum(np.isfinite(one.laser_uv).all(axis=1).sum() for one in strobed)),
         "sealed": [one.hex() for one in sealed(messages)],
         "opened": hashlib.sha256(b"".join(bodies)).hexdigest(),

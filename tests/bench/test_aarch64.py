@@ -226,10 +226,10 @@ def test_a_missing_tool_is_named_with_its_package(
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     assert main(["count", "six"]) == 2
-    said = capsys.readouterr().err
-    assert "apt install" in said
+    output = capsys.readouterr().err
+    assert "apt install" in output
     for package in ("mmdebstrap", "gcc", "tar"):
-        assert package in said
+        assert package in output
 
 
 @pytest.mark.parametrize(
@@ -328,9 +328,9 @@ def test_the_plugin_says_what_it_needs(emulated: Sysroot, tmp_path: Path) -> Non
     file.write_bytes(program(MACHINE_CODE))
     file.chmod(0o755)
     command = [*emulated.qemu, "-plugin", f"file={emulated.plugin}", str(file)]
-    said = subprocess.run(command, capture_output=True, text=True)
-    assert said.returncode != 0
-    assert "to=FILE" in said.stderr
+    output = subprocess.run(command, capture_output=True, text=True)
+    assert output.returncode != 0
+    assert "to=FILE" in output.stderr
 
 
 @pytest.fixture(scope="module")

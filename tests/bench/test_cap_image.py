@@ -14,7 +14,7 @@ WHITE = (1.0, 1.0, 1.0)
 BLACK = (0.0, 0.0, 0.0)
 FROM_ABOVE = np.array([0.0, 0.0, 1.0])
 ALIAS_PX = 3e-3  # the first moment of a box-sampled image is exact only on average over sub-pixel places
-CAP = Cap(u=20.3, v=17.8, a=7.3, b=5.1, angle=0.6, paint=WHITE, bulge=0.0)
+CAP = Cap(u=20.3, v=17.8, a=7.3, b=5.1, angle=0.6, marker_colour=WHITE, bulge=0.0)
 
 
 def clipped_polygon(cap: Cap, corners: int = 200_000) -> tuple[float, float, float]:

@@ -43,20 +43,24 @@ def test_markers_are_reported_near_the_truth_and_only_where_paint_is_in_sight(ma
         uv = both.scene.optics[message.camera].project(truth.markers_m)
         seen = np.isfinite(message.uv[:, 0])
         off += np.linalg.norm(message.uv - uv, axis=1)[seen].tolist()
-        k = int(np.argmin(np.abs(made.sight.paint_t_s[message.camera] - 1e-9 * (message.t_ns - START_NS))))
-        assert (made.sight.paint_px2[message.camera][k][seen] > 0.0).all()
+        k = int(
+            np.argmin(
+                np.abs(made.line_of_sight.visible_t_s[message.camera] - 1e-9 * (message.t_ns - START_NS))
+            )
+        )
+        assert (made.line_of_sight.visible_px2[message.camera][k][seen] > 0.0).all()
     assert len(off) > 100
     assert np.median(off) < 5.0  # what is seen of a cap is not its middle
     assert max(off) < 12.0
 
 
 def test_lines_and_tips_are_reported_only_where_they_are_in_sight(made: Shown) -> None:
-    triples = [message for message in made.messages if isinstance(message, WristDetections)]
-    line = np.array([np.isfinite(message.laser_uv[:, 0]) for message in triples])
-    tip = np.array([np.isfinite(message.tip_uv[:, 0]) for message in triples])
+    cycles = [message for message in made.messages if isinstance(message, WristDetections)]
+    line = np.array([np.isfinite(message.laser_uv[:, 0]) for message in cycles])
+    tip = np.array([np.isfinite(message.tip_uv[:, 0]) for message in cycles])
     assert line.any()
-    assert not (line & (made.sight.line_m < 2e-3)).any()
-    assert not (tip & ~made.sight.tip).any()
+    assert not (line & (made.line_of_sight.line_m < 2e-3)).any()
+    assert not (tip & ~made.line_of_sight.tip).any()
 
 
 def test_what_was_kept_is_what_was_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made: Shown) -> None:
@@ -72,13 +76,13 @@ def test_what_was_kept_is_what_was_made(tmp_path: Path, monkeypatch: pytest.Monk
         assert [encode(message) for message in again.messages] == [
             encode(message) for message in made.messages
         ]
-        _same(again.sight, made.sight)
+        _same(again.line_of_sight, made.line_of_sight)
     assert calls == ["both-poses"]
 
 
 def _same(a: Sight, b: Sight) -> None:
-    for name in b.paint_t_s:
-        np.testing.assert_array_equal(a.paint_t_s[name], b.paint_t_s[name])
-        np.testing.assert_array_equal(a.paint_px2[name], b.paint_px2[name])
+    for name in b.visible_t_s:
+        np.testing.assert_array_equal(a.visible_t_s[name], b.visible_t_s[name])
+        np.testing.assert_array_equal(a.visible_px2[name], b.visible_px2[name])
     for field in ("line_t_s", "line_m", "tip"):
         np.testing.assert_array_equal(getattr(a, field), getattr(b, field))

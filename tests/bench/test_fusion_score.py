@@ -5,7 +5,7 @@ import pytest
 
 from bench.fusion_scene import Both, Shown, Sight
 from bench.fusion_score import Figures, Sighted, ratios
-from bench.fusion_solved import Away, Solved
+from bench.fusion_solved import RejectedPeer, Solved
 from bench.played import START_NS
 from common.arrays import Float
 from common.geometry import matrix_to_quaternion
@@ -53,21 +53,21 @@ def solved(**changes: Float) -> Solved:
     return Solved.of(BOTH, poses(**changes), BOTH.fused)
 
 
-def shown(paint: float = 100.0, line: float = 0.02) -> Shown:
+def shown(visible_area: float = 100.0, line: float = 0.02) -> Shown:
     """So much paint of every marker in both cameras, and so much line on every finger, at all times."""
     times = np.arange(0.0, 6.0, 1.0 / HZ)
     cameras = BOTH.markers.rig.cameras
-    sight = Sight(
+    line_of_sight = Sight(
         dict.fromkeys(cameras, times),
-        {name: np.full((len(times), 6), paint) for name in cameras},
+        {name: np.full((len(times), 6), visible_area) for name in cameras},
         times,
         np.full((len(times), 5), line),
         np.zeros((len(times), 5), np.bool_),
     )
-    return Shown(BOTH, 6.0, [], sight)
+    return Shown(BOTH, 6.0, [], line_of_sight)
 
 
-def figures(one: Solved, of: Shown, away: Away | None = None) -> Figures:
+def figures(one: Solved, of: Shown, away: RejectedPeer | None = None) -> Figures:
     return Figures.of(one, Sighted.of(of, one, away))
 
 
@@ -114,47 +114,49 @@ def test_a_tracked_bit_is_false_where_the_joint_is_far_off() -> None:
     assert got.unseen == 0.0
 
 
-@pytest.mark.parametrize(("paint", "line", "false"), [(0.0, 0.02, 1.0), (100.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
+@pytest.mark.parametrize(
+    ("visible_area", "line", "false"), [(0.0, 0.02, 1.0), (100.0, 0.0, 0.0), (0.0, 0.0, 1.0)]
+)
 def test_a_tracked_bit_is_false_where_nothing_tells_of_the_joint(
-    paint: float, line: float, false: float
+    visible_area: float, line: float, false: float
 ) -> None:
-    got = figures(solved(), shown(paint, line))  # without paint nothing tells where the palm is
+    got = figures(solved(), shown(visible_area, line))  # without paint nothing tells where the palm is
     assert got.false_tracked == false
     palm_apart = np.ones((COUNT, 26))
     palm_apart[:, np.setdiff1d(np.arange(26), CHAINS)] = 0.0
-    fingers = figures(solved(tracked=palm_apart), shown(paint, line))
-    assert fingers.unseen == (1.0 if paint == line == 0.0 else 0.0)
+    fingers = figures(solved(tracked=palm_apart), shown(visible_area, line))
+    assert fingers.unseen == (1.0 if visible_area == line == 0.0 else 0.0)
 
 
 def test_markers_alone_do_not_see_what_the_wrist_device_sees() -> None:
     alone = Solved.of(BOTH, poses(), BOTH.markers)
-    assert figures(alone, shown(paint=0.0)).unseen == 1.0
+    assert figures(alone, shown(visible_area=0.0)).unseen == 1.0
     assert figures(alone, shown(line=0.0)).unseen == 0.0
 
 
 def test_a_wrist_device_s_hand_is_put_where_it_truly_is() -> None:
     moved = poses()
-    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    elsewhere = [_moved(pose, turn, np.array([0.3, -0.1, 0.2])) for pose in moved]
+    R_extra = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    elsewhere = [_moved(pose, R_extra, np.array([0.3, -0.1, 0.2])) for pose in moved]
     alone = Solved.of(BOTH, elsewhere, BOTH.wrist)
     assert np.nanmax(alone.off_mm) == pytest.approx(0.0, abs=1e-6)
-    strapped = figures(alone, shown(paint=0.0))
+    strapped = figures(alone, shown(visible_area=0.0))
     assert strapped.false_tracked == 0.0  # its palm is where the strap has it
 
 
-def _moved(pose: HandPose, turn: Float, shift: Float) -> HandPose:
+def _moved(pose: HandPose, R_extra: Float, shift: Float) -> HandPose:
     t = 1e-9 * (pose.t_ns - START_NS)
-    rotation = turn @ BOTH.scene.truth(t).joints.rotation
+    rotation = R_extra @ BOTH.scene.truth(t).joints.rotation
     fields = {name: getattr(pose, name) for name in pose.__struct_fields__}
     fields |= {
-        "position_m": pose.position_m @ turn.T + shift,
+        "position_m": pose.position_m @ R_extra.T + shift,
         "orientation_wxyz": matrix_to_quaternion(rotation),
     }
     return HandPose(**fields)
 
 
 def test_streams_are_cut_off_in_turn_and_never_both() -> None:
-    away = Away()
+    away = RejectedPeer()
     t = np.arange(0.0, 60.0, 0.01)
     markers, wrist = away.at(t)
     assert not (markers & wrist).any()
@@ -175,23 +177,23 @@ def test_what_is_cut_off_does_not_come() -> None:
     wrist = [
         WristDetections("wrist", 1, k, t, t, five, none, none, five, none, none) for k, t in enumerate(ns)
     ]
-    left = Away().left([*markers, *wrist])
+    left = RejectedPeer().left([*markers, *wrist])
     assert [one.seq for one in left if isinstance(one, MarkerDetections)] == [0, 2, 3, 4]
     assert [one.seq for one in left if isinstance(one, WristDetections)] == [0, 1, 2, 4]
 
 
 def test_a_finger_is_in_sight_around_the_frame_that_shows_it() -> None:
-    both = shown(paint=0.0, line=0.0)
+    both = shown(visible_area=0.0, line=0.0)
     name = BOTH.markers.rig.cameras[0]
-    both.sight.paint_px2[name][120, INDEX] = 50.0  # at 2 s
-    seen = both.sight.cameras_of(np.array([1.94, 1.97, 2.0, 2.03, 2.06]), 0.04)[:, INDEX]
+    both.line_of_sight.visible_px2[name][120, INDEX] = 50.0  # at 2 s
+    seen = both.line_of_sight.cameras_of(np.array([1.94, 1.97, 2.0, 2.03, 2.06]), 0.04)[:, INDEX]
     assert seen.tolist() == [0, 1, 1, 1, 0]
 
 
 def test_hand_overs_are_where_sight_changes() -> None:
     both = shown()
     for name in BOTH.markers.rig.cameras:
-        both.sight.paint_px2[name][180:, INDEX] = 0.0  # from 3 s on
+        both.line_of_sight.visible_px2[name][180:, INDEX] = 0.0  # from 3 s on
     sighted = Sighted.of(both, solved(), None)
     near = sighted.hand_over[:, INDEX]
     assert near[np.abs(T_S - 3.04) < 0.45].all()

@@ -49,9 +49,9 @@ def test_a_dial_is_told_in_time_and_as_far_as_it_was_turned(setup: RigSetup, tru
 
 
 def test_everything_that_is_said_is_in_the_truth_in_that_order(truth: GestureTruth) -> None:
-    said = [one for one in truth.motion.said if one.stop_s < 13.0]
-    assert [(one.kind, one.name) for one in truth.events] == [(one.kind, one.name) for one in said]
-    for event, one in zip(truth.events, said, strict=True):
+    annotations = [one for one in truth.motion.annotations if one.stop_s < 13.0]
+    assert [(one.kind, one.name) for one in truth.events] == [(one.kind, one.name) for one in annotations]
+    for event, one in zip(truth.events, annotations, strict=True):
         assert one.start_s < event.begin_s < event.end_s <= one.stop_s + SETTINGS.dial.regrip_s
     pinched = next(one for one in truth.events if one.kind == "pinch")
     gap = truth.pinch_at(0.5 * (pinched.begin_s + pinched.end_s), pinched.name)
@@ -82,8 +82,8 @@ def test_what_nobody_said_is_false_and_what_was_not_told_is_missed(truth: Gestur
     assert score.late["pinch begin"] == pytest.approx([1.0])
     unheard = Score()
     unheard.add([], truth)
-    assert unheard.missed == unheard.said
-    assert sum(unheard.said.values()) == len(truth.events) > 3
+    assert unheard.missed == unheard.annotations
+    assert sum(unheard.annotations.values()) == len(truth.events) > 3
 
 
 def _later(one: Gesture, seconds: float) -> Gesture:

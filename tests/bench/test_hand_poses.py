@@ -41,11 +41,11 @@ def test_joints_are_independent_but_for_the_dip() -> None:
 
 
 def test_palms_turn_by_up_to_45_degrees_about_each_axis_from_facing_the_cameras() -> None:
-    turn = TRUTH.T_rig_palm[:, :3, :3] @ FACING_ROTATION.T
+    rotation = TRUTH.T_rig_palm[:, :3, :3] @ FACING_ROTATION.T
     # R = Rz Ry Rx: the three angles can be read off.
-    x = np.degrees(np.arctan2(turn[:, 2, 1], turn[:, 2, 2]))
-    y = np.degrees(np.arcsin(-turn[:, 2, 0]))
-    z = np.degrees(np.arctan2(turn[:, 1, 0], turn[:, 0, 0]))
+    x = np.degrees(np.arctan2(rotation[:, 2, 1], rotation[:, 2, 2]))
+    y = np.degrees(np.arcsin(-rotation[:, 2, 0]))
+    z = np.degrees(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
     for angle in (x, y, z):
         assert 42.0 < np.abs(angle).max() <= 45.0
     assert (TRUTH.T_rig_palm[:, 2, 1] < 0).mean() > 0.95  # the back still looks to cameras that look along +z
@@ -98,7 +98,7 @@ def test_a_hand_that_is_not_found_is_counted_and_spoils_no_other() -> None:
     assert found.joints_mm.max() < 1e-9
 
 
-def test_a_palm_beside_the_truth_moves_every_joint_and_misses_every_tip() -> None:
+def test_a_palm_off_the_truth_moves_every_joint_and_misses_every_tip() -> None:
     T, angles = perfect(TRUTH)
     T[:, 0, 3] += 2e-3
     found = score(MODEL, TRUTH, T, angles, TRUTH.caps_m)

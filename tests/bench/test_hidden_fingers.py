@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bench.hidden_fingers import HIDDEN_S, rms_deg, strayed_deg
+from bench.hidden_fingers import HIDDEN_S, growth_deg, rms_deg
 from common.arrays import Float
 from tests.hand_helpers import RIGHT
 
@@ -20,7 +20,7 @@ def bending(fingers: tuple[int, ...]) -> Float:
 
 
 def test_a_hand_at_rest_hardly_strays() -> None:
-    at_rest = strayed_deg(RIGHT, bending(()), alike=True)
+    at_rest = growth_deg(RIGHT, bending(()), alike=True)
     assert at_rest.shape == (len(HIDDEN_S), 4, 2)
     for after_s, most_deg in ((0.1, 0.5), (0.6, 3.0)):  # with fewer markers the palm settles anew
         assert np.abs(at_rest[HIDDEN_S.index(after_s)] - at_rest[0]).max() < most_deg
@@ -29,8 +29,8 @@ def test_a_hand_at_rest_hardly_strays() -> None:
 def test_neighbours_tell_of_a_fist_and_mislead_about_one_finger() -> None:
     after = HIDDEN_S.index(0.3)
     fist = bending((1, 2, 3, 4))
-    alone, together = (rms_deg(strayed_deg(RIGHT, fist, alike=alike)[after]) for alike in (False, True))
+    alone, together = (rms_deg(growth_deg(RIGHT, fist, alike=alike)[after]) for alike in (False, True))
     assert 1.0 < together < 0.7 * alone
     one = bending((2,))
-    alone, together = (rms_deg(strayed_deg(RIGHT, one, alike=alike)[after]) for alike in (False, True))
+    alone, together = (rms_deg(growth_deg(RIGHT, one, alike=alike)[after]) for alike in (False, True))
     assert together > alone

@@ -20,8 +20,8 @@ def test_a_tip_is_unseen_where_fewer_than_two_cameras_see_it() -> None:
 def test_the_second_pair_of_the_rig_stands_where_the_map_says() -> None:
     for name, pose in zip(("left2", "right2"), pair_at(RIG, 110.0, 45.0), strict=True):
         np.testing.assert_allclose(RIG.camera_pose(name), pose, atol=1e-6)
-    beside = pair_at(RIG, 110.0, 45.0)
-    for a, b in zip(beside, (RIG.camera_pose("left"), RIG.camera_pose("right")), strict=True):
+    aside = pair_at(RIG, 110.0, 45.0)
+    for a, b in zip(aside, (RIG.camera_pose("left"), RIG.camera_pose("right")), strict=True):
         assert np.degrees(np.arccos(a[:3, 2] @ b[:3, 2])) == pytest.approx(110.0, abs=1.5)  # the bar's toe-in
 
 

@@ -47,10 +47,10 @@ def test_jitter_is_what_differs_over_time() -> None:
     caps = model.marker_points(model.forward(palm(), angles), MARKERS)
     near = [solver.push(k, caps + np.array([x, 0.0, 0.0]), small_cov()) for k, x in enumerate((-1e-3, 1e-3))]
     hands = [hand.solution for hand in near if hand.solution is not None]
-    place, bent, turned = jitter(hands * 4)
+    place, bent, rotated = jitter(hands * 4)
     np.testing.assert_allclose(place, 1.0, atol=0.05)  # 1 mm to either side
     assert bent < 0.2
-    assert turned < 0.2
+    assert rotated < 0.2
     assert jitter(hands[:1] * 4) == (0.0, 0.0, 0.0)
 
 

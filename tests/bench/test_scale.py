@@ -48,7 +48,7 @@ def test_the_model_is_the_line_through_the_runs() -> None:
 
 
 def test_what_a_hand_costs_is_no_cost_of_a_camera() -> None:
-    stages = {"hand": 3000.0, "filter": 100.0, "gestures": 900.0, "pairing": 500.0}
+    stages = {"hand": 3000.0, "filter": 100.0, "gestures": 900.0, "frame_sync": 500.0}
     assert cost_per_camera(run(4), stages) == pytest.approx((90.0 * 6.8 - 90.0 * 4.0) * 1e-3 / 4)
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from bench.processes import Footprint, footprint
+from bench.soak_monitor import Minute, SoakHistory, judged
 from bench.soak_steps import Mapping, grown, mapped, steps_of
 from bench.soak_verdict import judge, latency_slope, memory_slope, slope
-from bench.soak_watch import Course, Minute, judged
 from common.messages import Health
 
 _EVERY_S, _HOUR_S = 5.0, 3600.0
@@ -21,9 +21,9 @@ def minute(t_s: float, p50_ms: float = 20.0, **counts: int) -> Minute:
     return Minute(t_s, 10.0, p50_ms, 3.0 * p50_ms, 1.0, {}, counts, {}, {})
 
 
-def course(
+def history(
     mb_per_h: float, length_s: float = _HOUR_S, seed: int = 3, grows_ms: float = 0.0, **counts: int
-) -> Course:
+) -> SoakHistory:
     """A process that leaks, in steps of a page as memory does, and reads that wobble now and then."""
     rng = np.random.default_rng(seed)
     times = np.arange(0.0, length_s, _EVERY_S)
@@ -34,10 +34,10 @@ def course(
         for k in range(1, round(length_s / 60.0) + 1)
     ]
     reads = [Footprint(float(x), float(x), float(x), float(x), 0.0, 5, 9) for x in mb]
-    return Course(list(times), {"master": reads}, minutes)
+    return SoakHistory(list(times), {"master": reads}, minutes)
 
 
-def verdict(of: Course) -> dict[str, bool | None]:
+def verdict(of: SoakHistory) -> dict[str, bool | None]:
     return {one.what: one.ok for one in judge(of, [])}
 
 
@@ -59,19 +59,19 @@ def test_too_few_points_tell_nothing_and_gaps_are_left_out() -> None:
 
 
 def test_a_leak_is_found_and_a_process_that_settles_is_none() -> None:
-    assert memory_slope(course(3.0), "master").per_h == pytest.approx(3.0, abs=0.3)
-    assert verdict(course(3.0))["memory of master"] is False
-    assert verdict(course(0.0))["memory of master"] is True
+    assert memory_slope(history(3.0), "master").per_h == pytest.approx(3.0, abs=0.3)
+    assert verdict(history(3.0))["memory of master"] is False
+    assert verdict(history(0.0))["memory of master"] is True
 
 
 def test_latency_that_creeps_up_is_found_below_the_noise_of_a_busy_machine() -> None:
-    assert verdict(course(0.0, grows_ms=20.0))["latency p50"] is False
-    assert verdict(course(0.0))["latency p50"] is True
-    assert latency_slope(course(0.0, grows_ms=20.0).minutes, "p50_ms").per_h == pytest.approx(20.0, abs=6.0)
+    assert verdict(history(0.0, grows_ms=20.0))["latency p50"] is False
+    assert verdict(history(0.0))["latency p50"] is True
+    assert latency_slope(history(0.0, grows_ms=20.0).minutes, "p50_ms").per_h == pytest.approx(20.0, abs=6.0)
 
 
 def test_a_run_of_minutes_says_that_it_is_too_short() -> None:
-    short = verdict(course(9.0, 300.0, lost=0))
+    short = verdict(history(9.0, 300.0, lost=0))
     assert short["memory of master"] is None
     assert short["latency p99"] is None
     assert short["lost"] is True
@@ -79,8 +79,8 @@ def test_a_run_of_minutes_says_that_it_is_too_short() -> None:
 
 @pytest.mark.parametrize("what", ["lost", "dropped", "refused", "blocked"])
 def test_one_message_that_is_gone_is_no_pass_and_one_never_sent_is_told_apart(what: str) -> None:
-    assert verdict(course(0.0, **{what: 1}))[what] is False
-    assert "skipped" not in verdict(course(0.0, skipped=900))
+    assert verdict(history(0.0, **{what: 1}))[what] is False
+    assert "skipped" not in verdict(history(0.0, skipped=900))
 
 
 def test_the_counts_of_all_processes_are_summed_by_what_they_mean() -> None:
@@ -91,9 +91,9 @@ def test_the_counts_of_all_processes_are_summed_by_what_they_mean() -> None:
     assert judged({"master": master, "left": left}) == expected
 
 
-def stepped(at_s: float, mb: float, length_s: float = 1200.0) -> Course:
+def stepped(at_s: float, mb: float, length_s: float = 1200.0) -> SoakHistory:
     """A process that leaks nothing, and one buffer that comes late, in two halves."""
-    made = course(0.0, length_s)
+    made = history(0.0, length_s)
     times = np.array(made.times_s)
     more = 0.5 * mb * ((times >= at_s).astype(float) + (times >= at_s + 5.0))
     mbs = np.array(made.series("master", "rss_mb")) + more
@@ -110,15 +110,15 @@ def test_a_step_is_found_in_the_minute_in_which_it_came(at_s: float) -> None:
 
 
 def test_a_step_after_the_start_is_no_pass_though_the_slope_leaves_it_out() -> None:
-    said = verdict(stepped(66.0, 34.0))
-    assert said["memory of master"] is True
-    assert said["steps of master"] is False
+    output = verdict(stepped(66.0, 34.0))
+    assert output["memory of master"] is True
+    assert output["steps of master"] is False
 
 
 def test_a_leak_noise_and_a_process_that_settles_are_no_steps() -> None:
     for per_h in (0.0, 3.0, 30.0):
-        assert verdict(course(per_h))["steps of master"] is True
-    assert verdict(course(0.0, 120.0))["steps of master"] is None
+        assert verdict(history(per_h))["steps of master"] is True
+    assert verdict(history(0.0, 120.0))["steps of master"] is None
 
 
 def test_a_step_says_which_mapping_grew() -> None:

@@ -56,8 +56,8 @@ def chunk(
 ) -> Chunk:
     """A chunk of these bytes; `size`: what it says of its own size."""
     packed = zstandard.compress(content, 19) if compression == "zstd" else content
-    said = len(content) if size is None else size
-    return Chunk(compression, packed, last_ns, first_ns, zlib.crc32(content), said)
+    output = len(content) if size is None else size
+    return Chunk(compression, packed, last_ns, first_ns, zlib.crc32(content), output)
 
 
 def streamed(content: bytes, size: int) -> Chunk:

@@ -11,7 +11,7 @@ from common.calibration import CameraCalibration, HandProfile, RigCalibration, l
 from common.errors import CalibrationError
 from common.hand_model import HandModel
 from common.hand_profiles import generated_profile
-from common.sim.light import paint
+from common.sim.light import marker_colour
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from slave.markers.detector import MarkerDetector
@@ -78,4 +78,4 @@ def test_a_detector_tells_all_eight_paints_where_they_are(camera: str, root: Pat
 
 def test_a_marker_without_paint_is_refused_with_those_there_are() -> None:
     with pytest.raises(CalibrationError, match=r"'back4'.*no such paint; it has thumb.*back2, back3"):
-        paint("back4")
+        marker_colour("back4")

@@ -48,7 +48,7 @@ def test_a_message_arrives_with_its_content_and_only_under_its_name(pair: Pair) 
     else:
         pytest.fail("nothing arrived")
     assert isinstance(got, Health)
-    assert (got.source, got.counts, got.gauges) == ("left", {"frames": 7}, {"rate_hz": 60.0})
+    assert (got.source, got.counts, got.metrics) == ("left", {"frames": 7}, {"rate_hz": 60.0})
     assert right_only.get(0.05) is None
     pair.slave.publish("health", "right", health("right"))
     got = right_only.get(60.0)

@@ -102,7 +102,7 @@ def hands(draw: st.DrawFn) -> HandProfile:
 
 
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-BESIDE = ((1.0, 0.0, 0.0, 0.075), *IDENTITY[1:])
+SHIFTED = ((1.0, 0.0, 0.0, 0.075), *IDENTITY[1:])
 CAMERA: dict[str, Any] = {
     "version": 1,
     "name": "left",
@@ -128,7 +128,7 @@ RIG: dict[str, Any] = {
     "kind": "markers",
     "cameras": ["left", "right"],
     "markers": ["thumb", "index"],
-    "T_rig_camera": {"left": IDENTITY, "right": BESIDE},
+    "T_rig_camera": {"left": IDENTITY, "right": SHIFTED},
     "depth_model": "power_law",
     "power_law": {"k_m": 45.433, "z": -1.035},
     "hand": "default-right",
@@ -195,7 +195,7 @@ def test_a_rig_is_loaded_equal(x0: float, k: float, z: float, imu: ImuCalibratio
         kind="markers",
         cameras=("left", "right"),
         hand="me",
-        T_rig_camera={"left": IDENTITY, "right": BESIDE},
+        T_rig_camera={"left": IDENTITY, "right": SHIFTED},
         depth_model="affine_disparity",
         power_law=PowerLawCalibration(k_m=k, z=z),
         affine_disparity=AffineDisparityCalibration(a_m_px=k, x0_px=x0),
@@ -210,7 +210,7 @@ def test_the_samples_of_this_file_are_valid(kind: type[msgspec.Struct]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "path", "value", "said"),
+    ("kind", "path", "value", "output"),
     [
         (RigCalibration, "imu", {"q_palm_imu": [1, 1, 0, 0]}, r"imu\.q_palm_imu: length 1\.414"),
         (RigCalibration, "imu", {"q_rig_world": [1, 0, 0]}, r"\$\.imu\.q_rig_world"),
@@ -269,14 +269,14 @@ def test_the_samples_of_this_file_are_valid(kind: type[msgspec.Struct]) -> None:
     ],
 )
 def test_a_wrong_key_or_value_is_refused_with_file_and_key(
-    kind: type[msgspec.Struct], path: str, value: object, said: str | None, tmp_path: Path
+    kind: type[msgspec.Struct], path: str, value: object, output: str | None, tmp_path: Path
 ) -> None:
     file = tmp_path / "some.json"
     file.write_bytes(changed(SAMPLES[kind], path, value))
-    if said is None:
+    if output is None:
         load(file, kind)
         return
-    with pytest.raises(CalibrationError, match=said) as caught:
+    with pytest.raises(CalibrationError, match=output) as caught:
         load(file, kind)
     assert str(caught.value).startswith(str(file))
 

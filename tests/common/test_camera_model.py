@@ -55,9 +55,9 @@ def test_project_is_opencvs(
     camera = model(distortion)
     points = transform(T_RIG_CAMERA, depth * np.concatenate([xy, np.ones((7, 1))], axis=1))
     T = invert(T_RIG_CAMERA)
-    turn = np.asarray(cv2.Rodrigues(T[:3, :3])[0], dtype=np.float64)
+    rotation = np.asarray(cv2.Rodrigues(T[:3, :3])[0], dtype=np.float64)
     expected = np.asarray(
-        cv2.projectPoints(points.reshape(-1, 1, 3), turn, T[:3, 3], camera.matrix, camera.distortion)[0]
+        cv2.projectPoints(points.reshape(-1, 1, 3), rotation, T[:3, 3], camera.matrix, camera.distortion)[0]
     )
     np.testing.assert_allclose(camera.project(points), expected.reshape(-1, 2), atol=1e-8)
 

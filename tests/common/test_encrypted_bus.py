@@ -93,7 +93,7 @@ def arrives(bus: ZenohBus, inbox: Subscription, name: str) -> bool:
     return inbox.get(0.05) is not None
 
 
-def all_heard(inbox: Subscription) -> set[str]:
+def all_received(inbox: Subscription) -> set[str]:
     """Of whom else there was something, until nothing comes any more."""
     names: set[str] = set()
     while isinstance(message := inbox.get(0.2), Health):
@@ -114,10 +114,10 @@ def test_commands_of_master_and_viewer_reach_a_camera_also_after_the_master_rest
         assert rig.master.ask(REPORT, 5.0).counts == {"frames": 7}
         assert until(lambda: "left" in rig.viewer.alive())
         assert rig.viewer.ask(REPORT, 5.0).counts == {"frames": 7}
-        heard = rig.viewer.subscribe("health", "left")
+        received = rig.viewer.subscribe("health", "left")
 
-        assert until(lambda inbox=heard: arrives(rig.left, inbox, "left"))
-        heard.close()
+        assert until(lambda inbox=received: arrives(rig.left, inbox, "left"))
+        received.close()
         rig.master.close()
         rig.master = rig.opened(lambda: ZenohBus(rig.endpoint, None, access(MASTER, rig.keys)))
         assert until(lambda: "left" in rig.master.alive())
@@ -132,18 +132,18 @@ def test_a_camera_commands_nobody_and_hears_nobody(rig: Rig) -> None:
             rig.right.ask(Command(target, "report"), 0.3)
     assert until(lambda: arrives(rig.left, open_one, "left"))
     assert until(lambda: arrives(rig.master, open_one, MASTER))
-    assert not all_heard(secret)
+    assert not all_received(secret)
 
 
 def test_a_camera_speaks_for_itself_alone(rig: Rig) -> None:
-    heard = rig.master.subscribe("health")
+    received = rig.master.subscribe("health")
     rig.right.announce("right")
     rig.right.announce("master")
     rig.right.serve("outputs", lambda command: health("outputs", 666))
-    assert until(lambda: arrives(rig.right, heard, "right"))
+    assert until(lambda: arrives(rig.right, received, "right"))
     for name in ("left", MASTER, "right"):
         rig.right.publish("health", name, health(name))
-    assert all_heard(heard) == {"right"}
+    assert all_received(received) == {"right"}
     assert rig.master.alive() == {"left", "right"}
     for asker in (rig.master, rig.viewer):
         with pytest.raises(BusError, match="no answer"):
@@ -160,7 +160,7 @@ def test_a_camera_tells_no_poses_and_nothing_in_the_name_of_another(rig: Rig) ->
         rig.right.publish("health", name, health("left"))
     rig.right.serve("right", lambda command: health("left", 666))
     assert until(lambda: arrives(rig.right, told["health"], "right"))
-    assert all_heard(told["health"]) <= {"right"}
+    assert all_received(told["health"]) <= {"right"}
     assert all(told[stream].get(0.0) is None for stream in ("hand", "gesture", "taken"))
     with pytest.raises(BusError, match="not its health report"):
         rig.master.ask(Command("right", "report"), 5.0)
@@ -174,13 +174,13 @@ def test_a_viewer_is_a_program_of_its_own_but_tells_no_poses_and_speaks_for_no_c
     rig.viewer.serve("right", lambda command: health("right", 666))
     with pytest.raises(BusError, match="no answer"):
         rig.master.ask(Command("right", "report"), 0.3)
-    heard, gestures = rig.master.subscribe("health"), rig.master.subscribe("gesture")
-    assert until(lambda: arrives(rig.viewer, heard, "outputs"))
+    received, gestures = rig.master.subscribe("health"), rig.master.subscribe("gesture")
+    assert until(lambda: arrives(rig.viewer, received, "outputs"))
     rig.viewer.publish("gesture", "hand", gesture())
     for name in ("left", MASTER, "outputs"):
         rig.viewer.publish("health", name, health(name))
     rig.viewer.publish("health", "*", health("left"))
-    assert all_heard(heard) == {"outputs"}
+    assert all_received(received) == {"outputs"}
     assert gestures.get(0.0) is None
 
 
@@ -221,11 +221,11 @@ def test_without_a_certificate_of_the_rig_nobody_comes_in_and_hears_why(
     with pytest.raises(BusError, match="cannot open the bus"):
         ZenohBus(None, plain, beyond=True)
     with caplog.at_level(logging.WARNING):
-        stranger = rig.opened(lambda: ZenohBus(None, rig.endpoint, access("left", foreign)))
+        unknown_peer = rig.opened(lambda: ZenohBus(None, rig.endpoint, access("left", foreign)))
         assert until(lambda: "another rig's" in caplog.text)
-    assert stranger.peers == 0
+    assert unknown_peer.peers == 0
     with pytest.raises(BusError, match="no certificate of this rig's master"):
-        stranger.ask(Command(MASTER, "report"), 0.1)
+        unknown_peer.ask(Command(MASTER, "report"), 0.1)
 
 
 def test_a_certificate_of_the_rig_that_its_authority_did_not_sign_is_refused_by_the_master(

@@ -47,7 +47,7 @@ def test_the_default_is_encrypted_where_there_are_keys() -> None:
 
 
 @pytest.mark.parametrize(
-    ("said", "heard_from", "reached"),
+    ("output", "received_from", "reached"),
     [
         ("tls/0.0.0.0:47802", "192.168.1.2", "tls/192.168.1.2:47802"),
         ("tls/192.168.7.7:47802", "192.168.1.2", "tls/192.168.7.7:47802"),
@@ -56,8 +56,8 @@ def test_the_default_is_encrypted_where_there_are_keys() -> None:
         ("", "192.168.1.2", ""),
     ],
 )
-def test_who_listens_everywhere_is_where_it_was_heard(said: str, heard_from: str, reached: str) -> None:
-    assert reached_at(said, heard_from) == reached
+def test_who_listens_everywhere_is_where_it_was_heard(output: str, received_from: str, reached: str) -> None:
+    assert reached_at(output, received_from) == reached
 
 
 def test_hosts_and_ports_are_read_off_any_endpoint() -> None:

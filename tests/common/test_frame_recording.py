@@ -65,7 +65,7 @@ def test_a_recording_without_frames_is_empty_not_broken(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("row", "said"),
+    ("row", "output"),
     [
         ("left,0,5,none", "columns"),
         ("left,0,5,none,", "columns"),
@@ -81,8 +81,8 @@ def test_a_recording_without_frames_is_empty_not_broken(tmp_path: Path) -> None:
         ("left,0,5,dark,x.png", "illumination: 'dark' is none of none, ambient, laser, led"),
     ],
 )
-def test_a_broken_row_is_named_by_file_and_line(row: str, said: str, tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=rf"frames\.csv: line 5: .*{said}"):
+def test_a_broken_row_is_named_by_file_and_line(row: str, output: str, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=rf"frames\.csv: line 5: .*{output}"):
         open_recording(write(tmp_path, rows=(*ROWS, row)))
 
 
@@ -116,7 +116,7 @@ def test_a_missing_file_is_named(file: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("manifest", "said"),
+    ("manifest", "output"),
     [
         ({"versoin": 1}, "versoin"),
         ({"version": 2}, "version"),
@@ -128,9 +128,9 @@ def test_a_missing_file_is_named(file: str, tmp_path: Path) -> None:
     ],
 )
 def test_a_broken_manifest_is_named_by_file_and_key(
-    manifest: dict[str, Any], said: str, tmp_path: Path
+    manifest: dict[str, Any], output: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(RecordingError, match=rf"recording\.json: .*{said}"):
+    with pytest.raises(RecordingError, match=rf"recording\.json: .*{output}"):
         open_recording(write(tmp_path, **manifest))
 
 

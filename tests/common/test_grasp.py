@@ -95,9 +95,9 @@ def test_the_bar_lies_still_follows_the_palm_and_comes_back_without_a_jump() -> 
         of_round = slice(round(k * ROUND_S / STEP_S), round((k + 1) * ROUND_S / STEP_S))
         lifted = motion.at(k * ROUND_S + LIFTED_S * float(motion.pace[k])).things[0]
         assert 0.07 < place[0, 1, 3] - lifted.T_rig_object[1, 3] < 0.13
-        turns = place[0, :3, :3].T @ place[of_round, :3, :3]
-        turned = np.arccos(np.clip(0.5 * (np.trace(turns, axis1=1, axis2=2) - 1.0), -1.0, 1.0))
-        assert 24.0 < np.degrees(turned.max()) < 30.0
+        rotations = place[0, :3, :3].T @ place[of_round, :3, :3]
+        rotated = np.arccos(np.clip(0.5 * (np.trace(rotations, axis1=1, axis2=2) - 1.0), -1.0, 1.0))
+        assert 24.0 < np.degrees(rotated.max()) < 30.0
 
 
 def held_times(motion: Grasp, step_s: float) -> list[float]:
@@ -143,7 +143,7 @@ class Before:
     def at(self, t_s: float) -> HandState:
         state = self._state
         return HandState(
-            state.T_rig_palm, state.angles_rad, state.bend_rad, () if self.bare else (self._bar,)
+            state.T_rig_palm, state.angles_rad, state.wrist_angles_rad, () if self.bare else (self._bar,)
         )
 
 

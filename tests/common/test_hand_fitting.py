@@ -38,8 +38,8 @@ def test_a_generated_hand_comes_back_from_its_joints(side: str) -> None:
         np.testing.assert_allclose(
             found.rest_position_m[chain[0]], truth.rest_position_m[chain[0]], atol=1e-6
         )
-        turn = found.rest_rotation[chain[0]].T @ truth.rest_rotation[chain[0]]
-        off_deg = np.degrees(np.arccos(np.clip(0.5 * (np.trace(turn) - 1.0), -1.0, 1.0)))
+        rotation = found.rest_rotation[chain[0]].T @ truth.rest_rotation[chain[0]]
+        off_deg = np.degrees(np.arccos(np.clip(0.5 * (np.trace(rotation) - 1.0), -1.0, 1.0)))
         assert off_deg < 2.0  # where abduction is zero is what the recording shows of it
 
 

@@ -61,9 +61,9 @@ def naive(profile: HandProfile, T_rig_palm: Float, angles: Float) -> dict[str, F
         names = [JOINTS[j] for j in joints][-4:]
         abduction, flexion, pip, dip = (float(a) for a in angles[f])
         root = rest[names[0]]
-        at, turn = rigid(np.eye(3), root[:3, 3]), rigid(root[:3, :3], np.zeros(3))
+        at, rotation = rigid(np.eye(3), root[:3, 3]), rigid(root[:3, :3], np.zeros(3))
         swing = about("y", sign * abduction)
-        now = at @ (turn @ swing if f == 0 else swing @ turn) @ about("x", -flexion)
+        now = at @ (rotation @ swing if f == 0 else swing @ rotation) @ about("x", -flexion)
         out[names[0]] = T_rig_palm @ now
         for before, name, bend in zip(names, names[1:], (pip, dip, 0.0), strict=False):
             now = now @ np.linalg.inv(rest[before]) @ rest[name] @ about("x", -bend)
@@ -325,7 +325,7 @@ def spread_without_zero(profile: HandProfile) -> HandProfile:
     return msgspec.structs.replace(profile, limits_rad=msgspec.structs.replace(limits, ring=ring))
 
 
-def stray_without_ratio(profile: HandProfile) -> HandProfile:
+def spread_without_ratio(profile: HandProfile) -> HandProfile:
     return msgspec.structs.replace(profile, couplings=Couplings(dip_per_pip=None, dip_spread_rad=0.1))
 
 
@@ -347,7 +347,7 @@ BROKEN: dict[str, tuple[Callable[[HandProfile], HandProfile], tuple[str, ...]]] 
     ),
     "crossed limits": (crossed, ("limits_rad.ring.pip_rad",)),
     "narrowing away from zero": (spread_without_zero, ("limits_rad.ring.spread_at_full_flexion", "0.1")),
-    "straying from nothing": (stray_without_ratio, ("couplings.dip_spread_rad", "dip_per_pip")),
+    "straying from nothing": (spread_without_ratio, ("couplings.dip_spread_rad", "dip_per_pip")),
     "unknown mount": (mounted, ("markers.index.joint", "elbow")),
     "unknown radius": (lambda p: msgspec.structs.replace(p, radius_m={"elbow": 0.01}), ("radius_m", "elbow")),
 }

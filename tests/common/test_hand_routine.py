@@ -8,7 +8,7 @@ import pytest
 from common.hand_model import HandModel
 from common.hand_profiles import generated_profile
 from common.hand_routine import MOVES, ROUTINE_S, STEPS, move_at, posture_at
-from common.sim.routine import LEAD_S, PERIOD_S, HandRoutine
+from common.sim.routine import PERIOD_S, REACTION_S, HandRoutine
 
 MODEL = HandModel.of(generated_profile("any", "right"))
 
@@ -51,7 +51,7 @@ def test_the_user_is_late_within_limits_seeded_and_rests_the_palm() -> None:
     script = np.array([user.script_s(t) for t in times.tolist()])
     assert (np.diff(script) >= 0.0).all()
     assert script[-1] == pytest.approx(ROUTINE_S)
-    late = times - LEAD_S - script
+    late = times - REACTION_S - script
     middle = (script > 0.5) & (script < ROUTINE_S - 0.5)
     assert late[middle].min() > 0.0
     assert late[middle].max() < 0.5

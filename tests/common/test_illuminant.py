@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.errors import PhalanxError
-from common.sim.illuminant import CALIBRATED_KELVIN, ROOM, Light, LightCourse, planckian_xy, white
+from common.sim.illuminant import CALIBRATED_KELVIN, ROOM, Light, LightSchedule, planckian_xy, white
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from common.sim.scenes import scene_by_name
-from common.srgb import relit_bytes, to_linear, to_srgb
+from common.srgb import gain_tables, to_linear, to_srgb
 
 ROOT = Path(__file__).resolve().parents[2]
 RIG = load(ROOT / "calib_json/rigs/desk.json", RigCalibration)
@@ -65,32 +65,32 @@ def test_the_range_that_is_followed_in_numbers() -> None:
 
 
 def test_a_course_goes_straight_jumps_and_stays() -> None:
-    course = LightCourse(((1.0, 3000.0, 1.0), (3.0, 5000.0, 0.5), (3.0, 6500.0, 1.5)))
-    assert course.at(0.0) == Light(3000.0, 1.0)
-    assert course.at(2.0) == Light(4000.0, 0.75)
-    assert course.at(3.0) == course.at(99.0) == Light(6500.0, 1.5)
-    assert course.at(2.999999).kelvin == pytest.approx(5000.0, abs=0.01)
+    schedule = LightSchedule(((1.0, 3000.0, 1.0), (3.0, 5000.0, 0.5), (3.0, 6500.0, 1.5)))
+    assert schedule.at(0.0) == Light(3000.0, 1.0)
+    assert schedule.at(2.0) == Light(4000.0, 0.75)
+    assert schedule.at(3.0) == schedule.at(99.0) == Light(6500.0, 1.5)
+    assert schedule.at(2.999999).kelvin == pytest.approx(5000.0, abs=0.01)
 
 
 @pytest.mark.parametrize(
-    ("make", "says"),
+    ("make", "expected"),
     [
         (lambda: planckian_xy(1000.0), "1000 K"),
-        (lambda: LightCourse(()), "at least one"),
-        (lambda: LightCourse(((2.0, 5000.0, 1.0), (1.0, 5000.0, 1.0))), "order of time"),
-        (lambda: LightCourse(((0.0, 100.0, 1.0),)), "100 K"),
-        (lambda: LightCourse(((0.0, 5000.0, 0.0),)), "exposure 0"),
-        (lambda: LightCourse(((0.0, 5000.0, 1.0),), calibrated_kelvin=1700.0), "no blue"),
+        (lambda: LightSchedule(()), "at least one"),
+        (lambda: LightSchedule(((2.0, 5000.0, 1.0), (1.0, 5000.0, 1.0))), "order of time"),
+        (lambda: LightSchedule(((0.0, 100.0, 1.0),)), "100 K"),
+        (lambda: LightSchedule(((0.0, 5000.0, 0.0),)), "exposure 0"),
+        (lambda: LightSchedule(((0.0, 5000.0, 1.0),), calibrated_kelvin=1700.0), "no blue"),
     ],
 )
-def test_an_impossible_light_is_refused(make: object, says: str) -> None:
+def test_an_impossible_light_is_refused(make: object, expected: str) -> None:
     assert callable(make)
-    with pytest.raises(PhalanxError, match=says):
+    with pytest.raises(PhalanxError, match=expected):
         make()
 
 
 def test_bytes_change_in_linear_light_and_clip() -> None:
-    tables = relit_bytes([1.0, 0.5, 2.0])
+    tables = gain_tables([1.0, 0.5, 2.0])
     np.testing.assert_array_equal(tables[0], np.arange(256))
     # sRGB 188 is half the light of 255 (IEC 61966-2-1: 0.5 -> 0.7354).
     assert tables[1][255] == 188
@@ -101,7 +101,7 @@ def test_bytes_change_in_linear_light_and_clip() -> None:
 
 def test_a_picture_under_another_light() -> None:
     plain = Scene.standard(RIG, CAMERAS, HAND)
-    lit = replace(plain, light=LightCourse(((0.0, 3000.0, 0.8),)))
+    lit = replace(plain, light=LightSchedule(((0.0, 3000.0, 0.8),)))
     before, after = Renderer(plain, "left").render(20.0), Renderer(lit, "left").render(20.0)
     quiet = (before > 60) & (before < 150)  # neither clipped, nor so dark that noise is most of it
     for channel, gain in enumerate(Light(3000.0, 0.8).gains_bgr()):
@@ -112,7 +112,7 @@ def test_a_picture_under_another_light() -> None:
 
 def test_calibrated_light_changes_no_pixel() -> None:
     plain = Scene.standard(RIG, CAMERAS, HAND)
-    lit = replace(plain, light=LightCourse(((0.0, CALIBRATED_KELVIN, 1.0),)))
+    lit = replace(plain, light=LightSchedule(((0.0, CALIBRATED_KELVIN, 1.0),)))
     np.testing.assert_array_equal(Renderer(plain, "left").render(20.0), Renderer(lit, "left").render(20.0))
 
 

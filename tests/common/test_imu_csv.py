@@ -70,7 +70,11 @@ def test_time_without_a_unit_is_in_the_one_that_fits(unit: str, step: float, tmp
     rows = [f"{k * step},0,0,0,0,0,1" for k in range(4)]
     table = read(tmp_path, "\n".join(["t,gx,gy,gz,ax,ay,az", *rows]))
     assert np.diff(table.t_ns) == pytest.approx(step * UNITS["time"][unit])
-    assert table.units == {"time": f"{unit} (not said)", "gyro": "rad/s (not said)", "accel": "g (not said)"}
+    assert table.units == {
+        "time": f"{unit} (not stated)",
+        "gyro": "rad/s (not stated)",
+        "accel": "g (not stated)",
+    }
 
 
 def test_units_can_be_given_and_a_table_may_lack_time(tmp_path: Path) -> None:
@@ -99,7 +103,7 @@ def test_what_was_not_measured_is_nan_and_counted_and_late_rows_are_left_out(tmp
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "expected"),
     [
         (
             "t,gx,gy,ax,ay,az\n0,0,0,0,0,1\n",
@@ -120,8 +124,8 @@ def test_what_was_not_measured_is_nan_and_counted_and_late_rows_are_left_out(tmp
         ("hello\n", "line 1: no header"),
     ],
 )
-def test_what_cannot_be_read_is_refused_with_its_place(text: str, says: str, tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=says):
+def test_what_cannot_be_read_is_refused_with_its_place(text: str, expected: str, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=expected):
         read(tmp_path, text)
 
 

@@ -18,22 +18,22 @@ from tests.hand_helpers import any_rotation
 RATE_HZ = 120.0
 STEP_NS = round(1e9 / RATE_HZ)
 G = np.array([0.0, 0.0, 9.81])
-NO_RATE, NONE, NO_TURN = np.zeros(3), np.full(3, np.nan), np.full(4, np.nan)
+NO_RATE, NONE, NO_QUATERNION = np.zeros(3), np.full(3, np.nan), np.full(4, np.nan)
 
 
 def sample(k: float, gyro: Float, accel: Float) -> ImuSample:
-    return ImuSample("imu", 3, 7, round(k * STEP_NS), gyro, accel, NONE, NO_TURN)
+    return ImuSample("imu", 3, 7, round(k * STEP_NS), gyro, accel, NONE, NO_QUATERNION)
 
 
 def still(first: float, seconds: float, gyro: Float = NO_RATE, accel: Float = G) -> list[ImuSample]:
     return [sample(first + k, gyro, accel) for k in range(round(seconds * RATE_HZ))]
 
 
-def swayed(first: int, seconds: float, bias: Float, turn: float = 0.6) -> list[tuple[ImuSample, Float]]:
+def swayed(first: int, seconds: float, bias: Float, rotation: float = 0.6) -> list[tuple[ImuSample, Float]]:
     """Samples of a forearm that sways about two level axes, and how it lies (3, 3)."""
 
     def at(t: float) -> Float:
-        return axis_rotation(0, turn * np.sin(3.0 * t)) @ axis_rotation(1, turn * np.sin(2.0 * t))
+        return axis_rotation(0, rotation * np.sin(3.0 * t)) @ axis_rotation(1, rotation * np.sin(2.0 * t))
 
     made: list[tuple[ImuSample, Float]] = []
     for k in range(first, first + round(seconds * RATE_HZ)):
@@ -94,11 +94,11 @@ def test_it_is_known_after_nine_tenths_of_a_second() -> None:
 def test_a_quarter_turn_is_a_quarter_turn_at_any_rate(every: int) -> None:
     fusion = OrientationFilter(RATE_HZ / every)
     begun = heading_deg(run(fusion, still(0, 2.0)[::every]))
-    turn = np.array([0.0, 0.0, 5.0])  # rad/s, for pi / 10 s; half a step more at either end
+    rotation = np.array([0.0, 0.0, 5.0])  # rad/s, for pi / 10 s; half a step more at either end
     k = 240 + np.arange(0.0, np.pi / 10.0 * RATE_HZ - every, every)
-    run(fusion, [sample(240 - 1e-3, turn, G), *(sample(one, turn, G) for one in k[1:])])
+    run(fusion, [sample(240 - 1e-3, rotation, G), *(sample(one, rotation, G) for one in k[1:])])
     last = 240 + np.pi / 10.0 * RATE_HZ
-    found = run(fusion, [sample(last, turn, G), sample(last + 1e-3, np.zeros(3), G)])
+    found = run(fusion, [sample(last, rotation, G), sample(last + 1e-3, np.zeros(3), G)])
     assert heading_deg(found) - begun == pytest.approx(90.0, abs=2.5 * every)  # trapezoid where it begins
     assert tilt_deg(found, np.eye(3)) < 0.1
 
@@ -130,8 +130,8 @@ def test_rest_tells_the_bias_and_the_heading_stays_after_it() -> None:
     found = run(fusion, [one for one, _ in made])
     assert not fusion.at_rest
     assert tilt_deg(found, made[-1][1]) < 0.7
-    turned = quaternion_to_matrix(found.orientation_wxyz) @ made[-1][1].T  # about the vertical, nearly
-    drift = abs(np.degrees(np.arctan2(turned[1, 0], turned[0, 0])) - begun)
+    rotated = quaternion_to_matrix(found.orientation_wxyz) @ made[-1][1].T  # about the vertical, nearly
+    drift = abs(np.degrees(np.arctan2(rotated[1, 0], rotated[0, 0])) - begun)
     assert drift < 3.0 * np.degrees(np.sqrt(fusion.heading_sigma_rad**2 - grown**2)) < 10.0
     assert drift < 1.0
 
@@ -232,7 +232,7 @@ def test_after_a_gap_it_settles_anew_and_its_heading_is_unsure(away_s: float) ->
 def test_one_sample_of_the_future_does_not_shut_out_those_that_follow() -> None:
     fusion = OrientationFilter(RATE_HZ)
     run(fusion, still(0, 1.0))
-    fusion.push(ImuSample("imu", 0, 0, 2**62, np.zeros(3), G, NONE, NO_TURN))
+    fusion.push(ImuSample("imu", 0, 0, 2**62, np.zeros(3), G, NONE, NO_QUATERNION))
     assert tilt_deg(run(fusion, still(121, 1.0)), np.eye(3)) < 0.05
     assert fusion.counts == {"fusion.gap": 2}
 
@@ -254,13 +254,13 @@ def test_one_sample_of_the_future_does_not_shut_out_those_that_follow() -> None:
 def test_an_even_turn_that_looks_like_rest_is_found_out(
     parts: list[tuple[float, float]], within_deg: float
 ) -> None:
-    fusion, first, turned_deg = OrientationFilter(RATE_HZ), 0, 0.0
+    fusion, first, rotated_deg = OrientationFilter(RATE_HZ), 0, 0.0
     found = run(fusion, still(-60, 0.5))
     for seconds, upright_deg_s in parts:
         found = run(fusion, still(first, seconds, np.radians([0.2, -0.2, upright_deg_s])))
         first += round(seconds * RATE_HZ)
-        turned_deg += seconds * upright_deg_s
-    off_deg = abs((heading_deg(found) - turned_deg + 180.0) % 360.0 - 180.0)
+        rotated_deg += seconds * upright_deg_s
+    off_deg = abs((heading_deg(found) - rotated_deg + 180.0) % 360.0 - 180.0)
     assert off_deg < within_deg
     assert off_deg < 2.0 * np.degrees(found.heading_sigma_rad)
     assert np.degrees(fusion.bias_rad_s) == pytest.approx([0.2, -0.2, 0.0], abs=0.05)

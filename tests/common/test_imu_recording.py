@@ -15,11 +15,15 @@ ROW = "1000,0.1,0.2,0.3,0,0,9.81,20,0,-40,1,0,0,0"
 
 def samples(count: int = 20) -> list[ImuSample]:
     rng = np.random.default_rng(3)
-    nothing, turns = np.full(3, np.nan), rng.normal(size=(count, 4))
+    nothing, rotations = np.full(3, np.nan), rng.normal(size=(count, 4))
     return [
         ImuSample("imu", 0, k, 10**9 + 8_333_333 * k, gyro, accel, nothing, q, np.nan if k < 5 else 0.1 * k)
         for k, (gyro, accel, q) in enumerate(
-            zip(*rng.normal(size=(2, count, 3)), turns / np.linalg.norm(turns, axis=1)[:, None], strict=True)
+            zip(
+                *rng.normal(size=(2, count, 3)),
+                rotations / np.linalg.norm(rotations, axis=1)[:, None],
+                strict=True,
+            )
         )
     ]
 
@@ -53,7 +57,7 @@ def test_field_and_orientation_may_be_left_out(header: tuple[str, ...], tmp_path
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "output"),
     [
         ("t_ns,gx,gy\n", r"imu\.csv: header t_ns,gx,gy: must be t_ns,gx"),
         ("", r"imu\.csv: header : must be"),
@@ -67,9 +71,9 @@ def test_field_and_orientation_may_be_left_out(header: tuple[str, ...], tmp_path
         (f"{FULL}\n{ROW}\n{ROW}\n", r"line 3: t_ns: 1000 is not after 1000"),
     ],
 )
-def test_a_broken_table_is_refused_with_file_line_and_column(text: str, said: str, tmp_path: Path) -> None:
+def test_a_broken_table_is_refused_with_file_line_and_column(text: str, output: str, tmp_path: Path) -> None:
     (tmp_path / "imu.csv").write_text(text)
-    with pytest.raises(RecordingError, match=said) as caught:
+    with pytest.raises(RecordingError, match=output) as caught:
         read_imu(tmp_path, "imu")
     assert str(tmp_path) in str(caught.value)
 

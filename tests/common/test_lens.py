@@ -53,7 +53,7 @@ def test_lenses_that_fold_and_lenses_that_do_not(
     assert (fold_of(lens(*distortion)) is not None) == folds
 
 
-def test_a_fold_between_the_axis_and_a_picture_beside_it_counts() -> None:
+def test_a_fold_between_the_axis_and_a_picture_next_to_it_counts() -> None:
     assert fold_of(lens(-0.3, 0, 0, 0, 0, centre=(-600.0, 240.0))) is not None
     assert fold_of(lens(-0.01, 0, 0, 0, 0, centre=(-600.0, 240.0))) is None
     # On the other side of the axis it does not.

@@ -25,8 +25,8 @@ def test_a_pi_is_hot_from_where_it_lowers_its_clock(tmp_path: Path) -> None:
     flags.parent.mkdir(parents=True)
     flags.write_text("50005\n")  # now and since the start: weak supply, throttled
     (tmp_path / "disk_free_mb").write_text("123.5\n")
-    gauges = Machine(tmp_path, {ROOT: str(tmp_path)}).gauges()
-    assert gauges == {
+    metrics = Machine(tmp_path, {ROOT: str(tmp_path)}).metrics()
+    assert metrics == {
         "temperature_c": 81.3,
         "temperature_limit_c": 80.0,
         "throttled": 5.0,
@@ -39,16 +39,16 @@ def test_of_another_computer_the_zone_nearest_to_its_trip_point_counts(tmp_path:
     _zone(tmp_path, 1, "x86_pkg_temp", "91000", **TRIPS)
     _zone(tmp_path, 2, "wifi", "60000", **TRIPS)
     _zone(tmp_path, 3, "odd", "not known", **TRIPS)
-    gauges = Machine(tmp_path, {ROOT: str(tmp_path)}).gauges()
-    assert (gauges["temperature_c"], gauges["temperature_limit_c"]) == (91.0, 95.0)
+    metrics = Machine(tmp_path, {ROOT: str(tmp_path)}).metrics()
+    assert (metrics["temperature_c"], metrics["temperature_limit_c"]) == (91.0, 95.0)
 
 
 def test_what_is_not_there_is_not_told(tmp_path: Path) -> None:
-    gauges = Machine(tmp_path, {ROOT: str(tmp_path)}).gauges()
-    assert set(gauges) == {"disk_free_mb"}
-    assert gauges["disk_free_mb"] > 0.0  # of the disk that the folder really is on
+    metrics = Machine(tmp_path, {ROOT: str(tmp_path)}).metrics()
+    assert set(metrics) == {"disk_free_mb"}
+    assert metrics["disk_free_mb"] > 0.0  # of the disk that the folder really is on
     (tmp_path / "disk_free_mb").write_text("")  # as it is while somebody writes it
-    assert Machine(tmp_path, {ROOT: str(tmp_path)}).gauges()["disk_free_mb"] > 0.0
+    assert Machine(tmp_path, {ROOT: str(tmp_path)}).metrics()["disk_free_mb"] > 0.0
     assert Machine(tmp_path / "gone", {ROOT: str(tmp_path)}).disk_free_mb() is None
 
 
@@ -56,7 +56,7 @@ def test_a_pi_5_has_the_flags_of_its_firmware_elsewhere(tmp_path: Path) -> None:
     flags = tmp_path / "sys/devices/platform/soc@107c000000/soc@107c000000:firmware/get_throttled"
     flags.parent.mkdir(parents=True)
     flags.write_text("80008\n")
-    assert Machine(tmp_path, {ROOT: str(tmp_path)}).gauges()["throttled"] == 8.0
+    assert Machine(tmp_path, {ROOT: str(tmp_path)}).metrics()["throttled"] == 8.0
 
 
 def test_a_kernel_without_these_flags_tells_of_a_weak_supply_alone(tmp_path: Path) -> None:
@@ -65,4 +65,4 @@ def test_a_kernel_without_these_flags_tells_of_a_weak_supply_alone(tmp_path: Pat
         sensor.mkdir(parents=True)
         (sensor / "name").write_text(name + "\n")
         (sensor / "in0_lcrit_alarm").write_text(alarm + "\n")
-    assert Machine(tmp_path, {ROOT: str(tmp_path)}).gauges()["throttled"] == 1.0
+    assert Machine(tmp_path, {ROOT: str(tmp_path)}).metrics()["throttled"] == 1.0

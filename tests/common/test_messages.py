@@ -32,12 +32,12 @@ from common.messages import (
     HandPose,
     Health,
     ImuSample,
-    Level,
     MarkerDetections,
     Message,
     ObjectPose,
     ObjectSource,
     Preview,
+    SolverMode,
     Source,
     Still,
     TagDetections,
@@ -72,7 +72,7 @@ def rows(kind: type[Message], field: str, *shape: int) -> st.SearchStrategy[Floa
     )
 
 
-def turns() -> st.SearchStrategy[Float]:
+def rotations() -> st.SearchStrategy[Float]:
     """Unit quaternions, and the one that is not known."""
     whole = arrays(np.float64, 4, elements=st.floats(-1.0, 1.0)).filter(lambda q: float(q @ q) > 0.01)
     return st.just(np.full(4, np.nan)) | whole.map(lambda q: q / np.linalg.norm(q))
@@ -94,13 +94,13 @@ def detections(draw: st.DrawFn) -> MarkerDetections:
         area=draw(floats(kind, "area", m)),
         quality=draw(floats(kind, "quality", m)),
         sigma_px=positive(draw, seen),
-        rival_uv=np.where(seen[:, None], draw(rows(kind, "rival_uv", m, 2)), np.nan),
+        alt_uv=np.where(seen[:, None], draw(rows(kind, "alt_uv", m, 2)), np.nan),
         t_sigma_ns=draw(st.floats(0.0, 1e10)),
     )
 
 
 @st.composite
-def triples(draw: st.DrawFn) -> WristDetections:
+def cycles(draw: st.DrawFn) -> WristDetections:
     kind, size = WristDetections, FINGER_COUNT
     laser, tip = (draw(rows(kind, name, size, 2)) for name in ("laser_uv", "tip_uv"))
     return WristDetections(
@@ -145,7 +145,7 @@ trackers = st.builds(
     seq=counts,
     t_ns=times,
     position_m=rows(TrackerPose, "position_m", 3),
-    orientation_wxyz=turns(),
+    orientation_wxyz=rotations(),
 )
 objects = st.builds(
     ObjectPose,
@@ -211,12 +211,12 @@ def hand_poses(draw: st.DrawFn) -> HandPose:
         inside_volume=draw(arrays(np.bool_, j)),
         latency_ns=draw(times),
         laser_m=draw(floats(HandPose, "laser_m", FINGER_COUNT, 3)),
-        level=draw(arrays(np.uint8, FINGER_COUNT, elements=st.sampled_from(list(Level)).map(int))),
+        solver_mode=draw(arrays(np.uint8, FINGER_COUNT, elements=st.sampled_from(list(SolverMode)).map(int))),
         ambiguous=draw(arrays(np.bool_, FINGER_COUNT)),
         palm_world_wxyz=draw(floats(HandPose, "palm_world_wxyz", 4)),
         palm_world_sigma_rad=draw(floats(HandPose, "palm_world_sigma_rad", 2)),
-        wrist_bend_rad=draw(floats(HandPose, "wrist_bend_rad", 2)),
-        wrist_bend_sigma_rad=draw(floats(HandPose, "wrist_bend_sigma_rad", 2)),
+        wrist_angles_rad=draw(floats(HandPose, "wrist_angles_rad", 2)),
+        wrist_angles_sigma_rad=draw(floats(HandPose, "wrist_angles_sigma_rad", 2)),
     )
 
 
@@ -229,7 +229,7 @@ imu_samples = st.builds(
     gyro_rad_s=rows(ImuSample, "gyro_rad_s", 3),
     accel_m_s2=rows(ImuSample, "accel_m_s2", 3),
     mag_ut=rows(ImuSample, "mag_ut", 3),
-    orientation_wxyz=turns(),
+    orientation_wxyz=rotations(),
     heading_sigma_rad=st.just(float("nan")) | st.floats(0.0, 10.0),
 )
 healths = st.builds(
@@ -238,10 +238,10 @@ healths = st.builds(
     session=counts,
     t_ns=times,
     counts=st.dictionaries(names, counts, max_size=64),
-    gauges=st.dictionaries(names, st.floats(-1e18, 1e18), max_size=64),
+    metrics=st.dictionaries(names, st.floats(-1e18, 1e18), max_size=64),
 )
 commands = st.builds(Command, target=names, verb=names, body=st.text(max_size=200))
-backlogs = st.builds(Backlog, source=names, t_ns=times, leave_out=st.integers(0, 64))
+backlogs = st.builds(Backlog, source=names, t_ns=times, reject=st.integers(0, 64))
 previews = st.builds(
     Preview, camera=names, t_ns=times, jpeg=st.binary(max_size=200).map(lambda tail: JPEG_HEAD + tail)
 )
@@ -267,15 +267,17 @@ def sample_pose(markers: int = 6) -> HandPose:
     )
 
 
-def sample_detections(markers: int = 6, rivals: Float | None = None) -> MarkerDetections:
+def sample_detections(markers: int = 6, alternatives: Float | None = None) -> MarkerDetections:
     uv = np.arange(2.0 * markers).reshape(markers, 2)
     uv[1:2] = np.nan
     sigma = np.where(np.isnan(uv[:, 0]), np.nan, 0.1)
-    rival = np.full((markers, 2), np.nan) if rivals is None else rivals
-    return MarkerDetections("left", 1, 2, 3, 4, uv, np.full(markers, 80.0), np.ones(markers), sigma, rival)
+    alternative = np.full((markers, 2), np.nan) if alternatives is None else alternatives
+    return MarkerDetections(
+        "left", 1, 2, 3, 4, uv, np.full(markers, 80.0), np.ones(markers), sigma, alternative
+    )
 
 
-def sample_triple() -> WristDetections:
+def sample_cycle() -> WristDetections:
     """The little finger's laser and the thumb's tip are not seen."""
     laser, tip = np.arange(10.0).reshape(5, 2), np.arange(20.0, 30.0).reshape(5, 2)
     laser[4], tip[0] = np.nan, np.nan
@@ -303,7 +305,7 @@ def sample_contact() -> Contact:
 
 SAMPLES: tuple[Message, ...] = (
     sample_detections(),
-    sample_triple(),
+    sample_cycle(),
     sample_tags(),
     TrackerPose("tracker", 1, 2, 3, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])),
     sample_object(),
@@ -337,7 +339,7 @@ def as_map(message: Message) -> dict[str, object]:
 
 
 EVERY = (
-    *(detections(), triples(), tags(), trackers, imu_samples, hand_poses(), objects, contacts, gestures),
+    *(detections(), cycles(), tags(), trackers, imu_samples, hand_poses(), objects, contacts, gestures),
     *(healths, commands, backlogs, previews),
 )
 
@@ -377,7 +379,7 @@ def parts_of(pose: HandPose, *more: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize("markers", [0, 6, MAX_MARKERS])
 def test_a_pose_of_good_arrays_is_the_one_that_is_checked_and_holds_them(markers: int) -> None:
-    parts = parts_of(sample_pose(markers), "laser_m", "level")
+    parts = parts_of(sample_pose(markers), "laser_m", "solver_mode")
     pose = HandPose.known_good("right", 5, **parts)
     assert_same(pose, HandPose(hand="right", t_ns=5, **parts))
     assert encode(decode(encode(pose))) == encode(pose)
@@ -393,7 +395,7 @@ def test_a_pose_of_good_arrays_is_the_one_that_is_checked_and_holds_them(markers
         ("position_m", np.zeros((JOINT_COUNT, 3), np.float32)),
         ("valid", np.ones(JOINT_COUNT, np.uint8)),
         ("markers_raw_m", np.zeros((5, 3))),
-        ("level", np.zeros(5)),
+        ("solver_mode", np.zeros(5)),
         ("latency", np.zeros(5)),
     ],
 )
@@ -431,9 +433,9 @@ def longest(markers: int) -> MarkerDetections:
     )
 
 
-def test_a_triple_is_far_below_one_ethernet_packet() -> None:
-    longest_triple = msgspec.structs.replace(
-        sample_triple(),
+def test_a_cycle_is_far_below_one_ethernet_packet() -> None:
+    longest_cycle = msgspec.structs.replace(
+        sample_cycle(),
         camera="x" * 64,
         session=2**63 - 1,
         seq=2**63 - 1,
@@ -441,7 +443,7 @@ def test_a_triple_is_far_below_one_ethernet_packet() -> None:
         ready_t_ns=-MAX_TIME_NS,
     )
     # 5 * (2 + 1 + 1 + 2 + 1 + 1) * 8 bytes of numbers; names and keys come on top.
-    assert 320 < len(encode(sample_triple())) < len(encode(longest_triple)) < 640
+    assert 320 < len(encode(sample_cycle())) < len(encode(longest_cycle)) < 640
 
 
 def test_the_most_tags_are_one_ethernet_packet() -> None:
@@ -464,16 +466,16 @@ def test_the_detections_of_24_markers_are_one_ethernet_packet_while_none_has_a_r
 
 
 def test_no_rival_travels_as_no_bytes_and_one_rival_with_its_row() -> None:
-    assert as_map(sample_detections())["rival_uv"] == b""
+    assert as_map(sample_detections())["alt_uv"] == b""
     decoded = decode(encode(sample_detections()))
     assert isinstance(decoded, MarkerDetections)
-    assert decoded.rival_uv.shape == (6, 2)
-    assert np.isnan(decoded.rival_uv).all()
-    rivals = np.full((6, 2), np.nan)
-    rivals[3] = 7.0, 8.0
-    decoded = decode(encode(sample_detections(6, rivals)))
+    assert decoded.alt_uv.shape == (6, 2)
+    assert np.isnan(decoded.alt_uv).all()
+    alternatives = np.full((6, 2), np.nan)
+    alternatives[3] = 7.0, 8.0
+    decoded = decode(encode(sample_detections(6, alternatives)))
     assert isinstance(decoded, MarkerDetections)
-    np.testing.assert_array_equal(decoded.rival_uv, rivals)
+    np.testing.assert_array_equal(decoded.alt_uv, alternatives)
 
 
 @pytest.mark.parametrize("value", [np.inf, -np.inf])
@@ -497,14 +499,14 @@ def test_a_restamped_message_is_another_one_with_the_same_arrays() -> None:
 
 
 def test_a_message_knows_whether_a_marker_has_a_rival() -> None:
-    rivals = np.full((6, 2), np.nan)
-    rivals[3] = [40.0, 50.0]
-    assert sample_detections(6, rivals).has_rivals
+    alternatives = np.full((6, 2), np.nan)
+    alternatives[3] = [40.0, 50.0]
+    assert sample_detections(6, alternatives).has_alternatives
     none = sample_detections(6)
-    assert not none.has_rivals
+    assert not none.has_alternatives
     back = decode(encode(none))
     assert isinstance(back, MarkerDetections)
-    assert not back.has_rivals
+    assert not back.has_alternatives
 
 
 @pytest.mark.parametrize(
@@ -532,10 +534,10 @@ def test_a_message_knows_whether_a_marker_has_a_rival() -> None:
         (MarkerDetections, {"sigma_px": np.array([0.1, np.nan, 0.1, np.inf, 0.1, 0.1]).tobytes()}),
         (MarkerDetections, {"sigma_px": np.array([0.1, np.nan, 0.1, np.nan, 0.1, 0.1]).tobytes()}),  # seen
         (MarkerDetections, {"sigma_px": np.full(6, 0.1).tobytes()}),  # the second is not seen
-        (MarkerDetections, {"rival_uv": b"\0" * 8}),
-        (MarkerDetections, {"rival_uv": np.zeros((5, 2)).tobytes()}),
-        (MarkerDetections, {"rival_uv": np.zeros((6, 2)).tobytes()}),  # the second is not seen
-        (MarkerDetections, {"rival_uv": np.full((6, 2), -np.inf).tobytes()}),
+        (MarkerDetections, {"alt_uv": b"\0" * 8}),
+        (MarkerDetections, {"alt_uv": np.zeros((5, 2)).tobytes()}),
+        (MarkerDetections, {"alt_uv": np.zeros((6, 2)).tobytes()}),  # the second is not seen
+        (MarkerDetections, {"alt_uv": np.full((6, 2), -np.inf).tobytes()}),
         (MarkerDetections, {"surplus": 1}),
         (MarkerDetections, {"type": "HandPose"}),
         (MarkerDetections, {"type": "Pickle"}),
@@ -547,12 +549,12 @@ def test_a_message_knows_whether_a_marker_has_a_rival() -> None:
         (HandPose, {"markers_raw_m": b""}),
         (Health, {"counts": {"frames": -1}}),
         (Health, {"counts": {f"c{i}": 1 for i in range(513)}}),
-        (Health, {"gauges": {"rate_hz": float("nan")}}),
-        (Health, {"gauges": {"rate_hz": float("inf")}}),
-        (Health, {"gauges": {"a b": 1.0}}),
+        (Health, {"metrics": {"rate_hz": float("nan")}}),
+        (Health, {"metrics": {"rate_hz": float("inf")}}),
+        (Health, {"metrics": {"a b": 1.0}}),
         (Command, {"verb": ""}),
-        (Backlog, {"leave_out": -1}),
-        (Backlog, {"leave_out": 65}),
+        (Backlog, {"reject": -1}),
+        (Backlog, {"reject": 65}),
         (Preview, {"jpeg": b""}),
         (Preview, {"jpeg": b"GIF89a"}),
         (Preview, {"jpeg": "text"}),
@@ -578,7 +580,7 @@ def test_a_message_knows_whether_a_marker_has_a_rival() -> None:
         (ImuSample, {"heading_sigma_rad": -0.1}),
         (ImuSample, {"heading_sigma_rad": float("inf")}),
         (HandPose, {"laser_m": b"\0" * 8 * 14}),
-        (HandPose, {"level": b"\3\0\0\0\0"}),
+        (HandPose, {"solver_mode": b"\3\0\0\0\0"}),
         (HandPose, {"ambiguous": b"\0" * 4}),
         (HandPose, {"palm_world_wxyz": b"\0" * 8 * 3}),
         (HandPose, {"palm_world_sigma_rad": np.full(2, np.inf).tobytes()}),
@@ -642,7 +644,7 @@ def test_a_number_beyond_its_bounds_is_refused_as_such(
         (MarkerDetections, {"t_sigma_ns": 1e11}),
         (MarkerDetections, {"seq": -1}),
         (WristDetections, {"exposure_us": 1e8}),
-        (Backlog, {"leave_out": 65}),
+        (Backlog, {"reject": 65}),
         (TrackerPose, {"orientation_wxyz": np.array([0.5, 0.0, 0.0, 0.0]).tobytes()}),
         (ImuSample, {"orientation_wxyz": np.zeros(4).tobytes()}),
     ],
@@ -679,24 +681,24 @@ def test_texts_of_a_device_are_printable(text: str) -> None:
     for field in ("host", "version"):
         with pytest.raises(MessageError):
             decode(msgspec.msgpack.encode(content | {field: text}))
-    said = decode(encode(Health("left", 1, 2, {}, {}, text, text)))
-    assert isinstance(said, Health)
-    assert said.host == said.version == printable(text) != text
+    output = decode(encode(Health("left", 1, 2, {}, {}, text, text)))
+    assert isinstance(output, Health)
+    assert output.host == output.version == printable(text) != text
 
 
 def test_a_report_can_be_read_whatever_was_counted() -> None:
     counts = {"frames": 2**70, "gone": -5, "x" * 80: 1} | {f"c{i}": i for i in range(600)}
-    gauges = {"rate_hz": float("nan"), "high": float("inf"), "accel": 1e300, "low": -1e300}
-    report = decode(encode(Health("left", 1, 2, counts, gauges, "h" * 90)))
+    metrics = {"rate_hz": float("nan"), "high": float("inf"), "accel": 1e300, "low": -1e300}
+    report = decode(encode(Health("left", 1, 2, counts, metrics, "h" * 90)))
     assert isinstance(report, Health)
     assert (report.counts["frames"], report.counts["gone"], report.counts["x" * 64]) == (2**63 - 1, 0, 1)
     assert len(report.counts) == 512
-    assert report.gauges == {"accel": 1e18, "low": -1e18}
+    assert report.metrics == {"accel": 1e18, "low": -1e18}
 
 
 DEFAULTED = {
-    *("latency_ns", "laser_m", "level", "ambiguous", "palm_world_wxyz", "palm_world_sigma_rad"),
-    *("wrist_bend_rad", "wrist_bend_sigma_rad"),
+    *("latency_ns", "laser_m", "solver_mode", "ambiguous", "palm_world_wxyz", "palm_world_sigma_rad"),
+    *("wrist_angles_rad", "wrist_angles_sigma_rad"),
     *("heading_sigma_rad", "t_sigma_ns", "exposure_us", "body"),
     *("strength", "angle_rad", "origin_m", "direction"),
     *("host", "version"),
@@ -807,8 +809,8 @@ def test_constructors_refuse_what_does_not_fit() -> None:
         msgspec.structs.replace(sample_detections(), uv=np.zeros((6, 3)))
     with pytest.raises(ValueError, match="sigma_px: 0 is not within"):
         msgspec.structs.replace(sample_detections(), sigma_px=np.zeros(6))
-    with pytest.raises(ValueError, match="rival_uv: a rival of a marker that is not seen"):
-        msgspec.structs.replace(sample_detections(), rival_uv=np.ones((6, 2)))
+    with pytest.raises(ValueError, match="alt_uv: a rival of a marker that is not seen"):
+        msgspec.structs.replace(sample_detections(), alt_uv=np.ones((6, 2)))
     with pytest.raises(ValueError, match="at most 48"):
         sample_detections(MAX_MARKERS + 1)
     with pytest.raises(ValueError, match="at most 48"):

@@ -62,9 +62,13 @@ def test_palm_turns_twenty_degrees_about_every_axis_in_each_half() -> None:
     for half in (0, 30):
         acts = [act for act in MOTION.acts if act.name == "turns" and half <= act.start_s < half + 30]
         rows = (acts[0].start_s < GRID) & (acts[0].stop_s > GRID)
-        turn = POSE_GRID[rows, :3, :3] @ still.T
+        rotation = POSE_GRID[rows, :3, :3] @ still.T
         vector = np.stack(
-            [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]],
+            [
+                rotation[:, 2, 1] - rotation[:, 1, 2],
+                rotation[:, 0, 2] - rotation[:, 2, 0],
+                rotation[:, 1, 0] - rotation[:, 0, 1],
+            ],
             axis=1,
         )
         degrees = np.degrees(np.arcsin(np.clip(vector / 2.0, -1.0, 1.0)))

@@ -71,7 +71,7 @@ def test_the_size_of_every_jpeg_and_of_none_that_is_cut(flags: list[int]) -> Non
 
 
 @pytest.mark.parametrize(
-    ("data", "says"),
+    ("data", "expected"),
     [
         (b"", "no JPEG, PNG, BMP or TIFF"),
         (b"GIF89a" + b"\1" * 20, "no JPEG, PNG, BMP or TIFF"),
@@ -88,12 +88,12 @@ def test_the_size_of_every_jpeg_and_of_none_that_is_cut(flags: list[int]) -> Non
         (b"II*\0\xff\xff\xff\xff", "TIFF whose header is cut"),
     ],
 )
-def test_what_is_no_picture_or_an_absurd_one_is_refused(data: bytes, says: str) -> None:
-    with pytest.raises(PictureError, match=says):
+def test_what_is_no_picture_or_an_absurd_one_is_refused(data: bytes, expected: str) -> None:
+    with pytest.raises(PictureError, match=expected):
         size_of(data)
-    with pytest.raises(PictureError, match=says):
+    with pytest.raises(PictureError, match=expected):
         decode_file(data)
-    with pytest.raises(PictureError, match=f"{says}|is no JPEG or PNG"):
+    with pytest.raises(PictureError, match=f"{expected}|is no JPEG or PNG"):
         picture(data, (16, 16))
 
 
@@ -102,11 +102,11 @@ def test_the_picture_of_a_device_has_the_size_of_its_camera_or_is_not_decoded() 
         picture(REAL["jpg"], (24, 32))
     with pytest.raises(PictureError, match="is cut or broken"):
         picture(REAL["jpg"][:-100], (32, 24))
-    turned = REAL["jpg"][:2] + EXIF_TURNED + REAL["jpg"][2:]
-    assert picture(turned, (32, 24)).shape == (24, 32, 3), "as the sensor has it, whatever its notes say"
+    rotated = REAL["jpg"][:2] + EXIF_ROTATED + REAL["jpg"][2:]
+    assert picture(rotated, (32, 24)).shape == (24, 32, 3), "as the sensor has it, whatever its notes say"
 
 
-EXIF_TURNED = b"\xff\xe1\0\x22Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+EXIF_ROTATED = b"\xff\xe1\0\x22Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
 
 
 @given(st.sampled_from(SIGNATURES), st.binary(max_size=300))

@@ -11,7 +11,7 @@ from common.calibration import CameraCalibration, HandProfile, Matrix4, RigCalib
 from common.frame_recording import open_recording
 from common.hand_model import CHAINS, HandModel
 from common.sim.motion import PERIOD_S, POSES, HandState
-from common.sim.poses import MOVE_S, REACH_M, ROUNDS, STATION_S, TURN_DEG, StudyPoses
+from common.sim.poses import MOVE_S, REACH_M, ROTATION_DEG, ROUNDS, STATION_S, StudyPoses
 from common.sim.render import Renderer
 from common.sim.scene import Scene, view_centre
 from common.sim.scenes import scene_by_name
@@ -37,11 +37,13 @@ def test_every_pose_is_held_in_every_round_in_a_place_of_its_own() -> None:
     assert all(sorted(poses.order[6 * r : 6 * r + 6]) == sorted(POSES) for r in range(ROUNDS))
     held = [poses.held(float(t)) for t in TIMES]
     assert {held.count(name) for name in POSES} == {round(ROUNDS * (STATION_S - MOVE_S) / 0.02)}
-    turns = np.array([poses.at((k + 0.9) * STATION_S).T_rig_palm[:3, :3] for k in range(len(poses.order))])
-    cosines = 0.5 * (np.einsum("aij,bij->ab", turns, turns) - 1.0)
+    rotations = np.array(
+        [poses.at((k + 0.9) * STATION_S).T_rig_palm[:3, :3] for k in range(len(poses.order))]
+    )
+    cosines = 0.5 * (np.einsum("aij,bij->ab", rotations, rotations) - 1.0)
     apart_deg = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
-    assert apart_deg[np.triu_indices(len(turns), 1)].min() > 1.0
-    assert apart_deg.max() > TURN_DEG
+    assert apart_deg[np.triu_indices(len(rotations), 1)].min() > 1.0
+    assert apart_deg.max() > ROTATION_DEG
 
 
 @pytest.mark.parametrize("seed", [7, 21, 1234])

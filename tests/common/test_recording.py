@@ -19,7 +19,7 @@ from common.errors import RecordingError
 from common.messages import Health, Message, TagDetections, encode
 from common.recording import MessageRecording, MessageWriter, Recorded, open_messages
 from common.streams import sender_of
-from tests.network_helpers import detections, triple
+from tests.network_helpers import cycle, detections
 
 FILES = {"rigs/desk.json": b'{"version": 1}', "cameras/left.json": b"{}"}
 STEP_NS = 50_000_000
@@ -41,7 +41,7 @@ def told(count: int = 60, step_ns: int = STEP_NS) -> list[tuple[str, Message, in
         kinds = [
             ("taken", detections("left", 1, number, t_ns)),
             ("taken", tags(number, t_ns)),
-            ("taken", triple("wrist", 1, number, t_ns)),
+            ("taken", cycle("wrist", 1, number, t_ns)),
             ("health", Health("master", 7, t_ns, {"poses": number}, {"rate_hz": 60.0})),
         ]
         stream, message = kinds[number % 4]

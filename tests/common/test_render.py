@@ -273,7 +273,7 @@ def test_unknown_camera_and_paint_are_refused() -> None:
     with pytest.raises(CalibrationError, match="middle-camera"):
         Renderer(SCENE, "middle-camera")
     with pytest.raises(CalibrationError, match="elbow"):
-        light.paint("elbow")
+        light.marker_colour("elbow")
 
 
 def test_recording_has_the_form_and_the_exact_truth(tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ MESSAGES: list[tuple[Kind, Handshake]] = [
     (Kind.STARTED, Started(2**61)),
     (Kind.ECHO_ASK, EchoAsk(0)),
     (Kind.ECHO_ANSWER, EchoAnswer(1, 2, 3)),
-    (Kind.UNPROVEN, Unproven(A, B, apart=True)),
+    (Kind.UNPROVEN, Unproven(A, B, has_secrets=True)),
 ]
 
 
@@ -181,13 +181,13 @@ def test_a_rig_key_has_32_bytes(size: int) -> None:
 
 
 def test_without_secrets_of_their_own_all_follow_from_the_rig_key() -> None:
-    alone, apart = LinkKey(KEY), LinkKey(KEY, A + A)
-    assert not alone.apart
-    assert apart.apart
-    assert LinkKey(KEY, own=B + B).apart
+    alone, has_secrets = LinkKey(KEY), LinkKey(KEY, A + A)
+    assert not alone.has_secrets
+    assert has_secrets.has_secrets
+    assert LinkKey(KEY, own=B + B).has_secrets
     assert alone.secret("left") == device_secret(KEY, "left") != alone.secret("right")
-    assert apart.secret("left") == device_secret(A + A, "left") != alone.secret("left")
-    assert repr(apart) == "LinkKey()"
+    assert has_secrets.secret("left") == device_secret(A + A, "left") != alone.secret("left")
+    assert repr(has_secrets) == "LinkKey()"
 
 
 def test_the_rig_key_comes_from_the_environment_or_a_private_file(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ UP = quaternion_to_matrix(np.array(WORLD))[:, 2]
 RATE_RAD_S = 1.5
 
 
-class Turning:
+class Rotating:
     """A hand that turns steadily about the rig's x axis, at one place."""
 
     period_s = 100.0
@@ -36,16 +36,16 @@ class Swaying:
     period_s = 100.0
 
     def at(self, t_s: float) -> HandState:
-        turn = [axis_rotation(k, 0.5 * np.sin((2.0 + k) * t_s + k)) for k in range(3)]
+        rotation = [axis_rotation(k, 0.5 * np.sin((2.0 + k) * t_s + k)) for k in range(3)]
         place = 0.05 * np.array([np.sin(6.0 * t_s), np.cos(5.0 * t_s), np.sin(4.0 * t_s)])
-        return HandState(rigid(turn[0] @ turn[1] @ turn[2], place), np.zeros((5, 4)))
+        return HandState(rigid(rotation[0] @ rotation[1] @ rotation[2], place), np.zeros((5, 4)))
 
 
 def test_rates_and_forces_are_those_of_the_motion_in_the_sensors_axes_but_for_the_parts_errors() -> None:
     exact = msgspec.structs.replace(IMU, orientation_sigma_rad=1e-9)
-    rig_imu = Turning().at(0.1).T_rig_palm[:3, :3] @ PALM_IMU
+    rig_imu = Rotating().at(0.1).T_rig_palm[:3, :3] @ PALM_IMU
     for seed in range(20):
-        imu = SimulatedImu(Turning(), exact, seed)
+        imu = SimulatedImu(Rotating(), exact, seed)
         sample = imu.sample(12, 0.1, 7)
         assert (sample.source, sample.seq, sample.t_ns) == ("imu", 12, 7)
         rate = PALM_IMU @ (sample.gyro_rad_s - imu.bias_rad_s(0.1))
@@ -55,9 +55,9 @@ def test_rates_and_forces_are_those_of_the_motion_in_the_sensors_axes_but_for_th
 
 
 def test_bias_and_noise_are_those_of_the_data_sheet() -> None:
-    bias = np.array([SimulatedImu(Turning(), IMU, seed).bias_rad_s(0.0) for seed in range(300)])
+    bias = np.array([SimulatedImu(Rotating(), IMU, seed).bias_rad_s(0.0) for seed in range(300)])
     assert np.degrees(bias.std()) == pytest.approx(1.0, rel=0.1)
-    imu = SimulatedImu(Turning(), IMU, 5)
+    imu = SimulatedImu(Rotating(), IMU, 5)
     samples = [
         imu.sample(seq, 0.1, 0) for seq in range(400)
     ]  # one instant again and again: only noise differs
@@ -84,14 +84,14 @@ def test_the_filter_finds_the_tilt_as_well_as_the_file_says() -> None:
 
 
 def test_the_same_seed_is_the_same_imu_and_samples_keep_their_rate_and_come_early_enough_to_settle() -> None:
-    ones, again = (list(SimulatedImu(Turning(), IMU, 4).around(2.5, 2.9, 10**9)) for _ in range(2))
+    ones, again = (list(SimulatedImu(Rotating(), IMU, 4).around(2.5, 2.9, 10**9)) for _ in range(2))
     for name in ("gyro_rad_s", "accel_m_s2"):
         np.testing.assert_array_equal([getattr(a, name) for a in ones], [getattr(b, name) for b in again])
     assert [one.seq for one in ones] == list(range(60, 361))
     assert ones[0].t_ns == 1_500_000_000
-    assert next(iter(SimulatedImu(Turning(), IMU, 4).around(0.3, 0.4))).seq == 0
+    assert next(iter(SimulatedImu(Rotating(), IMU, 4).around(0.3, 0.4))).seq == 0
 
 
 def test_one_that_is_not_mounted_cannot_be_simulated() -> None:
     with pytest.raises(CalibrationError, match="q_palm_imu and q_rig_world"):
-        SimulatedImu(Turning(), ImuCalibration(), 1)
+        SimulatedImu(Rotating(), ImuCalibration(), 1)

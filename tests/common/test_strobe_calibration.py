@@ -49,7 +49,7 @@ def test_the_laser_of_the_shipped_device_by_hand() -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "says"),
+    ("key", "value", "expected"),
     [
         (
             "laser.power_w",
@@ -74,8 +74,8 @@ def test_the_laser_of_the_shipped_device_by_hand() -> None:
         ("pulse", 1.0, "unknown field `pulse`"),
     ],
 )
-def test_what_is_not_safe_is_refused_with_key_value_and_bound(key: str, value: object, says: str) -> None:
-    with pytest.raises(CalibrationError, match=says):
+def test_what_is_not_safe_is_refused_with_key_value_and_bound(key: str, value: object, expected: str) -> None:
+    with pytest.raises(CalibrationError, match=expected):
         strobe(changed(key, value))
 
 

@@ -34,14 +34,14 @@ def test_it_is_so_under_an_opencv_that_holds_it_upright(monkeypatch: pytest.Monk
     def upright(grid: Grid, number: int) -> Image:
         return np.rot90(held(grid, number), 2)
 
-    turned = not tag_family._half_turned()
-    tag_family._half_turned.cache_clear()
+    rotated = not tag_family._upside_down()
+    tag_family._upside_down.cache_clear()
     monkeypatch.setattr(tag_family, "_opencv_bits", upright)
     try:
-        assert tag_family._half_turned() is turned
+        assert tag_family._upside_down() is rotated
         np.testing.assert_array_equal(tag_bits("apriltag_25h9", 7), was)
     finally:
-        tag_family._half_turned.cache_clear()
+        tag_family._upside_down.cache_clear()
 
 
 @pytest.mark.parametrize("family", GRIDS)

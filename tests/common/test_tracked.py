@@ -16,12 +16,12 @@ from common.frame_recording import open_recording
 from common.geometry import axis_rotation, invert, rigid, transform
 from common.object_profile import ObjectProfile, TagFamily, Tags, tag_corners
 from common.sim.motion import PERIOD_S, HandState
-from common.sim.paint import MarkerView, Painter
+from common.sim.painter import MarkerView, Painter
 from common.sim.record import record_scene
 from common.sim.render import Renderer
 from common.sim.scene import Card, Scene
 from common.sim.scenes import scene_by_name
-from common.sim.tag_paint import INK, PAPER, TEXELS, printed
+from common.sim.tag_painter import INK, PAPER, TEXELS, printed
 from common.sim.tracked import facing
 from common.sim.travel import SHUTTLE_M_S
 from common.sim.view import View
@@ -101,7 +101,7 @@ def test_the_object_travels_turns_rests_and_comes_back(seed: int) -> None:
     assert np.linalg.norm(other[:3, 3] - poses[150, :3, 3]) > 1e-3
 
 
-def test_the_taken_thing_is_the_object_and_one_that_nothing_moves_rests_beside() -> None:
+def test_the_taken_thing_is_the_object_and_one_that_nothing_moves_rests() -> None:
     plain, held = scene_of("grasp", "desk"), scene_of("grasp", "desk-cube")
     for t in (0.0, 5.0, 8.0):
         (bar,) = plain.truth(t).things
@@ -149,11 +149,11 @@ def test_corners_and_beads_are_where_the_object_is_when_their_row_is_exposed(
 
 
 def test_a_lone_bead_covers_the_cone_of_rays_that_meet_its_ball() -> None:
-    lone = msgspec.structs.replace(OBJECTS["wand"], shape=())
-    scene = placed("desk-wand", Placed(MIDDLE), {"wand": lone})
+    single = msgspec.structs.replace(OBJECTS["wand"], shape=())
+    scene = placed("desk-wand", Placed(MIDDLE), {"wand": single})
     view, optics = markers_of(scene, "right"), scene.optics["right"]
     v, u = np.mgrid[0:1920, 0:2560] / 4.0 - 0.375  # sixteen rays a pixel
-    for m, bead in zip((6, 7, 8), lone.markers.values(), strict=True):
+    for m, bead in zip((6, 7, 8), single.markers.values(), strict=True):
         middle = transform(invert(optics.T_rig_camera), scene.truth(0.0).markers_m[m])
         near = np.hypot(u - view.uv[m, 0], v - view.uv[m, 1]) < 15.0
         rays = optics.undistort(np.stack([u[near], v[near]], axis=-1))
@@ -178,8 +178,8 @@ def test_a_tag_is_read_at_half_a_metre_where_the_truth_has_it(family: TagFamily)
     known = OBJECTS["cube"].tags
     assert known is not None
     profile = msgspec.structs.replace(OBJECTS["cube"], tags=Tags(family, known.tags))
-    turned = rigid(axis_rotation(2, 0.4) @ facing(0.0), np.array([0.03, 0.0, 0.5]))
-    scene = placed("desk-cube", Placed(turned), {"cube": profile})
+    rotated = rigid(axis_rotation(2, 0.4) @ facing(0.0), np.array([0.03, 0.0, 0.5]))
+    scene = placed("desk-cube", Placed(rotated), {"cube": profile})
     found = dictionary(family, range(5))
     for name in CAMERAS:
         image, view = Renderer(scene, name).observe(0.0)

@@ -3,14 +3,14 @@
 import os
 from pathlib import Path
 
+from common.file_monitor import MonitoredFiles
 from common.replacing import replacing
-from common.watching import WatchedFiles
 
 
 def test_the_first_look_tells_and_the_next_does_not(tmp_path: Path) -> None:
     paths = [tmp_path / "a", tmp_path / "b"]
     paths[0].write_text("1")
-    watched = WatchedFiles()
+    watched = MonitoredFiles()
     assert watched.changed(paths)
     assert not watched.changed(paths)
 
@@ -18,7 +18,7 @@ def test_the_first_look_tells_and_the_next_does_not(tmp_path: Path) -> None:
 def test_every_way_to_change_a_file_is_noticed_once(tmp_path: Path) -> None:
     path = tmp_path / "a"
     path.write_text("1")
-    watched = WatchedFiles()
+    watched = MonitoredFiles()
     watched.changed([path])
 
     def replace() -> None:
@@ -37,7 +37,7 @@ def test_every_way_to_change_a_file_is_noticed_once(tmp_path: Path) -> None:
 def test_a_file_with_the_same_content_is_not_changed(tmp_path: Path) -> None:
     path = tmp_path / "a"
     path.write_text("1")
-    watched = WatchedFiles()
+    watched = MonitoredFiles()
     watched.changed([path])
     os.utime(path, ns=(1, 1))
     assert not watched.changed([path])

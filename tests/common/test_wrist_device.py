@@ -32,7 +32,7 @@ PERSPECTIVE = ((1.0, 0, 0, 0), (0, 1.0, 0, 0), (0, 0, 1.0, 0), (0, 0, 0.1, 1.0))
 
 @pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "expected"),
     [
         ({"kind": "markers"}, "kind is 'markers'"),
         ({"cameras": ("other",)}, "cameras: other"),
@@ -59,8 +59,10 @@ PERSPECTIVE = ((1.0, 0, 0, 0), (0, 1.0, 0, 0), (0, 0, 1.0, 0), (0, 0, 0.1, 1.0))
         ),
     ],
 )
-def test_a_rig_that_does_not_fit_is_refused_alike(side: str, change: dict[str, object], says: str) -> None:
-    with pytest.raises(CalibrationError, match=f"rig 'wrist': .*{says}"):
+def test_a_rig_that_does_not_fit_is_refused_alike(
+    side: str, change: dict[str, object], expected: str
+) -> None:
+    with pytest.raises(CalibrationError, match=f"rig 'wrist': .*{expected}"):
         SIDES[side](replace(RIG, **change), CAMERA)
 
 
@@ -73,12 +75,12 @@ def test_a_camera_without_intrinsics_is_refused(side: str) -> None:
 def test_slave_and_master_place_the_same_plane_and_palm_also_where_the_file_is_rounded() -> None:
     assert RIG.laser_plane is not None
     assert RIG.T_camera_palm is not None
-    turned = tuple(tuple(round(number, 3) for number in row) for row in RIG.T_camera_palm)
+    rotated = tuple(tuple(round(number, 3) for number in row) for row in RIG.T_camera_palm)
     normal = tuple(-1.005 * number for number in RIG.laser_plane.normal)  # and seen from its other side
     plane = LaserPlane(normal=(normal[0], normal[1], normal[2]), offset_m=-1.005 * RIG.laser_plane.offset_m)
-    rig = replace(RIG, T_camera_palm=turned, laser_plane=plane)
+    rig = replace(RIG, T_camera_palm=rotated, laser_plane=plane)
     slave, master = (make(rig, CAMERA) for make in SIDES.values())
-    assert slave.T_camera_palm.tolist() == master.T_camera_palm.tolist() == [list(row) for row in turned]
+    assert slave.T_camera_palm.tolist() == master.T_camera_palm.tolist() == [list(row) for row in rotated]
     assert slave.normal.tolist() == master.normal.tolist()
     assert slave.offset_m == master.offset_m
     assert abs(slave.offset_m + RIG.laser_plane.offset_m) < 1e-6
@@ -87,7 +89,7 @@ def test_slave_and_master_place_the_same_plane_and_palm_also_where_the_file_is_r
 
 
 @pytest.mark.parametrize(
-    ("laser", "says"),
+    ("laser", "expected"),
     [
         (Laser(forward=(0.0, 0.0, 0.0)), "laser.forward: length 0, not 1"),
         (Laser(forward=(0.0, 0.0, 1000.0)), r"Expected `float` <= 1.01 - at `\$.laser.forward\[2\]`"),
@@ -95,7 +97,7 @@ def test_slave_and_master_place_the_same_plane_and_palm_also_where_the_file_is_r
         (Laser(forward=(0.0, 1.0, 0.0)), "laser.forward: leaves laser_plane"),
     ],
 )
-def test_a_laser_whose_light_goes_nowhere_or_out_of_its_plane_is_refused(laser: Laser, says: str) -> None:
+def test_a_laser_whose_light_goes_nowhere_or_out_of_its_plane_is_refused(laser: Laser, expected: str) -> None:
     data = msgspec.json.encode(replace(RIG, laser=laser))
-    with pytest.raises(CalibrationError, match=f"rig.json: {says}"):
+    with pytest.raises(CalibrationError, match=f"rig.json: {expected}"):
         parse(data, RigCalibration, "rig.json")

@@ -28,7 +28,7 @@ SCENE = WristScene.by_name(
 )
 
 
-def test_a_recording_has_triples_in_order_and_their_truth(tmp_path: Path) -> None:
+def test_a_recording_has_cycles_in_order_and_their_truth(tmp_path: Path) -> None:
     assert record_wrist(tmp_path / "r", SCENE, 0.1, start_s=8.0, step=2) == 3
     recording = open_recording(tmp_path / "r")
     assert recording.manifest.continuous
@@ -54,7 +54,7 @@ def test_a_recording_has_triples_in_order_and_their_truth(tmp_path: Path) -> Non
         record_wrist(tmp_path / "r", SCENE, 0.1)
 
 
-def test_in_a_recording_of_poses_the_hand_stands_still_within_a_triple(tmp_path: Path) -> None:
+def test_in_a_recording_of_poses_the_hand_stands_still_within_a_cycle(tmp_path: Path) -> None:
     assert record_wrist(tmp_path / "r", SCENE, poses_s=[2.0, 30.0], step=2) == 2
     assert not open_recording(tmp_path / "r").manifest.continuous
     truth = np.load(tmp_path / "r/truth.npz")

@@ -12,7 +12,7 @@ from common.calibration import CameraCalibration, HandProfile, RigCalibration, l
 from common.errors import CalibrationError
 from common.frame_recording import Illumination
 from common.sim.scenes import renderer_of
-from common.sim.wrist.light import SKIN_AT_M, Leds, Sensor
+from common.sim.wrist.light import SURFACE_AT_M, Leds, Sensor
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 
@@ -45,7 +45,7 @@ def test_the_line_is_drawn_where_the_truth_says_to_parts_of_a_pixel(t_s: float) 
     shown = scene("curl@dark")
     dim = WristRenderer(shown, "wrist").exposed(60.0, np.full(3, 0.03))  # so that it does not saturate
     image = dim.render(t_s, LASER)
-    bodies = shown.flesh.bodies(shown.joints_at(t_s))
+    bodies = shown.capsules.bodies(shown.joints_at(t_s))
     curve = shown.sheet.cross(bodies)
     uv = shown.optics.project(curve.points)
     off: list[float] = []
@@ -105,13 +105,13 @@ def test_a_window_saturates_in_every_room_that_has_one(ambient: str, least: floa
 def test_leds_light_by_the_inverse_square_and_the_cosine() -> None:
     leds = Leds(np.array([[0.0, 0.0, 0.0]] * 4))
     points = np.array(
-        [[0.0, 0.0, SKIN_AT_M], [0.0, 0.0, 2 * SKIN_AT_M], [0.0, 0.0, SKIN_AT_M]], dtype=np.float32
+        [[0.0, 0.0, SURFACE_AT_M], [0.0, 0.0, 2 * SURFACE_AT_M], [0.0, 0.0, SURFACE_AT_M]], dtype=np.float32
     )
     normals = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [np.sqrt(0.75), 0.0, -0.5]], dtype=np.float32)
-    near, far, aslant = leds.on_skin(points, normals).tolist()
+    near, far, aslant = leds.on_surface(points, normals).tolist()
     assert near == pytest.approx(4.0 * far, rel=1e-5)
     assert near == pytest.approx(2.0 * aslant, rel=1e-5)
-    behind = leds.on_skin(points[:1], -normals[:1])
+    behind = leds.on_surface(points[:1], -normals[:1])
     assert behind[0] == 0.0
 
 
@@ -162,17 +162,17 @@ def test_another_camera_is_refused() -> None:
 
 
 def test_skin_that_gives_back_a_fifth_less_light_is_darker_by_that_and_lies_where_it_lay() -> None:
-    usual, dull = scene("poses@dark"), replace(scene("poses@dark"), reflectance=0.8)
-    bright = WristRenderer(usual, "wrist").render(2.0, LED).astype(np.float64)
+    typical, dull = scene("poses@dark"), replace(scene("poses@dark"), reflectance=0.8)
+    bright = WristRenderer(typical, "wrist").render(2.0, LED).astype(np.float64)
     dark = WristRenderer(dull, "wrist").render(2.0, LED).astype(np.float64)
-    skin = (bright > 40.0) & (bright < 250.0)
-    assert skin.sum() > 10_000
-    assert np.median((dark[skin] - 2.0) / (bright[skin] - 2.0)) == pytest.approx(0.8, abs=0.01)
-    dim = [WristRenderer(one, "wrist").exposed(60.0, np.full(3, 0.01)) for one in (usual, dull)]
+    surface = (bright > 40.0) & (bright < 250.0)
+    assert surface.sum() > 10_000
+    assert np.median((dark[surface] - 2.0) / (bright[surface] - 2.0)) == pytest.approx(0.8, abs=0.01)
+    dim = [WristRenderer(one, "wrist").exposed(60.0, np.full(3, 0.01)) for one in (typical, dull)]
     line, duller = (one.render(2.0, LASER).astype(np.float64) - 2.0 for one in dim)
     lit = (line > 12.0) & (line < 250.0)
     assert np.median(duller[lit] / line[lit]) == pytest.approx(0.8, abs=0.05)
-    np.testing.assert_array_equal(dull.truth(2.0).laser_uv, usual.truth(2.0).laser_uv)
+    np.testing.assert_array_equal(dull.truth(2.0).laser_uv, typical.truth(2.0).laser_uv)
 
 
 @pytest.mark.parametrize("reflectance", [0.0, -1.0, np.nan, np.inf])

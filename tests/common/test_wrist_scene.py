@@ -14,13 +14,13 @@ from common.calibration import CameraCalibration, HandProfile, RigCalibration, l
 from common.camera_model import CameraModel
 from common.errors import CalibrationError, PhalanxError
 from common.hand_model import HandModel
-from common.round_cones import Cones, distances, first_hits, terms
 from common.sim.imu import SimulatedImu
 from common.sim.scenes import renderer_of, view_by_name
-from common.sim.wrist.flesh import PALM_GROUP, THENAR_GROUP, THUMB_GROUP, Flesh
+from common.sim.wrist.capsules import PALM_GROUP, THENAR_GROUP, THUMB_GROUP, HandCapsules
 from common.sim.wrist.laser import LaserSheet, LineTruth
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import AMBIENTS, MOTIONS, WristScene
+from common.tapered_capsules import Capsules, distances, first_hits, terms
 
 CALIB = Path(__file__).resolve().parents[2] / "calib_json"
 CAMERAS = {"wrist": load(CALIB / "cameras/wrist.json", CameraCalibration)}
@@ -40,17 +40,17 @@ def scene(name: str, seed: int = 3, side: str = "right") -> WristScene:
     return WristScene.by_name(name, RIGS[side], CAMERAS, HANDS[side], seed)
 
 
-def depth_inside(cones: Cones, points: Float) -> Float:
+def depth_inside(capsules: Capsules, points: Float) -> Float:
     """How deep points (N, 3) are in the bodies (N, B) [m]; negative: outside.
 
     A body is a row of balls; the depth in a ball is concave along the row, so its best one is found by thirds.
     """
-    low = np.zeros((len(points), len(cones.start_m)))
+    low = np.zeros((len(points), len(capsules.start_m)))
     high = np.ones_like(low)
 
     def depth(share: Float) -> Float:
-        centre = cones.start_m + share[..., None] * (cones.stop_m - cones.start_m)
-        radius = cones.start_radius_m + share * (cones.stop_radius_m - cones.start_radius_m)
+        centre = capsules.start_m + share[..., None] * (capsules.stop_m - capsules.start_m)
+        radius = capsules.start_radius_m + share * (capsules.stop_radius_m - capsules.start_radius_m)
         return radius - np.linalg.norm(points[:, None] - centre, axis=-1)
 
     for _ in range(36):
@@ -60,39 +60,39 @@ def depth_inside(cones: Cones, points: Float) -> Float:
     return depth(0.5 * (low + high))
 
 
-def random_cones(rng: np.random.Generator, count: int) -> Cones:
+def random_capsules(rng: np.random.Generator, count: int) -> Capsules:
     start = rng.uniform(-0.03, 0.03, (count, 3)) + AHEAD
     way = rng.normal(size=(count, 3))
     stop = start + rng.uniform(0.012, 0.05, (count, 1)) * way / np.linalg.norm(way, axis=1, keepdims=True)
-    return Cones(start, stop, rng.uniform(0.005, 0.011, count), rng.uniform(0.004, 0.011, count))
+    return Capsules(start, stop, rng.uniform(0.005, 0.011, count), rng.uniform(0.004, 0.011, count))
 
 
 @settings(max_examples=30)
 @given(st.integers(0, 10**6))
-def test_a_ray_ends_on_the_skin_and_meets_nothing_before(seed: int) -> None:
+def test_a_ray_ends_on_the_surface_and_meets_nothing_before(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    cones = random_cones(rng, 3)
+    capsules = random_capsules(rng, 3)
     aim = rng.uniform(-0.035, 0.035, (6, 3)) + AHEAD
     rays = aim / np.linalg.norm(aim, axis=1, keepdims=True)
-    reach = distances(cones, np.zeros(3), rays)
+    reach = distances(capsules, np.zeros(3), rays)
     single = np.stack(
         [
-            first_hits(terms(cones, np.zeros(3), np.float32)[:, b], rays.T.astype(np.float32))
+            first_hits(terms(capsules, np.zeros(3), np.float32)[:, b], rays.T.astype(np.float32))
             for b in range(3)
         ],
         axis=1,
     )
     for ray, far, coarse in zip(rays, reach, single, strict=True):
         for b in range(3):
-            body = cones.of(slice(b, b + 1))
+            body = capsules.of(slice(b, b + 1))
             before = np.linspace(0.0, min(float(far[b]), 0.3), 60)[:-1, None] * ray
             assert depth_inside(body, before).max() < 2e-5
             if np.isfinite(far[b]):
-                on_skin = far[b] * ray
-                assert abs(depth_inside(body, on_skin[None])[0, 0]) < 2e-5
-                normal = cones.normals(np.array([b]), on_skin[None])[0]
+                on_surface = far[b] * ray
+                assert abs(depth_inside(body, on_surface[None])[0, 0]) < 2e-5
+                normal = capsules.normals(np.array([b]), on_surface[None])[0]
                 assert normal @ ray < 1e-3
-                assert depth_inside(body, (on_skin + 1e-3 * normal)[None])[0, 0] == pytest.approx(
+                assert depth_inside(body, (on_surface + 1e-3 * normal)[None])[0, 0] == pytest.approx(
                     -1e-3, abs=2e-5
                 )
                 if normal @ ray < -0.2:  # where it is grazed, single precision may miss
@@ -104,7 +104,7 @@ def test_the_line_on_a_ball_is_the_arc_of_its_slice_that_faces_the_laser() -> No
     radius, above, far = 0.02, 0.012, 0.11
     forward = sheet.forward
     middle = sheet.origin + far * forward + above * sheet.normal
-    flesh = Flesh(
+    capsules = HandCapsules(
         joint=np.array([1, 1]),
         start=np.zeros((2, 3)),
         stop=np.zeros((2, 3)),
@@ -117,7 +117,7 @@ def test_the_line_on_a_ball_is_the_arc_of_its_slice_that_faces_the_laser() -> No
         forearm=np.zeros(0, dtype=np.int64),
         still=1,
     )
-    ball = Cones(
+    ball = Capsules(
         np.array([[0.0, 0.0, -1.0], middle]),
         np.array([[0.0, 0.0, -1.001], middle + 1e-9]),
         np.full(2, radius),
@@ -125,7 +125,7 @@ def test_the_line_on_a_ball_is_the_arc_of_its_slice_that_faces_the_laser() -> No
     )
     alone = replace(
         sheet,
-        flesh=flesh,
+        capsules=capsules,
         still=ball.of(slice(1)),
         still_m=np.full(len(sheet.angle_rad), np.inf),
         still_body=np.zeros(len(sheet.angle_rad), np.int64),
@@ -142,10 +142,10 @@ def test_the_line_on_a_ball_is_the_arc_of_its_slice_that_faces_the_laser() -> No
 
 @pytest.mark.parametrize("side", ["right", "left"])
 @pytest.mark.parametrize("t_s", [0.4, 7.3, 21.0, 33.3])
-def test_the_line_is_on_the_plane_on_the_skin_and_in_no_shadow(side: str, t_s: float) -> None:
+def test_the_line_is_on_the_plane_on_the_surface_and_in_no_shadow(side: str, t_s: float) -> None:
     shown = scene("standard", side=side)
     sheet = shown.sheet
-    bodies = shown.flesh.bodies(shown.joints_at(t_s))
+    bodies = shown.capsules.bodies(shown.joints_at(t_s))
     curve = sheet.cross(bodies)
     some = slice(None, None, 61)
     points = curve.points[some]
@@ -199,7 +199,7 @@ def test_the_joint_of_the_thumb_parts_it_from_its_ball() -> None:
     both = 0
     for t_s in np.arange(1.2, 60.0, 2.5).tolist():
         joints = shown.joints_at(t_s).position_m
-        curve = shown.sheet.cross(shown.flesh.bodies(shown.joints_at(t_s)))
+        curve = shown.sheet.cross(shown.capsules.bodies(shown.joints_at(t_s)))
         ball, beyond = (curve.points[curve.group == group] for group in (THENAR_GROUP, THUMB_GROUP))
         before, after = (joints[k + 1] - joints[k] for k in (2, 3))
         halving = before / np.linalg.norm(before) + after / np.linalg.norm(after)
@@ -228,7 +228,7 @@ def test_a_left_hand_is_the_right_one_mirrored() -> None:
 
 def test_seeds_are_different_hands_and_one_seed_is_one_hand() -> None:
     model = HandModel.of(HANDS["right"])
-    one, same, other = (Flesh.of(model, seed) for seed in (1, 1, 2))
+    one, same, other = (HandCapsules.of(model, seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.start_radius_m, same.start_radius_m)
     assert np.abs(one.start_radius_m - other.start_radius_m).max() > 3e-4
     truths = [scene("standard", seed).truth(11.0) for seed in (1, 1, 2)]

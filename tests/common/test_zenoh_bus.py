@@ -72,11 +72,11 @@ def test_everything_declared_holds_again_after_the_master_restarts() -> None:
                 assert master.ask(Command("left", "report"), timeout_s=5).counts == {"frames": 3}
                 assert until(lambda bus=master: "left" in bus.alive())
 
-                def heard(bus: ZenohBus = master) -> bool:
+                def received(bus: ZenohBus = master) -> bool:
                     bus.publish("health", "master", health("master"))
                     return inbox.get(0.05) is not None
 
-                assert until(heard)
+                assert until(received)
             finally:
                 master.close()
             assert until(lambda: slave.peers == 0)
@@ -211,11 +211,11 @@ def test_a_client_reaches_beyond_the_master_and_still_does_after_its_restart() -
         ZenohBus(None, endpoint, beyond=True)
     assert ".rs" not in str(refused.value)  # no lines of zenoh's source
     master, slave = ZenohBus(endpoint, None), ZenohBus(None, endpoint)
-    viewer, stranger = ZenohBus(None, endpoint, beyond=True), ZenohBus(None, endpoint)
+    viewer, unknown_peer = ZenohBus(None, endpoint, beyond=True), ZenohBus(None, endpoint)
     try:
         slave.announce("left")
         slave.serve("left", lambda command: health("left", 7))
-        seen, unseen = viewer.subscribe("health"), stranger.subscribe("health")
+        seen, unseen = viewer.subscribe("health"), unknown_peer.subscribe("health")
         for _ in range(2):
             assert viewer.ask(Command("left", "report"), 10.0).counts == {"frames": 7}
             assert until(lambda: "left" in viewer.alive())
@@ -228,7 +228,7 @@ def test_a_client_reaches_beyond_the_master_and_still_does_after_its_restart() -
             master.close()
             master = ZenohBus(endpoint, None)
         assert unseen.get(0.1) is None  # a peer sees only the one it is connected to
-        assert "left" not in stranger.alive()
+        assert "left" not in unknown_peer.alive()
     finally:
-        for bus in (viewer, stranger, slave, master):
+        for bus in (viewer, unknown_peer, slave, master):
             bus.close()

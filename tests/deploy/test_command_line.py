@@ -47,18 +47,18 @@ def test_a_folder_that_is_no_recording_is_named(tmp_path: Path, capsys: pytest.C
 
 
 @pytest.mark.parametrize(
-    ("rigs", "says"),
+    ("rigs", "expected"),
     [
         ([{"name": "g", "kind": "glove", "cameras": []}], "no rig of kind 'markers' or 'wrist'"),
         ([], "no rig of kind"),
     ],
 )
 def test_a_recording_of_no_known_kind_is_refused_by_name(
-    rigs: list[object], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    rigs: list[object], expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "recording.json").write_text(json.dumps({"rigs": rigs}))
     assert main(["replay", str(tmp_path), "--out", str(tmp_path / "out")]) == 1
-    assert says in capsys.readouterr().err
+    assert expected in capsys.readouterr().err
 
 
 def steps_of_replay(
@@ -86,14 +86,14 @@ def steps_of_replay(
 def test_both_kinds_are_detected_camera_by_camera_and_solved_together(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    steps = steps_of_replay(tmp_path, monkeypatch, level="fk")
+    steps = steps_of_replay(tmp_path, monkeypatch, solver_mode="fk")
     assert [step[step.index("--camera") + 1] for step in steps if "detect" in step] == [
         "left",
         "right",
         "palm",
     ]
     assert ["--hand" in step for step in steps] == [False, False, True, True]  # markers know no hand
-    assert ["--level" in step for step in steps] == [False, False, False, True]
+    assert ["--solver-mode" in step for step in steps] == [False, False, False, True]
     assert steps[2][-1] == str(tmp_path / "out/detections_palm.npz")
     assert steps[3][-4:] == ("--detections", str(tmp_path / "out"), "--out", str(tmp_path / "out"))
 
@@ -158,7 +158,7 @@ def test_a_missing_hand_is_said_before_the_work(tmp_path: Path, capsys: pytest.C
 def test_levels_of_a_marker_rig_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig = {"name": "desk", "kind": "markers", "cameras": ["left", "right"]}
     (tmp_path / "recording.json").write_text(json.dumps({"rig": rig}))
-    assert main(["replay", str(tmp_path), "--out", str(tmp_path / "out"), "--level", "ik"]) == 1
+    assert main(["replay", str(tmp_path), "--out", str(tmp_path / "out"), "--solver-mode", "ik"]) == 1
     assert "of no wrist device" in capsys.readouterr().err
 
 
@@ -283,7 +283,7 @@ def test_of_both_kinds_each_sensor_has_its_rig_and_one_master_runs_all(tmp_path:
 
 
 @pytest.mark.parametrize(
-    ("rigs", "scene", "says"),
+    ("rigs", "scene", "expected"),
     [
         (("desk", "wrist"), "standard", "desk, wrist see one hand together only in grasp, both-poses"),
         (("desk", "desk"), "grasp", "a rig stands twice"),
@@ -292,9 +292,9 @@ def test_of_both_kinds_each_sensor_has_its_rig_and_one_master_runs_all(tmp_path:
     ],
 )
 def test_rigs_that_cannot_be_played_together_are_refused(
-    rigs: tuple[str, ...], scene: str, says: str, tmp_path: Path
+    rigs: tuple[str, ...], scene: str, expected: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(sensors.DemoError, match=says):
+    with pytest.raises(sensors.DemoError, match=expected):
         rows(rigs, ROOT / "calib_json", tmp_path, scene)
 
 

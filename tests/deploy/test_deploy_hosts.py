@@ -13,16 +13,16 @@ from pathlib import Path
 
 import pytest
 
-from deploy import deployment, hearing
+from deploy import deployment, sender_check
 from deploy import wheelhouse as wheels_module
 from deploy.__main__ import main
 from deploy.bundle import BUNDLE, bundle, command
 from deploy.deployment import make_keys
 from deploy.fleet import table
-from deploy.hearing import Ears, Heard
 from deploy.keys import prepared_keys
 from deploy.one_host import Host, Wish
 from deploy.remote import Deadline, Remote
+from deploy.sender_check import Ears, Received
 from deploy.targets import DeployError, RigFile, Target, read_rig, targets_of
 from deploy.wheelhouse import own_wheel, wheelhouse
 from master.keys_folder import make
@@ -48,7 +48,7 @@ def test_hosts_take_cameras_in_the_order_of_the_rig_or_by_name(
 
 
 @pytest.mark.parametrize(
-    ("hosts", "said"),
+    ("hosts", "output"),
     [
         (["a", "b", "c"], "c: rig 'desk' has no camera left for it; it has left, right"),
         (["up=a"], "rig 'desk' has no camera or IMU 'up'"),
@@ -58,10 +58,10 @@ def test_hosts_take_cameras_in_the_order_of_the_rig_or_by_name(
         (["a b"], "not a host"),
     ],
 )
-def test_hosts_that_do_not_fit_are_refused(hosts: list[str], said: str) -> None:
+def test_hosts_that_do_not_fit_are_refused(hosts: list[str], output: str) -> None:
     with pytest.raises(DeployError) as refused:
         targets_of(hosts, DESK)
-    assert said in str(refused.value)
+    assert output in str(refused.value)
 
 
 def test_our_own_wheel_is_whole_and_always_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,7 +168,7 @@ def test_a_link_that_hangs_ends_by_the_deadline_with_all_that_it_started(
 
 
 @pytest.mark.parametrize(
-    ("said", "expected"),
+    ("output", "expected"),
     [
         (
             "ssh: Could not resolve hostname pi: Name or service not known",
@@ -193,12 +193,12 @@ def test_a_link_that_hangs_ends_by_the_deadline_with_all_that_it_started(
 )
 def test_a_host_that_is_not_reached_is_told_in_one_line_with_what_to_do(
     fake_ssh: Callable[[str], None],
-    said: str,
+    output: str,
     expected: str,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    fake_ssh(f"echo '{said}' >&2; exit 255")
+    fake_ssh(f"echo '{output}' >&2; exit 255")
     assert main(["uninstall", "pi"]) == 1
     error = capsys.readouterr().err
     assert error.startswith("pi: FAILED: ")
@@ -216,55 +216,57 @@ class Remembered(Host):
         return "back at release 1.0-0"
 
 
-def _hosts(said: list[str]) -> list[Remembered]:
+def _hosts(output: list[str]) -> list[Remembered]:
     remote = Remote("none", (), Deadline(9.0))
     hosts = [
-        Remembered(Target(name, (name,)), remote, said.append, changed=True) for name in ("left", "right")
+        Remembered(Target(name, (name,)), remote, output.append, changed=True) for name in ("left", "right")
     ]
     hosts[1].changed = False
     return hosts
 
 
-def _hear_only(monkeypatch: pytest.MonkeyPatch, heard: dict[str, float], cause: str | None = None) -> None:
-    def answer(_names: object, _ears: object) -> Heard:
-        return Heard(heard, cause)
+def _receive_only(
+    monkeypatch: pytest.MonkeyPatch, received: dict[str, float], cause: str | None = None
+) -> None:
+    def answer(_names: object, _ears: object) -> Received:
+        return Received(received, cause)
 
-    monkeypatch.setattr(deployment, "heard_of", answer)
+    monkeypatch.setattr(deployment, "received_of", answer)
 
 
 def test_a_machine_that_is_not_heard_goes_back_and_others_stay(monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[str] = []
-    hosts = _hosts(said)
-    _hear_only(monkeypatch, {"right": 30.0})
-    failed = deployment._hear(hosts, Ears((), Path("keys"), 3.0))
+    output: list[str] = []
+    hosts = _hosts(output)
+    _receive_only(monkeypatch, {"right": 30.0})
+    failed = deployment._wait_for_senders(hosts, Ears((), Path("keys"), 3.0))
     assert failed == {
         "left": "no datagram of left in 3 s at the master; back at release 1.0-0",
         "right": None,
     }
     assert [host.back for host in hosts] == [1, 0]
-    assert "streams: right 30/s" in said
+    assert "streams: right 30/s" in output
 
 
-def _before(monkeypatch: pytest.MonkeyPatch, heard: Heard) -> hearing.Before:
-    def answer(_names: object, _ears: object, _ended: object) -> Heard:
-        return heard
+def _before(monkeypatch: pytest.MonkeyPatch, received: Received) -> sender_check.Before:
+    def answer(_names: object, _ears: object, _ended: object) -> Received:
+        return received
 
-    monkeypatch.setattr(hearing, "heard_of", answer)
-    return hearing.Before(["left", "right"], Ears((), Path("keys"), 12.0))
+    monkeypatch.setattr(sender_check, "received_of", answer)
+    return sender_check.Before(["left", "right"], Ears((), Path("keys"), 12.0))
 
 
 def test_what_streamed_at_a_master_is_listened_for_as_long_as_it_needs(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    streamed = _before(monkeypatch, Heard({"left": 30.0, "right": 30.0}, None, True))
+    streamed = _before(monkeypatch, Received({"left": 30.0, "right": 30.0}, None, True))
     assert streamed.at_master
-    assert streamed.ears(1.0).seconds == hearing.LEAST_S
+    assert streamed.ears(1.0).seconds == sender_check.LEAST_S
     assert streamed.ears(3.5).seconds == pytest.approx(7.0)
     assert streamed.ears(60.0).seconds == pytest.approx(12.0)
     assert streamed.ears(None).seconds == pytest.approx(12.0), "it did not run: nobody knows"
-    one_silent = _before(monkeypatch, Heard({"left": 30.0}, None, True))
+    one_silent = _before(monkeypatch, Received({"left": 30.0}, None, True))
     assert one_silent.ears(1.0).seconds == pytest.approx(12.0)
-    no_master = _before(monkeypatch, Heard({"left": 30.0, "right": 30.0}, None, False))
+    no_master = _before(monkeypatch, Received({"left": 30.0, "right": 30.0}, None, False))
     assert not no_master.at_master
     assert no_master.ears(1.0).seconds == pytest.approx(12.0)
 
@@ -284,19 +286,19 @@ def test_one_machine_by_two_names_is_refused(fake_ssh: Callable[[str], None]) ->
 
 
 def test_a_dry_run_without_keys_says_so_and_makes_none(tmp_path: Path) -> None:
-    keys, said = tmp_path / "keys", list[str]()
-    with prepared_keys(keys, ["left"], True, said.append) as lent:
+    keys, output = tmp_path / "keys", list[str]()
+    with prepared_keys(keys, ["left"], True, output.append) as lent:
         assert (lent / "devices/left.key").is_file()
-    assert said == [f"would make keys in {keys}"]
+    assert output == [f"would make keys in {keys}"]
     assert not keys.exists()
     assert not lent.exists()
-    with prepared_keys(keys, ["left"], False, said.append) as own:
+    with prepared_keys(keys, ["left"], False, output.append) as own:
         assert own == keys
-    del said[:]
-    with prepared_keys(keys, ["left", "right"], True, said.append) as lent:
+    del output[:]
+    with prepared_keys(keys, ["left", "right"], True, output.append) as lent:
         assert (lent / "rig.key").resolve() == (keys / "rig.key").resolve()
         assert (lent / "devices/right.key").is_file()
-    assert said == [f"would make keys in {keys}"]
+    assert output == [f"would make keys in {keys}"]
     assert not (keys / "devices/right.key").exists()
 
 
@@ -322,30 +324,30 @@ def test_what_was_not_changed_stays_and_so_does_all_if_nobody_can_listen(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     hosts = _hosts([])
-    _hear_only(monkeypatch, {"left": 30.0})
+    _receive_only(monkeypatch, {"left": 30.0})
     assert (
-        deployment._hear(hosts, Ears((), Path("keys"), 3.0))["right"]
+        deployment._wait_for_senders(hosts, Ears((), Path("keys"), 3.0))["right"]
         == "no datagram of right in 3 s at the master"
     )
-    _hear_only(monkeypatch, {}, "cannot listen for it: port taken")
-    assert set(deployment._hear(hosts, Ears((), Path("keys"), 3.0)).values()) == {
+    _receive_only(monkeypatch, {}, "cannot listen for it: port taken")
+    assert set(deployment._wait_for_senders(hosts, Ears((), Path("keys"), 3.0)).values()) == {
         "cannot listen for it: port taken"
     }
     assert [host.back for host in hosts] == [0, 0]
 
 
 def test_missing_keys_are_made_and_what_is_there_stays(tmp_path: Path) -> None:
-    keys, said = tmp_path / "keys", list[str]()
-    make_keys(keys, ["left"], said.append)
+    keys, output = tmp_path / "keys", list[str]()
+    make_keys(keys, ["left"], output.append)
     rig_key = (keys / "rig.key").read_text()
-    make_keys(keys, ["left"], said.append)
-    assert said == [f"making keys in {keys}"]
+    make_keys(keys, ["left"], output.append)
+    assert output == [f"making keys in {keys}"]
     assert (keys / "rig.key").read_text() == rig_key
     assert (keys / "devices/left.key").stat().st_mode & 0o777 == 0o600
     (keys / "devices.key").unlink()  # a folder from before there were secrets
     (keys / "devices/left.secret").unlink()
-    make_keys(keys, ["left"], said.append)
-    assert said == [f"making keys in {keys}"] * 2
+    make_keys(keys, ["left"], output.append)
+    assert output == [f"making keys in {keys}"] * 2
     assert (keys / "devices/left.secret").stat().st_mode & 0o777 == 0o600
     assert (keys / "rig.key").read_text() == rig_key
 
@@ -371,7 +373,7 @@ def _file(path: Path, content: bytes) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "output"),
     [
         (["--options", "rihgt=--sync client"], "--options 'rihgt=--sync client': rig 'desk' has no 'rihgt'"),
         (["--camera", "up=v4l2"], "--camera 'up=v4l2': rig 'desk' has no 'up'; it has left, right"),
@@ -380,12 +382,12 @@ def _file(path: Path, content: bytes) -> Path:
     ],
 )
 def test_what_is_mistyped_is_told_before_a_machine_is_asked(
-    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+    words: list[str], output: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tree = str(ROOT / "calib_json")
     line = ["deploy", "left=a.invalid", "--master", "127.0.0.1", "--dry-run", "--calibration", tree, *words]
     assert main(line) == 1
-    assert said in capsys.readouterr().err
+    assert output in capsys.readouterr().err
 
 
 def test_a_fleet_with_a_keys_folder_that_is_not_there_is_told_so(capsys: pytest.CaptureFixture[str]) -> None:
@@ -394,7 +396,7 @@ def test_a_fleet_with_a_keys_folder_that_is_not_there_is_told_so(capsys: pytest.
 
 
 @pytest.mark.parametrize(
-    ("said", "names", "driver"),
+    ("output", "names", "driver"),
     [
         ((), ("left",), "picamera2"),
         (("v4l2:0",), ("left",), "v4l2:0"),
@@ -405,9 +407,9 @@ def test_a_fleet_with_a_keys_folder_that_is_not_there_is_told_so(capsys: pytest.
     ],
 )
 def test_each_machine_gets_what_its_own_cameras_need(
-    said: tuple[str, ...], names: tuple[str, ...], driver: str
+    output: tuple[str, ...], names: tuple[str, ...], driver: str
 ) -> None:
-    wish = Wish("10.0.0.2", DESK, ROOT, None, (), said, None, apt=True, dry_run=True, ready_s=9.0)
+    wish = Wish("10.0.0.2", DESK, ROOT, None, (), output, None, apt=True, dry_run=True, ready_s=9.0)
     assert wish.driver(names) == driver
 
 

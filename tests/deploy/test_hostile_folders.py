@@ -115,7 +115,7 @@ ATTACKS: dict[str, tuple[Callable[[Path, Path], object], dict[tuple[str, str], s
 
 @pytest.mark.parametrize(
     ("name", "wanted"),
-    [(name, wanted) for name, (_, said) in ATTACKS.items() for wanted in said],
+    [(name, wanted) for name, (_, output) in ATTACKS.items() for wanted in output],
     ids=lambda one: one if isinstance(one, str) else one[1],
 )
 def test_a_hostile_folder_ends_in_a_line(name: str, wanted: tuple[str, str], tmp_path: Path) -> None:
@@ -124,7 +124,7 @@ def test_a_hostile_folder_ends_in_a_line(name: str, wanted: tuple[str, str], tmp
         one.mkdir()
     (outside / "secret").write_text(SECRET)
     (outside / "0.png").write_text(SECRET)
-    make, said = ATTACKS[name]
+    make, output = ATTACKS[name]
     make(folder, outside)
     module, verb = wanted
     arguments = {
@@ -138,6 +138,6 @@ def test_a_hostile_folder_ends_in_a_line(name: str, wanted: tuple[str, str], tmp
     assert "Traceback" not in done.text, done.text
     assert SECRET not in done.text
     assert all(one.isprintable() for one in done.text.replace("\n", "")), done.text
-    assert re.search(said[wanted], done.text), done.text
+    assert re.search(output[wanted], done.text), done.text
     assert not list(out.rglob("*.png")), "a file outside was copied"
     assert {one.name for one in tmp_path.iterdir()} == {"recording", "outside", "out"}, "written elsewhere"

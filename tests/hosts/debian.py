@@ -5,7 +5,7 @@ import platform
 import subprocess
 from pathlib import Path
 
-from bench.made_once import key_of, made_once
+from bench.cached import key_of, made_once
 from tests.programs import missing
 
 SUITE, MIRROR = "trixie", "http://deb.debian.org/debian"
@@ -51,8 +51,8 @@ def root_tree() -> Path:
 
 def cache() -> Path:
     """Folder for what is made once: PHALANX_CACHE, by default phalanx in ~/.cache or XDG_CACHE_HOME."""
-    usual = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "phalanx"
-    return Path(os.environ.get("PHALANX_CACHE", usual)) / "hosts"
+    typical = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "phalanx"
+    return Path(os.environ.get("PHALANX_CACHE", typical)) / "hosts"
 
 
 def _make(architecture: str, folder: Path) -> None:

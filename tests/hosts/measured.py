@@ -30,8 +30,8 @@ class Measured:
         self._file.parent.mkdir(exist_ok=True)
         self._file.write_text(json.dumps(self._numbers, indent=1) + "\n")
         bound = "" if limit is None else f"  at most {limit:g}"
-        beside = f"  on a machine {strain():.1f} times overloaded" if strain() > 1.0 else ""
-        self.lines.append(f"{name:<66} {value:8.2f} {unit:<3}{bound}{beside}")
+        overload = f"  on a machine {strain():.1f} times overloaded" if strain() > 1.0 else ""
+        self.lines.append(f"{name:<66} {value:8.2f} {unit:<3}{bound}{overload}")
 
 
 def kept(file: Path) -> Iterator[Measured]:

@@ -80,9 +80,9 @@ class Rig:
             env=self._environment(),
         )
         self.fleet.undo.later("kill process", str(self._master.pid))
-        said, end = self.folder / "master.log", time.monotonic() + UP_S
-        while "listening on" not in said.read_text()[began:]:
-            assert self._master.poll() is None, said.read_text()[-2000:]
+        output, end = self.folder / "master.log", time.monotonic() + UP_S
+        while "listening on" not in output.read_text()[began:]:
+            assert self._master.poll() is None, output.read_text()[-2000:]
             assert time.monotonic() < end, "the master does not listen"
             time.sleep(0.1)
 

@@ -76,8 +76,8 @@ def test_it_reads_its_own_keys_and_not_those_of_the_machine(host: Host) -> None:
 
 
 def test_a_service_like_it_is_exposed_little(host: Host, measured: Measured) -> None:
-    said = host.run(f"systemd-analyze security {host.unit} --no-pager | tail -1")
-    exposure = float(said.split(":")[1].split()[0])
+    output = host.run(f"systemd-analyze security {host.unit} --no-pager | tail -1")
+    exposure = float(output.split(":")[1].split()[0])
     measured("exposure of the running unit, systemd-analyze security", exposure, unit="")
     assert exposure <= 2.5
 

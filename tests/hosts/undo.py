@@ -25,7 +25,7 @@ class Undo:
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, text=True, start_new_session=True)
 
     def later(self, act: str, argument: str) -> None:
-        """Do `act` with `argument` in the end. Say it before the deed: what is not there to take back is no error.
+        """Do `act` with `argument` in the end. Notify it before the deed: what is not there to take back is no error.
 
         Raises:
             KeyError: There is no such act.

@@ -132,7 +132,7 @@ def test_demo_tracks_scores_and_leaves_its_results(demo_of: Demo, tmp_path: Path
         assert np.isfinite(summary[key]), key
     assert summary["camera_hz"] == pytest.approx({"left": 60.0, "right": 60.0}, rel=2e-3)
     assert set(summary["received_hz"]) == {"left", "right"}
-    assert set(summary["stage_us"]) == {"pairing", "triangulate", "filter", "fabrik", "hand", "gestures"}
+    assert set(summary["stage_us"]) == {"frame_sync", "triangulate", "filter", "fabrik", "hand", "gestures"}
     for name in ("hand.png", "run.rrd", "poses.npz", "left.log", "right.log", "master.log"):
         assert (tmp_path / name).stat().st_size > 0, name
     poses = load_poses(tmp_path / "poses.npz")
@@ -189,7 +189,7 @@ def test_a_killed_process_is_back_within_two_seconds_and_ctrl_c_still_ends_and_s
 ) -> None:
     demo = demo_of(tmp_path, 180.0)
     held_up = HeldUp(demo)
-    heard: list[str] = []
+    received: list[str] = []
     killed_ns: dict[str, int] = {}
     pids: dict[str, int] = {}
     back, told, back_s = "", 0, 0.0  # who is back, how many poses were told before, and when it was
@@ -199,7 +199,7 @@ def test_a_killed_process_is_back_within_two_seconds_and_ctrl_c_still_ends_and_s
         os.kill(pids[victim], signal.SIGKILL)
 
     for line in _lines(demo):
-        heard.append(line)
+        received.append(line)
         pids = pids or _pids(line)
         if _scene_s(line) >= 2 and not killed_ns:
             kill("master")  # first: rows that it had not yet written are lost with it
@@ -214,7 +214,7 @@ def test_a_killed_process_is_back_within_two_seconds_and_ctrl_c_still_ends_and_s
             else:
                 demo.send_signal(signal.SIGINT)
             back = ""
-    assert demo.wait(60) == 0, "\n".join(heard)
+    assert demo.wait(60) == 0, "\n".join(received)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["restarts"] == {"right": 1, "master": 1}
     assert summary["poses"] > 10
@@ -238,22 +238,22 @@ def test_a_killed_process_is_back_within_two_seconds_and_ctrl_c_still_ends_and_s
 
 def _ready_again_ns(log: Path) -> int:
     """When a process that was started again was ready, on this machine's monotonic clock."""
-    said = [line for line in log.read_text().splitlines() if "ready, waiting" in line]
-    return int(float(said[1].split()[0]) * 1e9)
+    output = [line for line in log.read_text().splitlines() if "ready, waiting" in line]
+    return int(float(output[1].split()[0]) * 1e9)
 
 
 def test_two_pairs_track_together_and_one_goes_on_while_the_other_is_gone(
     demo_of: Demo, tmp_path: Path
 ) -> None:
     demo = demo_of(tmp_path, 180.0, "--rig", "desk4", "--scene", "poses")
-    heard: list[str] = []
+    received: list[str] = []
     killed_ns = epoch_ns = told = 0
     ended = False
     pids: dict[str, int] = {}
     gone = ("left2", "right2")
     logs = [tmp_path / f"{name}.log" for name in gone]
     for line in _lines(demo):
-        heard.append(line)
+        received.append(line)
         pids = pids or _pids(line)
         if _scene_s(line) >= 3 and not killed_ns and _poses_told(tmp_path) > ENOUGH:
             epoch_ns = _epoch_ns(pids["left"])
@@ -264,8 +264,8 @@ def test_two_pairs_track_together_and_one_goes_on_while_the_other_is_gone(
         if back and not ended and _poses_told(tmp_path) > told + ENOUGH:
             ended = True
             demo.send_signal(signal.SIGINT)
-    assert demo.wait(90) == 0, "\n".join(heard)
-    assert killed_ns, "\n".join(heard)
+    assert demo.wait(90) == 0, "\n".join(received)
+    assert killed_ns, "\n".join(received)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["restarts"] == {"left2": 1, "right2": 1}
     # From the stamps, so it does not matter how many frames a busy machine had no time for.
@@ -294,16 +294,16 @@ def test_two_pairs_track_together_and_one_goes_on_while_the_other_is_gone(
 
 def test_a_second_ctrl_c_ends_at_once_and_leaves_nobody_behind(demo_of: Demo, tmp_path: Path) -> None:
     demo = demo_of(tmp_path, 60.0)
-    heard: list[str] = []
+    received: list[str] = []
     for line in _lines(demo):
-        heard.append(line)
+        received.append(line)
         if _scene_s(line) >= 1:
             break
-    pids = _pids(heard[0])
+    pids = _pids(received[0])
     demo.send_signal(signal.SIGINT)
     # It was heard, and everybody is being ended: two at the same moment would be one.
     assert until(lambda: (tmp_path / "live.json").exists() or not Path(f"/proc/{pids['master']}").exists())
     demo.send_signal(signal.SIGINT)
-    heard += _lines(demo)
-    assert demo.wait(60) == 130, "\n".join(heard)
+    received += _lines(demo)
+    assert demo.wait(60) == 130, "\n".join(received)
     assert _gone(pids)

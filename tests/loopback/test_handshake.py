@@ -95,7 +95,7 @@ class Wires:
         t_ns = self.clock.now_ns()
         if to == BROADCAST:
             for slave in self.slaves.values():
-                slave.hear_beacon(datagram, source, slave._clock.now_ns())
+                slave.receive_beacon(datagram, source, slave._clock.now_ns())
         elif to == MASTER and self.master is not None:
             message = self.master.receive(datagram, source, t_ns)
             if isinstance(message, ImuSample):
@@ -213,7 +213,7 @@ def test_any_loss_pattern_of_20_percent_still_starts(seed: int) -> None:
     assert wires.run(2.5, wires.all_started)
     assert set(master.refused) <= {
         Refusal.STALE,
-        Refusal.TWIN,
+        Refusal.DUPLICATE_SENDER,
     }  # the restarted slave, while the old one seems well
 
 
@@ -294,13 +294,13 @@ def test_a_hello_that_was_kept_back_cannot_end_the_session_of_the_restarted_slav
     master, left, _ = started_pair(wires)
     beacon = next(d for d, _, to in reversed(wires.seen) if to == BROADCAST)
     swallowed = wires.new_slave("left")
-    swallowed.hear_beacon(beacon, MASTER, wires.clock.now_ns())
+    swallowed.receive_beacon(beacon, MASTER, wires.clock.now_ns())
     hello = swallowed.due()[0][0]
     wires.remove(swallowed)
     live = master._senders["left"].live
     wires.carry(hello, ("6.6.6.6", 6), MASTER, keep=False)
     assert master._senders["left"].pending is None
-    assert master.refused[Refusal.TWIN] == 1
+    assert master.refused[Refusal.DUPLICATE_SENDER] == 1
     wires.run(1.5)
     assert master._senders["left"].live is live
     assert master._senders["left"].pending is None
@@ -321,7 +321,7 @@ def test_replayed_beacons_neither_end_nor_renew_a_session() -> None:
         wires.carry(datagram, ("6.6.6.6", 6), BROADCAST, keep=False)
         wires.step()
     assert [slave._session for slave in (old_left, old_right)] == sessions
-    assert old_left.refused[Refusal.RIVAL] > 0  # those of the first life
+    assert old_left.refused[Refusal.OTHER_MASTER] > 0  # those of the first life
     assert old_left.refused[Refusal.REPLAYED] > 0  # those of this one
     assert wires.all_started()
 
@@ -329,14 +329,14 @@ def test_replayed_beacons_neither_end_nor_renew_a_session() -> None:
 def test_a_second_master_does_not_tear_the_slaves_apart() -> None:
     wires = Wires()
     _, left, right = started_pair(wires)
-    rival = MasterLink(("left", "right"), KEY, wires.clock, BROADCAST, "", S, seeded(99))
+    alternative = MasterLink(("left", "right"), KEY, wires.clock, BROADCAST, "", S, seeded(99))
     sessions = (left._session, right._session)
     for _ in range(100):
-        for datagram, to in rival.due():
+        for datagram, to in alternative.due():
             wires.carry(datagram, ("10.0.0.2", 1), to, keep=False)
         wires.step()
     assert (left._session, right._session) == sessions
-    assert left.refused[Refusal.RIVAL] > 0
+    assert left.refused[Refusal.OTHER_MASTER] > 0
 
 
 def test_a_master_that_vanishes_is_noticed_and_its_return_too() -> None:
@@ -376,9 +376,9 @@ def test_who_speaks_for_another_camera_is_refused() -> None:
 def test_a_camera_that_the_rig_does_not_have_gets_no_session() -> None:
     wires = Wires()
     master = wires.new_master()
-    stranger = wires.new_slave("third")
+    unknown_peer = wires.new_slave("third")
     wires.run(1.0)
-    assert stranger._session is None
+    assert unknown_peer._session is None
     assert master.refused[Refusal.UNKNOWN] > 0
     assert not master._sessions
 
@@ -386,9 +386,9 @@ def test_a_camera_that_the_rig_does_not_have_gets_no_session() -> None:
 def test_without_the_rig_key_nothing_is_said_and_nothing_heard() -> None:
     wires = Wires()
     master = wires.new_master()
-    stranger = wires.new_slave("left", key=bytes(32))
+    unknown_peer = wires.new_slave("left", key=bytes(32))
     wires.run(1.0)
-    assert set(stranger.refused) == {Refusal.FOREIGN}
+    assert set(unknown_peer.refused) == {Refusal.FOREIGN}
     assert all(to == BROADCAST for _, _, to in wires.seen)
     tag = RigKeys(KEY).rig_tag  # the tag is no secret: forge with it
     nonce = bytes(16)

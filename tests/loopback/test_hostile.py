@@ -98,12 +98,12 @@ def test_a_slave_whose_rig_has_other_markers_is_refused_by_name_with_the_fix(
         )  # fmt: skip
         try:
             assert until(lambda: says_which_and_what_to_do(rig.log.read_text()), 20.0), rig.log.read_text()
-            _, said = rig.command("check")
+            _, output = rig.command("check")
         finally:
             slave.kill()
             slave.wait()
     assert refused(rise, MARKERS) > 0, rise
-    assert says_which_and_what_to_do(said.decode()), said.decode()
+    assert says_which_and_what_to_do(output.decode()), output.decode()
 
 
 def says_which_and_what_to_do(text: str) -> bool:
@@ -122,9 +122,9 @@ def test_a_session_that_is_not_the_hellos_and_a_leaping_seq_are_refused(rig: Hos
     assert refused(rise, SESSION) >= 3, rise
     assert refused(rise, SEQUENCE) >= 3, rise
     for command in (("fleet", "--seconds", "1"), ("check",)):
-        code, said = rig.command(*command)
-        assert code in (0, 1), said
-        assert b"Traceback" not in said
+        code, output = rig.command(*command)
+        assert code in (0, 1), output
+        assert b"Traceback" not in output
 
 
 def array(count: int, value: float) -> bytes:

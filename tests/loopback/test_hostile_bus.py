@@ -51,8 +51,8 @@ def test_what_a_device_says_of_itself_reaches_no_terminal(rig: HostileRig) -> No
         while any(one.poll() is None for one in running):
             for changes in (
                 {"host": OWNED, "version": OWNED},
-                {"gauges": {"temperature_c": 1e300}},
-                {"gauges": {OWNED: 1.0}},
+                {"metrics": {"temperature_c": 1e300}},
+                {"metrics": {OWNED: 1.0}},
                 {"counts": {"frames": 2**64 - 1}},
                 {"version": "9" * 64},
             ):
@@ -73,9 +73,9 @@ def test_a_device_that_reports_without_end_keeps_nobody_from_being_heard(rig: Ho
         while time.monotonic() < ended:
             session.put("phalanx/health/cam02", body, congestion_control=zenoh.CongestionControl.BLOCK)
         report(session, "cam00", {"version": "heard"})
-        code, said = rig.command("fleet", "--seconds", "1")
+        code, output = rig.command("fleet", "--seconds", "1")
     assert rise["bus.dropped"] > 0, rise
-    assert code == 0, said
+    assert code == 0, output
 
 
 @pytest.mark.parametrize("verb", ["stop", "report"])

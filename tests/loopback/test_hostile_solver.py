@@ -21,11 +21,11 @@ from common.messages import HandPose, decode, encode
 from common.session import EchoAnswer, Started
 from master.admission import limits_of
 from master.app import told_at
+from master.dispatcher import new_dispatcher
 from master.link import MasterLink
-from master.link_senders import Taken
+from master.link_senders import SensorMessage
 from master.rig import load_setup, load_setups
 from master.rig_setup import RigSetup
-from master.world import fresh_world
 from slave.link import SlaveLink
 from tests.loopback.test_handshake import BROADCAST, KEY, MASTER, S, Wires
 from tests.network_helpers import seeded
@@ -45,7 +45,7 @@ class Room:
     def __init__(self, tree: Path, device: str) -> None:
         setups = load_setups(tree, (ROOM, WRIST_RIG), None)
         self.setup: RigSetup = load_setup(tree, STOLEN[device])
-        self.wires, self.world, self.poses = Wires(), fresh_world(setups), 0
+        self.wires, self.dispatcher, self.poses = Wires(), new_dispatcher(setups), 0
         limits = {name: replace(one, rate_hz=1e6) for name, one in limits_of(setups).items()}
         others = (("imu",), ("wrist",), ("tracker",))
         cameras = (*HONEST, "cam02", "wrist")
@@ -75,7 +75,7 @@ class Room:
             self.solve()
 
     def attack(self, attack: Attack) -> None:
-        """Say it, and solve what comes of it."""
+        """Notify it, and solve what comes of it."""
         session = self._stolen._session
         assert session is not None
         body = self._speaker.body(attack, self._stolen.process, self.wires.clock.t_ns)
@@ -90,11 +90,11 @@ class Room:
     def solve(self) -> None:
         """Publish what comes of all that was taken, as a reader decodes it."""
         for message in self.taken():
-            for solved in self.world.push(message):
+            for solved in self.dispatcher.push(message):
                 out = decode(encode(told_at(solved, self.wires.clock.t_ns)))
                 self.poses += isinstance(out, HandPose) and out.hand == HAND
 
-    def taken(self) -> Iterator[Taken]:
+    def taken(self) -> Iterator[SensorMessage]:
         for came in (self.wires.got, self.wires.tags, self.wires.samples, self.wires.tracked):
             while came:
                 yield came.pop(0)

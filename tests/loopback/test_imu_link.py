@@ -20,9 +20,9 @@ from tests.network_helpers import PATIENCE_S, clock_known, detections, free_udp_
 
 
 def sample(source: str, session: int, seq: int, t_ns: int = 0) -> ImuSample:
-    turn = np.array([0.5, 0.5, 0.5, 0.5])
+    quaternion = np.array([0.5, 0.5, 0.5, 0.5])
     return ImuSample(
-        source, session, seq, t_ns, np.zeros(3), np.array([0, 0, 9.81]), np.full(3, np.nan), turn
+        source, session, seq, t_ns, np.zeros(3), np.array([0, 0, 9.81]), np.full(3, np.nan), quaternion
     )
 
 
@@ -119,9 +119,9 @@ def test_an_imu_that_the_rig_does_not_have_gets_no_session() -> None:
     wires = Wires()
     master = wires.new_master(cameras=("left",), imus=("palm-imu",))
     wires.new_slave("left")
-    stranger = wires.new_slave("other-imu")
+    unknown_peer = wires.new_slave("other-imu")
     wires.run(1.0)
-    assert stranger._session is None
+    assert unknown_peer._session is None
     assert master.refused[Refusal.UNKNOWN] > 0
 
 

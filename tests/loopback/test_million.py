@@ -66,7 +66,7 @@ def feed(master: MasterLink, slave: SlaveLink, datagrams: Iterator[bytes], t_ns:
     for count, datagram in enumerate(datagrams, start=1):
         which = count % 4
         if which == 0:
-            slave.hear_beacon(datagram, SOURCE, t_ns)
+            slave.receive_beacon(datagram, SOURCE, t_ns)
         elif which == 1:
             slave.receive(datagram, SOURCE, t_ns)
         else:

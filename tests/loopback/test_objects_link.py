@@ -14,12 +14,12 @@ from common.messages import MarkerDetections, TagDetections, TrackerPose, WristD
 from common.session import RigKeys
 from master.ingest import Ingest
 from master.link import MasterLink
-from master.message_queue import ROOM
+from master.message_queue import CAPACITY
 from slave.link import SlaveLink
 from slave.uplink import Uplink
 from tests.loopback.test_handshake import BROADCAST, KEY, MASTER, S, Wires
 from tests.loopback.test_imu_link import sample
-from tests.network_helpers import PATIENCE_S, detections, free_udp_port, seeded, triple, until
+from tests.network_helpers import PATIENCE_S, cycle, detections, free_udp_port, seeded, until
 
 
 def tags(camera: str, session: int, seq: int, t_ns: int = 0, count: int = 3) -> TagDetections:
@@ -171,7 +171,7 @@ def test_who_sends_what_another_kind_of_sender_sends_is_an_impostor(
     assert master.refused == {Refusal.IMPOSTOR: 1}
     assert [*wires.got, *wires.tags, *wires.tracked, *wires.samples] == []
     wires.send(left, tags("left", left.process, 0))
-    wires.send(wrist, triple("wrist", wrist.process, 1))
+    wires.send(wrist, cycle("wrist", wrist.process, 1))
     wires.send(puck, tracker("puck", puck.process, 0))
     assert len(wires.got) == len(wires.tags) == len(wires.tracked) == 1, "the true ones are heard as before"
 
@@ -264,11 +264,11 @@ def test_nobody_waits_for_a_tracker_and_it_alone_starts_nothing() -> None:
 
 def test_one_name_is_not_for_two() -> None:
     wires = Wires()
-    for imus, trackers, says in (
+    for imus, trackers, expected in (
         ((), ("left",), "'left' is a camera and a tracker"),
         (("puck",), ("puck",), "'puck' is an IMU and a tracker"),
     ):
-        with pytest.raises(ValueError, match=says):
+        with pytest.raises(ValueError, match=expected):
             MasterLink(("left",), KEY, wires.clock, BROADCAST, "", S, seeded(1), imus, (), trackers)
 
 
@@ -304,13 +304,13 @@ def test_at_overload_each_kind_of_message_keeps_its_newest(stack: ExitStack) -> 
         ("left",), KEY, SystemClock(), ("127.255.255.255", 9), ("127.0.0.1", 0), "", trackers=("puck",)
     )
     stack.callback(ingest.close)
-    count = ROOM["tracker"] + 5
+    count = CAPACITY["tracker"] + 5
     for seq in range(count):
         for message in (detections("left", 1, seq), tags("left", 1, seq), tracker("puck", 1, seq)):
             ingest.queue.put([message])
-    taken = [ingest.get(0.0) for _ in range(sum(ROOM[kind] for kind in ("frame", "tags", "tracker")))]
+    taken = [ingest.get(0.0) for _ in range(sum(CAPACITY[kind] for kind in ("frame", "tags", "tracker")))]
     for kind, room in ((MarkerDetections, "frame"), (TagDetections, "tags"), (TrackerPose, "tracker")):
-        newest = list(range(count - ROOM[room], count))
+        newest = list(range(count - CAPACITY[room], count))
         assert [one.seq for one in taken if isinstance(one, kind)] == newest, kind
     assert ingest.get(0.0) is None
     assert ingest.counts["queue.dropped"] == 3 * count - len(taken)

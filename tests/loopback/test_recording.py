@@ -68,8 +68,8 @@ def recorded_run(folder: Path, file: Path) -> str:
 
 def test_a_replay_is_what_was_told_live(tmp_path: Path) -> None:
     file = tmp_path / "wave.mcap"
-    said = recorded_run(tmp_path, file)
-    assert "recorder: recorded" in said
+    output = recorded_run(tmp_path, file)
+    assert "recorder: recorded" in output
     recording = open_messages(file)
     assert not recording.cut
     poses = json.loads((tmp_path / "live.json").read_text())["poses"]

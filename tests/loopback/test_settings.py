@@ -44,7 +44,7 @@ class Rig:
                     )
                 )
 
-    def said(self, process: str, text: str) -> bool:
+    def output(self, process: str, text: str) -> bool:
         """Whether the process has said it, after some patience."""
         return until(lambda: text in self.logs[process].read_text())
 
@@ -82,8 +82,8 @@ def rig(folder: Path) -> Generator[Rig, None, None]:
 
 def test_a_camera_is_set_by_command_and_by_file_while_everything_runs(tmp_path: Path) -> None:
     with rig(tmp_path) as desk:
-        assert desk.said("master", "started")
-        assert desk.said("slave", "exposure_us 5000"), "frames come"
+        assert desk.output("master", "started")
+        assert desk.output("slave", "exposure_us 5000"), "frames come"
         assert desk.shown("left")["exposure_us"] == ("5000", "5000")
         shown = desk.shown("left", "--exposure-us", "4000", "--colour-gains", "0.9,1.3", "--save")
         assert (shown["exposure_us"], shown["red_gain"]) == (("4000", "4000"), ("0.9", "0.9"))
@@ -91,12 +91,12 @@ def test_a_camera_is_set_by_command_and_by_file_while_everything_runs(tmp_path: 
         assert (saved.exposure_us, saved.colour_gains) == (4000.0, (0.9, 1.3))
 
         save(desk.left, msgspec.structs.replace(saved, exposure_us=6000.0))
-        assert desk.said("slave", "changed, in use now")
+        assert desk.output("slave", "changed, in use now")
         assert desk.shown("left")["exposure_us"] == ("6000", "6000")
-        assert desk.said("master", "changed files are in use"), "it reads the camera files, too"
+        assert desk.output("master", "changed files are in use"), "it reads the camera files, too"
         desk.left.write_text("{")
-        assert desk.said("slave", "changed, but not used")
-        assert desk.said("master", "changed files are not used")
+        assert desk.output("slave", "changed, but not used")
+        assert desk.output("master", "changed files are not used")
 
         refused = desk.camera("left", "--exposure-us", "90000")
         assert refused.returncode == 1

@@ -31,7 +31,7 @@ SITES = {"room-a": "star", "room-b": "hash"}  # and the key that is tapped there
 READY_S, BACK_S = 60.0, 60.0
 
 
-def tap(key: str) -> Gesture:
+def probe(key: str) -> Gesture:
     """What a master tells."""
     nowhere = np.full(3, np.nan)
     return Gesture("right", 1, "tap", key, "end", 1, 1.0, np.nan, np.nan, np.nan, nowhere, nowhere)
@@ -55,7 +55,7 @@ class Building:
             bus.serve(MASTER, self._obey)
             self.start(site, "relay", "--bus", endpoint, "--router", self.near, "--site", site)
         self.readers = {site: self.opened(lambda site=site: self.reader(site)) for site in SITES}
-        self.heard = {site: bus.subscribe("gesture") for site, bus in self.readers.items()}
+        self.received = {site: bus.subscribe("gesture") for site, bus in self.readers.items()}
 
     def reader(self, site: str) -> ZenohBus:
         """Who reads one site at the far router."""
@@ -91,23 +91,23 @@ class Building:
     def tell(self) -> None:
         """Every master tells something."""
         for site, bus in self.masters.items():
-            bus.publish("gesture", "right", tap(SITES[site]))
+            bus.publish("gesture", "right", probe(SITES[site]))
 
     def what_comes(self, wait_s: float) -> dict[str, set[str]]:
         """Tell until every reader has heard something, and once more; what each heard."""
-        for source in self.heard.values():
+        for source in self.received.values():
             _all(source)
-        heard: dict[str, set[str]] = {site: set() for site in SITES}
+        received: dict[str, set[str]] = {site: set() for site in SITES}
 
-        def all_heard() -> bool:
+        def all_received() -> bool:
             self.tell()
             time.sleep(0.05)
-            for site, source in self.heard.items():
-                heard[site] |= _all(source)
-            return all(heard.values())
+            for site, source in self.received.items():
+                received[site] |= _all(source)
+            return all(received.values())
 
-        assert until(all_heard, wait_s), f"heard {heard}; {self.logs()}"
-        return heard
+        assert until(all_received, wait_s), f"heard {received}; {self.logs()}"
+        return received
 
     def logs(self) -> str:
         """The last words of every process."""

@@ -59,10 +59,10 @@ class Scene:
         )
         return len(self.wires.got) > before
 
-    def heard(self, kind: type[HandshakeT]) -> list[HandshakeT]:
+    def received(self, kind: type[HandshakeT]) -> list[HandshakeT]:
         """All handshakes of a kind that travelled, as the thief reads them."""
         read = ((parse(one, self.keys.rig_tag), one) for one, _, _ in self.wires.seen if one[5] < Kind.START)
-        told = [self.keys.hear(header, one, kind) for header, one in read if isinstance(header, Header)]
+        told = [self.keys.open_as(header, one, kind) for header, one in read if isinstance(header, Header)]
         return [one for one in told if not isinstance(one, Refusal)]
 
     def hello(self, name: str = "left", process: int = 7, seed: int = 1) -> bytes:
@@ -71,7 +71,7 @@ class Scene:
         return seal(self.sealer, self.keys.hello(name, process, nonce, self.master._nonce))
 
     def lure(self, counter: int) -> None:
-        """Say a beacon as if it were the master's, in which the victim has no session."""
+        """Notify a beacon as if it were the master's, in which the victim has no session."""
         self.sealer._counter = counter
         beacon = Beacon(self.master._nonce, "tls/0.0.0.0:47802", {})
         self.wires.carry(seal(self.sealer, beacon), THIEF, BROADCAST)
@@ -80,8 +80,8 @@ class Scene:
 def test_a_captured_session_opens_for_its_device_and_the_master_alone() -> None:
     scene = Scene()
     assert scene.frame_comes()
-    hello = next(one for one in scene.heard(Hello) if one.name == "left")
-    (welcome,) = {one for one in scene.heard(Welcome) if one.slave_nonce == hello.slave_nonce}
+    hello = next(one for one in scene.received(Hello) if one.name == "left")
+    (welcome,) = {one for one in scene.received(Welcome) if one.slave_nonce == hello.slave_nonce}
     datagrams = [one for one, _, _ in scene.wires.seen if one[12:20] == scene.session.to_bytes(8, "big")]
     assert len(datagrams) > 10
     for who, opens in {
@@ -120,9 +120,10 @@ def test_a_flood_of_hellos_in_anothers_name_takes_no_room_and_ends_no_session() 
     assert all(sender.pending is None for sender in scene.master._senders.values())
     assert len(scene.master._sessions) == 2
     assert {
-        name: away.host for name, away in scene.master.turned_away.secrets(scene.wires.clock.now_ns()).items()
+        name: away.host
+        for name, away in scene.master.rejected_peers.secrets(scene.wires.clock.now_ns()).items()
     } == {"left": THIEF[0]}
-    assert not scene.master.turned_away.twins(scene.wires.clock.now_ns())
+    assert not scene.master.rejected_peers.duplicates(scene.wires.clock.now_ns())
     for one in replayed:  # from an address of his own: they make nothing new
         scene.wires.carry(one, THIEF, MASTER)
     scene.wires.run(PENDING_NS / S + 0.1)
@@ -164,7 +165,7 @@ def test_a_master_without_the_devices_secret_is_none_to_it() -> None:
     assert scene.session == session
     assert scene.frame_comes()
     assert scene.wires.run(
-        2.0, lambda: scene.left._offer is None or scene.left._offer.heard_ns < scene.wires.clock.t_ns - S
+        2.0, lambda: scene.left._offer is None or scene.left._offer.received_ns < scene.wires.clock.t_ns - S
     )
     assert scene.frame_comes()
 
@@ -179,10 +180,10 @@ def test_a_thief_between_both_reads_nothing_and_when_he_is_gone_they_find_each_o
     scene.wires.carry(welcome, THIEF, scene.address)
     assert scene.left._session is not None
     assert scene.left._session.address == THIEF
-    (hello,) = [one for one in scene.heard(Hello) if one.slave_nonce == scene.left._session.slave_nonce]
+    (hello,) = [one for one in scene.received(Hello) if one.slave_nonce == scene.left._session.slave_nonce]
     header = parse(welcome, scene.keys.rig_tag)
     assert isinstance(header, Header)
-    read = scene.keys.hear(header, welcome, Welcome)
+    read = scene.keys.open_as(header, welcome, Welcome)
     assert isinstance(read, Welcome)
     assert scene.keys.session(hello, read.session_nonce).key_id != scene.session
     taken = scene.session
@@ -194,7 +195,7 @@ def test_a_thief_between_both_reads_nothing_and_when_he_is_gone_they_find_each_o
 
 
 @pytest.mark.parametrize(
-    ("master", "slave", "said"),
+    ("master", "slave", "output"),
     [
         (LinkKey(KEY, ROOT), KEY, "has the rig key alone: phalanx deploy brings device-left.secret"),
         (KEY, own("left"), "start the master with --keys DIR, a folder that has devices.key"),
@@ -206,24 +207,24 @@ def test_a_thief_between_both_reads_nothing_and_when_he_is_gone_they_find_each_o
     ],
 )
 def test_secrets_that_do_not_fit_are_named_on_both_sides(
-    master: LinkKey | bytes, slave: LinkKey | bytes, said: str
+    master: LinkKey | bytes, slave: LinkKey | bytes, output: str
 ) -> None:
     wires = Wires()
     link, left = wires.new_master(("left",), key=master), wires.new_slave("left", key=slave)
     wires.run(2.0)
     assert not left.started
     assert left.wrong is not None
-    assert said in left.wrong
+    assert output in left.wrong
     assert left.refused[Refusal.SECRET] > 10
     assert link.refused[Refusal.SECRET] > 10
-    assert set(link.turned_away.secrets(wires.clock.now_ns())) == {"left"}
+    assert set(link.rejected_peers.secrets(wires.clock.now_ns())) == {"left"}
     right = wires.new_slave("left", key=LinkKey(KEY, ROOT) if isinstance(master, LinkKey) else master)
     assert wires.run(2.0, lambda: right.started), "with its secret it is taken at once"
 
 
 def test_an_unproven_that_the_thief_says_changes_nothing() -> None:
     scene = Scene()
-    told = Unproven(scene.master._nonce, bytes(NONCE_BYTES), apart=False)
+    told = Unproven(scene.master._nonce, bytes(NONCE_BYTES), has_secrets=False)
     scene.wires.carry(seal(scene.sealer, told), THIEF, scene.address)
     assert scene.left.refused == {Refusal.REPLAYED: 1}
     assert scene.left.wrong is None

@@ -33,14 +33,14 @@ def test_the_grab_test_runs_scores_and_outlives_its_wrist_device(tmp_path: Path)
         stderr=subprocess.STDOUT,
         text=True,
     )
-    heard: list[str] = []
+    received: list[str] = []
     pids: dict[str, int] = {}
     listening: set[Listener] = set()
     killed_ns = told = 0
     ended = False
     assert demo.stdout is not None
     for line in demo.stdout:
-        heard.append(line)
+        received.append(line)
         pids = pids or {name: int(pid) for name, pid in re.findall(r"(\w+) \(pid (\d+)\)", line)}
         run_s = int(found[1]) if (found := re.search(r"(\d+) of 180 s ", line)) else 0
         if run_s >= 14 and not killed_ns and poses_told(tmp_path) > ENOUGH:
@@ -50,8 +50,8 @@ def test_the_grab_test_runs_scores_and_outlives_its_wrist_device(tmp_path: Path)
         if killed_ns and not ended and run_s >= 24 and poses_told(tmp_path) > told + ENOUGH:
             ended = True
             demo.send_signal(signal.SIGINT)
-    said = "".join(heard)
-    assert demo.wait(60) == 0, said
+    output = "".join(received)
+    assert demo.wait(60) == 0, output
     assert {"master run", "slave run", "slave imu"} <= {one.program for one in listening}
     assert undocumented(listening, rows()) == [], "what listens is in docs/security.md"
     assert all(one.here for one in listening), "a demo is nobody else's business"
@@ -70,7 +70,7 @@ def test_the_grab_test_runs_scores_and_outlives_its_wrist_device(tmp_path: Path)
     assert counts["imu.received"] > 50
     for key in ("joint_mm", "joint_mm_visible", "pip_deg", "marker_mm"):
         assert np.isfinite(summary[key]), key
-    assert "joint error, visible fingers" in said
+    assert "joint error, visible fingers" in output
     for name in ("hand.png", "run.rrd", "poses.npz", *(f"{name}.log" for name in pids)):
         assert (tmp_path / name).stat().st_size > 0, name
     poses = load_poses(tmp_path / "poses.npz")

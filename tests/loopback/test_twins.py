@@ -29,16 +29,16 @@ def stream(wires: Wires, *slaves: SlaveLink, seconds: float, first: int = 0) -> 
 def test_of_two_with_one_name_the_first_keeps_its_session_and_both_sides_say_so() -> None:
     wires = Wires()
     master, left, _ = started_pair(wires)
-    twin = wires.new_slave("left")
-    taken = stream(wires, left, twin, seconds=5.0)
+    duplicate = wires.new_slave("left")
+    taken = stream(wires, left, duplicate, seconds=5.0)
     assert set(taken) == {left.process}
     assert len(taken) == 250
-    assert not twin.started
-    assert master.refused[Refusal.TWIN] > 50  # it says hello again and again
-    assert set(master.turned_away.twins(wires.clock.now_ns())) == {"left"}
-    assert twin.refused[Refusal.TWIN] > 10
-    assert twin.wrong is not None
-    assert "'left'" in twin.wrong
+    assert not duplicate.started
+    assert master.refused[Refusal.DUPLICATE_SENDER] > 50  # it says hello again and again
+    assert set(master.rejected_peers.duplicates(wires.clock.now_ns())) == {"left"}
+    assert duplicate.refused[Refusal.DUPLICATE_SENDER] > 10
+    assert duplicate.wrong is not None
+    assert "'left'" in duplicate.wrong
     assert left.wrong is None
     assert not left.refused
 
@@ -46,21 +46,21 @@ def test_of_two_with_one_name_the_first_keeps_its_session_and_both_sides_say_so(
 def test_the_second_is_taken_as_soon_as_the_first_is_silent_and_then_keeps_it() -> None:
     wires = Wires()
     master, left, _ = started_pair(wires)
-    twin = wires.new_slave("left")
-    stream(wires, left, twin, seconds=1.0)
+    duplicate = wires.new_slave("left")
+    stream(wires, left, duplicate, seconds=1.0)
     address = next(address for address, slave in wires.slaves.items() if slave is left)
     del wires.slaves[address]  # its cable is out
-    assert wires.run(1.0, lambda: twin.started)
-    stream(wires, twin, seconds=2.0)
+    assert wires.run(1.0, lambda: duplicate.started)
+    stream(wires, duplicate, seconds=2.0)
     wires.slaves[address] = left  # and is in again
-    taken = stream(wires, left, twin, seconds=5.0, first=1000)
-    assert set(taken) == {twin.process}
+    taken = stream(wires, left, duplicate, seconds=5.0, first=1000)
+    assert set(taken) == {duplicate.process}
     assert left.wrong is not None
-    assert twin.wrong is None
-    assert not master.turned_away.versions(wires.clock.now_ns())
+    assert duplicate.wrong is None
+    assert not master.rejected_peers.versions(wires.clock.now_ns())
     wires.remove(left)
     wires.run(3.0)
-    assert not master.turned_away.twins(wires.clock.now_ns())
+    assert not master.rejected_peers.duplicates(wires.clock.now_ns())
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -104,7 +104,7 @@ class Versions:
         while wires.clock.t_ns < end:
             for datagram, to in self.master.due():
                 if to == BROADCAST:
-                    self._old(lambda d=datagram: self.slave.hear_beacon(d, MASTER, wires.clock.now_ns()))
+                    self._old(lambda d=datagram: self.slave.receive_beacon(d, MASTER, wires.clock.now_ns()))
             for datagram, _ in self._old(self.slave.due):
                 self.hellos += 1
                 assert HEADER.unpack_from(datagram)[1:3] == (OTHER, Kind.HELLO)
@@ -123,14 +123,14 @@ def test_a_slave_of_another_wire_version_is_named_on_both_sides(monkeypatch: pyt
     now_ns = both.wires.clock.now_ns()
     assert both.hellos == 5  # once a second
     assert both.master.refused == {Refusal.VERSION: 5}
-    ((name, away),) = both.master.turned_away.versions(now_ns).items()
+    ((name, away),) = both.master.rejected_peers.versions(now_ns).items()
     assert (name, away.version) == ("left", OTHER)
     assert both.slave.refused[Refusal.VERSION] == 50  # beacons
     assert both.slave.wrong is not None
     assert f"wire version {WIRE_VERSION}" in both.slave.wrong
     assert not both.master.connected()
     both.wires.clock.t_ns += 2_000_000_000
-    assert not both.master.turned_away.versions(both.wires.clock.now_ns())
+    assert not both.master.rejected_peers.versions(both.wires.clock.now_ns())
 
 
 def test_only_a_hello_of_this_rig_makes_a_name_known(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,7 +141,7 @@ def test_only_a_hello_of_this_rig_makes_a_name_known(monkeypatch: pytest.MonkeyP
     hello = HEADER.pack(b"PHLX", OTHER, Kind.HELLO, 100, both.master._keys.rig_tag, 7, 7) + bytes(72)
     for datagram in (hello, hello[:20], hello[:28], b"PHLX" + bytes([OTHER]) + bytes(60)):
         both.master.receive(datagram, ("6.6.6.6", 6), now_ns)
-    assert not both.master.turned_away.versions(now_ns)
+    assert not both.master.rejected_peers.versions(now_ns)
     assert both.master.refused[Refusal.VERSION] >= 3
     slave = both.slave
     forged = HEADER.pack(
@@ -149,5 +149,5 @@ def test_only_a_hello_of_this_rig_makes_a_name_known(monkeypatch: pytest.MonkeyP
     ) + bytes(72)
     slave.due()
     for _ in range(1000):
-        slave.hear_beacon(forged, ("6.6.6.6", 6), now_ns)
+        slave.receive_beacon(forged, ("6.6.6.6", 6), now_ns)
     assert len(slave.due()) <= 1

@@ -69,8 +69,8 @@ def test_lines_of_a_recording_become_an_object_in_the_rig_that_is_where_it_is() 
             if pose.tracked:
                 R, p = motion.truth(np.array([1e-9 * (pose.t_ns - ZERO_NS)]))
                 off_mm.append(1e3 * float(np.linalg.norm(pose.position_m - p[0])))
-                turn = matrix_to_rotation_vector(quaternion_to_matrix(pose.orientation_wxyz) @ R[0].T)
-                off_deg.append(float(np.degrees(np.linalg.norm(turn))))
+                rotation = matrix_to_rotation_vector(quaternion_to_matrix(pose.orientation_wxyz) @ R[0].T)
+                off_deg.append(float(np.degrees(np.linalg.norm(rotation))))
     assert len(off_mm) > 3000
     assert np.quantile(off_mm, 0.95) < 2.5
     assert np.quantile(off_deg, 0.95) < 1.0

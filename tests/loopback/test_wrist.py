@@ -33,7 +33,7 @@ class Device:
     def __init__(self, files: Path, ingest: Ingest, bus: Bus, log: Path) -> None:
         self.files, self.ingest, self.bus, self.log = files, ingest, bus, log
 
-    def triples(self, count: int) -> list[WristDetections]:
+    def cycles(self, count: int) -> list[WristDetections]:
         """The next so many."""
         found: list[WristDetections] = []
         assert until(lambda: len(found) >= count or self._take(found)), self.log.read_text()
@@ -96,9 +96,9 @@ def device(folder: Path) -> Generator[Device, None, None]:
     assert "Traceback" not in log.read_text()
 
 
-def test_a_slave_sends_triples_reports_them_and_follows_its_files(tmp_path: Path) -> None:
+def test_a_slave_sends_cycles_reports_them_and_follows_its_files(tmp_path: Path) -> None:
     with device(tmp_path) as wrist:
-        sent = wrist.triples(5)
+        sent = wrist.cycles(5)
         assert all(message.seq % 3 == 1 for message in sent)
         assert (np.diff([message.seq for message in sent]) > 0).all()
         assert (
@@ -111,10 +111,8 @@ def test_a_slave_sends_triples_reports_them_and_follows_its_files(tmp_path: Path
             lambda: wrist.ask("report").counts["frames"] >= 15
         )  # counted a moment after they are sent
         counts, later = wrist.ask("report").counts, wrist.ask("report").counts
-        assert counts["strobe.triples"] >= 5
-        assert (
-            later["frames"] + 1 >= 3 * counts["strobe.triples"]
-        )  # a triple is counted before its last frame
+        assert counts["strobe.cycles"] >= 5
+        assert later["frames"] + 1 >= 3 * counts["strobe.cycles"]  # a triple is counted before its last frame
         assert sum(count for name, count in counts.items() if name.startswith("seen.laser.")) >= 12
         assert {f"seen.tip.{finger}" for finger in ("thumb", "little")} <= counts.keys()
 
@@ -124,7 +122,7 @@ def test_a_slave_sends_triples_reports_them_and_follows_its_files(tmp_path: Path
         assert shown.shape == (240, 320)
         assert shown[60:180, 80:240].mean() > 30.0  # by the LEDs
 
-        assert wrist.ask("set", '{"exposure_us": 1500}').gauges["exposure_us"] == 1500.0
+        assert wrist.ask("set", '{"exposure_us": 1500}').metrics["exposure_us"] == 1500.0
         path = wrist.files / "rigs/wrist.json"
         rig = load(path, RigCalibration)
         assert rig.T_camera_palm is not None
@@ -138,7 +136,7 @@ def test_a_slave_sends_triples_reports_them_and_follows_its_files(tmp_path: Path
         assert until(lambda: "laser_plane" in wrist.log.read_text())  # counted, then said
         while wrist.ingest.get(0.0) is not None:
             pass
-        wrist.triples(2)  # it goes on
+        wrist.cycles(2)  # it goes on
 
 
 def test_the_demo_of_the_device_scores_against_its_truth_and_leaves_its_results(tmp_path: Path) -> None:

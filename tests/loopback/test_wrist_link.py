@@ -15,7 +15,7 @@ from slave.link import SlaveLink
 from slave.uplink import Uplink
 from tests.loopback.test_handshake import BROADCAST, KEY, MASTER, S, Wires
 from tests.loopback.test_imu_link import sample
-from tests.network_helpers import PATIENCE_S, detections, free_udp_port, seeded, triple, until
+from tests.network_helpers import PATIENCE_S, cycle, detections, free_udp_port, seeded, until
 
 
 def started(wires: Wires, clock: SkewedClock | None = None) -> tuple[MasterLink, SlaveLink, SlaveLink]:
@@ -33,7 +33,7 @@ def test_its_triples_come_on_the_masters_clock_with_the_doubt_of_the_conversion(
     master, _, wrist = started(wires, clock)
     wires.run(3.0)
     t_ns = wires.clock.now_ns()
-    wires.send(wrist, triple("wrist", wrist.process, 1, clock.now_ns()))
+    wires.send(wrist, cycle("wrist", wrist.process, 1, clock.now_ns()))
     [got] = wires.got
     assert isinstance(got, WristDetections)
     assert got.t_ns == pytest.approx(t_ns, abs=2_000_000)
@@ -48,10 +48,10 @@ def test_its_triples_come_on_the_masters_clock_with_the_doubt_of_the_conversion(
     ("wrist_says", "message"),
     [
         (True, detections("wrist", 1, 0)),  # markers of a camera that has none
-        (True, triple("left", 1, 0)),
+        (True, cycle("left", 1, 0)),
         (True, sample("wrist", 1, 0)),
-        (False, triple("left", 1, 0)),  # a triple of a camera without strobes
-        (False, triple("wrist", 1, 0)),
+        (False, cycle("left", 1, 0)),  # a triple of a camera without strobes
+        (False, cycle("wrist", 1, 0)),
         (False, detections("wrist", 1, 0)),
     ],
 )
@@ -65,7 +65,7 @@ def test_who_sends_what_another_kind_of_camera_sends_is_an_impostor(
     assert master.refused == {Refusal.IMPOSTOR: 1}
     assert not wires.got
     wires.send(left, detections("left", left.process, 0))  # and the true ones are heard as before
-    wires.send(wrist, triple("wrist", wrist.process, 1))
+    wires.send(wrist, cycle("wrist", wrist.process, 1))
     assert [message.camera for message in wires.got] == ["left", "wrist"]
     assert master.counts_of("wrist").received == 1
 
@@ -74,7 +74,7 @@ def test_nothing_is_lost_where_nothing_was_though_numbers_rise_by_three() -> Non
     wires = Wires()
     master, _, wrist = started(wires)
     for k in range(50):
-        wires.send(wrist, triple("wrist", wrist.process, 3 * k + 1 + (k % 4 == 2)))
+        wires.send(wrist, cycle("wrist", wrist.process, 3 * k + 1 + (k % 4 == 2)))
         wires.step()
     counts = master.counts_of("wrist")
     assert (counts.received, counts.lost, counts.skipped, counts.late) == (50, 0, 0, 0)
@@ -86,7 +86,7 @@ def test_triples_lost_on_the_way_and_never_sent_are_told_apart() -> None:
     for k in range(60):
         if k in (7, 8, 30):  # a frame was missing, or there was no time
             continue
-        message = triple("wrist", wrist.process, 3 * k + 1)
+        message = cycle("wrist", wrist.process, 3 * k + 1)
         if k in (20, 41, 42, 43):
             assert wrist.seal(message) is not None  # sent, and never heard of again
         else:
@@ -96,12 +96,12 @@ def test_triples_lost_on_the_way_and_never_sent_are_told_apart() -> None:
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_any_loss_is_accounted_for_in_triples(seed: int) -> None:
+def test_any_loss_is_accounted_for_in_cycles(seed: int) -> None:
     wires, chance = Wires(seed=seed), random.Random(seed)
     master, _, wrist = started(wires)
     kept: list[int] = []
     for k in range(200):
-        message = triple("wrist", wrist.process, 3 * k + 1)
+        message = cycle("wrist", wrist.process, 3 * k + 1)
         if chance.random() < 0.2:
             assert wrist.seal(message) is not None
         else:
@@ -114,12 +114,12 @@ def test_any_loss_is_accounted_for_in_triples(seed: int) -> None:
     assert counts.received + counts.lost == span
 
 
-def test_mutated_triples_are_counted_and_have_no_effect() -> None:
+def test_mutated_cycles_are_counted_and_have_no_effect() -> None:
     wires, chance = Wires(), random.Random(5)
     master, _, wrist = started(wires)
     session = wrist._session
     assert session is not None
-    body = encode(triple("wrist", wrist.process, 1))
+    body = encode(cycle("wrist", wrist.process, 1))
     for _ in range(3000):  # sealed rightly: whoever has the session may send what he likes
         broken = bytearray(body)
         for _ in range(chance.randint(1, 3)):
@@ -152,7 +152,7 @@ def stack() -> Iterator[ExitStack]:
         yield stack
 
 
-def test_triples_come_over_real_sockets_and_none_is_lost(stack: ExitStack) -> None:
+def test_cycles_come_over_real_sockets_and_none_is_lost(stack: ExitStack) -> None:
     port, clock = free_udp_port(), SystemClock()
     ingest = Ingest(
         ("wrist",), KEY, clock, ("127.255.255.255", port), ("127.0.0.1", 0), "", wrists=("wrist",)
@@ -162,7 +162,7 @@ def test_triples_come_over_real_sockets_and_none_is_lost(stack: ExitStack) -> No
     stack.callback(wrist.close)
     assert wrist.wait_for_start(PATIENCE_S)
     for k in range(30):
-        wrist.send(triple("wrist", wrist.session, 3 * k + 1, clock.now_ns()))
+        wrist.send(cycle("wrist", wrist.session, 3 * k + 1, clock.now_ns()))
         assert until(lambda k=k: ingest.counts_of("wrist").received == k + 1)
     taken = [ingest.get(PATIENCE_S) for _ in range(30)]
     assert [one.seq for one in taken if isinstance(one, WristDetections)] == [3 * k + 1 for k in range(30)]

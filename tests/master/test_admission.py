@@ -11,7 +11,7 @@ from common.messages import MarkerDetections, TagDetections, WristDetections
 from master.admission import READY_NS, SenderLimits, bucket_of, limits_of, refused
 from master.link_senders import Sender
 from master.rig import load_setups
-from tests.network_helpers import detections, triple
+from tests.network_helpers import cycle, detections
 
 S = 1_000_000_000
 CALIBRATION = Path(__file__).resolve().parents[2] / "calib_json"
@@ -34,9 +34,9 @@ def at(*uv: float) -> MarkerDetections:
         (msgspec.structs.replace(at(1.0, 1.0), ready_t_ns=READY_NS), None),
         (msgspec.structs.replace(at(1.0, 1.0), ready_t_ns=READY_NS + 1), Refusal.READY_TIME),
         (msgspec.structs.replace(at(1.0, 1.0), ready_t_ns=-READY_NS - 1), Refusal.READY_TIME),
-        (msgspec.structs.replace(at(1.0, 1.0), rival_uv=np.full((6, 2), 2000.0)), Refusal.OUTSIDE_PICTURE),
-        (triple("left", 1, 0), None),
-        (msgspec.structs.replace(triple("left", 1, 0), tip_sigma_px=np.ones(5), tip_uv=np.full((5, 2), -999.0)),
+        (msgspec.structs.replace(at(1.0, 1.0), alt_uv=np.full((6, 2), 2000.0)), Refusal.OUTSIDE_PICTURE),
+        (cycle("left", 1, 0), None),
+        (msgspec.structs.replace(cycle("left", 1, 0), tip_sigma_px=np.ones(5), tip_uv=np.full((5, 2), -999.0)),
          Refusal.OUTSIDE_PICTURE),
         (TagDetections("left", 1, 0, 0, 0, np.array([3], np.uint16), np.full((1, 4, 2), 1290.0), np.ones(1)),
          Refusal.OUTSIDE_PICTURE),

@@ -12,12 +12,12 @@ from common.calibration import ImuCalibration
 from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
 from common.hand_model import WRIST
 from common.messages import HandPose, ImuSample, MarkerDetections, Told
-from master.app import Beside, Observed, RunFigures, health, run
+from master.app import AuxiliaryMessage, Observed, RunFigures, health, run
+from master.dispatcher import Dispatcher
 from master.live import cameras_line
 from master.rig_pipeline import pipeline_of
 from master.rig_setup import RigSetup
 from master.stages import StageTimes
-from master.world import World
 from tests.hand_helpers import detections
 from tests.synthetic_run import SyntheticRun, hand_at, setup_of, synthetic_run
 
@@ -25,10 +25,12 @@ from tests.synthetic_run import SyntheticRun, hand_at, setup_of, synthetic_run
 class ScriptedSource:
     """Gives messages in turn, with pauses (None), then sets `stop`."""
 
-    def __init__(self, messages: Sequence[MarkerDetections | Beside | None], stop: threading.Event) -> None:
+    def __init__(
+        self, messages: Sequence[MarkerDetections | AuxiliaryMessage | None], stop: threading.Event
+    ) -> None:
         self._messages, self._stop = iter(messages), stop
 
-    def get(self, timeout_s: float) -> MarkerDetections | Beside | None:
+    def get(self, timeout_s: float) -> MarkerDetections | AuxiliaryMessage | None:
         assert timeout_s > 0
         try:
             return next(self._messages)
@@ -61,8 +63,8 @@ class Collector:
         raise AssertionError("the loop does not own its sinks")
 
 
-def world_of(*setups: RigSetup) -> World:
-    return World(setups, [pipeline_of(setup, StageTimes()) for setup in setups], StageTimes())
+def world_of(*setups: RigSetup) -> Dispatcher:
+    return Dispatcher(setups, [pipeline_of(setup, StageTimes()) for setup in setups], StageTimes())
 
 
 @pytest.fixture(scope="module")
@@ -85,9 +87,9 @@ def test_every_pose_reaches_every_sink_with_its_latency(short_run: SyntheticRun)
     assert last.latency_ns == 1_000_000  # handed over 2 ms after its capture, published after 3 ms
 
 
-def turned(t_ns: int, turn: Float) -> ImuSample:
-    """A sample of an IMU whose axes are the palm's and whose world is the rig's, `turn` (3, 3) off the truth."""
-    q = matrix_to_quaternion(turn @ hand_at(t_ns * 1e-9).T_rig_palm[:3, :3])
+def rotated(t_ns: int, rotation: Float) -> ImuSample:
+    """A sample of an IMU whose axes are the palm's and whose world is the rig's, `rotation` (3, 3) off the truth."""
+    q = matrix_to_quaternion(rotation @ hand_at(t_ns * 1e-9).T_rig_palm[:3, :3])
     return ImuSample("imu", 1, t_ns // 8_000_000, t_ns, np.zeros(3), np.zeros(3), np.full(3, np.nan), q)
 
 
@@ -98,7 +100,7 @@ def test_samples_of_an_imu_turn_the_palm_and_are_no_frames(short_run: SyntheticR
     )
     setup, off = setup_of(msgspec.structs.replace(short_run.setup.rig, imu=imu)), axis_rotation(0, 0.1)
     first, last = short_run.messages[0].t_ns, short_run.messages[-1].t_ns
-    samples = [turned(t_ns, off) for t_ns in range(first, last, 8_000_000)]
+    samples = [rotated(t_ns, off) for t_ns in range(first, last, 8_000_000)]
     script = sorted([*short_run.messages, *samples], key=lambda message: message.t_ns)
     stop, sink, figures = threading.Event(), Collector(), RunFigures()
     hands, watched = world_of(setup), list[MarkerDetections]()
@@ -116,7 +118,7 @@ def test_samples_of_an_imu_turn_the_palm_and_are_no_frames(short_run: SyntheticR
 def test_samples_of_an_imu_that_has_no_place_are_counted(short_run: SyntheticRun) -> None:
     unplaced = setup_of(msgspec.structs.replace(short_run.setup.rig, imu=ImuCalibration()))
     stop, hands = threading.Event(), world_of(unplaced)
-    run(ScriptedSource([turned(0, np.eye(3))], stop), hands, [], ScriptedClock(), RunFigures(), stop)
+    run(ScriptedSource([rotated(0, np.eye(3))], stop), hands, [], ScriptedClock(), RunFigures(), stop)
     assert hands.counts == {"orientation.unplaced": 1}
 
 
@@ -157,7 +159,7 @@ def test_health_carries_counts_and_gauges() -> None:
     report = health(5, clock, figures, {"left received": 9})
     assert (report.source, report.session, report.t_ns) == ("master", 5, 77)
     assert report.counts == {"poses": 1, "left received": 9}
-    assert report.gauges == {"latency_p50_ms": 4.0, "latency_p99_ms": 4.0, "camera_hz.left": 50.0}
+    assert report.metrics == {"latency_p50_ms": 4.0, "latency_p99_ms": 4.0, "camera_hz.left": 50.0}
 
 
 def test_stages_are_means_and_survive_an_error() -> None:
@@ -171,12 +173,12 @@ def test_stages_are_means_and_survive_an_error() -> None:
 
 
 @pytest.mark.parametrize(
-    ("connected", "said"),
+    ("connected", "output"),
     [
         ([], "cameras: none yet; waiting for left, right"),
         (["right"], "cameras: right; waiting for left"),
         (["right", "left"], "cameras: left, right"),
     ],
 )
-def test_who_is_waited_for_is_said(connected: list[str], said: str) -> None:
-    assert cameras_line(("left", "right"), frozenset(connected)) == said
+def test_who_is_waited_for_is_said(connected: list[str], output: str) -> None:
+    assert cameras_line(("left", "right"), frozenset(connected)) == output

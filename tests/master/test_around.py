@@ -30,14 +30,14 @@ ANGLES = np.radians(
 PERIOD_NS = 16_666_667
 
 
-def around(turn_deg: float) -> RigCalibration:
+def around(rotation_deg: float) -> RigCalibration:
     """Two pairs, both half a metre from (0.04, 0, 0.5); the second turned about the first's y axis."""
-    a = np.radians(turn_deg)
-    turn = np.array([[np.cos(a), 0.0, np.sin(a)], [0.0, 1.0, 0.0], [-np.sin(a), 0.0, np.cos(a)]])
+    a = np.radians(rotation_deg)
+    rotation = np.array([[np.cos(a), 0.0, np.sin(a)], [0.0, 1.0, 0.0], [-np.sin(a), 0.0, np.cos(a)]])
     middle = np.array([0.0375, 0.0, 0.5])
     rig = rig_file(("left", "right", "left2", "right2"))
     poses = {
-        name: rigid(turn, middle + turn @ (np.array([x, 0.0, 0.0]) - middle))
+        name: rigid(rotation, middle + rotation @ (np.array([x, 0.0, 0.0]) - middle))
         for name, x in (("left2", 0.0), ("right2", 0.075))
     }
     places = {name: msgspec.convert(pose.tolist(), Matrix4) for name, pose in poses.items()}
@@ -62,13 +62,13 @@ def solved(rig: RigCalibration, T_rig_palm: Float) -> list[HandPose]:
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("turn_deg", [60.0, 90.0])
-def test_a_second_pair_aside_does_not_turn_the_hand(turn_deg: float) -> None:
+@pytest.mark.parametrize("rotation_deg", [60.0, 90.0])
+def test_a_second_pair_aside_does_not_turn_the_hand(rotation_deg: float) -> None:
     """How far the palm rolls is told by habits here, in either rig: of 25 degrees 4 to 9 are left. The second pair must
     not draw it its way: a hand that faced the middle of both pairs would roll 6 degrees farther with 60 between them.
     """
     alone, both = np.zeros((3, 2)), np.zeros((3, 2))
-    four = around(turn_deg)
+    four = around(rotation_deg)
     for k, roll_deg in enumerate((-25.0, 0.0, 25.0)):
         T = palm(np.array([0.0, roll_deg, 0.0]), np.array([0.04, 0.08, 0.5]))
         alone[k] = off(msgspec.structs.replace(four, cameras=("left", "right")), T)
@@ -92,5 +92,5 @@ def off(rig: RigCalibration, T_rig_palm: Float) -> tuple[float, float]:
     assert poses[-1].valid.all()
     truth = RIGHT.forward(T_rig_palm, ANGLES)
     mm = 1e3 * float(np.linalg.norm(poses[-1].position_m - truth.position_m, axis=1).mean())
-    turn = quaternion_to_matrix(poses[-1].orientation_wxyz[WRIST]) @ truth.rotation[WRIST].T
-    return mm, float(np.degrees(matrix_to_rotation_vector(turn)[1]))
+    rotation = quaternion_to_matrix(poses[-1].orientation_wxyz[WRIST]) @ truth.rotation[WRIST].T
+    return mm, float(np.degrees(matrix_to_rotation_vector(rotation)[1]))

@@ -51,7 +51,7 @@ def test_a_file_is_loaded_then_changed_then_saved() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
+    ("options", "expected"),
     [
         ({"exposure_us": 0.0}, "--exposure-us 0: must be positive"),
         ({"gain": float("nan")}, "--gain nan: must be positive"),
@@ -68,8 +68,10 @@ def test_a_file_is_loaded_then_changed_then_saved() -> None:
         ({"load_file": LEFT.with_name("none.json")}, "none.json: cannot read"),
     ],
 )
-def test_what_makes_no_sense_is_refused_before_anything_is_told(options: dict[str, Any], says: str) -> None:
-    with pytest.raises(PhalanxError, match=says):
+def test_what_makes_no_sense_is_refused_before_anything_is_told(
+    options: dict[str, Any], expected: str
+) -> None:
+    with pytest.raises(PhalanxError, match=expected):
         asked(**options)
 
 
@@ -87,14 +89,14 @@ def served(name: str, verbs: Mapping[str, Callable[[str], Mapping[str, float]]])
 
 
 def test_wanted_and_read_back_stand_side_by_side() -> None:
-    gauges = {
+    metrics = {
         "wanted.exposure_us": 5000.0,
         "exposure_us": 4989.0,
         "wanted.red_gain": 0.83,
         "sync_locked": 1.0,
         "rate_hz": 60.0,
     }
-    health = tell(served("left", {"settings": lambda _body: gauges}), asked())
+    health = tell(served("left", {"settings": lambda _body: metrics}), asked())
     assert [line.split() for line in table(health)] == [
         ["setting", "wanted", "read", "back"],
         ["exposure_us", "5000", "4989"],
@@ -105,15 +107,15 @@ def test_wanted_and_read_back_stand_side_by_side() -> None:
 
 
 def test_a_refusal_ends_the_steps() -> None:
-    said: list[str] = []
+    output: list[str] = []
 
     def refuse(_body: str) -> Mapping[str, float]:
         raise CameraError("exposure_us: wanted 9000 us, got 8000 us")
 
-    bus = served("left", {"set": refuse, "save": lambda body: said.append(body) or {}})
+    bus = served("left", {"set": refuse, "save": lambda body: output.append(body) or {}})
     with pytest.raises(BusError, match="'left' refused 'set': exposure_us: wanted 9000 us, got 8000 us"):
         tell(bus, asked(exposure_us=9000.0, save=True))
-    assert said == []
+    assert output == []
 
 
 def test_a_camera_that_is_not_there_is_named_with_those_that_are(monkeypatch: pytest.MonkeyPatch) -> None:

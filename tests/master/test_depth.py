@@ -119,11 +119,11 @@ def _rig(**parts: object) -> RigCalibration:
 
 
 def camera(
-    turn: tuple[int, float] = (0, 0.0), at: Vector = (0.075, 0.0, 0.0), f: float = 500.0
+    rotation: tuple[int, float] = (0, 0.0), at: Vector = (0.075, 0.0, 0.0), f: float = 500.0
 ) -> CameraModel:
     """A camera of the pair, turned about an axis by an angle [deg]."""
     matrix = np.array([[f, 0.0, 319.5], [0.0, f, 239.5], [0.0, 0.0, 1.0]])
-    pose = rigid(axis_rotation(turn[0], np.radians(turn[1])), np.array(at))
+    pose = rigid(axis_rotation(rotation[0], np.radians(rotation[1])), np.array(at))
     return CameraModel(matrix, np.zeros(5), pose, 640, 480, 0.0)
 
 

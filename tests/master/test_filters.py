@@ -118,16 +118,16 @@ def test_long_gap_restarts_from_the_value_itself() -> None:
 
 
 def test_zero_is_a_time_and_a_late_sample_changes_nothing() -> None:
-    machine, twin = OneEuro(PAPER), OneEuro(PAPER)
-    for m in (machine, twin):
+    machine, duplicate = OneEuro(PAPER), OneEuro(PAPER)
+    for m in (machine, duplicate):
         m.push(0, np.array([0.0]))
     second = machine.push(10_000_000, np.array([1.0]))
     assert 0.0 < second[0] < 1.0  # t = 0 was taken as the time before
-    assert twin.push(10_000_000, np.array([1.0])) == second
+    assert duplicate.push(10_000_000, np.array([1.0])) == second
     assert machine.push(10_000_000, np.array([50.0])) == second
     assert machine.push(4, np.array([50.0])) == second
     assert machine.late == 2
-    assert machine.push(20_000_000, np.array([2.0])) == twin.push(20_000_000, np.array([2.0]))
+    assert machine.push(20_000_000, np.array([2.0])) == duplicate.push(20_000_000, np.array([2.0]))
 
 
 @given(st.lists(st.sampled_from([0.3, -1.0, math.nan, math.inf]), min_size=2, max_size=40))
@@ -185,9 +185,9 @@ def test_read_only_and_transposed_samples_are_taken_as_they_are() -> None:
     samples = np.random.default_rng(8).normal(0.0, 1.0, (20, 4, 3))
     ours, theirs = OneEuro(PAPER), OneEuro(PAPER)
     for k, sample in enumerate(samples):
-        turned = np.asfortranarray(sample)
-        turned.flags.writeable = False
-        np.testing.assert_array_equal(ours.push(k * 10_000_000, turned), theirs.push(k * 10_000_000, sample))
+        rotated = np.asfortranarray(sample)
+        rotated.flags.writeable = False
+        np.testing.assert_array_equal(ours.push(k * 10_000_000, rotated), theirs.push(k * 10_000_000, sample))
 
 
 def test_a_group_has_the_cut_off_of_its_fastest_signal_and_another_its_own() -> None:
@@ -219,11 +219,11 @@ def _by_noise(signals: Float, sigma_m: float, groups: tuple[int, ...]) -> Float:
 
 
 @pytest.mark.parametrize(
-    ("sigma_m", "said", "left_m"), [(1e-3, 1.0, 4e-4), (1e-3, 2.0, 2e-4), (3e-3, 2.0, 4e-4)]
+    ("sigma_m", "output", "left_m"), [(1e-3, 1.0, 4e-4), (1e-3, 2.0, 2e-4), (3e-3, 2.0, 4e-4)]
 )
-def test_at_rest_known_noise_leaves_about_the_jitter(sigma_m: float, said: float, left_m: float) -> None:
+def test_at_rest_known_noise_leaves_about_the_jitter(sigma_m: float, output: float, left_m: float) -> None:
     noise = np.random.default_rng(1).normal(0.0, sigma_m, (2000, 6))
-    out = _by_noise(noise, said * sigma_m, (3, 3))[200:]
+    out = _by_noise(noise, output * sigma_m, (3, 3))[200:]
     assert out.std(axis=0).max() < left_m
 
 
@@ -301,9 +301,11 @@ def test_a_sample_far_less_sure_than_its_neighbours_is_ridden_over() -> None:
 
 def test_the_axes_are_those_of_the_view() -> None:
     rng = np.random.default_rng(4)
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     points, sd = np.cumsum(rng.normal(0.0, 1e-3, (100, 3)), axis=0), np.tile([3e-4, 1e-3, 5e-3], (100, 1))
-    np.testing.assert_allclose(_filtered(points @ turn, sd, turn), _filtered(points, sd) @ turn, atol=1e-9)
+    np.testing.assert_allclose(
+        _filtered(points @ rotation, sd, rotation), _filtered(points, sd) @ rotation, atol=1e-9
+    )
 
 
 def test_a_point_without_a_covariance_or_unseen_poisons_nothing() -> None:

@@ -13,7 +13,7 @@ from common.clock import SystemClock
 from common.errors import BusError, PhalanxError
 from common.messages import Health
 from master.fleet import Roll, expected_devices
-from master.hear import at_master, here
+from master.wait_for_senders import at_master, here
 from slave.uplink import Uplink
 from tests.network_helpers import detections, free_udp_port
 
@@ -116,9 +116,9 @@ def test_where_no_master_runs_the_start_is_given_and_datagrams_are_counted() -> 
     thread.start()
     ends = ("127.255.255.255", beacon_port), ("127.0.0.1", port)
     try:
-        heard = here(["left"], DESK, key, *ends, 20.0, threading.Event())
-        assert set(heard) == {"left"}
-        assert heard["left"] > 0.0
+        received = here(["left"], DESK, key, *ends, 20.0, threading.Event())
+        assert set(received) == {"left"}
+        assert received["left"] > 0.0
         assert here(["left"], DESK, os.urandom(32), *ends, 1.0, threading.Event()) == {}, "of another rig key"
     finally:
         done.set()

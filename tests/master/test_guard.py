@@ -8,9 +8,9 @@ import pytest
 from common.messages import MarkerDetections
 from common.streams import sender_of
 from master.app import Solved
-from master.guard import SolverGuard, culprit
-from master.link_senders import Taken
+from master.link_senders import SensorMessage
 from master.quarantine import FIRST_NS, LONGEST_NS, MAX_CAUSES, Quarantine
+from master.solver_supervisor import SolverSupervisor, culprit
 from tests.network_helpers import ManualClock, detections
 
 S = 1_000_000_000
@@ -24,7 +24,7 @@ class Fragile:
         self._at, self.poisoned = at, False
         self.taken: list[str] = []
 
-    def push(self, message: Taken) -> Iterator[Solved]:
+    def push(self, message: SensorMessage) -> Iterator[Solved]:
         assert isinstance(message, MarkerDetections)
         if message.area[0] == POISON:
             self.poisoned = True
@@ -51,7 +51,7 @@ def frame(camera: str, seq: int, area: float = 50.0) -> MarkerDetections:
         np.full(6, area),
         message.quality,
         message.sigma_px,
-        message.rival_uv,
+        message.alt_uv,
     )
 
 
@@ -61,19 +61,21 @@ class Scene:
     def __init__(self, at: str | None = None) -> None:
         self.at, self.clock, self.quarantine = at, ManualClock(0), Quarantine()
         self.solver, self.renewed = Fragile(at), list[str]()
-        self.guard = SolverGuard(self, self.quarantine, self.clock, self.renew, lambda _sender: Fragile(at))
+        self.guard = SolverSupervisor(
+            self, self.quarantine, self.clock, self.renew, lambda _sender: Fragile(at)
+        )
 
-    def push_inner(self, message: Taken) -> Iterator[Solved]:
+    def push_inner(self, message: SensorMessage) -> Iterator[Solved]:
         return self.solver.push(message)
 
-    def push(self, message: Taken) -> Iterator[Solved]:
+    def push(self, message: SensorMessage) -> Iterator[Solved]:
         yield from self.solver.push(message)
 
     def renew(self, sender: str) -> None:
         self.renewed.append(sender)
         self.solver = Fragile(self.at)
 
-    def send(self, message: Taken) -> None:
+    def send(self, message: SensorMessage) -> None:
         assert list(self.guard.push(message)) == []
         if self.guard._repair is not None:
             self.guard._repair.join()

@@ -13,20 +13,20 @@ from common.arrays import Float
 from common.calibration import ImuCalibration, RigCalibration, load, save
 from common.errors import CalibrationError
 from common.messages import Detections, ImuSample, MarkerDetections
+from master.clock_monitor import ClockMonitor
+from master.dispatcher import Dispatcher
 from master.estimator.pipeline import SolvedPose
 from master.needs_restart import refuse_restart
 from master.outputs.files import RunFiles, load_poses
 from master.rig import RigFiles, load_setup
 from master.rig_pipeline import pipeline_of
 from master.stages import StageTimes
-from master.time_watch import TimeWatch
 from master.tuning import LivePipeline, RigTuning
-from master.world import World
 from tests.hand_helpers import MARKERS
 from tests.master.test_outputs_files import random_pose
 from tests.master.test_rig_merge import setups, two_hands
 from tests.synthetic_run import SyntheticRun, setup_of, synthetic_run
-from tests.wrist_run import START_NS, TRIPLE_NS, exact_triple, wrist_scene, wrist_setup
+from tests.wrist_run import CYCLE_NS, START_NS, exact_cycle, wrist_scene, wrist_setup
 
 
 class Told:
@@ -63,7 +63,7 @@ def with_left_markers(message: MarkerDetections) -> MarkerDetections:
     """The message of a rig whose second six markers are those of a left hand, seen where the right ones are."""
     twice = {
         name: np.concatenate([getattr(message, name)] * 2)
-        for name in ("uv", "area", "quality", "sigma_px", "rival_uv")
+        for name in ("uv", "area", "quality", "sigma_px", "alt_uv")
     }
     return msgspec.structs.replace(message, **twice)
 
@@ -74,7 +74,9 @@ def test_cameras_that_watch_two_hands_solve_both(short_run: SyntheticRun) -> Non
         short_run.setup.rig, markers=markers, other_hands=("made-left",), stamp_offset_us={}
     )
     both = setups(rig)
-    hands = World(both, [pipeline_of(setup, StageTimes()) for setup in both], StageTimes(), gestures=False)
+    hands = Dispatcher(
+        both, [pipeline_of(setup, StageTimes()) for setup in both], StageTimes(), gestures=False
+    )
     told = [one for message in short_run.messages for one in hands.push(with_left_markers(message))]
     poses = [one.pose for one in told if isinstance(one, SolvedPose)]
     of = {name: [pose for pose in poses if pose.hand == name] for name in ("made-right", "made-left")}
@@ -92,8 +94,8 @@ def test_messages_and_samples_go_to_their_own_hand(short_run: SyntheticRun, root
     right = setup_of(msgspec.structs.replace(short_run.setup.rig, imu=imu))
     left = load_setup(root / "calib_json", "wrist-left")
     lines = Told(), Told()
-    hands = World((right, left), lines, StageTimes())
-    seen = exact_triple(left, wrist_scene(left).truth(0.5), 0)
+    hands = Dispatcher((right, left), lines, StageTimes())
+    seen = exact_cycle(left, wrist_scene(left).truth(0.5), 0)
     samples = [sample(source, t_ns) for source, t_ns in (("palm", 1), (left.imus[0], 2), ("another", 3))]
     for message in (short_run.messages[0], seen, *samples):
         assert not list(hands.push(message))
@@ -134,17 +136,17 @@ def test_a_joined_hand_follows_all_its_files(root: Path, tmp_path: Path) -> None
     tuning = RigTuning(files, [setup], [pipeline], lines.append)
     scene = wrist_scene(wrist_setup(root))
     for k in range(6):
-        pipeline.push_orientation(START_NS + k * TRIPLE_NS - 1, np.eye(4)[0])
-        pipeline.push(exact_triple(wrist_setup(root), scene.truth(0.1 * k), k))
+        pipeline.push_orientation(START_NS + k * CYCLE_NS - 1, np.eye(4)[0])
+        pipeline.push(exact_cycle(wrist_setup(root), scene.truth(0.1 * k), k))
     path = files.calibration / "rigs/wrist.json"
     rig = load(path, RigCalibration)
-    save(path, msgspec.structs.replace(rig, level="fk"))
+    save(path, msgspec.structs.replace(rig, solver_mode="fk"))
     tuning.reload()
     assert lines == ["changed files are in use"]
     [new] = tuning.setups
     assert new.wrist is not None
-    assert new.wrist.level == "fk"
-    pipeline.push(exact_triple(wrist_setup(root), scene.truth(0.6), 6))
+    assert new.wrist.solver_mode == "fk"
+    pipeline.push(exact_cycle(wrist_setup(root), scene.truth(0.6), 6))
     save(path, msgspec.structs.replace(rig, hand="default-left"))
     with pytest.raises(
         CalibrationError, match="hand: default-right cannot become default-right, default-left"
@@ -162,7 +164,7 @@ def test_markers_of_two_hands_keep_their_rows() -> None:
 
 
 def test_cameras_that_watch_two_hands_are_measured_once(short_run: SyntheticRun) -> None:
-    watch = TimeWatch(setups(two_hands()))
+    watch = ClockMonitor(setups(two_hands()))
     for message in short_run.messages:
         watch.push(message)
     assert watch.look() == []

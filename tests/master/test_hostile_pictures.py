@@ -96,12 +96,12 @@ def test_a_calibration_decodes_no_still_of_another_size_and_says_whose(
         assert round_.images["left"].shape == (480, 640, 3)
         assert ("right" in round_.refused) == known, "what no camera sends is not even a message"
 
-        def say(line: str) -> None:
+        def notify(line: str) -> None:
             lines.append(line)
             stop.set()
 
         new_folder(tmp_path / "views")
-        capture(taker.take, live, tmp_path / "views", 5, stop, say)
+        capture(taker.take, live, tmp_path / "views", 5, stop, notify)
         assert ("the picture of right is" if known else "no picture from right") in lines[0]
     finally:
         taker.close()

@@ -11,7 +11,7 @@ from common.datagram import MAX_DATAGRAM
 from common.errors import BusError
 from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerPose
 from master.ingest import Ingest
-from master.link_senders import Taken
+from master.link_senders import SensorMessage
 from master.message_queue import QUEUE
 from tests.network_helpers import detections, free_udp_port, until
 
@@ -30,7 +30,7 @@ def ingest() -> Iterator[Ingest]:
 
 
 def test_rubbish_is_counted_by_reason(ingest: Ingest) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as unknown_peer:
         for datagram in (
             b"GET / HTTP/1.0",
             b"",
@@ -39,7 +39,7 @@ def test_rubbish_is_counted_by_reason(ingest: Ingest) -> None:
             bytes(MAX_DATAGRAM + 1),
             bytes(60000),
         ):
-            stranger.sendto(datagram, ingest.address)
+            unknown_peer.sendto(datagram, ingest.address)
     expected = {"foreign": 2, "cut": 1, "version": 1, "oversized": 2}
     assert until(lambda: ingest.refused == expected)
     assert ingest.counts["refused.oversized"] == 2
@@ -73,7 +73,7 @@ def test_samples_of_an_imu_drive_no_frame_out(ingest: Ingest) -> None:
 @pytest.mark.parametrize("kind", ["imu", "tracker", "tags"])
 def test_frames_that_pile_up_starve_nothing_else(ingest: Ingest, kind: str) -> None:
     # Two frames come for each that the master has time for, for a long while; what is cheap comes with each.
-    taken: list[Taken] = []
+    taken: list[SensorMessage] = []
     for k in range(6 * QUEUE):
         for message in (detections("left", 1, 2 * k), detections("left", 1, 2 * k + 1), cheap(kind, k)):
             ingest.queue.put([message])
@@ -88,7 +88,7 @@ def test_frames_that_pile_up_starve_nothing_else(ingest: Ingest, kind: str) -> N
     assert ingest.counts["queue.dropped"] == 6 * QUEUE - (QUEUE - 1)  # the rest waits
 
 
-def cheap(kind: str, seq: int) -> Taken:
+def cheap(kind: str, seq: int) -> SensorMessage:
     nan3, nan4 = np.full(3, np.nan), np.full(4, np.nan)
     if kind == "imu":
         return ImuSample("palm-imu", 1, seq, 0, nan3, nan3, nan3, nan4)

@@ -15,7 +15,7 @@ from common.errors import PhalanxError
 from common.service_manager import ServiceManager
 from master.install_command import command_of, environment_of
 from master.keys_folder import make
-from master.loop_watch import WatchedLoop
+from master.loop_monitor import MonitoredLoop
 from master.service_unit import UNIT, unit_text
 from master.user_services import UserServices
 
@@ -63,7 +63,7 @@ def test_systemd_has_nothing_to_say_about_the_unit(tmp_path: Path) -> None:
 
 @NEEDS_SYSTEMD
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "output"),
     [
         ("WatchdogSec", "WatchdogSek", "Unknown key 'WatchdogSek'"),
         ("MemoryMax=1G", "MemoryMax=1X", "Invalid memory limit"),
@@ -71,10 +71,10 @@ def test_systemd_has_nothing_to_say_about_the_unit(tmp_path: Path) -> None:
         ("phalanx-master run", "phalanx run", "not executable"),
     ],
 )
-def test_a_slip_in_the_unit_would_be_said(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_a_slip_in_the_unit_would_be_said(tmp_path: Path, old: str, new: str, output: str) -> None:
     text = text_of(tmp_path, "--rig", "desk")
     assert old in text
-    assert said in verified(tmp_path, text.replace(old, new, 1))
+    assert output in verified(tmp_path, text.replace(old, new, 1))
 
 
 @NEEDS_SYSTEMD
@@ -96,10 +96,10 @@ def test_exposure_of_the_unit(tmp_path: Path, drop: str | None, passes: bool) ->
 
 
 def test_the_unit_starts_again_and_is_bounded(tmp_path: Path) -> None:
-    said = dict(re.findall(r"^(\w+)=(.*)$", text_of(tmp_path), re.MULTILINE))
-    assert (said["Type"], said["Restart"], said["RestartSec"]) == ("notify", "on-failure", "100ms")
-    assert said["StartLimitIntervalSec"] == "0"
-    assert (said["MemoryMax"], said["MemorySwapMax"], said["TasksMax"]) == ("1G", "0", "256")
+    output = dict(re.findall(r"^(\w+)=(.*)$", text_of(tmp_path), re.MULTILINE))
+    assert (output["Type"], output["Restart"], output["RestartSec"]) == ("notify", "on-failure", "100ms")
+    assert output["StartLimitIntervalSec"] == "0"
+    assert (output["MemoryMax"], output["MemorySwapMax"], output["TasksMax"]) == ("1G", "0", "256")
 
 
 @pytest.mark.parametrize(
@@ -202,7 +202,7 @@ def test_the_loop_is_ready_once_and_gives_a_sign_of_life_four_times_in_a_period(
         manager.setblocking(False)
         now = [0]
         environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "8000000"}
-        loop = WatchedLoop(_Nothing(), ServiceManager(environment), lambda: now[0])
+        loop = MonitoredLoop(_Nothing(), ServiceManager(environment), lambda: now[0])
         assert manager.recv(100) == b"READY=1\nSTATUS=tracks"
         for now[0] in range(0, 8_000_000_001, 100_000_000):
             assert loop.get(0.1) is None

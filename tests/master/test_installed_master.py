@@ -40,9 +40,9 @@ class Installed:
         self.environment, self._keys = environment, keys
         self._port = free_port(socket.SOCK_STREAM)
         self.options = ["--rig", "desk", "--keys", str(keys), "--bus", f"tls/127.0.0.1:{self._port}"]
-        beside = self.unit.with_name(f"{UNIT}.d") / "test.conf"
-        beside.parent.mkdir(parents=True)
-        beside.write_text(_NOTES_ENDS)
+        drop_in = self.unit.with_name(f"{UNIT}.d") / "test.conf"
+        drop_in.parent.mkdir(parents=True)
+        drop_in.write_text(_NOTES_ENDS)
         self.options += [
             "--bind",
             "127.0.0.1:0",

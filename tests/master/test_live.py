@@ -18,7 +18,7 @@ from master.outputs.files import load_poses
 from master.rig import load_setup, load_setups
 from slave.uplink import Uplink
 from tests.network_helpers import detections, free_udp_port, until
-from tests.wrist_run import exact_triple, wrist_scene
+from tests.wrist_run import exact_cycle, wrist_scene
 
 
 def free_tcp_port() -> int:
@@ -81,7 +81,7 @@ def test_a_master_of_two_hands_publishes_each_under_its_name(tmp_path: Path, roo
         tmp_path / "live.json",
     )
     setups = load_setups(root / "calib_json", ("desk", "wrist-left"))
-    triple = exact_triple(setups[1], wrist_scene(setups[1]).truth(0.5), 0)
+    cycle = exact_cycle(setups[1], wrist_scene(setups[1]).truth(0.5), 0)
     stop, lines = threading.Event(), list[str]()
     master = threading.Thread(target=run_live, args=(setups, key, settings, stop, lines.append))
     master.start()
@@ -96,7 +96,7 @@ def test_a_master_of_two_hands_publishes_each_under_its_name(tmp_path: Path, roo
             for name in ("left", "right"):
                 ends[name].send(detections(name, ends[name].session, seq, t_ns))
             changes = {"session": ends["wrist"].session, "seq": 3 * seq, "t_ns": t_ns, "ready_t_ns": t_ns}
-            ends["wrist"].send(msgspec.structs.replace(triple, **changes))
+            ends["wrist"].send(msgspec.structs.replace(cycle, **changes))
             stop.wait(0.01)
 
         def counted() -> bool:

@@ -18,7 +18,7 @@ from master.tuning import LivePipeline
 from slave.uplink import Uplink
 from tests.master.test_live import free_tcp_port
 from tests.network_helpers import detections, free_udp_port, until
-from tests.wrist_run import exact_triple, wrist_scene
+from tests.wrist_run import exact_cycle, wrist_scene
 
 POISON_US = 250_000.0  # the exposure of the triples that the planted fault cannot stand
 
@@ -40,7 +40,7 @@ def test_a_fault_of_one_hands_solver_costs_its_sender_a_pause_and_the_other_hand
         ("127.255.255.255", beacon := free_udp_port()), ("127.0.0.1", 0), bus, 5.0, files=files
     )
     setups = files.load()
-    triple = exact_triple(setups[1], wrist_scene(setups[1]).truth(0.5), 0)
+    cycle = exact_cycle(setups[1], wrist_scene(setups[1]).truth(0.5), 0)
     stop = threading.Event()
     master = threading.Thread(target=run_live, args=(setups, key, settings, stop, list[str]().append))
     master.start()
@@ -57,7 +57,7 @@ def test_a_fault_of_one_hands_solver_costs_its_sender_a_pause_and_the_other_hand
                 ends[name].send(detections(name, ends[name].session, seq, t_ns))
             changes = {"session": ends["wrist"].session, "seq": seq, "t_ns": t_ns, "ready_t_ns": t_ns}
             if seq % 3 == 0:
-                ends["wrist"].send(msgspec.structs.replace(triple, exposure_us=exposure_us, **changes))
+                ends["wrist"].send(msgspec.structs.replace(cycle, exposure_us=exposure_us, **changes))
             stop.wait(0.02)
         return counts()
 

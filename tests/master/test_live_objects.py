@@ -148,8 +148,8 @@ def test_objects_and_contact_come_on_the_bus_and_into_files(
     hands = [one for one in drained(master, "hand") if isinstance(one, HandPose)]
     contacts = [one for one in drained(master, "contact") if isinstance(one, Contact)]
     assert len(hands) == len(contacts) > 0
-    shed = counts.get("instants_shed", 0)  # what a busy machine leaves out is counted
-    assert len(hands) + shed > FRAMES // 2
+    dropped_epochs = counts.get("instants_shed", 0)  # what a busy machine leaves out is counted
+    assert len(hands) + dropped_epochs > FRAMES // 2
     assert {(one.hand, one.object) for one in contacts} == {("default-right", "cube")}
     assert all(isinstance(one, Gesture) for one in drained(master, "gesture"))
     assert len(load_object(object_path(tmp_path, "cube"))) == len(poses)
@@ -167,5 +167,5 @@ def drained(master: Master, name: str) -> list[object]:
 
 
 def test_who_is_there_is_said_by_kind() -> None:
-    said = cameras_line(("left",), frozenset({"left", "palm", "puck"}), ("puck", "other"))
-    assert said == "cameras: left; IMU: palm; tracker: puck"
+    output = cameras_line(("left",), frozenset({"left", "palm", "puck"}), ("puck", "other"))
+    assert output == "cameras: left; IMU: palm; tracker: puck"

@@ -52,7 +52,12 @@ def among(run: SyntheticRun, message: MarkerDetections) -> MarkerDetections:
     uv = np.array([message.uv[own[n]] if n in own else still[FREE.index(n)] for n in ALL])
     ones = np.ones(len(ALL))
     return msgspec.structs.replace(
-        message, uv=uv, area=400 * ones, quality=ones, sigma_px=0.1 * ones, rival_uv=np.full((24, 2), np.nan)
+        message,
+        uv=uv,
+        area=400 * ones,
+        quality=ones,
+        sigma_px=0.1 * ones,
+        alt_uv=np.full((24, 2), np.nan),
     )
 
 
@@ -88,13 +93,13 @@ def test_a_free_marker_has_its_rival_told_by_the_other_camera_and_by_its_own_pas
         if m.seq < 6 or m.camera == "left":
             messages.append(m)
             continue
-        uv, rival = m.uv.copy(), m.rival_uv.copy()
-        uv[row], rival[row] = many.setup.models[m.camera].project(thing), m.uv[row]
-        messages.append(msgspec.structs.replace(m, uv=uv, rival_uv=rival))
+        uv, alternative = m.uv.copy(), m.alt_uv.copy()
+        uv[row], alternative[row] = many.setup.models[m.camera].project(thing), m.uv[row]
+        messages.append(msgspec.structs.replace(m, uv=uv, alt_uv=alternative))
     poses, counts = solve(many, messages)
     for pose in poses:
         np.testing.assert_allclose(pose.markers_raw_m[row], PLACES[FREE.index("cube-3")], atol=2e-3)
-    assert counts["rival.cube-3"] >= 5
+    assert counts["alternative.cube-3"] >= 5
 
 
 @pytest.mark.parametrize("names", [("back",), ("index",), ("thumb", "index"), ("index", "middle", "back")])
@@ -106,7 +111,7 @@ def test_fewer_markers_are_placed_and_a_hand_is_solved_where_they_determine_one(
     some = [
         msgspec.structs.replace(
             m,
-            **{field: getattr(m, field)[rows] for field in ("uv", "area", "quality", "sigma_px", "rival_uv")},
+            **{field: getattr(m, field)[rows] for field in ("uv", "area", "quality", "sigma_px", "alt_uv")},
         )
         for m in six.messages
     ]
@@ -132,7 +137,7 @@ def test_a_marker_on_no_hand_must_be_said_to_be_free() -> None:
 
 
 @pytest.mark.parametrize("solver", ["estimator", "fabrik"])
-def test_a_marker_on_a_bone_beside_that_of_the_finger_tip_counts_for_the_hand(solver: str) -> None:
+def test_a_marker_on_a_bone_next_to_that_of_the_finger_tip_counts_for_the_hand(solver: str) -> None:
     bone = MarkerMount("index-finger-phalanx-intermediate", (0.0, 0.009, -0.01), 0.012)
     knuckle = MarkerMount("middle-finger-metacarpal", (0.0, 0.01, -0.02), 0.012)
     profile = msgspec.structs.replace(

@@ -28,12 +28,12 @@ HAND = "default-right"
 
 def object_pose(k: int, name: str = "cube") -> ObjectPose:
     rng = np.random.default_rng(k)
-    lost, turn = k % 4 == 3, rng.normal(size=4)
+    lost, quaternion = k % 4 == 3, rng.normal(size=4)
     return ObjectPose(
         object=name,
         t_ns=2**60 + k,
         position_m=np.full(3, nan) if lost else rng.normal(size=3),
-        orientation_wxyz=np.full(4, nan) if lost else turn / np.linalg.norm(turn),
+        orientation_wxyz=np.full(4, nan) if lost else quaternion / np.linalg.norm(quaternion),
         cov=rng.normal(size=(6, 6)),
         residual_m=nan if lost else float(rng.uniform()),
         source=int(ObjectSource.NONE if lost else ObjectSource.TAGS),
@@ -59,7 +59,7 @@ def gesture(k: int) -> Gesture:
 
 
 def written(folder: Path) -> list[Told]:
-    sink = RunFiles(folder / "poses.npz", {HAND: 6, "worn": 0}, ["cube"])
+    sink = RunFiles(folder / "poses.npz", {HAND: 6, "device": 0}, ["cube"])
     told: list[Told] = []
     for k in range(9):
         told += [random_pose(k), object_pose(k), contact(k), gesture(k)]
@@ -83,13 +83,13 @@ def test_what_is_told_is_read_back_exactly(tmp_path: Path) -> None:
                 np.testing.assert_array_equal(
                     getattr(table, field)[k], getattr(message, field), err_msg=field
                 )
-    said = load_gestures_told(tmp_path / GESTURES)
+    output = load_gestures_told(tmp_path / GESTURES)
     gestures = [one for one in told if isinstance(one, Gesture)]
-    assert len(said) == len(gestures)
-    for one, other in zip(said, gestures, strict=True):
+    assert len(output) == len(gestures)
+    for one, other in zip(output, gestures, strict=True):
         for field in Gesture.__struct_fields__:
             np.testing.assert_array_equal(getattr(one, field), getattr(other, field), err_msg=field)
-    assert not contact_path(tmp_path, "worn", "cube").exists(), "a wrist device alone touches nothing"
+    assert not contact_path(tmp_path, "device", "cube").exists(), "a wrist device alone touches nothing"
 
 
 def test_the_same_run_makes_the_same_bytes(tmp_path: Path) -> None:
@@ -140,7 +140,7 @@ def test_a_folder_that_is_not_there_is_said_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "says"),
+    ("line", "expected"),
     [
         (b"{", "line 2: Input data was truncated"),
         (b"[1]", "line 2: Expected `object`"),
@@ -148,10 +148,10 @@ def test_a_folder_that_is_not_there_is_said_at_once(tmp_path: Path) -> None:
         (b'{"type": "HandPose"}', "line 2: Invalid value 'HandPose'"),
     ],
 )
-def test_a_broken_line_of_gestures_is_named(tmp_path: Path, line: bytes, says: str) -> None:
+def test_a_broken_line_of_gestures_is_named(tmp_path: Path, line: bytes, expected: str) -> None:
     path = tmp_path / GESTURES
     path.write_bytes(gesture_line(gesture(1)) + line + b"\n")
-    with pytest.raises(RecordingError, match=says):
+    with pytest.raises(RecordingError, match=expected):
         load_gestures_told(path)
 
 
@@ -199,7 +199,7 @@ def test_searched_frames_come_back_with_their_tags_in_order(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "expected"),
     [
         ({"row": None}, "'row' is missing"),
         ({"row": np.array([0, 0, 3])}, "row or ids: out of range"),
@@ -215,9 +215,9 @@ def test_searched_frames_come_back_with_their_tags_in_order(tmp_path: Path) -> N
         ({"t_ns": np.array([10, 20])}, r"t_ns has shape \(2,\), expected \(3,\)"),
     ],
 )
-def test_tags_that_do_not_fit_are_named(tmp_path: Path, changes: dict[str, object], says: str) -> None:
+def test_tags_that_do_not_fit_are_named(tmp_path: Path, changes: dict[str, object], expected: str) -> None:
     save_tags(tmp_path, **changes)
-    with pytest.raises(RecordingError, match=says) as error:
+    with pytest.raises(RecordingError, match=expected) as error:
         list(recorded_tags(tmp_path, "left"))
     assert "`phalanx-slave detect` for camera 'left'" in str(error.value)
 

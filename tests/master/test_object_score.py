@@ -46,10 +46,10 @@ def poses(t_ns: Int, T: Float, tracked: bool = True, sigma: float = 1e-3) -> Obj
     )
 
 
-def moved(T: Float, shift_m: Float, turn: Float) -> Float:
+def moved(T: Float, shift_m: Float, rotation: Float) -> Float:
     out = T.copy()
     out[:, :3, 3] += shift_m
-    out[:, :3, :3] = turn @ out[:, :3, :3]
+    out[:, :3, :3] = rotation @ out[:, :3, :3]
     return out
 
 

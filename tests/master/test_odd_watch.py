@@ -4,11 +4,11 @@ from collections import Counter
 
 import numpy as np
 
-from master.odd_watch import OddWatch
-from tests.master.test_odd_camera import THREE, messages, rig, solve
+from master.extrinsics_monitor import ExtrinsicsMonitor
+from tests.master.test_camera_outlier import THREE, messages, rig, solve
 
 
-def looks(watch: OddWatch, counts: Counter[str], seconds: int, **per_second: int) -> list[str]:
+def looks(watch: ExtrinsicsMonitor, counts: Counter[str], seconds: int, **per_second: int) -> list[str]:
     out: list[str] = []
     for _ in range(seconds):
         counts.update({name.replace("__", "."): number for name, number in per_second.items()})
@@ -17,7 +17,7 @@ def looks(watch: OddWatch, counts: Counter[str], seconds: int, **per_second: int
 
 
 def test_a_camera_that_is_mostly_left_out_is_named_once() -> None:
-    watch, counts = OddWatch(("left", "right", "top")), Counter[str]()
+    watch, counts = ExtrinsicsMonitor(("left", "right", "top")), Counter[str]()
     assert not looks(watch, counts, 20, poses=60)
     assert not looks(watch, counts, 4, poses=60, mostly_left_out__right=60)
     assert not looks(watch, counts, 1, poses=60)  # a short while is no knock
@@ -28,12 +28,15 @@ def test_a_camera_that_is_mostly_left_out_is_named_once() -> None:
 
 
 def test_a_master_that_solves_nothing_names_nobody() -> None:
-    watch, counts = OddWatch(("left", "right")), Counter[str](poses=10, **{"mostly_left_out.left": 9})
+    watch, counts = (
+        ExtrinsicsMonitor(("left", "right")),
+        Counter[str](poses=10, **{"mostly_left_out.left": 9}),
+    )
     assert not looks(watch, counts, 30)
 
 
 def test_what_the_pipeline_counts_is_what_is_watched() -> None:
-    watch = OddWatch(THREE)
+    watch = ExtrinsicsMonitor(THREE)
     _, counts = solve(rig(THREE, "top", np.radians([1.4, 1.4, 0.0])), messages(THREE))
     lines: list[str] = []
     for second in range(1, 6):

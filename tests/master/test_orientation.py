@@ -18,7 +18,7 @@ from common.geometry import (
     matrix_to_quaternion,
     quaternion_to_matrix,
 )
-from master.estimator.epoch import Turn
+from master.estimator.epoch import OrientationMeasurement
 from master.estimator.imu_samples import REACH_NS, slerp
 from master.estimator.palm_imu import OrientationTrack
 from master.fabrik.estimate import SolvedHand
@@ -35,7 +35,7 @@ TILT_ONLY = msgspec.structs.replace(KNOWN, heading_sigma_rad=None)
 seeds = st.integers(0, 2**32 - 1)
 
 
-def said(palm: Float) -> Float:
+def output(palm: Float) -> Float:
     """What the IMU says of itself (4,) when the palm lies like this (3, 3)."""
     world_imu = quaternion_to_matrix(np.array(WORLD)).T @ palm @ quaternion_to_matrix(np.array(MOUNTED))
     return matrix_to_quaternion(world_imu)
@@ -52,13 +52,13 @@ def degrees(a: Float, b: Float) -> float:
     return float(np.degrees(Rotation.from_matrix(a @ b.T).magnitude()))
 
 
-def at(track: OrientationTrack, t_ns: int, near: SolvedHand | None = None) -> Turn:
+def at(track: OrientationTrack, t_ns: int, near: SolvedHand | None = None) -> OrientationMeasurement:
     found = track.at(t_ns, near)
     assert found is not None
     return found
 
 
-def covariance(found: Turn) -> Float:
+def covariance(found: OrientationMeasurement) -> Float:
     """Of the palm's turn (3, 3) [rad^2]."""
     return np.asarray(np.linalg.inv(found.information), np.float64)
 
@@ -67,7 +67,7 @@ def filled(imu: ImuCalibration, count: int = 12, rate_rad_s: float = 2.0) -> Ori
     """A palm that turns about the rig's x axis, sampled every 8 ms from 1 s on."""
     track = OrientationTrack(imu)
     for k in range(count):
-        track.push(1000 * MS + 8 * k * MS, said(axis_rotation(0, rate_rad_s * 0.008 * k)))
+        track.push(1000 * MS + 8 * k * MS, output(axis_rotation(0, rate_rad_s * 0.008 * k)))
     return track
 
 
@@ -93,7 +93,7 @@ def test_between_two_samples_it_turns_steadily_and_lies_in_the_rig() -> None:
 def test_opposite_quaternions_are_the_same_turn() -> None:
     track = OrientationTrack(KNOWN)
     for k in range(4):
-        track.push(k * 8 * MS, (-1.0) ** k * said(axis_rotation(0, 0.01 * k)))
+        track.push(k * 8 * MS, (-1.0) ** k * output(axis_rotation(0, 0.01 * k)))
     assert degrees(at(track, 12 * MS).rotation, axis_rotation(0, 0.015)) < 1e-4
 
 
@@ -107,10 +107,10 @@ def test_it_is_narrow_across_the_vertical_and_wide_about_it() -> None:
 
 def test_a_heading_drifts_until_nothing_is_known_of_it() -> None:
     track = filled(msgspec.structs.replace(KNOWN, heading_drift_rad_s=0.01))
-    track.push(21_000 * MS, said(np.eye(3)))
+    track.push(21_000 * MS, output(np.eye(3)))
     cov = covariance(at(track, 21_000 * MS))
     assert np.sqrt(UP @ cov @ UP) == pytest.approx(np.hypot(HEADING_RAD, 0.2))
-    track.push(601_000 * MS, said(np.eye(3)))
+    track.push(601_000 * MS, output(np.eye(3)))
     assert track.at(601_000 * MS, None) is None
 
 
@@ -118,9 +118,9 @@ def test_a_heading_drifts_until_nothing_is_known_of_it() -> None:
 def test_an_unknown_heading_is_that_of_the_hand_and_its_tilt_stays(wrong_rad: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     truth = any_rotation(rng)
-    turned = np.asarray(Rotation.from_rotvec(wrong_rad * UP).as_matrix(), np.float64)
+    rotated = np.asarray(Rotation.from_rotvec(wrong_rad * UP).as_matrix(), np.float64)
     track = OrientationTrack(TILT_ONLY)
-    track.push(0, said(turned @ truth))
+    track.push(0, output(rotated @ truth))
     assert track.at(0, None) is None  # nobody says where it points
     assert degrees(at(track, 0, solved(truth)).rotation, truth) < 1e-3
     off = np.asarray(Rotation.from_rotvec(rng.normal(0.0, 0.1, 3)).as_matrix(), np.float64)
@@ -139,7 +139,7 @@ def test_doubt_grows_away_from_samples() -> None:
 
 def test_in_a_gap_there_is_none() -> None:
     track = filled(KNOWN, 3)
-    track.push(2000 * MS, said(np.eye(3)))
+    track.push(2000 * MS, output(np.eye(3)))
     assert track.at(1500 * MS, None) is None
     assert track.at(1016 * MS + REACH_NS, None) is not None
     assert track.at(1016 * MS + REACH_NS + 1, None) is None
@@ -168,24 +168,24 @@ def test_what_is_no_rotation_is_dropped_and_counted(wrong: Float, reason: str) -
 
 def test_a_quaternion_that_was_rounded_is_taken() -> None:
     track = OrientationTrack(KNOWN)
-    track.push(0, 1.005 * said(axis_rotation(1, 0.4)))
+    track.push(0, 1.005 * output(axis_rotation(1, 0.4)))
     assert degrees(at(track, 0).rotation, axis_rotation(1, 0.4)) < 1e-4
 
 
 def test_a_late_sample_is_dropped_and_a_clock_set_back_begins_anew() -> None:
     track = filled(KNOWN)
-    track.push(1040 * MS, said(axis_rotation(2, 1.0)))
+    track.push(1040 * MS, output(axis_rotation(2, 1.0)))
     assert track.counts["orientation.late"] == 1
-    track.push(10 * MS, said(axis_rotation(2, 1.0)))
+    track.push(10 * MS, output(axis_rotation(2, 1.0)))
     assert degrees(at(track, 10 * MS).rotation, axis_rotation(2, 1.0)) < 1e-4
     assert track.at(1040 * MS, None) is None
 
 
 def test_one_sample_of_the_future_does_not_shut_out_those_that_follow() -> None:
     track = filled(msgspec.structs.replace(KNOWN, heading_drift_rad_s=0.01))
-    track.push(2**62, said(axis_rotation(2, 1.0)))
+    track.push(2**62, output(axis_rotation(2, 1.0)))
     for k in range(2):
-        track.push((21_000 + 8 * k) * MS, said(axis_rotation(0, 0.3)))
+        track.push((21_000 + 8 * k) * MS, output(axis_rotation(0, 0.3)))
     found = at(track, 21_004 * MS)
     assert degrees(found.rotation, axis_rotation(0, 0.3)) < 1e-4
     assert np.sqrt(UP @ covariance(found) @ UP) == pytest.approx(np.hypot(HEADING_RAD, 0.2), rel=1e-3)
@@ -194,7 +194,7 @@ def test_one_sample_of_the_future_does_not_shut_out_those_that_follow() -> None:
 def test_what_it_holds_is_bounded() -> None:
     track = OrientationTrack(KNOWN)
     for k in range(3000):
-        track.push(k * MS, said(np.eye(3)))
+        track.push(k * MS, output(np.eye(3)))
     assert len(track._samples) < 1000
     assert track.at(2990 * MS, None) is not None
 

@@ -17,13 +17,13 @@ FIXED = "t_ns position_m orientation_wxyz radius_m valid tracked cov_m2 angles_r
 def random_pose(index: int, markers: int = 6, hand: str = "default-right") -> HandPose:
     rng = np.random.default_rng(index)
     raw = rng.normal(size=(markers, 3))
-    turns = rng.normal(size=(26, 4))
+    rotations = rng.normal(size=(26, 4))
     raw[index % max(markers, 1) :][:1] = np.nan
     return HandPose(
         hand=hand,
         t_ns=2**60 + index,  # beyond what a float64 holds exactly
         position_m=rng.normal(size=(26, 3)),
-        orientation_wxyz=turns / np.linalg.norm(turns, axis=1, keepdims=True),
+        orientation_wxyz=rotations / np.linalg.norm(rotations, axis=1, keepdims=True),
         radius_m=rng.uniform(0.005, 0.02, 26),
         valid=rng.random(26) < 0.9,
         tracked=rng.random(26) < 0.5,

@@ -35,7 +35,7 @@ def setup(root: Path) -> RigSetup:
 
 
 @pytest.fixture(scope="module")
-def worn(setup: RigSetup) -> list[WristTruth]:
+def wrist_truths(setup: RigSetup) -> list[WristTruth]:
     """What is true of the device at each instant, in the frame of its camera."""
     assert setup.wrist_rig is not None
     scene = WristScene.by_name("both-moves", setup.wrist_rig, setup.cameras, setup.hand.profile, 7)
@@ -43,13 +43,13 @@ def worn(setup: RigSetup) -> list[WristTruth]:
 
 
 @pytest.fixture(scope="module")
-def poses(setup: RigSetup, worn: list[WristTruth]) -> Poses:
+def poses(setup: RigSetup, wrist_truths: list[WristTruth]) -> Poses:
     """What an errorless master would publish; the fingers' bones by the device, the palm by markers."""
     scene = scene_by_name("both-moves", setup.rig, setup.cameras, setup.hand.profile, 7)
     out: list[HandPose] = []
     source = np.full(26, Source.WRIST, np.uint8)
     source[: WRIST + 1] = Source.SOLVED
-    for k, (t, device) in enumerate(zip(TIMES_S, worn, strict=True)):
+    for k, (t, device) in enumerate(zip(TIMES_S, wrist_truths, strict=True)):
         now = scene.truth(float(t))
         out.append(
             HandPose(
@@ -68,22 +68,22 @@ def poses(setup: RigSetup, worn: list[WristTruth]) -> Poses:
                 markers_cov_m2=np.full((6, 3, 3), np.nan),
                 inside_volume=np.ones(26, np.bool_),
                 laser_m=device.laser_pt[1:6],
-                wrist_bend_rad=now.bend_rad,
-                wrist_bend_sigma_rad=np.radians([2.0, 4.0]),
+                wrist_angles_rad=now.wrist_angles_rad,
+                wrist_angles_sigma_rad=np.radians([2.0, 4.0]),
             )
         )
     return Poses.of(out)
 
 
 def test_what_the_device_sees_stands_in_the_rig_where_the_hand_is(
-    setup: RigSetup, poses: Poses, worn: list[WristTruth]
+    setup: RigSetup, poses: Poses, wrist_truths: list[WristTruth]
 ) -> None:
     assert setup.wrist is not None
-    assert np.abs(poses.wrist_bend_rad).max() > np.radians(5.0), "a straight wrist would prove little"
+    assert np.abs(poses.wrist_angles_rad).max() > np.radians(5.0), "a straight wrist would prove little"
     cameras = DevicePlace.of(poses, setup.hand).cameras(setup.wrist.T_camera_palm)
-    for T, now, there in zip(cameras, worn, poses.position_m, strict=True):
+    for T, now, there in zip(cameras, wrist_truths, poses.position_m, strict=True):
         np.testing.assert_allclose(transform(T, now.joints.position_m), there, atol=1e-6)
-    straight = replace(poses, wrist_bend_rad=np.full((len(poses), 2), np.nan))
+    straight = replace(poses, wrist_angles_rad=np.full((len(poses), 2), np.nan))
     moved = DevicePlace.of(straight, setup.hand).cameras(setup.wrist.T_camera_palm)
     assert np.linalg.norm(moved[:, :3, 3] - cameras[:, :3, 3], axis=1).max() > 1e-3  # unknown counts as none
 
@@ -109,7 +109,7 @@ def test_a_fused_run_is_all_there_and_its_device_moves(setup: RigSetup, poses: P
     rows, hand = rows_of(path), f"/world/hand/{setup.hand.profile.name}"
     for entity in ("/world/markers/raw", "/world/rays/left", "/world/rays/wrist/laser", "/world/laser/points",
                    "/world/cameras/wrist/laser", f"{hand}/skeleton", f"{hand}/forearm", f"{hand}/forearm_doubt",
-                   "/plots/wrist_bend_deg/flexion", "/plots/seen/markers", "/plots/seen/laser_points"):  # fmt: skip
+                   "/plots/wrist_angles_deg/flexion", "/plots/seen/markers", "/plots/seen/laser_points"):  # fmt: skip
         assert rows[entity] == len(poses), entity
     for entity in ROOT:
         assert rows[entity] == len(poses) - 1, entity
@@ -120,8 +120,8 @@ def test_a_fused_run_is_all_there_and_its_device_moves(setup: RigSetup, poses: P
     _, xyzw = column(path, "/world/laser", "Transform3D:quaternion")
     _, at = column(path, "/world/laser", "Transform3D:translation")
     T = DevicePlace.of(poses, setup.hand).cameras(setup.wrist.T_camera_palm)[[0, 1, 3, 4]]
-    turned = quaternion_to_matrix(np.array(xyzw, np.float64)[:, 0][:, [3, 0, 1, 2]])
-    np.testing.assert_allclose(turned, T[:, :3, :3], atol=1e-6)
+    rotated = quaternion_to_matrix(np.array(xyzw, np.float64)[:, 0][:, [3, 0, 1, 2]])
+    np.testing.assert_allclose(rotated, T[:, :3, :3], atol=1e-6)
     np.testing.assert_allclose(np.array(at, np.float64)[:, 0], T[:, :3, 3], atol=1e-6)
     _, arms = column(path, f"{hand}/forearm", "strips")
     assert [len(row) for row in arms] == [1, 1, 0, 1, 1]

@@ -23,18 +23,18 @@ def shown(tmp_path: Path, *, held_row: int, known: bool = True) -> ToldPicture:
         files.write(contact(row, [0.0, 0.1, 0.1, 0.1, 0.1], held=row == held_row))
     files.close()
     run = ToldRun.load(tmp_path, WATCHED, 0)
-    said = [gesture(0, "pinch", "begin"), gesture(3, "pinch", "end"), gesture(4, "tap", "end")]
-    return ToldPicture(WATCHED.objects, run.objects, run.contacts, said)
+    output = [gesture(0, "pinch", "begin"), gesture(3, "pinch", "end"), gesture(4, "tap", "end")]
+    return ToldPicture(WATCHED.objects, run.objects, run.contacts, output)
 
 
 def test_a_span_ends_with_its_message_or_with_the_run() -> None:
-    said = [gesture(0, "pinch", "begin"), gesture(3, "pinch", "end")]
+    output = [gesture(0, "pinch", "begin"), gesture(3, "pinch", "end")]
     again = [gesture(5, "pinch", "begin", began_t_ns=START_NS + 5 * STEP_NS)]
-    assert spans([*said, *again], "pinch", START_NS + 9 * STEP_NS) == [
+    assert spans([*output, *again], "pinch", START_NS + 9 * STEP_NS) == [
         ("index", START_NS, START_NS + 3 * STEP_NS),
         ("index", START_NS + 5 * STEP_NS, START_NS + 9 * STEP_NS),
     ]
-    assert spans(said, "dial", START_NS) == []
+    assert spans(output, "dial", START_NS) == []
 
 
 def test_the_moment_that_is_shown_is_one_that_holds_the_object(tmp_path: Path) -> None:

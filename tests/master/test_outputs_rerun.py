@@ -28,14 +28,14 @@ from tests.hand_helpers import detections
 
 MODEL = HandModel.of(generated_profile("test-hand", "right"))
 EYE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-BESIDE = ((1.0, 0.0, 0.0, 0.075), *EYE[1:])
+SHIFTED = ((1.0, 0.0, 0.0, 0.075), *EYE[1:])
 RIG = RigCalibration(
     version=1,
     name="desk",
     kind="markers",
     cameras=("left", "right"),
     hand="test-hand",
-    T_rig_camera={"left": EYE, "right": BESIDE},
+    T_rig_camera={"left": EYE, "right": SHIFTED},
 )
 CAMERAS = {
     name: CameraCalibration(

@@ -11,22 +11,22 @@ from msgspec.structs import replace
 from common.bus import LoopbackBus
 from common.messages import Contact, Gesture, ObjectPose, ObjectSource
 from common.object_profile import Bead, BoxShape, CylinderShape, ObjectProfile, SphereShape, Tag, Tags
-from master.outputs.object_look import ObjectLook
+from master.outputs.object_appearance import ObjectAppearance
 from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
-from master.outputs.rerun_gestures import arc, said
+from master.outputs.rerun_gestures import arc, label_of
 from tests.master.test_outputs_rerun import SETUP, STEP_NS, Viewing, moving_hand, rows_of
 
 START_NS = 10**15
-TURNED = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, 0.05), (0.0, 0.0, 0.0, 1.0))
+ROTATED = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, 0.05), (0.0, 0.0, 0.0, 1.0))
 BAR = ObjectProfile(
     version=1,
     name="bar",
     markers={f"b{i}": Bead(position_m=(0.01 * i, 0.02 * i * i, 0.0)) for i in range(3)},
-    tags=Tags(family="apriltag_36h11", tags=(Tag(id=3, edge_m=0.03, T_object_tag=TURNED),)),
+    tags=Tags(family="apriltag_36h11", tags=(Tag(id=3, edge_m=0.03, T_object_tag=ROTATED),)),
     shape=(
         CylinderShape(radius_m=0.012, length_m=0.18),
-        BoxShape(size_m=(0.04, 0.04, 0.02), T_object_part=TURNED),
+        BoxShape(size_m=(0.04, 0.04, 0.02), T_object_part=ROTATED),
         SphereShape(radius_m=0.01),
     ),
 )
@@ -67,8 +67,8 @@ def contact(row: int, distance_m: list[float], *, held: bool = False) -> Contact
 
 def gesture(row: int, kind: str, phase: str, **more: object) -> Gesture:
     name = {"pose": "open_palm", "pinch": "index", "tap": "5"}.get(kind, kind)
-    usual = {"hand": "test-hand", "name": name, "began_t_ns": START_NS, "confidence": 0.9}
-    return Gesture(t_ns=START_NS + row * STEP_NS, kind=kind, phase=phase, **(usual | more))  # type: ignore[arg-type]
+    typical = {"hand": "test-hand", "name": name, "began_t_ns": START_NS, "confidence": 0.9}
+    return Gesture(t_ns=START_NS + row * STEP_NS, kind=kind, phase=phase, **(typical | more))  # type: ignore[arg-type]
 
 
 def column(path: Path, entity: str, component: str) -> tuple[list[int], list[list[object]]]:
@@ -92,7 +92,7 @@ def times(path: Path, entity: str, component: str) -> list[int]:
 
 def test_the_look_of_an_object_is_how_well_its_place_is_known() -> None:
     looks = [bar(0), bar(0, occluded=True), bar(0, tracked=False), bar(0, tracked=False, known=False)]
-    assert [ObjectLook.of(one) for one in looks] == list(ObjectLook)
+    assert [ObjectAppearance.of(one) for one in looks] == list(ObjectAppearance)
 
 
 def test_an_object_goes_its_way_and_is_dressed_only_when_its_look_changes(tmp_path: Path) -> None:
@@ -193,8 +193,8 @@ def test_an_arc_is_a_turn_about_its_axis(axis: list[float]) -> None:
 
 
 def test_what_is_not_known_is_said_without_a_number() -> None:
-    assert said(gesture(0, "pinch", "begin")) == "index"
-    assert said(gesture(0, "dial", "begin")) == "dial"
+    assert label_of(gesture(0, "pinch", "begin")) == "index"
+    assert label_of(gesture(0, "dial", "begin")) == "dial"
 
 
 def test_the_viewer_shows_what_is_on_the_bus_and_an_object_nobody_described(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from master.outputs.truth import PosesTruth
 from master.rig_setup import RigSetup
 from master.wrist_report import lit_view
 from tests.master.test_outputs_rerun import column, rows_of
-from tests.wrist_run import exact_triple, true_poses, wrist_scene, wrist_setup
+from tests.wrist_run import exact_cycle, true_poses, wrist_scene, wrist_setup
 
 
 @pytest.fixture(scope="module", params=["wrist", "wrist-left"])
@@ -74,7 +74,7 @@ def test_the_fan_lies_in_the_laser_plane_about_the_camera_view(setup: RigSetup) 
 def test_a_wrist_run_is_all_there(setup: RigSetup, truths: list[WristTruth], tmp_path: Path) -> None:
     path, camera = tmp_path / "run.rrd", setup.rig.cameras[0]
     poses = true_poses(setup, truths)
-    seen = [exact_triple(setup, now, k) for k, now in enumerate(truths)]
+    seen = [exact_cycle(setup, now, k) for k, now in enumerate(truths)]
     frames = [(camera, int(t), np.full((48, 64), 90, np.uint8)) for t in poses.t_ns]
     write_rrd(path, poses, setup, {camera: seen}, ghost_of(poses, 0.002), frames)
     rows, n = rows_of(path), len(truths)
@@ -105,7 +105,7 @@ def test_laser_points_stand_where_they_are_and_where_the_camera_saw_them(
 ) -> None:
     path, camera = tmp_path / "run.rrd", setup.rig.cameras[0]
     poses = true_poses(setup, truths)
-    seen = [exact_triple(setup, now, k) for k, now in enumerate(truths)]
+    seen = [exact_cycle(setup, now, k) for k, now in enumerate(truths)]
     write_rrd(path, poses, setup, {camera: seen})
     _, points = column(path, "/world/laser/points", "positions")
     _, detected = column(path, f"/world/cameras/{camera}/detections/laser", "positions")
@@ -167,13 +167,15 @@ def test_the_scene_is_turned_as_the_forearm_is_held(
     held = replace(poses, palm_world_wxyz=matrix_to_quaternion(np.array(world_camera) @ camera_palm))
     held.palm_world_wxyz[3] = np.nan
     write_rrd(tmp_path / "held.rrd", held, setup)
-    times, said = column(tmp_path / "held.rrd", "/world", "Transform3D:quaternion")
+    times, output = column(tmp_path / "held.rrd", "/world", "Transform3D:quaternion")
     known = [k for k in range(len(poses)) if k != 3]
     assert times == poses.t_ns[known].tolist()
-    xyzw = np.array(said, np.float64)[:, 0]
-    turned = quaternion_to_matrix(xyzw[:, [3, 0, 1, 2]])
+    xyzw = np.array(output, np.float64)[:, 0]
+    rotated = quaternion_to_matrix(xyzw[:, [3, 0, 1, 2]])
     up = np.array([R[2] for R in world_camera])[known]  # in the camera's frame
-    np.testing.assert_allclose((turned @ up[..., None])[..., 0], np.tile([0.0, -1.0, 0.0], (7, 1)), atol=1e-6)
-    assert turned[0, 0, 2] == pytest.approx(
+    np.testing.assert_allclose(
+        (rotated @ up[..., None])[..., 0], np.tile([0.0, -1.0, 0.0], (7, 1)), atol=1e-6
+    )
+    assert rotated[0, 0, 2] == pytest.approx(
         0.0, abs=1e-6
     )  # what the camera looks along begins straight ahead

@@ -88,11 +88,11 @@ def test_what_lies_in_the_frame_of_a_rig_moves_with_it() -> None:
     moved = RigSetup.joined([aside(volume=volume, imu=imu, T_world_rig=rows(shifted))]).rig
     assert moved.volume is not None
     np.testing.assert_allclose((moved.volume.low_m, moved.volume.high_m), [(0.1, 0.0, 0.4), (0.2, 0.2, 0.8)])
-    turned = RigSetup.joined([aside(volume=volume, imu=imu)]).rig
-    assert turned.volume is None, "a box that stands askew is none along the axes"
-    assert turned.imu is not None
-    assert turned.imu.q_rig_world is not None
-    np.testing.assert_allclose(np.abs(matrix_to_quaternion(ASIDE[:3, :3]) @ turned.imu.q_rig_world), 1.0)
+    rotated = RigSetup.joined([aside(volume=volume, imu=imu)]).rig
+    assert rotated.volume is None, "a box that stands askew is none along the axes"
+    assert rotated.imu is not None
+    assert rotated.imu.q_rig_world is not None
+    np.testing.assert_allclose(np.abs(matrix_to_quaternion(ASIDE[:3, :3]) @ rotated.imu.q_rig_world), 1.0)
 
 
 def test_cameras_together_are_placed_as_well_as_the_worst(bench: RigSetup) -> None:
@@ -106,10 +106,10 @@ def test_cameras_together_are_placed_as_well_as_the_worst(bench: RigSetup) -> No
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "expected"),
     [
         ({"markers": ("thumb", "index", "back")}, "'bench' and 'side': markers: differ"),
-        ({"pairing": "predict"}, "'bench' and 'side': pairing: differ"),
+        ({"frame_sync": "predict"}, "'bench' and 'side': pairing: differ"),
         ({"solver": "fabrik"}, "'bench' and 'side': solver: differ"),
         (
             {"T_world_rig": None},
@@ -118,9 +118,9 @@ def test_cameras_together_are_placed_as_well_as_the_worst(bench: RigSetup) -> No
     ],
 )
 def test_marker_rigs_that_contradict_each_other_are_refused(
-    changes: dict[str, object], says: str, bench: RigSetup
+    changes: dict[str, object], expected: str, bench: RigSetup
 ) -> None:
-    with pytest.raises(CalibrationError, match=says):
+    with pytest.raises(CalibrationError, match=expected):
         RigSetup.joined([bench, aside(**changes)])
 
 
@@ -203,7 +203,7 @@ def test_a_marker_is_of_one_hand() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "expected"),
     [
         ({"other_hands": ("made-right",)}, "other_hands: a hand stands twice"),
         ({"T_world_rig": rows(2.0 * np.eye(4))}, "T_world_rig: upper left 3x3 is not a rotation"),
@@ -211,9 +211,9 @@ def test_a_marker_is_of_one_hand() -> None:
         ({"kind": "wrist", "cameras": ("left",), "T_world_rig": rows(ASIDE)}, "T_world_rig: of marker rigs"),
     ],
 )
-def test_a_rig_file_that_contradicts_itself_is_refused(changes: dict[str, object], says: str) -> None:
+def test_a_rig_file_that_contradicts_itself_is_refused(changes: dict[str, object], expected: str) -> None:
     raw = msgspec.json.encode(msgspec.structs.replace(rig_file(), **changes))
-    with pytest.raises(CalibrationError, match=says):
+    with pytest.raises(CalibrationError, match=expected):
         parse(raw, RigCalibration, "rig.json")
 
 

@@ -12,13 +12,13 @@ from common.calibration import RigCalibration, load, save
 from common.errors import CalibrationError
 from common.gesture_settings import default_gestures
 from common.object_profile import Bead, ObjectProfile
+from master.dispatcher import Dispatcher
 from master.needs_restart import refuse_restart
 from master.rig import RigFiles, load_setup, load_setups, setups_with_hands
 from master.rig_merge import in_world, merged_rig
 from master.rig_objects import load_gestures, objects_of, refuse_shared_objects
 from master.stages import StageTimes
 from master.tuning import LivePipeline, RigTuning
-from master.world import World
 from tests.loopback.test_imu_link import sample
 from tests.master.test_rig_merge import ASIDE, rows
 
@@ -52,7 +52,7 @@ def test_a_rig_has_its_objects_and_its_gestures(tree: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "changes", "says"),
+    ("path", "changes", "expected"),
     [
         ("rigs/desk-wand.json", {"objects": ["pen"]}, r"objects/pen\.json"),
         ("rigs/desk-wand.json", {"free_markers": ["wand1", "wand2"]}, "'wand3'"),
@@ -63,10 +63,10 @@ def test_a_rig_has_its_objects_and_its_gestures(tree: Path) -> None:
     ],
 )
 def test_files_that_do_not_fit_are_refused_with_the_key(
-    tree: Path, path: str, changes: dict[str, object], says: str
+    tree: Path, path: str, changes: dict[str, object], expected: str
 ) -> None:
     changed(tree, path, **changes)
-    with pytest.raises(CalibrationError, match=says):
+    with pytest.raises(CalibrationError, match=expected):
         load_setups(tree, ("desk-wand",))
 
 
@@ -86,13 +86,13 @@ def test_two_objects_share_nothing_that_they_are_seen_by(tree: Path) -> None:
     wand = load(tree / "objects/wand.json", ObjectProfile)
     cube = load(tree / "objects/cube.json", ObjectProfile)
     puck = msgspec.structs.replace(cube, name="wand", tags=None, tracker="puck")
-    for one, says in (
+    for one, expected in (
         (wand, "'wand' and 'twin' both have marker 'wand1'"),
         (msgspec.structs.replace(cube, name="wand"), "both have tag 0 of"),
         (puck, "both have tracker 'puck'"),
     ):
         both = {"wand": one, "twin": msgspec.structs.replace(one, name="twin")}
-        with pytest.raises(CalibrationError, match=says):
+        with pytest.raises(CalibrationError, match=expected):
             objects_of(rig, both)
 
 
@@ -105,7 +105,7 @@ def test_rigs_of_two_hands_do_not_both_have_an_object(tree: Path) -> None:
 
 def test_merged_rigs_have_the_objects_of_all_in_the_shared_frame(tree: Path) -> None:
     rig = load(tree / "rigs/desk-cube.json", RigCalibration)
-    beside = msgspec.structs.replace(
+    neighbour = msgspec.structs.replace(
         rig,
         name="side",
         cameras=("left2", "right2"),
@@ -114,10 +114,10 @@ def test_merged_rigs_have_the_objects_of_all_in_the_shared_frame(tree: Path) -> 
         T_world_rig=rows(ASIDE),
         T_rig_tracking=rows(np.eye(4)),
     )
-    both = merged_rig([rig, beside])
+    both = merged_rig([rig, neighbour])
     assert both.objects == ("cube", "box")
     np.testing.assert_allclose(np.array(both.T_rig_tracking), ASIDE, atol=1e-12)
-    assert in_world(beside).T_world_rig is None
+    assert in_world(neighbour).T_world_rig is None
 
 
 def test_objects_of_a_recording_go_before_those_of_the_tree(tree: Path) -> None:
@@ -142,9 +142,9 @@ class Running:
         self.files = RigFiles(tree, ("desk-wand",))
         setups = self.files.load()
         self.lines = [LivePipeline(setup, StageTimes()) for setup in setups]
-        self.world = World(setups, self.lines, StageTimes())
-        self.said: list[str] = []
-        self.tuning = RigTuning(self.files, setups, self.lines, self.said.append, self.world)
+        self.dispatcher = Dispatcher(setups, self.lines, StageTimes())
+        self.output: list[str] = []
+        self.tuning = RigTuning(self.files, setups, self.lines, self.output.append, self.dispatcher)
         self.tuning.look()
 
 
@@ -156,17 +156,17 @@ def test_files_of_objects_and_gestures_are_followed_and_the_hand_is_left_alone(t
     larger = {name: Bead(position_m=one.position_m, radius_m=0.011) for name, one in wand.markers.items()}
     save(tree / "objects/wand.json", msgspec.structs.replace(wand, markers=larger))
     running.tuning.look()
-    assert running.said == ["changed files are in use"]
+    assert running.output == ["changed files are in use"]
     assert not running.lines[0]._next, "no hand was built anew"
-    assert len(running.world._next) == 1
-    list(running.world.push(sample("nobody", 1, 1)))
+    assert len(running.dispatcher._next) == 1
+    list(running.dispatcher.push(sample("nobody", 1, 1)))
     assert running.tuning.setups[0].objects[0].markers == larger
     save(tree / "gestures/default.json", msgspec.structs.replace(default_gestures(), poses={}))
     running.tuning.look()
-    assert len(running.world._next) == 1
+    assert len(running.dispatcher._next) == 1
     (tree / "objects/wand.json").write_text("{")
     running.tuning.look()
-    assert running.said[-1].startswith("changed files are not used")
+    assert running.output[-1].startswith("changed files are not used")
     assert running.tuning.counts() == {"reload.applied": 2, "reload.refused": 1}
 
 

@@ -48,7 +48,7 @@ def without_numbers(rig: dict[str, Any]) -> None:
     rig |= {"depth_model": "power_law", "power_law": None}
 
 
-def turned(rig: dict[str, Any]) -> None:
+def rotated(rig: dict[str, Any]) -> None:
     """The second camera looks four degrees more to the left."""
     pose = np.array(rig["T_rig_camera"]["right"])
     pose[:3, :3] = pose[:3, :3] @ axis_rotation(1, np.radians(-4.0))
@@ -69,7 +69,7 @@ def strange_solver(rig: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "expected"),
     [
         (
             without_numbers,
@@ -79,7 +79,7 @@ def strange_solver(rig: dict[str, Any]) -> None:
             ),
         ),
         (
-            turned,
+            rotated,
             (
                 "rig 'desk': depth_model 'power_law' needs parallel cameras side by side, but the second is turned by",
                 "at most 3 are allowed: turn them, or use 'stereo'",
@@ -105,17 +105,17 @@ def strange_solver(rig: dict[str, Any]) -> None:
     ids=["no numbers", "turned cameras", "law against places", "IMU", "no such solver"],
 )
 def test_what_does_not_fit_is_refused_with_its_reason_and_what_to_do(
-    change: Change, says: tuple[str, ...], tree: Path
+    change: Change, expected: tuple[str, ...], tree: Path
 ) -> None:
     changed(tree, change)
     ended = started(tree, "desk")
     assert ended.code == 1, ended.text
-    for part in says:
+    for part in expected:
         assert part in ended.err
     assert "Traceback" not in ended.text
 
 
-def test_fabrik_beside_a_wrist_device_is_refused(tree: Path) -> None:
+def test_fabrik_with_a_wrist_device_is_refused(tree: Path) -> None:
     ended = started(tree, "desk-fabrik", "wrist")
     assert ended.code == 1, ended.text
     assert "solver 'fabrik' knows markers alone, but a wrist device watches this hand too" in ended.err

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from master.sequence import REMEMBERED, TRIPLE, CameraCounts, Counted, Losses, Sequence
+from master.sequence import CYCLE_FRAMES, REMEMBERED, CameraCounts, Counted, Losses, Sequence
 
 
 @given(st.lists(st.integers(0, 300), min_size=1, max_size=200, unique=True))
@@ -45,10 +45,10 @@ def test_a_huge_gap_costs_no_memory() -> None:
     st.lists(st.integers(0, 1), min_size=100, max_size=100),
     st.lists(st.integers(0, 99), min_size=1, max_size=99, unique=True),
 )
-def test_triples_are_counted_as_triples_wherever_their_laser_frame_lies(
+def test_cycles_are_counted_as_cycles_wherever_their_laser_frame_lies(
     slips: list[int], order: list[int]
 ) -> None:
-    sequence = Sequence(TRIPLE)
+    sequence = Sequence(CYCLE_FRAMES)
     seq = [3 * k + 1 + slips[k] for k in range(100)]  # numbers 2, 3 and 4 apart
     used = [k for k in order if sequence.take(7, seq[k])]
     assert used == sorted(used)
@@ -72,8 +72,8 @@ def test_triples_are_counted_as_triples_wherever_their_laser_frame_lies(
         ((1, 2, 3), 0),
     ],
 )
-def test_what_is_missing_between_triples(numbers: tuple[int, ...], lost: int) -> None:
-    sequence = Sequence(TRIPLE)
+def test_what_is_missing_between_cycles(numbers: tuple[int, ...], lost: int) -> None:
+    sequence = Sequence(CYCLE_FRAMES)
     for seq in numbers:
         sequence.take(7, seq)
     assert sequence.counts.lost == lost

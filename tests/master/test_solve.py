@@ -32,7 +32,7 @@ def write_detections(folder: Path, run: SyntheticRun, **changes: object) -> None
             "area_px2": np.array([m.area for m in own]),
             "quality": np.array([m.quality for m in own]),
             "sigma_px": np.array([m.sigma_px for m in own]),
-            "rival_uv": np.array([m.rival_uv for m in own]),
+            "alt_uv": np.array([m.alt_uv for m in own]),
         } | changes
         np.savez(folder / f"detections_{camera}.npz", **{k: v for k, v in data.items() if v is not None})  # pyright: ignore[reportArgumentType]
 
@@ -77,7 +77,7 @@ def test_a_run_is_written_scored_and_repeated_byte_by_byte(tmp_path: Path, short
         assert isinstance(stored[key], float)
     assert stored["joint_mm"] < 6.0
     assert stored["marker_mm"] < 3.0
-    assert set(stored["stage_us"]) == {"pairing", "triangulate", "filter", "fabrik", "hand", "gestures"}
+    assert set(stored["stage_us"]) == {"frame_sync", "triangulate", "filter", "fabrik", "hand", "gestures"}
     assert stored["counts"]["poses"] == 10
 
 
@@ -103,13 +103,13 @@ def test_files_without_sigma_and_rivals_are_solved_with_a_sigma_from_their_quali
     poses: list[Poses] = []
     for folder in (clear, old):
         folder.mkdir()
-        left_out = {"sigma_px": None, "rival_uv": None} if folder is old else {}
-        write_detections(folder, short_run, **left_out)
+        rejected = {"sigma_px": None, "alt_uv": None} if folder is old else {}
+        write_detections(folder, short_run, **rejected)
         solve(recording(folder, short_run), short_run.setup, folder, folder)
         poses.append(load_poses(folder / "poses.npz"))
     # The run's markers are of full quality and state the 0.1 px that is the default for those.
     np.testing.assert_array_equal(poses[0].cov_m2, poses[1].cov_m2)
-    write_detections(old, short_run, sigma_px=None, rival_uv=None, quality=np.full((10, 6), np.nan))
+    write_detections(old, short_run, sigma_px=None, alt_uv=None, quality=np.full((10, 6), np.nan))
     solve(recording(old, short_run), short_run.setup, old, old)
     unknown = load_poses(old / "poses.npz")
     assert np.trace(unknown.cov_m2[5, 10]) > 2.0 * np.trace(poses[0].cov_m2[5, 10])  # the index's tip
@@ -123,7 +123,7 @@ def test_no_detections_at_all_are_no_poses(tmp_path: Path, short_run: SyntheticR
         "area_px2": np.zeros((0, 6)),
         "quality": np.zeros((0, 6)),
         "sigma_px": np.zeros((0, 6)),
-        "rival_uv": np.zeros((0, 6, 2)),
+        "alt_uv": np.zeros((0, 6, 2)),
     }
     write_detections(tmp_path, short_run, **empty)
     summary = solve(recording(tmp_path, short_run), short_run.setup, tmp_path, tmp_path)
@@ -156,13 +156,13 @@ BROKEN: dict[str, tuple[dict[str, object], str]] = {
     "text": ({"uv": np.full((10, 6, 2), "x")}, "detections_left"),
     "times of two axes": ({"t_ns": np.zeros((10, 2), np.int64)}, "t_ns and seq"),
     "times in seconds": ({"t_ns": np.zeros(10)}, "detections_left"),
-    "too few sigmas": ({"sigma_px": np.ones((10, 5))}, r"sigma_px and rival_uv have shapes \(10, 5\)"),
+    "too few sigmas": ({"sigma_px": np.ones((10, 5))}, r"sigma_px and alt_uv have shapes \(10, 5\)"),
     "no sigma where one is seen": (
         {"sigma_px": np.full((10, 6), np.nan)},
         "row 0: sigma_px: must be positive",
     ),
     "a sigma of zero": ({"sigma_px": np.zeros((10, 6))}, "row 0: sigma_px: 0 is not within"),
-    "rivals of five": ({"rival_uv": np.zeros((10, 5, 2))}, r"\(10, 5, 2\), expected \(10, 6\) and"),
+    "rivals of five": ({"alt_uv": np.zeros((10, 5, 2))}, r"\(10, 5, 2\), expected \(10, 6\) and"),
     "infinitely far": ({"uv": np.full((10, 6, 2), np.inf)}, "row 0: uv: inf is not within"),
     "fewer numbers than times": ({"seq": np.zeros(3, np.int64)}, "t_ns and seq"),
 }

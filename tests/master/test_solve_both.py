@@ -27,8 +27,8 @@ from master.solve import rigs_to_solve, solve_hands
 from tests.hand_helpers import LEFT
 
 SECONDS = 0.4
-MARKERS = ("t_ns", "seq", "uv", "quality", "sigma_px", "rival_uv")
-TRIPLES = ("t_ns", "seq", "laser_uv", "laser_sigma_px", "laser_px", "tip_uv", "tip_sigma_px", "tip_depth")
+MARKERS = ("t_ns", "seq", "uv", "quality", "sigma_px", "alt_uv")
+CYCLES = ("t_ns", "seq", "laser_uv", "laser_sigma_px", "laser_px", "tip_uv", "tip_sigma_px", "tip_depth")
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,12 @@ class Recorded:
     opened: FrameRecording
 
     def solve(
-        self, out: Path, only: Literal["markers", "wrist"] | None = None, level: Literal["fk"] | None = None
+        self,
+        out: Path,
+        only: Literal["markers", "wrist"] | None = None,
+        solver_mode: Literal["fk"] | None = None,
     ) -> dict[str, object]:
-        rigs = rigs_to_solve(self.opened.manifest, [], only, level)
+        rigs = rigs_to_solve(self.opened.manifest, [], only, solver_mode)
         out.mkdir()
         setups = setups_of(rigs, self.opened.manifest.cameras, lambda _name: self.both.markers.hand)
         return solve_hands(self.opened, setups, self.opened.folder, out)
@@ -53,7 +56,7 @@ def write_detections(folder: Path, messages: Sequence[Observed]) -> None:
         if not isinstance(message, ImuSample):
             cameras.setdefault(message.camera, []).append(message)
     for camera, seen in cameras.items():
-        names = MARKERS if isinstance(seen[0], MarkerDetections) else TRIPLES
+        names = MARKERS if isinstance(seen[0], MarkerDetections) else CYCLES
         arrays = {name: np.array([getattr(one, name) for one in seen]) for name in names}
         arrays |= {"area_px2": np.array([one.area for one in seen if isinstance(one, MarkerDetections)])}
         np.savez(folder / f"detections_{camera}.npz", **arrays)  # pyright: ignore[reportArgumentType]
@@ -72,8 +75,10 @@ def write_truth(folder: Path, both: Both) -> None:
             [np.nan_to_num(renderer.visible_fraction(t)) for renderer in renderers] for t in times.tolist()
         ],
     }
-    worn = {f"wrist_{name}": array for name, array in WristTake(both.worn, SECONDS).truth().items()}
-    np.savez(folder / "truth.npz", **arrays, **worn)  # pyright: ignore[reportArgumentType]
+    wrist_scene = {
+        f"wrist_{name}": array for name, array in WristTake(both.wrist_scene, SECONDS).truth().items()
+    }
+    np.savez(folder / "truth.npz", **arrays, **wrist_scene)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.fixture(scope="module")
@@ -92,17 +97,17 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
 def test_both_streams_make_one_hand_that_is_scored_against_both_truths(
     recorded: Recorded, tmp_path: Path
 ) -> None:
-    summary = recorded.solve(tmp_path / "out", level="fk")
+    summary = recorded.solve(tmp_path / "out", solver_mode="fk")
     poses = load_poses(tmp_path / "out/poses.npz")
     assert len(poses) == summary["poses"]
     assert len(poses) > 15
     assert poses.marker_count == 6
     assert np.isfinite(poses.laser_m).any()
-    assert set(summary) >= {"joint_mm", "pip_deg", "joint_mm_visible", "laser_mm", "laser_right", "triples"}
+    assert set(summary) >= {"joint_mm", "pip_deg", "joint_mm_visible", "laser_mm", "laser_right", "cycles"}
     assert summary["joint_mm"] < 6.0  # type: ignore[operator]
     assert summary["laser_mm"] < 2.0  # type: ignore[operator]
-    assert summary["triples"] == len(np.load(recorded.opened.folder / "detections_wrist.npz")["t_ns"])
-    assert summary["triples_missed"] <= 1.0  # type: ignore[operator]
+    assert summary["cycles"] == len(np.load(recorded.opened.folder / "detections_wrist.npz")["t_ns"])
+    assert summary["cycles_missed"] <= 1.0  # type: ignore[operator]
     assert summary["lost"] == 0
     assert summary["camera_hz"] == pytest.approx({"left": 60.0, "right": 60.0, "wrist": 90.0}, rel=1e-3)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
@@ -118,8 +123,8 @@ def test_either_stream_is_solved_alone_from_the_same_detections(
     markers = recorded.solve(tmp_path / "markers", "markers")
     wrist = recorded.solve(tmp_path / "wrist", "wrist", "fk")
     assert "not used" not in caplog.text  # the IMU is of a rig that is left out
-    assert set(markers) & {"joint_mm", "laser_mm", "triples_missed"} == {"joint_mm"}
-    assert set(wrist) & {"marker_mm", "laser_mm", "triples_missed"} == {"laser_mm", "triples_missed"}
+    assert set(markers) & {"joint_mm", "laser_mm", "cycles_missed"} == {"joint_mm"}
+    assert set(wrist) & {"marker_mm", "laser_mm", "cycles_missed"} == {"laser_mm", "cycles_missed"}
     assert load_poses(tmp_path / "wrist/poses.npz").marker_count == 0
     for name in ("left", "right"):
         assert name not in wrist["camera_hz"]  # type: ignore[operator]
@@ -134,9 +139,9 @@ def test_what_is_not_there_is_refused_by_name(recorded: Recorded) -> None:
         rigs_to_solve(manifest, ["attic"])
     with pytest.raises(RecordingError, match="no rig to solve of kind 'wrist'; it has desk of markers"):
         rigs_to_solve(manifest, ["desk"], "wrist")
-    with pytest.raises(CalibrationError, match="--level: rig 'desk' is of markers"):
+    with pytest.raises(CalibrationError, match="--solver-mode: rig 'desk' is of markers"):
         rigs_to_solve(manifest, [], "markers", "fk")
-    assert [rig.level for rig in rigs_to_solve(manifest, [], None, "fk")] == ["auto", "fk"]
+    assert [rig.solver_mode for rig in rigs_to_solve(manifest, [], None, "fk")] == ["auto", "fk"]
     with pytest.raises(CalibrationError, match=r"--solver: .* of a wrist device"):
         rigs_to_solve(manifest, [], "wrist", None, "fabrik")
     solvers = [rig.solver for rig in rigs_to_solve(manifest, [], None, None, "fabrik")]
@@ -147,8 +152,8 @@ def test_a_second_hand_has_files_of_its_own_and_no_score_of_the_first(
     recorded: Recorded, tmp_path: Path
 ) -> None:
     both, left = recorded.both, msgspec.structs.replace(recorded.both.markers.rig, hand="made-left")
-    worn = msgspec.structs.replace(both.wrist.rig, level="fk")
-    first = RigSetup.of(worn, both.wrist.cameras, both.wrist.hand)
+    wrist_scene = msgspec.structs.replace(both.wrist.rig, solver_mode="fk")
+    first = RigSetup.of(wrist_scene, both.wrist.cameras, both.wrist.hand)
     second = RigSetup.of(left, both.markers.cameras, LEFT)
     solve_hands(recorded.opened, (first, second), recorded.opened.folder, tmp_path)
     names = {"poses.npz", "summary.json", "poses-made-left.npz", "summary-made-left.json", "gestures.jsonl"}
@@ -164,9 +169,9 @@ def test_an_imu_whose_world_is_not_placed_is_of_no_use_to_a_hand_with_markers(
     both = recorded.both
     assert both.wrist.rig.imu is not None
     unplaced = msgspec.structs.replace(both.wrist.rig, imu=ImuCalibration(q_palm_imu=(1.0, 0.0, 0.0, 0.0)))
-    worn = RigSetup.of(unplaced, both.wrist.cameras, both.wrist.hand)
-    samples, _ = recorded_samples(recorded.opened, RigSetup.joined([both.markers, worn]))
+    wrist_scene = RigSetup.of(unplaced, both.wrist.cameras, both.wrist.hand)
+    samples, _ = recorded_samples(recorded.opened, RigSetup.joined([both.markers, wrist_scene]))
     assert samples == ()
     assert "imu.csv: not used" in caplog.text
-    samples, _ = recorded_samples(recorded.opened, worn)
+    samples, _ = recorded_samples(recorded.opened, wrist_scene)
     assert len(samples) > 20

@@ -101,7 +101,7 @@ def test_an_object_is_solved_scored_and_written_alike_every_time(
     assert summary["camera_hz"] == pytest.approx({"left": 60.0, "right": 60.0}, rel=1e-3)
 
 
-def test_a_wrist_device_beside_the_cameras_changes_nothing_of_the_object(
+def test_a_wrist_device_with_the_cameras_changes_nothing_of_the_object(
     recorded: FrameRecording, root: Path
 ) -> None:
     (wrist,) = load_setups(root / "calib_json", ("wrist",))

@@ -6,9 +6,9 @@ import pytest
 
 from common.clock_offset import ClockEstimate
 from common.messages import Health, MarkerDetections, decode, encode
+from master.clock_monitor import ClockMonitor
 from master.phases import CameraPhases
 from master.rig_setup import RigSetup
-from master.time_watch import TimeWatch
 from tests import timing_scenes as scenes
 from tests.hand_helpers import RIGHT, camera_file, detections, rig_file
 from tests.timing_scenes import Motion, cameras, recorded
@@ -24,7 +24,7 @@ def setup_of(**changes: object) -> RigSetup:
     )
 
 
-def watched(watch: TimeWatch, messages: list[MarkerDetections]) -> list[str]:
+def watched(watch: ClockMonitor, messages: list[MarkerDetections]) -> list[str]:
     """All lines of a run, looked at once a second."""
     lines: list[str] = []
     next_ns = messages[0].t_ns + S
@@ -55,7 +55,7 @@ def stepping(phase_ms: float, seconds: float, ppm: float = 0.0) -> list[MarkerDe
 
 @pytest.mark.parametrize("motion", [scenes.sideways, scenes.natural])
 def test_a_stamp_that_lies_is_named_once_with_what_to_do(motion: Callable[[int], Motion]) -> None:
-    lines = watched(TimeWatch([setup_of()]), messages_of(motion, 8.0))
+    lines = watched(ClockMonitor([setup_of()]), messages_of(motion, 8.0))
     warnings = [line for line in lines if "stamps" in line]
     assert len(warnings) == 1
     assert "camera right: its frames are " in warnings[0]
@@ -66,55 +66,55 @@ def test_a_stamp_that_lies_is_named_once_with_what_to_do(motion: Callable[[int],
 @pytest.mark.parametrize("motion", [scenes.sideways, scenes.natural, scenes.circling, scenes.resting])
 def test_true_stamps_are_never_named(motion: Callable[[int], Motion]) -> None:
     assert not [
-        line for line in watched(TimeWatch([setup_of()]), messages_of(motion, 0.0)) if "stamps" in line
+        line for line in watched(ClockMonitor([setup_of()]), messages_of(motion, 0.0)) if "stamps" in line
     ]
 
 
 def test_an_offset_of_the_rig_file_is_taken_into_account_and_followed() -> None:
     messages = messages_of(scenes.natural, 8.0)
     corrected = setup_of(stamp_offset_us={"right": 8000.0})
-    assert not [line for line in watched(TimeWatch([corrected]), messages) if "stamps" in line]
-    watch = TimeWatch([setup_of()])
+    assert not [line for line in watched(ClockMonitor([corrected]), messages) if "stamps" in line]
+    watch = ClockMonitor([setup_of()])
     for message in messages:
         watch.push(message)
     watch.look()
-    assert watch.gauges(lambda _name: None)["right.residual_offset_us"] > 7000.0
+    assert watch.metrics(lambda _name: None)["right.residual_offset_us"] > 7000.0
     watch.follow([corrected])
     for message in messages:
         watch.push(message)
     watch.look()
-    assert abs(watch.gauges(lambda _name: None)["right.residual_offset_us"]) < 500.0
+    assert abs(watch.metrics(lambda _name: None)["right.residual_offset_us"]) < 500.0
 
 
 def test_gauges_tell_of_clocks_phases_and_residuals_and_fit_a_report() -> None:
     long = "camera-" + "x" * 57
-    watch = TimeWatch([setup_of(cameras=("left", "right", long))])
+    watch = ClockMonitor([setup_of(cameras=("left", "right", long))])
     estimate = ClockEstimate(t_ns=S, offset_ns=-7 * S, drift_ppm=12.3456, sigma_ns=3_000.0, bound_ns=100_000)
     for message in messages_of(scenes.natural, 0.0):
         watch.push(message)
     watch.look()
-    gauges = watch.gauges(lambda name: None if name == "left" else estimate)
-    assert gauges["right.clock_offset_us"] == -7e6
-    assert gauges["right.clock_drift_ppm"] == 12.346
-    assert 57.0 < gauges["right.clock_sigma_us"] < 59.0  # 100 us / sqrt 3, and the scatter
-    assert abs(gauges["right.residual_offset_us"]) < 1000.0
-    assert 0.0 < gauges["right.residual_sigma_us"] < 1000.0
-    assert abs(gauges["right.phase_us"]) <= 8_334.0
-    assert not [name for name in gauges if name.startswith("left.")]
-    assert any(name.endswith("xxx.clock_drift_ppm") for name in gauges)
-    assert decode(encode(Health("master", 1, 2, {}, gauges))).gauges == gauges  # pyright: ignore[reportAttributeAccessIssue]
-    assert all(len(name) <= 64 for name in gauges)
+    metrics = watch.metrics(lambda name: None if name == "left" else estimate)
+    assert metrics["right.clock_offset_us"] == -7e6
+    assert metrics["right.clock_drift_ppm"] == 12.346
+    assert 57.0 < metrics["right.clock_sigma_us"] < 59.0  # 100 us / sqrt 3, and the scatter
+    assert abs(metrics["right.residual_offset_us"]) < 1000.0
+    assert 0.0 < metrics["right.residual_sigma_us"] < 1000.0
+    assert abs(metrics["right.phase_us"]) <= 8_334.0
+    assert not [name for name in metrics if name.startswith("left.")]
+    assert any(name.endswith("xxx.clock_drift_ppm") for name in metrics)
+    assert decode(encode(Health("master", 1, 2, {}, metrics))).metrics == metrics  # pyright: ignore[reportAttributeAccessIssue]
+    assert all(len(name) <= 64 for name in metrics)
 
 
 def test_cameras_in_step_and_out_of_it_are_told_on_change_only() -> None:
-    lines = watched(TimeWatch([setup_of()]), stepping(0.04, 30.0))
+    lines = watched(ClockMonitor([setup_of()]), stepping(0.04, 30.0))
     assert len(lines) == 1
     assert "camera right: in step with left, +0.04 ms" in lines[0]
-    lines = watched(TimeWatch([setup_of()]), stepping(5.0, 30.0))
+    lines = watched(ClockMonitor([setup_of()]), stepping(5.0, 30.0))
     assert len(lines) == 1
     assert "camera right: free of left, +5.00 ms" in lines[0]
     drifting = stepping(-0.2, 60.0, ppm=20.0)  # leaves the band after 35 s
-    lines = watched(TimeWatch([setup_of()]), drifting)
+    lines = watched(ClockMonitor([setup_of()]), drifting)
     assert [line.split(",")[0] for line in lines] == [
         "camera right: in step with left",
         "camera right: free of left",

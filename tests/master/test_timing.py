@@ -126,12 +126,12 @@ def test_the_standard_scene_raises_no_alarm_and_shows_a_lie() -> None:
     setup = load_setup(CALIBRATION, "desk")
     scene = scene_by_name("standard", setup.rig, setup.cameras, setup.hand.profile, 7)
     grid = np.arange(0.0, 15.0, 1 / 240)
-    course = np.array([scene.truth(t).markers_m for t in grid])
+    truth_m = np.array([scene.truth(t).markers_m for t in grid])
 
     def motion(t_s: Float) -> Float:
         flat = [
-            np.stack([np.interp(t_s[:, m], grid, course[:, m, axis]) for axis in range(3)], axis=-1)
-            for m in range(course.shape[1])
+            np.stack([np.interp(t_s[:, m], grid, truth_m[:, m, axis]) for axis in range(3)], axis=-1)
+            for m in range(truth_m.shape[1])
         ]
         return np.stack(flat, axis=1)
 
@@ -164,7 +164,7 @@ def test_what_is_not_seen_is_no_evidence() -> None:
 def test_a_marker_with_a_rival_is_not_used() -> None:
     models = cameras()
     messages = recorded(models, scenes.sideways(1), 60.0, 5.0, {}, 1, lost=0.0)
-    doubtful = [msgspec.structs.replace(message, rival_uv=message.uv + 9.0) for message in messages]
+    doubtful = [msgspec.structs.replace(message, alt_uv=message.uv + 9.0) for message in messages]
     assert run(models, messages, 60.0).offset_of("right") is not None
     assert run(models, doubtful, 60.0).offset_of("right") is None
 

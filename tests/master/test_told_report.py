@@ -8,7 +8,7 @@ import pytest
 
 from common.messages import Contact, Gesture, ObjectPose
 from master.outputs.files import RunFiles
-from master.told_report import Saying, ToldRun, judge_gestures
+from master.told_report import Annotated, ToldRun, judge_gestures
 from tests.master.test_outputs_rerun import STEP_NS
 from tests.master.test_outputs_told import START_NS, WATCHED, bar, contact, gesture
 
@@ -26,7 +26,7 @@ class Act:
 class Script:
     """Says three things in 10 s, and turns a knob by half a radian a second."""
 
-    said = (Act("pinch", "index", 1.0, 2.0), Act("dial", "dial", 3.0, 5.0), Act("tap", "5", 6.0, 6.3))
+    annotations = (Act("pinch", "index", 1.0, 2.0), Act("dial", "dial", 3.0, 5.0), Act("tap", "5", 6.0, 6.3))
     period_s = 10.0
 
     def dial_rad(self, t_s: float) -> float:
@@ -39,16 +39,16 @@ def told(kind: str, name: str, at_s: float, phase: str = "begin", **more: float)
 
 
 def test_the_script_is_one() -> None:
-    assert isinstance(Script(), Saying)
+    assert isinstance(Script(), Annotated)
 
 
 def test_what_was_made_and_told_is_right_and_what_was_not_made_is_false() -> None:
-    heard = [
+    received = [
         told("pinch", "index", 1.2),
         told("dial", "dial", 3.5, angle_rad=0.0),
         told("tap", "5", 6.5, "end"),
     ]
-    made = judge_gestures(heard, Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 10 * 10**9)
+    made = judge_gestures(received, Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 10 * 10**9)
     assert (made["gestures_right"], made["gestures_made"], made["gestures_false"]) == (3, 3, 0)
     wrong = [told("pinch", "ring", 1.2), told("tap", "5", 2.0, "end"), told("pose", "open_palm", 2.0)]
     made = judge_gestures(wrong, Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 10 * 10**9)
@@ -56,18 +56,18 @@ def test_what_was_made_and_told_is_right_and_what_was_not_made_is_false() -> Non
 
 
 def test_the_script_repeats_and_what_the_end_cuts_off_is_not_asked_for() -> None:
-    heard = [told("pinch", "index", 11.2), told("dial", "dial", 13.4, angle_rad=0.0)]
-    made = judge_gestures(heard, Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 14 * 10**9)
+    received = [told("pinch", "index", 11.2), told("dial", "dial", 13.4, angle_rad=0.0)]
+    made = judge_gestures(received, Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 14 * 10**9)
     assert (made["gestures_right"], made["gestures_made"], made["gestures_false"]) == (1, 4, 0)
 
 
 def test_what_the_beginning_of_the_run_cuts_off_is_neither_asked_for_nor_false() -> None:
-    heard = [
+    received = [
         told("pinch", "index", 1.6),
         told("tap", "5", 6.4, "end"),
         told("dial", "dial", 4.0, angle_rad=0.0),
     ]
-    made = judge_gestures(heard, Script(), EPOCH_NS, EPOCH_NS + 1_500_000_000, EPOCH_NS + 10**10)
+    made = judge_gestures(received, Script(), EPOCH_NS, EPOCH_NS + 1_500_000_000, EPOCH_NS + 10**10)
     assert (made["gestures_right"], made["gestures_made"], made["gestures_false"]) == (2, 2, 0)
     other = [told("pinch", "ring", 1.6)]  # that one it did not make
     assert (
@@ -85,10 +85,10 @@ def test_too_late_is_not_right() -> None:
 
 def test_the_angle_is_judged_from_where_the_dial_began() -> None:
     began = told("dial", "dial", 3.0, angle_rad=0.0)
-    turned = Gesture(
+    rotated = Gesture(
         "h", began.t_ns + 2 * 10**9, "dial", "dial", "update", began.t_ns, 0.9, angle_rad=1.0 + 0.05
     )
-    assert judge_gestures([began, turned, turned], Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 10**10)[
+    assert judge_gestures([began, rotated, rotated], Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 10**10)[
         "dial_deg"
     ] == pytest.approx(np.degrees(0.05), abs=0.01)
 

@@ -218,7 +218,7 @@ def test_another_rate_of_a_camera_is_followed(told: Told) -> None:
 
 
 @pytest.mark.parametrize(
-    ("part", "key", "value", "says"),
+    ("part", "key", "value", "expected"),
     [
         ("rigs/bench.json", "markers", ["thumb", "index", "back"], "markers: thumb, index, .* cannot become"),
         ("rigs/bench.json", "cameras", ["right", "left"], "cameras: left, right cannot become right, left"),
@@ -245,13 +245,13 @@ def test_another_rate_of_a_camera_is_followed(told: Told) -> None:
     ],
 )
 def test_what_needs_a_restart_is_refused_with_the_reason(
-    part: str, key: str, value: object, says: str, told: Told
+    part: str, key: str, value: object, expected: str, told: Told
 ) -> None:
     path = told.files.calibration / part
     content = msgspec.json.decode(path.read_bytes())
     content[key] = value
     path.write_bytes(msgspec.json.encode(content))
-    with pytest.raises(CalibrationError, match=says):
+    with pytest.raises(CalibrationError, match=expected):
         told.tuning.reload()
     assert not told.upcoming
 

@@ -26,6 +26,7 @@ from common.messages import (
     TrackerPose,
 )
 from master.app import Observed, RunFigures, health, run
+from master.dispatcher import Dispatcher
 from master.estimator.pipeline import SolvedPose
 from master.object_score import ObjectTruth, errors
 from master.outputs.told_files import ObjectPoses
@@ -34,7 +35,6 @@ from master.rig_pipeline import pipeline_of
 from master.rig_setup import RigSetup
 from master.stages import StageTimes
 from master.tracked_object import TrackedObject
-from master.world import World
 from tests.master.test_app import Collector, ScriptedClock, ScriptedSource
 from tests.master.test_outputs_files import random_pose
 from tests.object_run import (
@@ -72,15 +72,15 @@ class Poses:
         return []
 
 
-def world_of(*setups: RigSetup) -> World:
+def world_of(*setups: RigSetup) -> Dispatcher:
     """A world whose hands are not solved, which takes most of the time."""
     lines = [Poses(setup.hand.profile.name, len(setup.markers)) for setup in setups]
-    return World(setups, lines, StageTimes())
+    return Dispatcher(setups, lines, StageTimes())
 
 
-def told(world: World, messages: list[Sent]) -> list[Told]:
-    out = [one for message in messages for one in world.push(message)]
-    return [one if isinstance(one, Contact | Gesture) else one.pose for one in (*out, *world.flush())]
+def told(dispatcher: Dispatcher, messages: list[Sent]) -> list[Told]:
+    out = [one for message in messages for one in dispatcher.push(message)]
+    return [one if isinstance(one, Contact | Gesture) else one.pose for one in (*out, *dispatcher.flush())]
 
 
 @pytest.fixture(scope="module")
@@ -105,8 +105,8 @@ def test_objects_of_markers_and_of_tags_are_told_where_they_are(
     which: str, request: pytest.FixtureRequest
 ) -> None:
     shown: ObjectRun = request.getfixturevalue(which)
-    world = world_of(shown.setup)
-    poses = [one for one in told(world, shown.messages) if isinstance(one, ObjectPose)]
+    dispatcher = world_of(shown.setup)
+    poses = [one for one in told(dispatcher, shown.messages) if isinstance(one, ObjectPose)]
     tracked = [one for one in poses if one.tracked]
     assert len(tracked) > 0.7 * FRAMES
     assert {one.object for one in poses} == {which}
@@ -114,21 +114,21 @@ def test_objects_of_markers_and_of_tags_are_told_where_they_are(
     mm, deg = np.median([off(shown, one) for one in tracked], axis=0)
     assert mm < 2.0
     assert deg < 1.5
-    assert world.counts[f"object.{which}.poses"] == len(poses)
-    assert world.counts[f"object.{which}.tracked"] == len(tracked)
+    assert dispatcher.counts[f"object.{which}.poses"] == len(poses)
+    assert dispatcher.counts[f"object.{which}.tracked"] == len(tracked)
 
 
 def test_a_pose_of_the_hand_is_out_before_what_it_does_is_worked_out(wand: ObjectRun) -> None:
-    world, order = world_of(wand.setup), list[str]()
-    asked = world._now.contacts["default-right"].push
+    dispatcher, order = world_of(wand.setup), list[str]()
+    asked = dispatcher._now.contacts["default-right"].push
 
     def watched(pose: HandPose) -> list[Contact]:
         order.append("asked for contact")
         return asked(pose)
 
-    world._now.contacts["default-right"].push = watched
+    dispatcher._now.contacts["default-right"].push = watched
     for message in wand.messages:
-        for one in world.push(message):
+        for one in dispatcher.push(message):
             kind = type(one).__name__
             order.append(
                 {"SolvedPose": "hand", "SolvedObject": "object", "Contact": "contact"}.get(kind, kind)
@@ -142,15 +142,17 @@ def test_a_pose_of_the_hand_is_out_before_what_it_does_is_worked_out(wand: Objec
 
 
 def test_contact_is_made_for_every_hand_of_cameras_and_every_object(wand: ObjectRun, root: Path) -> None:
-    (worn,) = load_setups(root / "calib_json", ("wrist-left",))
+    (device,) = load_setups(root / "calib_json", ("wrist-left",))
     second = with_fields(wand.setup, objects=())
     profile = msgspec.structs.replace(second.hand.profile, name="another")
     second = with_fields(second, hand=HandModel.of(profile))
     other = msgspec.structs.replace(wand.setup.objects[0], name="twin")
     first = with_fields(wand.setup, objects=(*wand.setup.objects, other))
-    world = world_of(first, second, worn)
-    assert set(world._now.contacts) == {"default-right", "another"}, "a wrist device has a frame of its own"
-    contacts = [one for one in told(world, wand.messages) if isinstance(one, Contact)]
+    dispatcher = world_of(first, second, device)
+    assert set(dispatcher._now.contacts) == {"default-right", "another"}, (
+        "a wrist device has a frame of its own"
+    )
+    contacts = [one for one in told(dispatcher, wand.messages) if isinstance(one, Contact)]
     assert Counter((one.hand, one.object) for one in contacts) == {
         (hand, name): FRAMES for hand in ("default-right", "another") for name in ("wand", "twin")
     }
@@ -159,13 +161,13 @@ def test_contact_is_made_for_every_hand_of_cameras_and_every_object(wand: Object
 
 def test_a_rig_without_objects_has_neither_objects_nor_contact(root: Path, wand: ObjectRun) -> None:
     (bare,) = load_setups(root / "calib_json", ("desk",))
-    world = world_of(bare)
+    dispatcher = world_of(bare)
     frames = [one for one in wand.messages if isinstance(one, MarkerDetections)]
     tags = TagDetections("left", 1, 0, 0, 0, np.array([3], np.uint16), np.ones((1, 4, 2)), np.ones(1))
     puck = tracker_pose("puck", np.eye(4), 0, 0)
-    assert {type(one) for one in told(world, [*frames, tags, puck])} <= {HandPose, Gesture}
-    assert not world._now.shown
-    assert not world._now.contacts
+    assert {type(one) for one in told(dispatcher, [*frames, tags, puck])} <= {HandPose, Gesture}
+    assert not dispatcher._now.shown
+    assert not dispatcher._now.contacts
 
 
 def test_the_loop_says_how_long_an_object_took_and_counts_it(wand: ObjectRun) -> None:
@@ -189,7 +191,7 @@ def test_the_loop_says_how_long_an_object_took_and_counts_it(wand: ObjectRun) ->
     report = health(1, clock, figures, {})
     assert report.counts["objects"] == len(tracked_ms)
     assert report.counts["contacts"] == report.counts["poses"] == len(sink.poses)
-    assert report.gauges["object_latency_p99_ms"] >= report.gauges["object_latency_p50_ms"]
+    assert report.metrics["object_latency_p99_ms"] >= report.metrics["object_latency_p50_ms"]
     assert watched == [one for one in wand.messages if isinstance(one, MarkerDetections)]
 
 
@@ -197,8 +199,8 @@ def test_tags_and_poses_of_trackers_are_no_frames(cube: ObjectRun) -> None:
     stop, figures = threading.Event(), RunFigures()
     setup = with_tracker(cube.setup)
     script = [*cube.messages, tracker_pose("puck", cube.pose("cube", START_NS), 0, START_NS)]
-    world = world_of(setup)
-    observed = Observed(world, figures.rates, lambda _frame: None)
+    dispatcher = world_of(setup)
+    observed = Observed(dispatcher, figures.rates, lambda _frame: None)
     run(ScriptedSource([*script], stop), observed, [], ScriptedClock(), figures, stop)
     assert figures.rates.camera_hz == pytest.approx({"left": 60.0, "right": 60.0}, rel=1e-3)
 
@@ -233,24 +235,24 @@ def blind(message: Sent) -> Sent:
 
 def test_an_object_with_a_tracker_alone_needs_no_camera(wand: ObjectRun) -> None:
     setup = with_tracker(wand.setup, only=True)
-    world = world_of(setup)
+    dispatcher = world_of(setup)
     sent: list[Sent] = [
         tracker_pose("puck", wand.pose("wand", START_NS + k * PERIOD_NS), k, START_NS + k * PERIOD_NS)
         for k in range(5)
     ]
     lost = TrackerPose("puck", 1, 5, START_NS + 5 * PERIOD_NS, np.full(3, nan), np.full(4, nan))
-    poses = [one for one in told(world, [*sent, lost]) if isinstance(one, ObjectPose)]
+    poses = [one for one in told(dispatcher, [*sent, lost]) if isinstance(one, ObjectPose)]
     assert [one.tracked for one in poses] == [True] * 5 + [False]
-    assert world.counts["tracker.puck.lost"] == 1
-    assert told(world, [tracker_pose("another", np.eye(4), 0, 0)]) == []
+    assert dispatcher.counts["tracker.puck.lost"] == 1
+    assert told(dispatcher, [tracker_pose("another", np.eye(4), 0, 0)]) == []
 
 
 def test_a_tracker_that_is_not_registered_is_counted_and_said(wand: ObjectRun) -> None:
     setup = with_tracker(wand.setup, registered=False)
-    world = world_of(setup)
-    assert [(one.name, one.tracker) for one in world.unplaced] == [("wand", "puck")]
-    assert told(world, [tracker_pose("puck", np.eye(4), k, k) for k in range(3)]) == []
-    assert world.counts == {"tracker.puck.unplaced": 3}
+    dispatcher = world_of(setup)
+    assert [(one.name, one.tracker) for one in dispatcher.unplaced] == [("wand", "puck")]
+    assert told(dispatcher, [tracker_pose("puck", np.eye(4), k, k) for k in range(3)]) == []
+    assert dispatcher.counts == {"tracker.puck.unplaced": 3}
 
 
 def test_markers_of_objects_are_found_in_a_rig_of_two_hands(wand: ObjectRun, root: Path) -> None:
@@ -271,7 +273,7 @@ def test_markers_of_objects_are_found_in_a_rig_of_two_hands(wand: ObjectRun, roo
 
 def with_more(message: MarkerDetections, count: int) -> MarkerDetections:
     """The frame with so many markers of another hand before its own."""
-    names = ("uv", "area", "quality", "sigma_px", "rival_uv")
+    names = ("uv", "area", "quality", "sigma_px", "alt_uv")
     more = {name: np.full((count, *getattr(message, name).shape[1:]), nan) for name in names}
     return msgspec.structs.replace(
         message, **{name: np.concatenate([more[name], getattr(message, name)]) for name in names}
@@ -279,11 +281,11 @@ def with_more(message: MarkerDetections, count: int) -> MarkerDetections:
 
 
 def test_other_files_take_over_between_two_messages_and_what_had_begun_ends(wand: ObjectRun) -> None:
-    world = world_of(wand.setup)
+    dispatcher = world_of(wand.setup)
     half = len(wand.messages) // 2
-    before = told_only(world, wand.messages[:half])
+    before = told_only(dispatcher, wand.messages[:half])
     begun = Gesture("default-right", 7, "pinch", "index", "update", 5, 0.5)
-    world._remember(begun)
+    dispatcher._remember(begun)
     moved = tuple(
         msgspec.structs.replace(
             one, position_m=(one.position_m[0], one.position_m[1], one.position_m[2] + 0.03)
@@ -294,27 +296,27 @@ def test_other_files_take_over_between_two_messages_and_what_had_begun_ends(wand
     other = with_fields(
         wand.setup, objects=(msgspec.structs.replace(wand.setup.objects[0], markers=markers),)
     )
-    world.prepare([other])()
-    after = told_only(world, wand.messages[half:])
+    dispatcher.prepare([other])()
+    after = told_only(dispatcher, wand.messages[half:])
     assert isinstance(after[0], Gesture)
     assert (after[0].phase, after[0].kind, after[0].began_t_ns) == ("end", "pinch", 5)
     for poses, away_mm in ((before, 0.0), (after, 30.0)):
         seen = [one for one in poses if isinstance(one, ObjectPose) and one.tracked]
         assert np.median([off(wand, one)[0] for one in seen]) == pytest.approx(away_mm, abs=2.0)
-    assert world._begun == {} or all(one.t_ns > 7 for one in world._begun.values())
+    assert dispatcher._begun == {} or all(one.t_ns > 7 for one in dispatcher._begun.values())
 
 
-def told_only(world: World, messages: list[Sent]) -> list[Told]:
+def told_only(dispatcher: Dispatcher, messages: list[Sent]) -> list[Told]:
     """As `told`, and more messages come."""
-    out = [one for message in messages for one in world.push(message)]
+    out = [one for message in messages for one in dispatcher.push(message)]
     return [one if isinstance(one, Contact | Gesture) else one.pose for one in out]
 
 
 def test_single_pictures_have_no_gestures(wand: ObjectRun) -> None:
     lines = [Poses("default-right", len(wand.setup.markers))]
-    world = World([wand.setup], lines, StageTimes(), gestures=False)
-    assert not world._now.gestures
-    assert not [one for one in told(world, wand.messages) if isinstance(one, Gesture)]
+    dispatcher = Dispatcher([wand.setup], lines, StageTimes(), gestures=False)
+    assert not dispatcher._now.gestures
+    assert not [one for one in told(dispatcher, wand.messages) if isinstance(one, Gesture)]
 
 
 def test_the_same_messages_tell_the_same(cube: ObjectRun) -> None:
@@ -341,8 +343,8 @@ def test_a_hand_is_solved_as_without_objects(wand: ObjectRun) -> None:
     frames = [one for one in wand.messages if isinstance(one, MarkerDetections)][:16]
     poses: list[list[HandPose]] = []
     for setup in (bare, wand.setup):
-        world = World([setup], [pipeline_of(setup, StageTimes())], StageTimes())
-        poses.append([one for one in told_only(world, [*frames]) if isinstance(one, HandPose)])
+        dispatcher = Dispatcher([setup], [pipeline_of(setup, StageTimes())], StageTimes())
+        poses.append([one for one in told_only(dispatcher, [*frames]) if isinstance(one, HandPose)])
     assert len(poses[0]) == len(poses[1]) > 3
     for one, other in zip(*poses, strict=True):
         np.testing.assert_array_equal(one.position_m, other.position_m)
@@ -351,7 +353,7 @@ def test_a_hand_is_solved_as_without_objects(wand: ObjectRun) -> None:
 @pytest.mark.parametrize("which", ["wand", "cube"])
 def test_nonsense_that_is_sealed_rightly_ends_nothing(which: str, request: pytest.FixtureRequest) -> None:
     shown: ObjectRun = request.getfixturevalue(which)
-    world, rng = world_of(with_tracker(shown.setup)), np.random.default_rng(7)
+    dispatcher, rng = world_of(with_tracker(shown.setup)), np.random.default_rng(7)
     for k in range(60):
         base = shown.messages[int(rng.integers(len(shown.messages)))]
         t_ns = int(base.t_ns + rng.integers(-(10**9), 10**9))
@@ -359,14 +361,14 @@ def test_nonsense_that_is_sealed_rightly_ends_nothing(which: str, request: pytes
         ids = np.sort(rng.choice(8, count, replace=False)).astype(np.uint16)
         uv, sigma = rng.normal(size=(count, 4, 2)) * far, 10.0 ** rng.uniform(-5.0, 4.0, count)
         uv, place = np.clip(uv, -16384.0, 32768.0), np.clip(rng.normal(size=3) * far, -1e3, 1e3)
-        turn = rng.normal(size=4)
-        turn *= rng.uniform(0.95, 1.04) / np.linalg.norm(turn)
-        turn = np.clip(turn, -1.0, 1.0)
+        quaternion = rng.normal(size=4)
+        quaternion *= rng.uniform(0.95, 1.04) / np.linalg.norm(quaternion)
+        quaternion = np.clip(quaternion, -1.0, 1.0)
         for message in (
             TagDetections("left", 1, k, t_ns, t_ns, ids, uv, sigma),
-            TrackerPose("puck", 1, k, t_ns, place, turn),
+            TrackerPose("puck", 1, k, t_ns, place, quaternion),
             msgspec.structs.replace(base, t_ns=int(rng.integers(-(2**61), 2**61))),
             base,
         ):
-            for one in world.push(message):
+            for one in dispatcher.push(message):
                 assert isinstance(one, Contact | Gesture) or one.pose.t_ns is not None

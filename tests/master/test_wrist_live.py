@@ -25,7 +25,7 @@ from master.stages import StageTimes
 from master.tuning import LivePipeline, RigTuning
 from slave.uplink import Uplink
 from tests.network_helpers import detections, free_endpoint, free_udp_port, until
-from tests.wrist_run import exact_triple, wrist_scene, wrist_setup
+from tests.wrist_run import exact_cycle, wrist_scene, wrist_setup
 
 
 @pytest.fixture
@@ -66,8 +66,8 @@ class Running:
         scene, clock = wrist_scene(self.setup, "curl"), SystemClock()
         for _ in range(count):
             now = scene.truth(0.02 * self.sent)
-            triple = exact_triple(self.setup, now, self.sent, clock.now_ns() - 15_000_000)
-            self.camera.send(msgspec.structs.replace(triple, session=self.camera.session))
+            cycle = exact_cycle(self.setup, now, self.sent, clock.now_ns() - 15_000_000)
+            self.camera.send(msgspec.structs.replace(cycle, session=self.camera.session))
             self.sent += 1
             self.stop.wait(0.01)
 
@@ -111,8 +111,8 @@ def test_a_master_tracks_a_wrist_device_and_says_how_it_is(root: Path, tmp_path:
         assert report.counts["wrist.received"] == 40
         assert "wrist.lost" not in report.counts  # nothing was
         assert report.counts["poses"] > 30
-        assert report.gauges["wrist.clock_sigma_us"] >= 0.0
-        assert not [name for name in report.gauges if "phase" in name or "residual" in name]
+        assert report.metrics["wrist.clock_sigma_us"] >= 0.0
+        assert not [name for name in report.metrics if "phase" in name or "residual" in name]
     summary = json.loads((tmp_path / "live.json").read_text())
     poses = load_poses(tmp_path / "poses.npz")
     assert len(poses) == summary["poses"] > 30

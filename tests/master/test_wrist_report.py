@@ -17,7 +17,7 @@ from master.rig import load_setups
 from master.rig_setup import RigSetup
 from master.wrist_report import forearm_tilt, laser_scores, lit_view
 from tests.master.test_outputs_rerun import rows_of
-from tests.wrist_run import START_NS, TRIPLE_NS, true_poses, wrist_scene, wrist_setup
+from tests.wrist_run import CYCLE_NS, START_NS, true_poses, wrist_scene, wrist_setup
 
 N = 40
 
@@ -38,14 +38,14 @@ def test_the_forearm_is_scored_against_the_vertical_whatever_its_heading(
     imu = setup.rig.imu
     assert imu is not None
     assert imu.q_rig_world is not None
-    poses = true_poses(setup, [scene.truth(k * TRIPLE_NS * 1e-9) for k in range(N)])
+    poses = true_poses(setup, [scene.truth(k * CYCLE_NS * 1e-9) for k in range(N)])
     assert forearm_tilt(poses, scene, START_NS) == {}
     rig_world = quaternion_to_matrix(np.array(imu.q_rig_world))
     times = (poses.t_ns - START_NS) * 1e-9
     lies = np.array([rig_world.T @ scene.motion.at(float(t)).T_rig_palm[:3, :3] for t in times])
     for tilt_deg in (0.0, 5.0):
-        turned = axis_rotation(2, 1.0) @ axis_rotation(0, np.radians(tilt_deg)) @ lies
-        told = replace(poses, palm_world_wxyz=matrix_to_quaternion(turned))
+        rotated = axis_rotation(2, 1.0) @ axis_rotation(0, np.radians(tilt_deg)) @ lies
+        told = replace(poses, palm_world_wxyz=matrix_to_quaternion(rotated))
         told.palm_world_wxyz[:3] = np.nan
         assert forearm_tilt(told, scene, START_NS)["forearm_tilt_deg"] == pytest.approx(tilt_deg, abs=1e-4)
 
@@ -54,14 +54,14 @@ def test_the_forearm_is_scored_against_the_vertical_whatever_its_heading(
 def test_a_run_is_scored_at_the_times_of_its_poses(
     setup: RigSetup, scene: WristScene, tmp_path: Path, late_ms: int
 ) -> None:
-    poses = true_poses(setup, [scene.truth(k * TRIPLE_NS * 1e-9 + 1.5) for k in range(N)])
+    poses = true_poses(setup, [scene.truth(k * CYCLE_NS * 1e-9 + 1.5) for k in range(N)])
     save_poses(tmp_path / "poses.npz", poses)
     epoch_ns = START_NS - 1_500_000_000 - late_ms * 1_000_000
     told: list[str] = []
     full = report_scene(
         tmp_path / "poses.npz",
         setup,
-        Played(worn=scene),
+        Played(wrist_scene=scene),
         epoch_ns,
         tmp_path,
         {"poses_per_s": 30.0},
@@ -90,7 +90,7 @@ def test_a_run_without_a_pose_keeps_its_figures(setup: RigSetup, scene: WristSce
     full = report_scene(
         tmp_path / "poses.npz",
         setup,
-        Played(worn=scene),
+        Played(wrist_scene=scene),
         after_ns,
         tmp_path,
         {"poses": 0},
@@ -112,19 +112,19 @@ def test_a_hand_before_both_kinds_of_rig_is_played_by_one_motion(root: Path) -> 
     (both,) = load_setups(root / "calib_json", ("desk", "wrist"))
     played = Played.of(both, "both-curl@dark", 5)
     assert played.shown is not None
-    assert played.worn is not None
-    assert played.worn.ambient == "dark"
-    seen, worn = (scene.motion.at(1.3).angles_rad for scene in (played.shown, played.worn))
-    np.testing.assert_array_equal(seen, worn)
+    assert played.wrist_scene is not None
+    assert played.wrist_scene.ambient == "dark"
+    seen, device = (scene.motion.at(1.3).angles_rad for scene in (played.shown, played.wrist_scene))
+    np.testing.assert_array_equal(seen, device)
     with pytest.raises(PhalanxError, match="see one hand only in grasp, both-poses"):
         Played.of(both, "standard", 5)
     (desk,), (wrist,) = (load_setups(root / "calib_json", (name,)) for name in ("desk", "wrist"))
-    assert Played.of(desk, "grasp", 5).worn is Played.of(wrist, "curl@sun", 5).shown is None
+    assert Played.of(desk, "grasp", 5).wrist_scene is Played.of(wrist, "curl@sun", 5).shown is None
     assert [Played.of(desk, name, 5).together for name in ("grasp", "poses")] == [True, False]
 
 
-def test_laser_points_count_once_for_each_triple(setup: RigSetup, scene: WristScene) -> None:
-    poses = true_poses(setup, [scene.truth(k * TRIPLE_NS * 1e-9 + 1.5) for k in range(6)])
+def test_laser_points_count_once_for_each_cycle(setup: RigSetup, scene: WristScene) -> None:
+    poses = true_poses(setup, [scene.truth(k * CYCLE_NS * 1e-9 + 1.5) for k in range(6)])
     twice = replace(poses, laser_m=np.repeat(poses.laser_m[::2], 2, axis=0))
     told: list[int] = []
     epoch_ns = START_NS - 1_500_000_000

@@ -9,9 +9,9 @@ import pytest
 from common.arrays import Bool, Float, Int
 from common.errors import RecordingError
 from common.frame_recording import FrameRecording, FrameRow, Illumination, Manifest
-from common.messages import Level, WristDetections
+from common.messages import SolverMode, WristDetections
 from master.outputs.poses import Poses
-from master.wrist_score import GROUPS, WristTruth, load_wrist_truth, score_tips, score_wrist, triples_missed
+from master.wrist_score import GROUPS, WristTruth, cycles_missed, load_wrist_truth, score_tips, score_wrist
 from tests.hand_helpers import camera_file
 
 PERIOD_NS = 33_333_333
@@ -54,12 +54,12 @@ def poses(exact: WristTruth) -> Poses:
         inside_volume=np.ones((N, 26), np.bool_),
         latency_ns=np.zeros(N, np.int64),
         laser_m=exact.laser_m[:, 1:6],
-        level=np.full((N, 5), Level.FK, np.uint8),
+        solver_mode=np.full((N, 5), SolverMode.FK, np.uint8),
         ambiguous=np.zeros((N, 5), np.bool_),
         palm_world_wxyz=np.full((N, 4), np.nan),
         palm_world_sigma_rad=np.full((N, 2), np.nan),
-        wrist_bend_rad=np.full((N, 2), np.nan),
-        wrist_bend_sigma_rad=np.full((N, 2), np.nan),
+        wrist_angles_rad=np.full((N, 2), np.nan),
+        wrist_angles_sigma_rad=np.full((N, 2), np.nan),
     )
 
 
@@ -80,7 +80,7 @@ def test_an_errorless_device_has_no_errors() -> None:
     assert got["laser_mm"] == got["laser_mm_thumb"] == got["laser_mm_little"] == 0.0
     assert got["laser_right"] == 1.0
     assert got["laser_missed"] == got["pip_untracked"] == 0.0
-    assert triples_missed(poses(exact), exact) == 0
+    assert cycles_missed(poses(exact), exact) == 0
     assert got["pip_rms_deg"] == got["pip_deg"] == got["joint_mm"] == 0.0
     assert (got["tip_px"], got["tip_within_6px"], got["tip_false"]) == (0.0, 1.0, 0.0)
 
@@ -107,10 +107,10 @@ def test_fingers_with_laser_and_tip_in_sight_are_scored_apart() -> None:
     angles = poses(exact).angles_rad.copy()
     angles[:, 1, 2] += np.radians([50.0, 50.0, 4.0, -8.0])
     angles[3, 3, 2] = np.nan
-    level = np.full((N, 5), Level.FK, np.uint8)
-    level[1:3, 1] = Level.IK
+    solver_mode = np.full((N, 5), SolverMode.FK, np.uint8)
+    solver_mode[1:3, 1] = SolverMode.IK
     exact = replace(exact, tip_visible=visible, laser_seen_m=seen)
-    got = score_wrist(replace(poses(exact), angles_rad=angles, level=level), exact)
+    got = score_wrist(replace(poses(exact), angles_rad=angles, solver_mode=solver_mode), exact)
     assert (got["both_index"], got["both_ik_index"]) == (2.0, 1.0)
     assert got["both_pip_deg_index"] == pytest.approx(6.0)
     assert (got["both_ring"], got["both_pip_deg_ring"], got["both_ik_ring"]) == (4.0, 0.0, 0.0)
@@ -131,11 +131,11 @@ def test_little_line_and_no_line_are_not_scored() -> None:
     assert got["laser_missed"] == 0.0
 
 
-def test_a_triple_of_which_nothing_was_made_is_missed_with_all_its_points() -> None:
+def test_a_cycle_of_which_nothing_was_made_is_missed_with_all_its_points() -> None:
     exact = truth()
     found = poses(exact)
     got = score_wrist(found.rows(1, N), exact)
-    assert triples_missed(found.rows(1, N), exact) == 1
+    assert cycles_missed(found.rows(1, N), exact) == 1
     assert got["laser_missed"] == 5.0
     assert got["laser_right"] == 0.75
     tips = score_tips(messages(exact, exact.tip_uv)[1:], exact)
@@ -143,13 +143,13 @@ def test_a_triple_of_which_nothing_was_made_is_missed_with_all_its_points() -> N
     assert tips["tip_false"] == 0.0
 
 
-def test_poses_of_the_frames_beside_are_not_taken_for_those_of_the_triple() -> None:
+def test_poses_of_adjacent_frames_are_not_taken_for_those_of_the_cycle() -> None:
     exact = truth()
     late = replace(poses(exact), t_ns=exact.t_ns + 11_111_111)
-    assert triples_missed(late, exact) == N
+    assert cycles_missed(late, exact) == N
     assert "laser_mm" not in score_wrist(late, exact)
     near = replace(poses(exact), t_ns=exact.t_ns + 4_000_000)  # the centre row of a rolling shutter
-    assert triples_missed(near, exact) == 0
+    assert cycles_missed(near, exact) == 0
 
 
 def test_the_pip_is_scored_up_to_85_degrees_where_it_is_tracked() -> None:
@@ -205,12 +205,12 @@ def test_a_tip_that_is_not_reported_is_missed_and_not_false() -> None:
     assert score_tips([], exact) == {"tip_within_6px": 0.0}
 
 
-def recording(folder: Path, triples: int) -> FrameRecording:
+def recording(folder: Path, cycles: int) -> FrameRecording:
     manifest = Manifest(version=1, kind="wrist", cameras={"wrist": camera_file("wrist", 90.0)})
     lit = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
     rows = [
         FrameRow("wrist", k, 1_000_000_000 + k * PERIOD_NS // 3, lit[k % 3], f"{k}.png")
-        for k in range(3 * triples)
+        for k in range(3 * cycles)
     ]
     return FrameRecording(folder, manifest, tuple(reversed(rows)))  # the table is in no order
 

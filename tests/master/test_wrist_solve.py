@@ -13,11 +13,11 @@ from common.geometry import quaternion_to_matrix
 from common.messages import WristDetections
 from common.sim.wrist.scene import WristTruth
 from master.outputs.files import load_poses
-from master.recorded import recorded_triples
+from master.recorded import recorded_cycles
 from master.rig_setup import RigSetup
 from master.solve import solve
 from tests.hand_helpers import camera_file, rig_file
-from tests.wrist_run import START_NS, TRIPLE_NS, exact_triple, wrist_scene, wrist_setup
+from tests.wrist_run import CYCLE_NS, START_NS, exact_cycle, wrist_scene, wrist_setup
 
 N = 12
 ARRAYS = ("laser_uv", "laser_sigma_px", "laser_px", "tip_uv", "tip_sigma_px", "tip_depth")
@@ -35,13 +35,13 @@ def truths(setup: RigSetup) -> list[WristTruth]:
 
 
 @pytest.fixture(scope="module")
-def triples(setup: RigSetup, truths: list[WristTruth]) -> list[WristDetections]:
-    return [exact_triple(setup, now, k) for k, now in enumerate(truths)]
+def cycles(setup: RigSetup, truths: list[WristTruth]) -> list[WristDetections]:
+    return [exact_cycle(setup, now, k) for k, now in enumerate(truths)]
 
 
-def write_detections(folder: Path, triples: list[WristDetections], **changes: object) -> None:
-    data: dict[str, object] = {name: np.array([getattr(one, name) for one in triples]) for name in ARRAYS}
-    data |= {name: np.array([getattr(one, name) for one in triples], np.int64) for name in ("t_ns", "seq")}
+def write_detections(folder: Path, cycles: list[WristDetections], **changes: object) -> None:
+    data: dict[str, object] = {name: np.array([getattr(one, name) for one in cycles]) for name in ARRAYS}
+    data |= {name: np.array([getattr(one, name) for one in cycles], np.int64) for name in ("t_ns", "seq")}
     data |= changes
     np.savez(
         folder / "detections_wrist.npz",
@@ -53,7 +53,7 @@ def recording(folder: Path, setup: RigSetup, *, continuous: bool = False) -> Fra
     manifest = Manifest(version=1, kind="wrist", cameras=setup.cameras, rig=setup.rig, continuous=continuous)
     lit = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
     rows = [
-        FrameRow("wrist", 3 * k + j, START_NS + k * TRIPLE_NS + (j - 1) * 11_111_111, lit[j], f"{k}-{j}.png")
+        FrameRow("wrist", 3 * k + j, START_NS + k * CYCLE_NS + (j - 1) * 11_111_111, lit[j], f"{k}-{j}.png")
         for k in range(N)
         for j in range(3)
     ]
@@ -70,9 +70,9 @@ def write_truth(folder: Path, truths: list[WristTruth]) -> None:
 
 
 def test_a_recording_is_solved_scored_and_repeated_byte_by_byte(
-    tmp_path: Path, setup: RigSetup, truths: list[WristTruth], triples: list[WristDetections]
+    tmp_path: Path, setup: RigSetup, truths: list[WristTruth], cycles: list[WristDetections]
 ) -> None:
-    write_detections(tmp_path, triples)
+    write_detections(tmp_path, cycles)
     write_truth(tmp_path, truths)
     progress: list[tuple[int, int]] = []
     outs = [tmp_path / "first", tmp_path / "second"]
@@ -86,7 +86,7 @@ def test_a_recording_is_solved_scored_and_repeated_byte_by_byte(
     poses = load_poses(outs[0] / "poses.npz")
     assert poses.marker_count == 0
     assert len(poses) == summary["poses"] == summary["poses_valid"] == N
-    np.testing.assert_array_equal(poses.t_ns, [one.t_ns for one in triples])
+    np.testing.assert_array_equal(poses.t_ns, [one.t_ns for one in cycles])
     stored = json.loads((outs[1] / "summary.json").read_text())
     assert stored == json.loads(json.dumps(summary))
     # A ray through the true centroid meets the plane in the true point.
@@ -94,21 +94,21 @@ def test_a_recording_is_solved_scored_and_repeated_byte_by_byte(
     assert stored["laser_right"] == 1.0
     assert stored["tip_px"] == stored["tip_false"] == 0.0
     assert stored["tip_within_6px"] == 1.0
-    assert stored["triples_missed"] == stored["lost"] == 0
+    assert stored["cycles_missed"] == stored["lost"] == 0
     assert stored["camera_hz"]["wrist"] == pytest.approx(90.0, abs=0.1)
     for key in ("laser_mm_thumb", "laser_missed", "pip_rms_deg", "pip_deg", "joint_mm", "stage_us"):
         assert key in stored
     assert "marker_mm" not in stored
 
 
-def test_triples_that_are_missing_are_counted_and_their_points_are_missed(
-    tmp_path: Path, setup: RigSetup, truths: list[WristTruth], triples: list[WristDetections]
+def test_cycles_that_are_missing_are_counted_and_their_points_are_missed(
+    tmp_path: Path, setup: RigSetup, truths: list[WristTruth], cycles: list[WristDetections]
 ) -> None:
-    write_detections(tmp_path, [one for k, one in enumerate(triples) if k not in (3, 4, 7)])
+    write_detections(tmp_path, [one for k, one in enumerate(cycles) if k not in (3, 4, 7)])
     write_truth(tmp_path, truths)
     summary = solve(recording(tmp_path, setup), setup, tmp_path, tmp_path)
     assert summary["lost"] == 3
-    assert summary["triples_missed"] == 3
+    assert summary["cycles_missed"] == 3
     assert summary["poses"] == N - 3
     assert isinstance(summary["laser_missed"], float)
     assert summary["laser_missed"] >= 9
@@ -116,26 +116,26 @@ def test_triples_that_are_missing_are_counted_and_their_points_are_missed(
 
 
 def test_unrelated_poses_do_not_depend_on_their_order(
-    tmp_path: Path, setup: RigSetup, triples: list[WristDetections]
+    tmp_path: Path, setup: RigSetup, cycles: list[WristDetections]
 ) -> None:
-    backwards = list(reversed(triples))
+    backwards = list(reversed(cycles))
     angles: dict[str, Float] = {}
-    for name, rows in (("there", triples), ("back", backwards)):
+    for name, rows in (("there", cycles), ("back", backwards)):
         folder = tmp_path / name
         folder.mkdir()
-        times = np.array([one.t_ns for one in triples], np.int64)
-        numbers = np.array([one.seq for one in triples], np.int64)
+        times = np.array([one.t_ns for one in cycles], np.int64)
+        numbers = np.array([one.seq for one in cycles], np.int64)
         write_detections(folder, rows, t_ns=times, seq=numbers)
         solve(recording(folder, setup), setup, folder, folder)
         angles[name] = load_poses(folder / "poses.npz").angles_rad
-    # Hinges and the unit of light are of the wearer, and learnt from whatever pose comes.
+    # Hinges and the unit of light are of the subject, and learnt from whatever pose comes.
     np.testing.assert_allclose(angles["there"], angles["back"][::-1], atol=np.radians(8.0))
 
 
 def test_its_imu_turns_the_palm_in_the_world_and_nothing_in_the_camera(
-    tmp_path: Path, setup: RigSetup, triples: list[WristDetections]
+    tmp_path: Path, setup: RigSetup, cycles: list[WristDetections]
 ) -> None:
-    write_detections(tmp_path, triples)
+    write_detections(tmp_path, cycles)
     solve(recording(tmp_path, setup), setup, tmp_path, tmp_path)
     without = load_poses(tmp_path / "poses.npz")
     assert np.isnan(without.palm_world_wxyz).all()
@@ -154,30 +154,32 @@ def test_its_imu_turns_the_palm_in_the_world_and_nothing_in_the_camera(
     imu = setup.rig.imu
     assert imu is not None
     assert imu.q_palm_imu is not None
-    heard = (
+    received = (
         np.abs(found.t_ns - START_NS - 156_000_000) <= 206_000_000
     )  # the last sample is at 312 ms, and 50 ms
-    assert heard.any()
-    np.testing.assert_array_equal(np.isfinite(found.palm_world_wxyz[:, 0]), heard)
+    assert received.any()
+    np.testing.assert_array_equal(np.isfinite(found.palm_world_wxyz[:, 0]), received)
     np.testing.assert_allclose(
-        quaternion_to_matrix(found.palm_world_wxyz[heard]),
-        np.broadcast_to(quaternion_to_matrix(np.array(imu.q_palm_imu)).T, (heard.sum(), 3, 3)),
+        quaternion_to_matrix(found.palm_world_wxyz[received]),
+        np.broadcast_to(quaternion_to_matrix(np.array(imu.q_palm_imu)).T, (received.sum(), 3, 3)),
         atol=1e-9,
     )
-    drift_rad = imu.heading_drift_rad_s * 1e-9 * (found.t_ns[heard] - START_NS)  # as the rig file has it
-    np.testing.assert_allclose(found.palm_world_sigma_rad[heard, 1], drift_rad, atol=0.17)  # 50 ms at 3 rad/s
-    assert found.palm_world_sigma_rad[heard, 1].min() < 0.02
-    np.testing.assert_allclose(told.palm_world_sigma_rad[heard, 1], 0.3, rtol=0.15)  # as the IMU says
+    drift_rad = imu.heading_drift_rad_s * 1e-9 * (found.t_ns[received] - START_NS)  # as the rig file has it
+    np.testing.assert_allclose(
+        found.palm_world_sigma_rad[received, 1], drift_rad, atol=0.17
+    )  # 50 ms at 3 rad/s
+    assert found.palm_world_sigma_rad[received, 1].min() < 0.02
+    np.testing.assert_allclose(told.palm_world_sigma_rad[received, 1], 0.3, rtol=0.15)  # as the IMU says
     counts = summary["counts"]
     assert isinstance(counts, dict)
-    assert counts["orientation.used"] == heard.sum()
-    assert counts.get("orientation.absent", 0) == (~heard).sum()
+    assert counts["orientation.used"] == received.sum()
+    assert counts.get("orientation.absent", 0) == (~received).sum()
 
 
 def test_an_imu_that_gives_no_orientation_is_led_by_gravity(
-    tmp_path: Path, setup: RigSetup, triples: list[WristDetections]
+    tmp_path: Path, setup: RigSetup, cycles: list[WristDetections]
 ) -> None:
-    write_detections(tmp_path, triples)
+    write_detections(tmp_path, cycles)
     force = 9.81 * np.array([0.0, 0.5, np.sqrt(0.75)])
     rows = [f"{START_NS + 8_000_000 * k},0,0,0,{','.join(map(str, force.tolist()))}" for k in range(-120, 60)]
     (tmp_path / "imu.csv").write_text("\n".join(["t_ns,gx,gy,gz,ax,ay,az", *rows]) + "\n")
@@ -191,13 +193,13 @@ def test_an_imu_that_gives_no_orientation_is_led_by_gravity(
     np.testing.assert_allclose(found.palm_world_sigma_rad[:, 0], imu.orientation_sigma_rad, rtol=0.3)
 
 
-def test_nothing_seen_in_any_triple_is_no_crash_and_no_score(
-    tmp_path: Path, setup: RigSetup, truths: list[WristTruth], triples: list[WristDetections]
+def test_nothing_seen_in_any_cycle_is_no_crash_and_no_score(
+    tmp_path: Path, setup: RigSetup, truths: list[WristTruth], cycles: list[WristDetections]
 ) -> None:
     nothing = {
-        name: np.full(np.array([getattr(one, name) for one in triples]).shape, np.nan) for name in ARRAYS
+        name: np.full(np.array([getattr(one, name) for one in cycles]).shape, np.nan) for name in ARRAYS
     }
-    write_detections(tmp_path, triples, **nothing)
+    write_detections(tmp_path, cycles, **nothing)
     write_truth(tmp_path, truths)
     summary = solve(recording(tmp_path, setup), setup, tmp_path, tmp_path)
     assert "laser_mm" not in summary
@@ -207,7 +209,7 @@ def test_nothing_seen_in_any_triple_is_no_crash_and_no_score(
     assert "pip_rms_deg" not in summary  # nothing is tracked
 
 
-def test_no_triples_at_all_are_no_poses(tmp_path: Path, setup: RigSetup) -> None:
+def test_no_cycles_at_all_are_no_poses(tmp_path: Path, setup: RigSetup) -> None:
     empty = {"t_ns": np.zeros(0, np.int64), "laser_uv": np.zeros((0, 5, 2)), "tip_uv": np.zeros((0, 5, 2))}
     np.savez(tmp_path / "detections_wrist.npz", **empty)  # pyright: ignore[reportArgumentType]
     summary = solve(recording(tmp_path, setup), setup, tmp_path, tmp_path)
@@ -215,14 +217,14 @@ def test_no_triples_at_all_are_no_poses(tmp_path: Path, setup: RigSetup) -> None
 
 
 def test_files_of_the_three_columns_of_the_format_are_enough(
-    tmp_path: Path, triples: list[WristDetections]
+    tmp_path: Path, cycles: list[WristDetections]
 ) -> None:
-    write_detections(tmp_path, triples)
-    full = list(recorded_triples(tmp_path, "wrist"))
+    write_detections(tmp_path, cycles)
+    full = list(recorded_cycles(tmp_path, "wrist"))
     rest = {name: None for name in (*ARRAYS, "seq") if name not in ("laser_uv", "tip_uv")}
-    write_detections(tmp_path, triples, **rest)
-    short = list(recorded_triples(tmp_path, "wrist"))
-    for one, other, exact in zip(full, short, triples, strict=True):
+    write_detections(tmp_path, cycles, **rest)
+    short = list(recorded_cycles(tmp_path, "wrist"))
+    for one, other, exact in zip(full, short, cycles, strict=True):
         np.testing.assert_array_equal(one.laser_uv, other.laser_uv)
         np.testing.assert_array_equal(one.tip_depth, exact.tip_depth)
         np.testing.assert_array_equal(np.isnan(other.tip_sigma_px), np.isnan(other.tip_uv[:, 0]))
@@ -245,20 +247,20 @@ def test_files_of_the_three_columns_of_the_format_are_enough(
     ],
 )
 def test_a_broken_file_is_named_with_what_is_wrong_and_what_to_do(
-    tmp_path: Path, triples: list[WristDetections], changes: dict[str, object], message: str
+    tmp_path: Path, cycles: list[WristDetections], changes: dict[str, object], message: str
 ) -> None:
-    write_detections(tmp_path, triples, **changes)
+    write_detections(tmp_path, cycles, **changes)
     with pytest.raises(RecordingError, match=rf"detections_wrist\.npz: .*{message}.*phalanx-slave detect"):
-        list(recorded_triples(tmp_path, "wrist"))
+        list(recorded_cycles(tmp_path, "wrist"))
 
 
 @pytest.mark.parametrize("keep", [0, 1, 100, 2000])
-def test_a_cut_file_is_named(tmp_path: Path, triples: list[WristDetections], keep: int) -> None:
-    write_detections(tmp_path, triples)
+def test_a_cut_file_is_named(tmp_path: Path, cycles: list[WristDetections], keep: int) -> None:
+    write_detections(tmp_path, cycles)
     path = tmp_path / "detections_wrist.npz"
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(RecordingError, match=r"detections_wrist\.npz"):
-        list(recorded_triples(tmp_path, "wrist"))
+        list(recorded_cycles(tmp_path, "wrist"))
 
 
 def test_a_recording_of_both_kinds_is_solved_rig_by_rig(setup: RigSetup) -> None:

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from bench.aarch64.sysroot import PYTHON, Sysroot
-from bench.made_once import made_once
+from bench.cached import made_once
 from tests.hosts.board_image import MIRROR, SUITE, run
 from tests.hosts.debian import cache
 from tests.hosts.rig import ROOT
@@ -87,13 +87,17 @@ def started(
         stdin=subprocess.DEVNULL,
     ) as board:
         try:
-            while END not in (said := log.read_text(errors="replace") if log.exists() else ""):
-                if board.poll() is not None or "Kernel panic" in said or time.monotonic() - begin > timeout_s:
-                    raise RuntimeError(f"the board's program did not end:\n{said[-3000:]}")
+            while END not in (output := log.read_text(errors="replace") if log.exists() else ""):
+                if (
+                    board.poll() is not None
+                    or "Kernel panic" in output
+                    or time.monotonic() - begin > timeout_s
+                ):
+                    raise RuntimeError(f"the board's program did not end:\n{output[-3000:]}")
                 time.sleep(0.5)
         finally:
             board.kill()
-    return said, time.monotonic() - begin
+    return output, time.monotonic() - begin
 
 
 def _kernel() -> tuple[Path, Path]:

@@ -50,9 +50,9 @@ def test_frames_flow(rig: BoardRig, told: Measured) -> None:
 
 
 def test_settings_are_in_the_camera(rig: BoardRig) -> None:
-    said = rig.board.run(f"/opt/phalanx/current/bin/python - <<'END'\n{READ}\nEND")
-    assert "'gain': 100" in said, said
-    assert "'gain_automatic': 0" in said, said
+    output = rig.board.run(f"/opt/phalanx/current/bin/python - <<'END'\n{READ}\nEND")
+    assert "'gain': 100" in output, output
+    assert "'gain_automatic': 0" in output, output
 
 
 def test_a_camera_that_is_unplugged_is_opened_again(rig: BoardRig, told: Measured) -> None:

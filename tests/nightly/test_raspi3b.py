@@ -10,12 +10,12 @@ from tests.programs import needs
 
 def test_the_doctor_of_a_slave_says_what_the_board_has_and_lacks(tmp_path: Path, told: Measured) -> None:
     needs("qemu-system-aarch64")
-    said, seconds = started(sysroot_or_skip(), tmp_path)
+    output, seconds = started(sysroot_or_skip(), tmp_path)
     told("raspi3b, from power to the doctor's last word", seconds)
-    assert "Raspberry Pi 3 Model B" in said
-    assert "aarch64 4" in said
-    assert "PHALANX-DOCTOR 1" in said, said  # it has neither camera nor master: it says so, and fails
-    doctor = said[said.index("PHALANX-DOCTOR") :]
+    assert "Raspberry Pi 3 Model B" in output
+    assert "aarch64 4" in output
+    assert "PHALANX-DOCTOR 1" in output, output  # it has neither camera nor master: it says so, and fails
+    doctor = output[output.index("PHALANX-DOCTOR") :]
     for name in ("numpy", "cv2", "zenoh"):
         assert name in doctor, doctor
     assert "/dev/video0" in doctor, doctor

@@ -29,9 +29,9 @@ class Take:
         """Markers (T, M, 3) [m] that a replay of the videos finds, unfiltered; what it printed."""
         videos = [str(self.folder / f"{camera}.avi") for camera in ("left", "right")]
         tree, out = str(self.folder / "calib"), self.folder / "out"
-        said = command("deploy", "replay", *videos, "--calibration", tree, "--out", str(out), *options)
+        output = command("deploy", "replay", *videos, "--calibration", tree, "--out", str(out), *options)
         with np.load(out / "poses.npz") as poses:
-            return poses["markers_raw_m"], said
+            return poses["markers_raw_m"], output
 
     def off_mm(self, markers: Float) -> float:
         """Median distance from the true caps [mm]."""
@@ -81,6 +81,6 @@ def take(datasets: Path, tmp_path_factory: pytest.TempPathFactory) -> Take:
 
 
 def test_a_hand_in_videos_with_times_is_where_it_is(take: Take) -> None:
-    markers, said = take.replay("--times", str(take.folder / "times.csv"))
+    markers, output = take.replay("--times", str(take.folder / "times.csv"))
     assert take.off_mm(markers) < 3.0
-    assert "simultaneous" not in said
+    assert "simultaneous" not in output

@@ -68,10 +68,10 @@ def replays(datasets: Path, root: Path, tmp_path_factory: pytest.TempPathFactory
 
 
 @pytest.mark.parametrize("name", HANDS)
-def test_every_triple_becomes_a_pose(replays: dict[str, Replay], name: str) -> None:
+def test_every_cycle_becomes_a_pose(replays: dict[str, Replay], name: str) -> None:
     summary, count = replays[name].summary, len(replays[name].truth()["angles"])
     assert summary["poses"] == count
-    assert summary["triples_missed"] == summary["lost"] == 0
+    assert summary["cycles_missed"] == summary["lost"] == 0
     poses = load_poses(replays[name].out / "poses.npz")
     assert poses.marker_count == 0
     assert (np.diff(poses.t_ns) > 0).all()
@@ -111,7 +111,7 @@ def test_fingertips_are_not_invented(replays: dict[str, Replay], name: str) -> N
 def by_laser_alone(replay: Replay, root: Path, out: Path) -> Replay:
     """The same detections, solved at level fk."""
     files = ["--hand", str(replay.hand), "--detections", str(replay.out), "--out", str(out)]
-    command(root, "master", "solve", str(replay.recording), *files, "--level", "fk")
+    command(root, "master", "solve", str(replay.recording), *files, "--solver-mode", "fk")
     return replace(replay, out=out)
 
 
@@ -203,5 +203,5 @@ def test_of_exact_detections_the_master_leaves_nothing(datasets: Path, tmp_path:
     assert isinstance(summary["laser_mm"], float)
     assert summary["laser_mm"] < 0.02  # a ray through the true centroid meets the plane in the true point
     assert summary["laser_right"] == 1.0
-    assert summary["laser_missed"] == summary["triples_missed"] == 0.0
+    assert summary["laser_missed"] == summary["cycles_missed"] == 0.0
     assert (summary["tip_px"], summary["tip_within_6px"], summary["tip_false"]) == (0.0, 1.0, 0.0)

@@ -102,7 +102,7 @@ class Sensor:
     breaks_at: frozenset[int] = frozenset()
     dropped: frozenset[int] = frozenset()
     sync_ready_at: int | None = 30
-    sync_heard_at: int = 10
+    sync_received_at: int = 10
     adjust: Callable[[dict[str, Any]], None] = lambda _configuration: None
     loses: int = 0
     fails: frozenset[str] = frozenset()
@@ -331,7 +331,7 @@ class Picamera2:
     def _sync_of(self, number: int, client: bool) -> dict[str, Any]:
         ready_at = self._sensor.sync_ready_at
         found: dict[str, Any] = {"SyncReady": ready_at is not None and number >= ready_at}
-        if not client or (ready_at is not None and number >= self._sensor.sync_heard_at):
+        if not client or (ready_at is not None and number >= self._sensor.sync_received_at):
             found["SyncTimer"] = ((ready_at or 10**6) - number) * 16_667 - 37
         return found
 

@@ -14,7 +14,7 @@ from common.calibration import CameraCalibration, HandProfile, HsvRange, RigCali
 from common.sim.desk import desk_image
 from common.sim.render import Renderer
 from common.sim.scene import DESK_DEPTH_M, Scene
-from common.srgb import relit_bytes
+from common.srgb import gain_tables
 from slave.markers.classify import in_range
 
 TREE = Path(__file__).resolve().parents[2] / "calib_json"
@@ -95,9 +95,9 @@ def cluttered(frames: Moving) -> Moving:
     return each(change, frames)
 
 
-def relit(*gains: float) -> Change:
+def white_balanced(*gains: float) -> Change:
     """Another white balance or exposure: linear light times gains of blue, green, red."""
-    tables = relit_bytes(gains)
+    tables = gain_tables(gains)
 
     def change(image: Image, _k: int) -> Image:
         return np.stack([tables[c][image[..., c]] for c in range(3)], axis=-1)
@@ -141,10 +141,10 @@ def with_watch(frames: Moving) -> Moving:
     lilac = np.asarray(cv2.cvtColor(np.array([[(126, 200, 180)]], np.uint8), cv2.COLOR_HSV2BGR))[0, 0]
 
     def change(image: Image, k: int) -> Image:
-        worn = image.copy()
+        faded = image.copy()
         u, v = np.round(frames.uv[k, NAMES.index("back")]).astype(int)
-        cv2.rectangle(worn, (u - 9, v + 38), (u + 9, v + 48), [int(c) for c in lilac], -1)
-        return worn
+        cv2.rectangle(faded, (u - 9, v + 38), (u + 9, v + 48), [int(c) for c in lilac], -1)
+        return faded
 
     return each(change, frames)
 

@@ -33,7 +33,7 @@ class Disc:
     radius: float
 
 
-def paint(marker: int) -> tuple[int, int, int]:
+def marker_hsv(marker: int) -> tuple[int, int, int]:
     return (HUE[marker], 180, 150)
 
 
@@ -81,12 +81,12 @@ def render(
 
 def finger(marker: int, u: float, v: float, radius: float = 7.0) -> list[Disc]:
     """A cap with skin below it, as on a finger pointing up."""
-    return [Disc(SKIN, u, v + 0.9 * radius, 1.15 * radius), Disc(paint(marker), u, v, radius)]
+    return [Disc(SKIN, u, v + 0.9 * radius, 1.15 * radius), Disc(marker_hsv(marker), u, v, radius)]
 
 
 def hand(u: float = 300.0, v: float = 200.0) -> list[Disc]:
     """Six markers of a hand whose back is at (u, v)."""
-    discs = [Disc(SKIN, u, v, 40.0), Disc(paint(5), u, v, 16.0)]
+    discs = [Disc(SKIN, u, v, 40.0), Disc(marker_hsv(5), u, v, 16.0)]
     for m, (x, y) in enumerate([(-70, -30), (-35, -90), (-8, -102), (18, -92), (42, -66)]):
         discs += finger(m, u + x, v + y)
     return discs

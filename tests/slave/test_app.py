@@ -10,9 +10,9 @@ from common.errors import BusError, CameraError
 from common.messages import Command, Health, MarkerDetections, Message
 from slave.app import run, wait_for_start
 from slave.cameras.source import Frame
+from slave.counters import Counters
 from slave.markers.detector import MarkerDetector
 from slave.report import ALONE_AT, Reporter
-from slave.tally import Tally
 from tests.slave.painted import CENTRES, NAMES, camera, hand, render
 
 DETECTOR = MarkerDetector(camera(), NAMES)
@@ -63,14 +63,14 @@ def frame(seq: int, image: np.ndarray) -> Frame:
 def test_the_scatter_of_a_stamp_travels_with_it() -> None:
     wire = Wire()
     source = Source([replace(frame(3, HAND), t_sigma_ns=1.2e6), frame(4, HAND)])
-    run(source, DETECTOR.fresh(), wire, "left", Tally(NAMES), threading.Event())
+    run(source, DETECTOR.fresh(), wire, "left", Counters(NAMES), threading.Event())
     assert [m.t_sigma_ns for m in wire.sent] == [1.2e6, 0.0]
 
 
 def test_every_frame_is_sent_with_its_times_the_empty_ones_too() -> None:
-    wire, tally = Wire(), Tally(NAMES)
+    wire, counters = Wire(), Counters(NAMES)
     source = Source([frame(3, HAND), frame(4, EMPTY), frame(7, HAND)])
-    run(source, DETECTOR.fresh(), wire, "left", tally, threading.Event())
+    run(source, DETECTOR.fresh(), wire, "left", counters, threading.Event())
     assert [(m.camera, m.session, m.seq, m.t_ns, m.ready_t_ns) for m in wire.sent] == [
         ("left", 77, 3, 48_000_000, 48_000_005),
         ("left", 77, 4, 64_000_000, 64_000_005),
@@ -80,14 +80,14 @@ def test_every_frame_is_sent_with_its_times_the_empty_ones_too() -> None:
     assert np.isnan(wire.sent[1].uv).all()
     assert (wire.sent[0].sigma_px > 0.0).all()
     assert np.isnan(wire.sent[1].sigma_px).all()
-    counts = tally.counts()
+    counts = counters.counts()
     assert (counts["frames"], counts["dropped"], counts["empty"], counts["seen.back"]) == (3, 2, 1, 2)
 
 
 def test_the_loop_ends_when_told_and_passes_a_lost_camera_on() -> None:
     wire, stop = Wire(), threading.Event()
     stop.set()
-    run(Source([frame(0, HAND)]), DETECTOR.fresh(), wire, "left", Tally(NAMES), stop)
+    run(Source([frame(0, HAND)]), DETECTOR.fresh(), wire, "left", Counters(NAMES), stop)
     assert wire.sent == []
     with pytest.raises(CameraError, match="unplugged"):
         run(
@@ -95,7 +95,7 @@ def test_the_loop_ends_when_told_and_passes_a_lost_camera_on() -> None:
             DETECTOR.fresh(),
             wire,
             "left",
-            Tally(NAMES),
+            Counters(NAMES),
             threading.Event(),
         )
 
@@ -108,21 +108,21 @@ def test_the_barrier_opens_with_the_start_and_with_stop() -> None:
 
 
 def test_gauges_speak_of_the_time_since_the_last_look() -> None:
-    tally = Tally(NAMES)
+    counters = Counters(NAMES)
     for seq in range(4):
-        tally.frame(seq, 2_000_000 + seq, CENTRES)
-    first = tally.gauges()
+        counters.frame(seq, 2_000_000 + seq, CENTRES)
+    first = counters.metrics()
     assert first["rate_hz"] > 0.0
     assert first["detect_us"] == pytest.approx(2000.0, rel=0.01)
     assert first["detect_worst_us"] == pytest.approx(2000.003)
-    second = tally.gauges()
+    second = counters.metrics()
     assert second["rate_hz"] == 0.0
     assert second["detect_worst_us"] == 0.0
 
 
 def test_health_is_published_and_commands_are_answered_once_the_bus_is_known() -> None:
-    hub, wire, tally, stop = LoopbackBus(), Wire(), Tally(NAMES), threading.Event()
-    tally.frame(0, 1_000_000, CENTRES)
+    hub, wire, counters, stop = LoopbackBus(), Wire(), Counters(NAMES), threading.Event()
+    counters.frame(0, 1_000_000, CENTRES)
     asked: list[str] = []
 
     def connect(endpoint: str) -> LoopbackBus:
@@ -130,7 +130,7 @@ def test_health_is_published_and_commands_are_answered_once_the_bus_is_known() -
         return hub.join()
 
     listener = hub.subscribe("health")
-    reporter = Reporter("left", wire, tally, SystemClock(), connect, stop.set, period_s=0.01)
+    reporter = Reporter("left", wire, counters, SystemClock(), connect, stop.set, period_s=0.01)
     try:
         assert listener.get(0.05) is None  # no endpoint, no bus
         wire.zenoh_endpoint = "tcp/127.0.0.1:1"
@@ -166,7 +166,7 @@ def test_a_bus_that_cannot_be_opened_is_tried_again_and_never_ends_the_slave() -
         return hub.join()
 
     listener = hub.subscribe("health")
-    reporter = Reporter("left", wire, Tally(NAMES), SystemClock(), connect, lambda: None, period_s=0.01)
+    reporter = Reporter("left", wire, Counters(NAMES), SystemClock(), connect, lambda: None, period_s=0.01)
     try:
         assert isinstance(listener.get(60.0), Health)
         assert len(tries) == 3
@@ -175,7 +175,7 @@ def test_a_bus_that_cannot_be_opened_is_tried_again_and_never_ends_the_slave() -
 
 
 @pytest.mark.parametrize(
-    ("counts", "said"),
+    ("counts", "output"),
     [
         ({"sent": 0}, "no master heard yet"),
         ({"refused.foreign": 5}, "of another rig key"),
@@ -185,7 +185,7 @@ def test_a_bus_that_cannot_be_opened_is_tried_again_and_never_ends_the_slave() -
     ],
 )
 def test_a_slave_without_a_master_says_what_it_hears(
-    counts: dict[str, int], said: str, caplog: pytest.LogCaptureFixture
+    counts: dict[str, int], output: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     wire = Wire()
     wire.counts = counts
@@ -197,18 +197,18 @@ def test_a_slave_without_a_master_says_what_it_hears(
         assert looked.wait(60.0)
     finally:
         reporter.close()
-    assert said in caplog.text
+    assert output in caplog.text
 
 
-class Seen(Tally):
+class Seen(Counters):
     """Figures that tell when they have been read often enough for the slave to have spoken."""
 
     def __init__(self, looked: threading.Event) -> None:
         super().__init__(NAMES)
         self._looked, self._left = looked, ALONE_AT + 2
 
-    def gauges(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         self._left -= 1
         if self._left == 0:
             self._looked.set()
-        return super().gauges()
+        return super().metrics()

@@ -46,7 +46,7 @@ def test_help_of_all_lists_every_command(capsys: pytest.CaptureFixture[str]) -> 
 
 
 @pytest.mark.parametrize(
-    ("option", "text", "says"),
+    ("option", "text", "expected"),
     [
         ("--queue-mb", "abc", "abc: must be a number"),
         ("--queue-mb", "-1", "must not be negative"),
@@ -59,13 +59,13 @@ def test_help_of_all_lists_every_command(capsys: pytest.CaptureFixture[str]) -> 
     ],
 )
 def test_a_wrong_number_is_named_and_no_function_is(
-    option: str, text: str, says: str, capsys: pytest.CaptureFixture[str]
+    option: str, text: str, expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:
         parser().parse_args([*RECORD, f"{option}={text}"])
     assert ended.value.code == 2
     error = capsys.readouterr().err
-    assert says in error
+    assert expected in error
     assert option in error
     assert " _" not in error
 

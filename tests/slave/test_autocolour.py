@@ -16,7 +16,7 @@ from common.calibration import CameraCalibration, HsvRange, load
 from common.errors import CalibrationError, FitError, RecordingError
 from common.sim.record import record_scene
 from slave.__main__ import main
-from slave.markers.autocolour import Namer, Paint, calibrate_moving
+from slave.markers.autocolour import MarkerColour, Namer, calibrate_moving
 from slave.markers.autocolour_names import by_clicks, by_hand, by_hues, checked, pattern_of, votes_of
 from slave.markers.colours import calibrate, report
 from slave.markers.detector import MarkerDetector
@@ -34,10 +34,10 @@ from tests.slave.moving_hand import (
     noisy,
     on_wood,
     own_and_foreign,
-    relit,
     repainted,
     scene,
     seconds,
+    white_balanced,
     with_watch,
 )
 from tests.slave.test_marker_datasets import truth_of
@@ -63,15 +63,15 @@ def plain(frames: Moving) -> Moving:
 
 
 def warm(frames: Moving) -> Moving:
-    return relit(0.6, 0.9, 1.15)(cluttered(frames))
+    return white_balanced(0.6, 0.9, 1.15)(cluttered(frames))
 
 
 def cold(frames: Moving) -> Moving:
-    return relit(1.35, 1.0, 0.7)(cluttered(frames))
+    return white_balanced(1.35, 1.0, 0.7)(cluttered(frames))
 
 
 def dark(frames: Moving) -> Moving:
-    return noisy(3.0)(relit(0.5, 0.5, 0.5)(frames))
+    return noisy(3.0)(white_balanced(0.5, 0.5, 0.5)(frames))
 
 
 @pytest.mark.parametrize(
@@ -136,10 +136,10 @@ def test_things_of_a_paints_colour_on_the_desk_are_counted() -> None:
 
 
 def test_what_was_found_is_said() -> None:
-    said: list[str] = []
-    calibrate_moving(opening().images, NAMES, by_hand(HANDS["right"], NAMES, said.append), said.append)
-    assert sum(line.startswith("paint of hue") for line in said) == 6
-    assert any("votes" in line for line in said)
+    output: list[str] = []
+    calibrate_moving(opening().images, NAMES, by_hand(HANDS["right"], NAMES, output.append), output.append)
+    assert sum(line.startswith("paint of hue") for line in output) == 6
+    assert any("votes" in line for line in output)
 
 
 def stopped(frames: Moving) -> Moving:
@@ -177,8 +177,8 @@ def test_a_few_frames_are_not_enough() -> None:
 def test_a_turned_and_scaled_hand_votes_for_its_order(
     order: list[int], angle: float, scale: float, hidden: int | None
 ) -> None:
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    uv = (scale * PATTERN @ turn.T + 300.0)[None, order].copy()
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    uv = (scale * PATTERN @ rotation.T + 300.0)[None, order].copy()
     if hidden is not None:
         uv[0, hidden] = np.nan
     votes, against = votes_of(uv, PATTERN, ORDERS)
@@ -203,12 +203,12 @@ def ranges_at(*hues: float) -> dict[str, HsvRange]:
     }
 
 
-def paints_at(*hues: float) -> list[Paint]:
-    return [Paint(hue % 180.0, ()) for hue in hues]
+def colours_at(*hues: float) -> list[MarkerColour]:
+    return [MarkerColour(hue % 180.0, ()) for hue in hues]
 
 
-def named(namer: Namer, paints: list[Paint]) -> tuple[str, ...]:
-    return namer(paints, np.full((1, len(paints), 2), np.nan))
+def named(namer: Namer, colours: list[MarkerColour]) -> tuple[str, ...]:
+    return namer(colours, np.full((1, len(colours), 2), np.nan))
 
 
 @given(st.floats(-11.0, 11.0), st.permutations(range(6)))
@@ -216,15 +216,15 @@ def test_names_by_hue_survive_another_lamp(shift: float, order: list[int]) -> No
     hues = (92.0, 68.0, 113.0, 136.0, 172.0, 4.0)
     shifted = [hues[k] + shift for k in order]  # across 0 and 180, too
     namer = by_hues(ranges_at(*hues), NAMES, "old.json")
-    assert named(namer, paints_at(*shifted)) == tuple(NAMES[k] for k in order)
+    assert named(namer, colours_at(*shifted)) == tuple(NAMES[k] for k in order)
 
 
 def test_hues_that_fit_in_two_orders_name_nothing() -> None:
     even = tuple(30.0 * k for k in range(6))
     namer = by_hues(ranges_at(*even), NAMES, "old.json")
-    assert named(namer, paints_at(*even)) == NAMES
+    assert named(namer, colours_at(*even)) == NAMES
     with pytest.raises(FitError, match=r"old.json: its hues fit in two orders"):
-        named(namer, paints_at(*(h + 14.0 for h in even)))
+        named(namer, colours_at(*(h + 14.0 for h in even)))
     with pytest.raises(CalibrationError, match="no range for thumb, index"):
         by_hues(None, NAMES, "old.json")
 
@@ -245,21 +245,21 @@ def test_too_few_or_too_many_markers_need_another_way_to_be_named(names: tuple[s
     mounts = profile.markers | dict.fromkeys(names[6:], profile.markers["back"])
     namer = by_hand(msgspec.structs.replace(profile, markers=mounts), names)
     with pytest.raises(FitError, match=f"{len(names)} markers cannot be named from the shape"):
-        named(namer, [Paint(20.0 * k, ()) for k in range(len(names))])
+        named(namer, [MarkerColour(20.0 * k, ()) for k in range(len(names))])
 
 
 def test_names_that_the_shape_of_the_hand_contradicts_are_refused() -> None:
-    said: list[str] = []
+    output: list[str] = []
     unsure = by_hand(HANDS["right"], NAMES[:4])
-    paints = paints_at(92.0, 68.0, 113.0, 136.0, 172.0, 42.0)
+    colours = colours_at(92.0, 68.0, 113.0, 136.0, 172.0, 42.0)
     hues = by_hues(ranges_at(92.0, 68.0, 113.0, 136.0, 172.0, 42.0), NAMES, "old.json")
-    assert named(checked(hues, lambda _paints, _uv: NAMES, said.append), paints) == NAMES
-    assert said == []
-    assert named(checked(hues, unsure, said.append), paints) == NAMES
-    assert "not checked" in said[0]
+    assert named(checked(hues, lambda _colours, _uv: NAMES, output.append), colours) == NAMES
+    assert output == []
+    assert named(checked(hues, unsure, output.append), colours) == NAMES
+    assert "not checked" in output[0]
     swapped = ("index", "thumb", *NAMES[2:])
     with pytest.raises(FitError, match=r"hue 92: thumb or index, hue 68: index or thumb"):
-        named(checked(hues, lambda _paints, _uv: swapped, said.append), paints)
+        named(checked(hues, lambda _colours, _uv: swapped, output.append), colours)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from common.errors import FitError
 from slave.markers.classify import HUES
 from slave.markers.colours import calibrate, circular_median, grow, report
 from slave.offline import calibrate_colours
-from tests.slave.painted import CENTRES, HUE, NAMES, Disc, hand, linear, paint, render
+from tests.slave.painted import CENTRES, HUE, NAMES, Disc, hand, linear, marker_hsv, render
 
 IMAGE = render(hand(), noise=2.0)
 CLICKS = {n: (300.0 + x, 200.0 + y) for n, (x, y) in zip(NAMES, CENTRES.tolist(), strict=True)}
@@ -46,7 +46,7 @@ def test_a_hue_at_the_wrap_gives_a_range_that_wraps() -> None:
 
 
 def test_clutter_of_a_markers_colour_is_reported() -> None:
-    image = render([*hand(), Disc(paint(1), 560.0, 120.0, 60.0)])
+    image = render([*hand(), Disc(marker_hsv(1), 560.0, 120.0, 60.0)])
     rows = {r.name: r for r in calibrate(image, CLICKS)}
     assert rows["index"].background > 0.02
     text = report(list(rows.values()))
@@ -93,10 +93,10 @@ def test_two_paints_of_one_hue_are_refused() -> None:
 
 
 @given(st.lists(st.integers(0, 20), min_size=1, max_size=30), st.integers(0, 179))
-def test_the_circular_median_turns_with_the_hues(values: list[int], turn: int) -> None:
+def test_the_circular_median_turns_with_the_hues(values: list[int], rotation: int) -> None:
     hues = np.array(values, np.uint8)
-    turned = ((np.array(values) + turn) % HUES).astype(np.uint8)
-    difference = (circular_median(turned) - circular_median(hues) - turn) % HUES
+    rotated = ((np.array(values) + rotation) % HUES).astype(np.uint8)
+    difference = (circular_median(rotated) - circular_median(hues) - rotation) % HUES
     assert min(difference, HUES - difference) == pytest.approx(0.0, abs=1e-6)
     assert circular_median(hues) % HUES == pytest.approx(float(np.median(values)) % HUES, abs=1e-6)
 
@@ -125,7 +125,7 @@ def test_the_reference_is_the_paints_colour_in_linear_light() -> None:
 
 
 def test_background_that_may_look_like_a_marker_is_warned_of() -> None:
-    pen = Disc(paint(2), 560.0, 120.0, 5.0)  # 80 px: too few for a collision in share
+    pen = Disc(marker_hsv(2), 560.0, 120.0, 5.0)  # 80 px: too few for a collision in share
     text = report(calibrate(render([*hand(), pen]), CLICKS))
     assert "no collisions" in text
     assert "warning: middle: 8" in text or "warning: middle: 7" in text

@@ -6,10 +6,10 @@ import pytest
 from common.arrays import Image
 from common.calibration import HsvRange
 from slave.markers.detector import Detections, MarkerDetector
-from tests.slave.painted import CENTRES, NAMES, RANGES, Disc, camera, finger, hand, paint, render
+from tests.slave.painted import CENTRES, NAMES, RANGES, Disc, camera, finger, hand, marker_hsv, render
 
 STEP_NS = 16_666_667
-MUG = [Disc(paint(1), 560.0, 120.0, 17.0)]
+MUG = [Disc(marker_hsv(1), 560.0, 120.0, 17.0)]
 DETECTOR = MarkerDetector(camera(), NAMES)
 
 
@@ -31,8 +31,8 @@ def test_six_markers_of_a_hand_are_found_whole_and_certain() -> None:
 def test_each_is_measured_as_it_would_be_in_its_own_window() -> None:
     image = render(hand())
     tracked = push_all([render(hand(295.0, 200.0)), image])[1]
-    afresh = push_all([image])[0]
-    np.testing.assert_array_equal(tracked.uv, afresh.uv)
+    reinitialise = push_all([image])[0]
+    np.testing.assert_array_equal(tracked.uv, reinitialise.uv)
 
 
 def test_a_missing_marker_is_nan_in_all_and_the_others_are_what_they_were() -> None:
@@ -48,8 +48,8 @@ def test_a_missing_marker_is_nan_in_all_and_the_others_are_what_they_were() -> N
 
 
 def test_a_lost_marker_comes_back_anywhere_on_the_hand_in_the_first_frame_that_shows_it() -> None:
-    without = render([d for d in hand() if d.hsv != paint(2)])
-    moved = [d for d in hand(240.0, 260.0) if d.hsv != paint(2)] + finger(2, 300.0, 170.0)
+    without = render([d for d in hand() if d.hsv != marker_hsv(2)])
+    moved = [d for d in hand(240.0, 260.0) if d.hsv != marker_hsv(2)] + finger(2, 300.0, 170.0)
     frames = push_all([render(hand())] + [without] * 60 + [render(moved)])
     assert np.isnan(frames[60].uv[2]).all()
     assert np.hypot(*(frames[61].uv[2] - (300.0, 170.0))) < 0.3
@@ -67,14 +67,14 @@ def test_a_mug_of_the_same_colour_is_not_the_marker() -> None:
 
 
 def test_a_mug_is_not_taken_for_a_hidden_marker() -> None:
-    without = [d for d in hand() if d.hsv != paint(1)]
+    without = [d for d in hand() if d.hsv != marker_hsv(1)]
     for found in push_all([render(hand() + MUG), *[render(without + MUG)] * 60]):
         assert not np.hypot(*(found.uv[1] - (560.0, 120.0))) < 30.0
 
 
 def test_a_mug_near_a_fist_is_not_a_marker() -> None:
-    fist = [Disc((12, 100, 200), 300.0, 200.0, 40.0), Disc(paint(5), 300.0, 200.0, 16.0)]
-    (found,) = push_all([render([*fist, Disc(paint(1), 400.0, 180.0, 15.0)])])
+    fist = [Disc((12, 100, 200), 300.0, 200.0, 40.0), Disc(marker_hsv(5), 300.0, 200.0, 16.0)]
+    (found,) = push_all([render([*fist, Disc(marker_hsv(1), 400.0, 180.0, 15.0)])])
     assert np.isfinite(found.uv[5]).all()
     assert np.isnan(found.uv[1]).all()
 
@@ -91,7 +91,7 @@ def test_clicks_decide_where_two_hands_show_the_same_colours() -> None:
 
 def test_a_single_marker_without_a_hand_is_found_from_30_to_23000_px() -> None:
     for radius in (4.0, 12.0, 40.0, 85.0):
-        (found,) = push_all([render([Disc(paint(1), 300.0, 240.0, radius)])])
+        (found,) = push_all([render([Disc(marker_hsv(1), 300.0, 240.0, radius)])])
         assert found.uv[1] == pytest.approx((300.0, 240.0), abs=0.1)
         assert np.isnan(found.uv[[0, 2, 3, 4, 5]]).all()
 
@@ -116,37 +116,37 @@ def test_a_marker_first_seen_half_hidden_is_measured_as_it_is() -> None:
 
 
 def test_a_rival_of_the_same_colour_within_reach_is_named() -> None:
-    second = [Disc(paint(1), 245.0, 145.0, 7.0)]
+    second = [Disc(marker_hsv(1), 245.0, 145.0, 7.0)]
     frames = push_all([render(hand())] * 2 + [render(hand() + second)] * 2)
-    assert np.isnan(frames[1].rival_uv).all()
+    assert np.isnan(frames[1].alt_uv).all()
     for found in frames[2:]:
         assert (off(found, 300.0, 200.0)[[0, 1, 3, 4, 5]] < 0.3).all()
-        assert np.hypot(*(found.rival_uv[1] - (245.0, 145.0))) < 0.5
-        assert np.isnan(found.rival_uv[[0, 3, 4, 5]]).all()
+        assert np.hypot(*(found.alt_uv[1] - (245.0, 145.0))) < 0.5
+        assert np.isnan(found.alt_uv[[0, 3, 4, 5]]).all()
 
 
 @pytest.mark.parametrize("radius", [5.0, 7.0])
 @pytest.mark.parametrize("gap", [6.0, 9.0, 12.0])
-@pytest.mark.parametrize("turn", [-2.8, 3.6, 4.2])
-def test_a_thing_beside_a_marker_never_seen_before_is_its_rival_not_a_part_of_it(
-    radius: float, gap: float, turn: float
+@pytest.mark.parametrize("angle", [-2.8, 3.6, 4.2])
+def test_a_thing_near_a_marker_never_seen_before_is_an_alternative_not_a_part_of_it(
+    radius: float, gap: float, angle: float
 ) -> None:
-    away = 7.0 + gap + radius
-    thing = 265.0 + away * math.cos(turn), 110.0 + away * math.sin(turn)
-    for found in push_all([render([*hand(), Disc(paint(1), *thing, radius)])] * 2):
-        place, rival = (np.hypot(*(uv[1] - (265.0, 110.0))) for uv in (found.uv, found.rival_uv))
-        assert min(place, rival) < 0.3
-        assert np.hypot(*(found.rival_uv[1] - thing)) < 0.3 or np.hypot(*(found.uv[1] - thing)) < 0.3
+    connection_lost = 7.0 + gap + radius
+    thing = 265.0 + connection_lost * math.cos(angle), 110.0 + connection_lost * math.sin(angle)
+    for found in push_all([render([*hand(), Disc(marker_hsv(1), *thing, radius)])] * 2):
+        place, alternative = (np.hypot(*(uv[1] - (265.0, 110.0))) for uv in (found.uv, found.alt_uv))
+        assert min(place, alternative) < 0.3
+        assert np.hypot(*(found.alt_uv[1] - thing)) < 0.3 or np.hypot(*(found.uv[1] - thing)) < 0.3
 
 
 def test_a_piece_split_off_is_joined_in_doubt_where_the_whole_is_not_known() -> None:
-    whole, empty = render([Disc(paint(1), 300.0, 240.0, 30.0)]), render([])
+    whole, empty = render([Disc(marker_hsv(1), 300.0, 240.0, 30.0)]), render([])
     split = whole.copy()
     split[242:258] = empty[242:258]  # something in front, across the cap
     new, known = push_all([split])[0], push_all([whole, whole, split])[2]
     for found in (new, known):
         assert np.hypot(*(found.uv[1] - (300.0, 240.0))) < 6.0  # 12 px without the piece
-        assert np.isnan(found.rival_uv[1]).all()
+        assert np.isnan(found.alt_uv[1]).all()
     assert new.sigma_px[1] > 3.0
     assert known.sigma_px[1] < 0.8 * new.sigma_px[1]
 
@@ -173,7 +173,7 @@ def test_a_frame_of_another_size_or_kind_is_refused() -> None:
         DETECTOR.fresh().push(np.zeros((480, 640, 3), np.float32), 0)  # pyright: ignore[reportArgumentType]
 
 
-def test_a_free_marker_is_found_wherever_it_lies_beside_a_hand_or_alone() -> None:
+def test_a_free_marker_is_found_wherever_it_lies_next_to_a_hand_or_alone() -> None:
     ranges = {**RANGES, "puck": HsvRange(hsv_low=(0, 150, 40), hsv_high=(4, 255, 255))}
     names = (*NAMES, "puck")
     puck = (2, 230, 180)

@@ -11,12 +11,12 @@ OVER = 8
 
 
 def covered_ellipse(
-    a: float, b: float, turn: float, u: float, v: float, share: float, side: float
+    a: float, b: float, rotation: float, u: float, v: float, share: float, side: float
 ) -> tuple[np.ndarray, float, float]:
     """Shares of an ellipse whose outermost `share` on the side `side` is covered, and the centroid of the rest."""
     fine = (np.arange(48 * OVER) + 0.5) / OVER - 0.5
     x, y = np.meshgrid(fine, fine)
-    c, s = math.cos(turn), math.sin(turn)
+    c, s = math.cos(rotation), math.sin(rotation)
     p, q = (c * (x - u) + s * (y - v)) / a, (c * (y - v) - s * (x - u)) / b
     inside = p * p + q * q <= 1.0
     along = p * math.cos(side) + q * math.sin(side)
@@ -25,8 +25,8 @@ def covered_ellipse(
     return shares, float(x[inside].mean()), float(y[inside].mean())
 
 
-def moments(a: float, b: float, turn: float) -> Ellipse:
-    c, s = math.cos(turn), math.sin(turn)
+def moments(a: float, b: float, rotation: float) -> Ellipse:
+    c, s = math.cos(rotation), math.sin(rotation)
     xx, yy = a * a / 4.0, b * b / 4.0
     return Ellipse(c * c * xx + s * s * yy, c * s * (xx - yy), s * s * xx + c * c * yy)
 
@@ -39,15 +39,15 @@ def moments(a: float, b: float, turn: float) -> Ellipse:
     st.floats(0.0, 2.0 * math.pi),
 )
 def test_the_centre_of_a_covered_ellipse_is_found_from_its_own_edge(
-    a: float, aspect: float, turn: float, share: float, side: float
+    a: float, aspect: float, rotation: float, share: float, side: float
 ) -> None:
     u, v = 24.3, 23.6
-    shares, seen_u, seen_v = covered_ellipse(a, a * aspect, turn, u, v, share, side)
-    found = centre_of(shares, moments(a, a * aspect, turn), seen_u, seen_v)
+    shares, seen_u, seen_v = covered_ellipse(a, a * aspect, rotation, u, v, share, side)
+    found = centre_of(shares, moments(a, a * aspect, rotation), seen_u, seen_v)
     assert found is not None
-    away = math.hypot(found.u - u, found.v - v)
-    assert away < 0.3
-    assert away < 0.6 * math.hypot(seen_u - u, seen_v - v)
+    connection_lost = math.hypot(found.u - u, found.v - v)
+    assert connection_lost < 0.3
+    assert connection_lost < 0.6 * math.hypot(seen_u - u, seen_v - v)
 
 
 @given(
@@ -58,11 +58,11 @@ def test_the_centre_of_a_covered_ellipse_is_found_from_its_own_edge(
     st.floats(0.0, 2.0 * math.pi),
 )
 def test_a_straight_edge_explains_the_way_that_it_makes_and_not_twice_as_far(
-    a: float, aspect: float, turn: float, share: float, side: float
+    a: float, aspect: float, rotation: float, share: float, side: float
 ) -> None:
-    _, seen_u, seen_v = covered_ellipse(a, a * aspect, turn, 24.3, 23.6, share, side)
+    _, seen_u, seen_v = covered_ellipse(a, a * aspect, rotation, 24.3, 23.6, share, side)
     du, dv = 24.3 - seen_u, 23.6 - seen_v
-    shape = moments(a, a * aspect, turn)
+    shape = moments(a, a * aspect, rotation)
     assert explained(share, shape, du, dv)
     assert not explained(share, shape, 2.0 * du + math.copysign(1.5, du), 2.0 * dv + math.copysign(1.5, dv))
 
@@ -90,7 +90,7 @@ def test_moments_of_nothing_are_refused(shape: Ellipse) -> None:
     assert centre_of(shares, shape, u, v) is None
 
 
-def test_a_crescent_whose_centroid_lies_beside_its_paint_is_no_answer() -> None:
+def test_a_crescent_whose_centroid_lies_next_to_its_marker_is_no_answer() -> None:
     y, x = np.mgrid[0:48, 0:48]
     far = np.hypot(x - 24.0, y - 24.0)
     shares = ((far > 9.0) & (far < 11.0) & (x > 24)).astype(np.float32)

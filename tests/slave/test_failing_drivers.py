@@ -16,27 +16,27 @@ from common.errors import CameraError, ImuError
 from common.messages import ImuSample, MarkerDetections, Message, TrackerPose
 from slave import failures
 from slave.app import run, run_wrist
-from slave.cameras import reopening
+from slave.cameras import reconnecting
 from slave.cameras.grey import Pixels
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
-from slave.cameras.reopening import ReopeningCamera
+from slave.cameras.reconnecting import ReconnectingCamera
 from slave.cameras.repeated import CONTRAST, RepeatedPictures
 from slave.cameras.source import Frame, FrameSource
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
+from slave.counters import Counters
 from slave.failures import LOG_EVERY_NS, Failures
 from slave.imu import live as imu_live
-from slave.imu import reopening as imu_reopening
-from slave.imu.reopening import ReopeningImu
-from slave.imu.tally import SampleTally
-from slave.markers.blind import BlindDetector
+from slave.imu import reconnecting as imu_reconnecting
+from slave.imu.counters import SampleCounters
+from slave.imu.reconnecting import ReconnectingImu
 from slave.markers.detector import Detections
+from slave.markers.null_detector import NullDetector
 from slave.objects import live as objects_live
-from slave.objects import reopening as objects_reopening
-from slave.objects.reopening import ReopeningTracker
-from slave.objects.tally import PoseTally
-from slave.tally import Tally
-from slave.wrist.blind import BlindWrist
+from slave.objects import reconnecting as objects_reconnecting
+from slave.objects.counters import PoseCounters
+from slave.objects.reconnecting import ReconnectingTracker
+from slave.wrist.null_detector import NullWristDetector
 from tests.slave.fake_picamera2 import OV7251, Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice
 
@@ -60,11 +60,11 @@ CLOCK = SystemClock()
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is waited for as long as it would be."""
-    monkeypatch.setattr(reopening, "FIRST_WAIT_S", 0.001)
-    monkeypatch.setattr(reopening, "FROZEN_NS", 30_000_000)
-    monkeypatch.setattr(imu_reopening, "FIRST_WAIT_S", 0.001)
-    monkeypatch.setattr(objects_reopening, "FIRST_WAIT_S", 0.001)
-    monkeypatch.setattr(objects_reopening, "SAY_LOST_S", 0.001)
+    monkeypatch.setattr(reconnecting, "FIRST_WAIT_S", 0.001)
+    monkeypatch.setattr(reconnecting, "FROZEN_NS", 30_000_000)
+    monkeypatch.setattr(imu_reconnecting, "FIRST_WAIT_S", 0.001)
+    monkeypatch.setattr(objects_reconnecting, "FIRST_WAIT_S", 0.001)
+    monkeypatch.setattr(objects_reconnecting, "LOG_LOST_S", 0.001)
 
 
 class Wire:
@@ -90,12 +90,12 @@ def usb(camera: Camera, file: CameraCalibration, pixels: Pixels = Pixels.GREY) -
 
 def tracked(
     opener: Callable[[CameraCalibration], FrameSource], most: int
-) -> tuple[ReopeningCamera, list[Frame]]:
+) -> tuple[ReconnectingCamera, list[Frame]]:
     """Run the slave's loop with a camera until it has sent so many frames: the camera, and what was sent of."""
     stop = threading.Event()
-    source = ReopeningCamera(opener, FILE, CLOCK, stop)
+    source = ReconnectingCamera(opener, FILE, CLOCK, stop)
     wire, shown = Wire(stop, most), list[Frame]()
-    run(source, BlindDetector(6), wire, "left", Tally(("a",) * 6), stop, shown.append)
+    run(source, NullDetector(6), wire, "left", Counters(("a",) * 6), stop, shown.append)
     source.close()
     seqs = [one.seq for one in wire.sent if isinstance(one, MarkerDetections)]
     assert len(seqs) == len(shown) == most
@@ -139,7 +139,7 @@ def test_a_pi_library_that_raises_something_of_its_own_costs_no_process(
 
 @pytest.mark.parametrize("where", ["open", "close", "counts", "figures", "tune"])
 def test_nothing_else_that_a_driver_raises_ends_the_slave(where: str) -> None:
-    class Odd(V4l2Camera):
+    class Faulty(V4l2Camera):
         pass
 
     def fail(*_arguments: object) -> None:
@@ -151,7 +151,7 @@ def test_nothing_else_that_a_driver_raises_ends_the_slave(where: str) -> None:
         if where == "open" and len(opened) == 1:
             opened.append(opened[0])
             fail()
-        camera = Odd(file, V4l2Options(controls=CODES, pixels=Pixels.GREY), CLOCK, device)
+        camera = Faulty(file, V4l2Options(controls=CODES, pixels=Pixels.GREY), CLOCK, device)
         opened.append(camera)
         return camera
 
@@ -159,11 +159,11 @@ def test_nothing_else_that_a_driver_raises_ends_the_slave(where: str) -> None:
         return FakeDevice(Camera(formats=GREY, gone_after=20 if not opened else None))
 
     if where != "open":
-        setattr(Odd, where, fail)
+        setattr(Faulty, where, fail)
     stop = threading.Event()
-    source = ReopeningCamera(opener, FILE, CLOCK, stop)
+    source = ReconnectingCamera(opener, FILE, CLOCK, stop)
     wire = Wire(stop, 30)
-    run(source, BlindDetector(1), wire, "left", Tally(("a",)), stop)
+    run(source, NullDetector(1), wire, "left", Counters(("a",)), stop)
     assert len(wire.sent) == 30
     if where == "tune":
         with pytest.raises(CameraError, match="its settings cannot be changed: KeyError"):
@@ -207,11 +207,11 @@ def test_a_camera_that_stays_frozen_is_never_measured_again() -> None:
             stop.set()
         return usb(opened[-1], file)
 
-    source = ReopeningCamera(opener, FILE, CLOCK, stop)
-    tally = Tally(())
-    run_wrist(source, BlindWrist(), Wire(stop, 1), "left", tally, stop, lambda _frame: stop.set())
+    source = ReconnectingCamera(opener, FILE, CLOCK, stop)
+    counters = Counters(())
+    run_wrist(source, NullWristDetector(), Wire(stop, 1), "left", counters, stop, lambda _frame: stop.set())
     source.close()
-    assert tally.counts()["frames"] == 1, "its first picture, and no other"
+    assert counters.counts()["frames"] == 1, "its first picture, and no other"
     assert source.counts()["camera.lost"] >= 3
 
 
@@ -256,7 +256,7 @@ def test_a_driver_that_hands_the_same_buffers_round_is_found_in_the_third_turn(b
     assert found == [False] * (2 * buffers) + [True] * (2 * buffers)
 
 
-class Failing(BlindDetector):
+class Failing(NullDetector):
     """A detector that raises in some frames."""
 
     def __init__(self, fails: frozenset[int]) -> None:
@@ -273,10 +273,10 @@ class Failing(BlindDetector):
 def test_a_frame_that_the_detector_fails_of_is_dropped_and_counted(caplog: pytest.LogCaptureFixture) -> None:
     stop, alive = threading.Event(), list[int]()
     source = usb(Camera(formats=GREY), FILE)
-    wire, tally = Wire(stop, 20), Tally(("a",))
-    run(source, Failing(frozenset({3, 4, 9})), wire, "left", tally, stop, alive=lambda: alive.append(1))
+    wire, counters = Wire(stop, 20), Counters(("a",))
+    run(source, Failing(frozenset({3, 4, 9})), wire, "left", counters, stop, alive=lambda: alive.append(1))
     source.close()
-    counts = tally.counts()
+    counts = counters.counts()
     assert (counts["frames"], counts["failed"], counts["dropped"]) == (20, 3, 3)
     assert len(wire.sent) == len(alive) == 20, "what fails does not feed the watchdog"
     assert caplog.text.count("nothing is made of frame") == 1, "one line, however many frames"
@@ -288,10 +288,10 @@ def test_what_shows_or_finds_tags_costs_no_detection() -> None:
 
     stop = threading.Event()
     source = usb(Camera(formats=GREY), FILE)
-    wire, tally = Wire(stop, 10), Tally(("a",))
-    run(source, BlindDetector(1), wire, "left", tally, stop, fail)
+    wire, counters = Wire(stop, 10), Counters(("a",))
+    run(source, NullDetector(1), wire, "left", counters, stop, fail)
     source.close()
-    counts = tally.counts()
+    counts = counters.counts()
     assert (counts["frames"], counts["failed"], len(wire.sent)) == (10, 10, 10)
 
 
@@ -333,9 +333,9 @@ def test_an_imu_whose_driver_raises_something_of_its_own_is_opened_again(
         return made.pop(0)
 
     raised = list[bool]()
-    source = ReopeningImu(opener, 100.0, CLOCK, stop)
-    wire, tally = Wire(stop, 20), SampleTally(source)
-    imu_live.run(source, wire, tally, stop)
+    source = ReconnectingImu(opener, 100.0, CLOCK, stop)
+    wire, counters = Wire(stop, 20), SampleCounters(source)
+    imu_live.run(source, wire, counters, stop)
     source.close()
     assert len(wire.sent) == 20
     assert (source.counts()["lost"], source.counts()["back"]) == (1, 1)
@@ -362,9 +362,9 @@ class Poses:
 def test_a_tracker_whose_driver_raises_something_of_its_own_is_opened_again() -> None:
     stop = threading.Event()
     made = [Poses(True), Poses(False)]
-    source = ReopeningTracker("wand", lambda: made.pop(0), CLOCK, stop)
-    wire, tally = Wire(stop, 30), PoseTally(source)
-    objects_live.run(source, wire, tally, stop)
+    source = ReconnectingTracker("wand", lambda: made.pop(0), CLOCK, stop)
+    wire, counters = Wire(stop, 30), PoseCounters(source)
+    objects_live.run(source, wire, counters, stop)
     source.close()
     assert (source.counts()["lost"], source.counts()["back"], source.counts()["raised"]) == (1, 1, 1)
 

@@ -17,7 +17,7 @@ from common.calibration import CameraCalibration, HandProfile, HsvRange, RigCali
 from common.errors import PhalanxError
 from common.sim.render import Renderer
 from common.sim.scene import Scene
-from common.srgb import relit_bytes
+from common.srgb import gain_tables
 from slave.markers import centroid
 from slave.markers.blobs import Blob, find_blobs
 from slave.markers.centroid import Measured
@@ -176,8 +176,8 @@ def test_noise_of_all_colours_has_the_same_blobs_in_tables_of_every_width(numba:
 def test_under_another_light_both_engines_look_up_the_same_colours(
     numba: Engine, gains: tuple[float, float, float]
 ) -> None:
-    image = np.asarray(cv2.LUT(render(hand()), relit_bytes(gains).T[None]), np.uint8)
-    table = TABLE.relit(relit_bytes(1.0 / np.array(gains)))
+    image = np.asarray(cv2.LUT(render(hand()), gain_tables(gains).T[None]), np.uint8)
+    table = TABLE.white_balanced(gain_tables(1.0 / np.array(gains)))
     codes, options = numba.scan_blobs(image, table, table.bits, 4, 0, 0, None)
     np.testing.assert_array_equal(codes, table.scan(image, 4))
     assert_same_blobs(find_blobs(codes, table.bits, 4), options)

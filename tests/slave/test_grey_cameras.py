@@ -20,8 +20,8 @@ from slave.cameras.grey import GREY_FORMATS, Pixels, grey, luma
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
+from slave.counters import Counters
 from slave.preview import small_jpeg, whole_jpeg
-from slave.tally import Tally
 from slave.wrist.detector import WristDetector
 from tests.slave.fake_picamera2 import OV7251, OV9281, Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice, colour, level, row_bytes, webcam_knobs
@@ -286,9 +286,9 @@ def test_a_hand_before_a_real_camera_is_found_as_in_the_same_pictures_of_8_bits(
     source, wire = usb(strobed_camera()), Wire()
     detector = WristDetector(VIEW, RATE_HZ)
     taken = (frame for _ in range(12) if (frame := source.read()) is not None)
-    run_wrist(Source(list(taken)), detector, wire, "wrist", Tally(NAMES), threading.Event())
+    run_wrist(Source(list(taken)), detector, wire, "wrist", Counters(NAMES), threading.Event())
     source.close()
-    assert detector.counts["triples"] >= 3
+    assert detector.counts["cycles"] >= 3
     plain = WristDetector(VIEW, RATE_HZ)
     found = [one for frame in strobed("curl", 8)[12:] if (one := plain.push(frame)) is not None]
     for message, one in zip(wire.sent, found, strict=True):

@@ -84,10 +84,13 @@ def test_frames_of_all_cameras_in_the_order_of_time(tmp_path: Path) -> None:
 def test_the_imu_of_one_part_comes_along_on_the_clock_of_the_first(tmp_path: Path) -> None:
     parts = [part(tmp_path, "left"), part(tmp_path, "right", 1050 - 7_000_000_250, clock=THERE)]
     nothing = np.full(3, np.nan)
-    turn = np.array([1.0, 0.0, 0.0, 0.0])
+    quaternion = np.array([1.0, 0.0, 0.0, 0.0])
     write_imu(
         parts[1],
-        [ImuSample("x", 0, k, 50 * k - 7_000_000_250, nothing, nothing, nothing, turn) for k in range(9)],
+        [
+            ImuSample("x", 0, k, 50 * k - 7_000_000_250, nothing, nothing, nothing, quaternion)
+            for k in range(9)
+        ],
     )
     join_recordings(parts, tmp_path / "wave", by_wall_clock=True)
     assert [one.t_ns for one in read_imu(tmp_path / "wave", "x")] == [50 * k for k in range(9)]
@@ -101,7 +104,7 @@ def test_joined_recordings_can_be_joined_again(tmp_path: Path) -> None:
     assert join_recordings([two, part(tmp_path, "top")], tmp_path / "three") == dict.fromkeys(NAMES, 3)
 
 
-def worn(folder: Path, first_ns: int = 1020) -> Path:
+def device(folder: Path, first_ns: int = 1020) -> Path:
     """A triple of a wrist device."""
     wrist = msgspec.structs.replace(camera(), name="wrist")
     manifest = Manifest(version=1, kind="wrist", cameras={"wrist": wrist}, rig=WRIST, clock=HERE)
@@ -116,7 +119,7 @@ def worn(folder: Path, first_ns: int = 1020) -> Path:
 def test_marker_cameras_and_a_wrist_device_become_one_recording_of_both(
     order: tuple[int, ...], tmp_path: Path
 ) -> None:
-    parts = [part(tmp_path, "left"), part(tmp_path, "right", 1050), worn(tmp_path)]
+    parts = [part(tmp_path, "left"), part(tmp_path, "right", 1050), device(tmp_path)]
     join_recordings([parts[k] for k in order], tmp_path / "both")
     joined = open_recording(tmp_path / "both")
     assert joined.manifest.kind == "both"
@@ -226,7 +229,7 @@ def not_there(folder: Path) -> list[Path]:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "said"),
+    ("spoil", "output"),
     [
         (
             other_rig,
@@ -247,9 +250,9 @@ def not_there(folder: Path) -> list[Path]:
     ],
 )
 def test_what_does_not_belong_together_is_named_and_nothing_is_written(
-    spoil: Spoil, said: str, tmp_path: Path
+    spoil: Spoil, output: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(RecordingError, match=said):
+    with pytest.raises(RecordingError, match=output):
         join_recordings(spoil(tmp_path), tmp_path / "wave", by_wall_clock=True)
     assert not (tmp_path / "wave").exists()
 

@@ -27,11 +27,11 @@ from bench.light import (
     outcome,
     standard_scene,
 )
-from common.sim.illuminant import LightCourse
+from common.sim.illuminant import LightSchedule
 from common.sim.render import Renderer
 from slave.markers.detector import MarkerDetector
-from slave.markers.following import REFUSE, FollowingDetector, can_follow, detector_for
-from slave.markers.light import apart
+from slave.markers.light_adaptive import REFUSE, LightAdaptiveDetector, can_adapt, detector_for
+from slave.markers.white_balance import apart
 from slave.markers.workers import Inline
 from tests.slave import painted
 
@@ -46,10 +46,10 @@ def still(seed: int, camera: str) -> Outcome:
 
 @pytest.mark.parametrize(("seed", "camera"), [(5, "left"), (9, "right")])
 @pytest.mark.parametrize(
-    "course", [RAMP, STEPS, EXPOSURES, SWITCHED], ids=["ramp", "steps", "exposure", "switched"]
+    "schedule", [RAMP, STEPS, EXPOSURES, SWITCHED], ids=["ramp", "steps", "exposure", "switched"]
 )
-def test_markers_stay_found_and_themselves(course: LightCourse, seed: int, camera: str) -> None:
-    got = outcome(course, seed, camera)
+def test_markers_stay_found_and_themselves(schedule: LightSchedule, seed: int, camera: str) -> None:
+    got = outcome(schedule, seed, camera)
     assert got.visible > 1000
     assert got.swaps == 0
     assert got.found >= 0.99 * still(seed, camera).found
@@ -64,7 +64,7 @@ def test_without_following_the_same_light_swaps_markers() -> None:
 @pytest.mark.parametrize("begin_s", [0.0, 4.0, 15.0])  # an open hand, fists
 def test_a_start_under_another_light_swaps_nothing_unwarned(kelvin: float, begin_s: float) -> None:
     for exposure in (0.7, 1.3):
-        got = outcome(LightCourse(((0.0, kelvin, exposure),)), 7, "left", seconds=1.5, begin_s=begin_s)
+        got = outcome(LightSchedule(((0.0, kelvin, exposure),)), 7, "left", seconds=1.5, begin_s=begin_s)
         assert got.swaps_unwarned == 0
         if begin_s == 0.0:
             assert got.swaps == 0
@@ -102,10 +102,10 @@ class Later:
 
 
 def test_while_the_colours_are_behind_nothing_is_reported() -> None:
-    course = LightCourse(((OPEN_S + 1.0, 4300.0, 1.0), (OPEN_S + 1.0, 3000.0, 1.0)))
-    scene = replace(standard_scene(7), light=course)
+    schedule = LightSchedule(((OPEN_S + 1.0, 4300.0, 1.0), (OPEN_S + 1.0, 3000.0, 1.0)))
+    scene = replace(standard_scene(7), light=schedule)
     renderer, workers = Renderer(scene, "left"), Later(8)
-    detector = FollowingDetector(scene.cameras["left"], MARKERS, workers)
+    detector = LightAdaptiveDetector(scene.cameras["left"], MARKERS, workers)
     seen: list[int] = []
     for k in range(40):
         workers.frame()
@@ -116,18 +116,18 @@ def test_while_the_colours_are_behind_nothing_is_reported() -> None:
     assert seen[20:28] == [0] * 8  # the lamp was switched at frame 20
     assert min(seen[29:]) >= 5
     assert detector.refused == 16
-    assert apart(detector.log_gains, np.log(course.gains_bgr(OPEN_S + 2.0))) < 0.1
+    assert apart(detector.log_gains, np.log(schedule.gains_bgr(OPEN_S + 2.0))) < 0.1
 
 
 def test_it_says_that_a_light_is_not_known_and_what_to_do() -> None:
     ranges = {
         name: msgspec.structs.replace(painted.RANGES[name], reference_bgr_linear=tuple(painted.linear(paint)))
-        for name, paint in ((name, painted.paint(m)) for m, name in enumerate(painted.NAMES))
+        for name, paint in ((name, painted.marker_hsv(m)) for m, name in enumerate(painted.NAMES))
     }
     camera = msgspec.structs.replace(painted.camera(), markers=ranges)
-    detector = FollowingDetector(camera, painted.NAMES, Inline())
-    lone = painted.render(painted.finger(5, 300.0, 200.0), noise=2.0)
-    found = detector.push(lone, 0)
+    detector = LightAdaptiveDetector(camera, painted.NAMES, Inline())
+    single = painted.render(painted.finger(5, 300.0, 200.0), noise=2.0)
+    found = detector.push(single, 0)
     assert [warning.marker for warning in detector.warnings] == [None]
     assert "show 2 or more markers" in detector.warnings[0].text
     assert np.isfinite(found.uv[5]).all()  # nothing speaks against the light of calibration
@@ -138,11 +138,11 @@ def test_it_says_that_a_light_is_not_known_and_what_to_do() -> None:
 
 
 def test_the_same_frames_give_the_same_detections_and_a_fresh_start_keeps_the_light() -> None:
-    course = LightCourse(((0.0, 3200.0, 0.8), (2.0, 3600.0, 1.1)))
-    scene = replace(standard_scene(7), light=course)
+    schedule = LightSchedule(((0.0, 3200.0, 0.8), (2.0, 3600.0, 1.1)))
+    scene = replace(standard_scene(7), light=schedule)
     renderer = Renderer(scene, "right")
     images = [renderer.render(k / RATE_HZ) for k in range(12)]
-    one, two = (FollowingDetector(scene.cameras["right"], MARKERS, Inline()) for _ in range(2))
+    one, two = (LightAdaptiveDetector(scene.cameras["right"], MARKERS, Inline()) for _ in range(2))
     for k, image in enumerate(images):
         t_ns = round(k * 1e9 / RATE_HZ)
         np.testing.assert_array_equal(one.push(image, t_ns).uv, two.push(image, t_ns).uv)
@@ -152,19 +152,21 @@ def test_the_same_frames_give_the_same_detections_and_a_fresh_start_keeps_the_li
 
 
 def test_a_camera_file_without_reference_colours_cannot_follow() -> None:
-    assert can_follow(standard_scene(7).cameras["left"], MARKERS)
-    assert not can_follow(painted.camera(), painted.NAMES)
-    assert not can_follow(msgspec.structs.replace(painted.camera(), markers=None), painted.NAMES)
-    assert isinstance(detector_for(standard_scene(7).cameras["left"], MARKERS, Inline()), FollowingDetector)
+    assert can_adapt(standard_scene(7).cameras["left"], MARKERS)
+    assert not can_adapt(painted.camera(), painted.NAMES)
+    assert not can_adapt(msgspec.structs.replace(painted.camera(), markers=None), painted.NAMES)
+    assert isinstance(
+        detector_for(standard_scene(7).cameras["left"], MARKERS, Inline()), LightAdaptiveDetector
+    )
     assert isinstance(detector_for(painted.camera(), painted.NAMES, Inline()), MarkerDetector)
     with pytest.raises(ValueError, match="reference"):
-        FollowingDetector(painted.camera(), painted.NAMES, Inline())
+        LightAdaptiveDetector(painted.camera(), painted.NAMES, Inline())
 
 
 def test_with_the_light_of_calibration_it_detects_as_without() -> None:
     scene = standard_scene(7)
     renderer, camera = Renderer(scene, "left"), scene.cameras["left"]
-    plain, following = MarkerDetector(camera, MARKERS), FollowingDetector(camera, MARKERS, Inline())
+    plain, adaptive = MarkerDetector(camera, MARKERS), LightAdaptiveDetector(camera, MARKERS, Inline())
     for k in range(20):
         image, t_ns = renderer.render(20.0 + k / RATE_HZ), round(k * 1e9 / RATE_HZ)
-        np.testing.assert_allclose(following.push(image, t_ns).uv, plain.push(image, t_ns).uv, atol=0.2)
+        np.testing.assert_allclose(adaptive.push(image, t_ns).uv, plain.push(image, t_ns).uv, atol=0.2)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from common.arrays import Float, Image
 from common.sim.illuminant import Light
-from common.srgb import relit_bytes
+from common.srgb import gain_tables
 from slave.markers.light_meter import AGREE, EVERY_NS, Change, LightMeter
 
 SIZE = (320, 240)
@@ -27,7 +27,7 @@ def desk(seed: int = 0) -> Image:
 
 def seen(image: Image, gains: Float, k: int) -> Image:
     """One frame under a light, with its own noise."""
-    lit = np.asarray(cv2.LUT(image, relit_bytes(gains).T[None]), dtype=np.int16)
+    lit = np.asarray(cv2.LUT(image, gain_tables(gains).T[None]), dtype=np.int16)
     return np.clip(lit + np.random.default_rng([k, 9]).normal(0.0, 2.0, lit.shape).round(), 0, 255).astype(
         np.uint8
     )

@@ -8,7 +8,7 @@ import pytest
 from common.arrays import Float
 from slave.cameras.source import Frame
 from slave.light_report import LightReport
-from slave.markers.colour_watch import ColourWarning
+from slave.markers.colour_monitor import ColourWarning
 
 SECOND = 1_000_000_000
 IMAGE = np.zeros((2, 2, 3), np.uint8)
@@ -21,7 +21,7 @@ class Detector:
         self.warnings: list[ColourWarning] = []
         self.log_gains: Float = np.log([0.5, 1.25, 2.5])
         self.refused = 3
-        self.follows = True
+        self.adapts = True
         self.tables = 4
 
 
@@ -29,7 +29,7 @@ class Others:
     def counts(self) -> dict[str, int]:
         return {"frames": 7}
 
-    def gauges(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {"rate_hz": 60.0}
 
 
@@ -65,13 +65,13 @@ def test_the_log_names_marker_and_fix_and_is_quiet_for_a_while(caplog: pytest.Lo
 
 
 def test_the_gauges_are_the_light_against_calibration() -> None:
-    gauges = report()[1].gauges()
-    assert gauges == pytest.approx(
+    metrics = report()[1].metrics()
+    assert metrics == pytest.approx(
         {"rate_hz": 60.0, "light_red": 2.0, "light_blue": 0.4, "light_exposure": 1.25}
     )
 
 
 def test_of_a_light_that_is_not_followed_nothing_is_said() -> None:
     detector, light = report()
-    detector.follows = False
-    assert light.gauges() == {"rate_hz": 60.0}
+    detector.adapts = False
+    assert light.metrics() == {"rate_hz": 60.0}

@@ -12,10 +12,10 @@ import pytest
 from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
-from slave.cameras import passing, picamera2, reopening, v4l2_settings
+from slave.cameras import frame_observer, picamera2, reconnecting, v4l2_settings
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
-from slave.cameras.reopening import ReopeningCamera
+from slave.cameras.reconnecting import ReconnectingCamera
 from slave.cameras.source import FrameSource
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
 from tests.network_helpers import until
@@ -88,18 +88,18 @@ def pinned(name: str, value: object, after: int) -> Callable[[int, dict[str, Any
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "says"),
+    ("name", "value", "expected"),
     [
         ("ExposureTime", 7777, "ExposureTime: wanted 9000 us .exposure_us., got 7777 us"),
         ("AnalogueGain", 1.75, "AnalogueGain: wanted 2 .analogue_gain., got 1.75"),
     ],
 )
 def test_what_a_pi_camera_does_not_take_is_named_and_the_old_settings_come_back(
-    name: str, value: object, says: str, monkeypatch: pytest.MonkeyPatch
+    name: str, value: object, expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = pi(monkeypatch, Sensor(tamper=pinned(name, value, 10)))
     with reading(source):
-        with pytest.raises(CameraError, match=says) as error:
+        with pytest.raises(CameraError, match=expected) as error:
             source.tune(changed(exposure_us=9000.0, analogue_gain=2.0))
         assert str(error.value).endswith("the settings before are back")
         got = source.figures()
@@ -118,7 +118,7 @@ def test_settings_that_do_not_come_back_are_said_to_be_lost(monkeypatch: pytest.
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "expected"),
     [
         ({"exposure_us": 40_000.0}, "does not fit into a frame of 33333 us"),
         ({"analogue_gain": 90.0}, "AnalogueGain 90 is not within 1 to 63.9375"),
@@ -126,11 +126,11 @@ def test_settings_that_do_not_come_back_are_said_to_be_lost(monkeypatch: pytest.
     ],
 )
 def test_what_is_out_of_range_is_refused_before_anything_is_written(
-    changes: dict[str, Any], says: str, monkeypatch: pytest.MonkeyPatch
+    changes: dict[str, Any], expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sensor = Sensor()
     source = pi(monkeypatch, sensor)
-    with reading(source), pytest.raises(CameraError, match=says):
+    with reading(source), pytest.raises(CameraError, match=expected):
         source.tune(changed(**changes))
     written = {value for _, controls in sensor.opened[0]._changes for value in controls.values()}
     assert written <= {5000, 1.25, (0.83, 1.24), (33333, 33333)}, "what it had"
@@ -238,10 +238,12 @@ def test_without_a_loop_that_reads_frames_nothing_can_be_verified(monkeypatch: p
 
 
 def test_a_camera_that_comes_back_has_the_settings_it_was_given_last(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reopening, "FIRST_WAIT_S", 0.001)
+    monkeypatch.setattr(reconnecting, "FIRST_WAIT_S", 0.001)
     first, second = Camera(damaged=frozenset({20, 21})), Camera(damaged=frozenset({13}))
     plugged = [first, second]
-    source = ReopeningCamera(lambda file: usb(plugged.pop(0), file), FILE, SystemClock(), threading.Event())
+    source = ReconnectingCamera(
+        lambda file: usb(plugged.pop(0), file), FILE, SystemClock(), threading.Event()
+    )
     with reading(source):
         source.tune(changed(exposure_us=9000.0))
         assert until(lambda: source.counts()["camera.broken"] == 2)
@@ -258,7 +260,7 @@ def test_a_camera_that_comes_back_has_the_settings_it_was_given_last(monkeypatch
 
 
 def test_a_camera_that_is_away_cannot_be_changed() -> None:
-    source = ReopeningCamera(lambda file: usb(Camera(), file), FILE, SystemClock(), threading.Event())
+    source = ReconnectingCamera(lambda file: usb(Camera(), file), FILE, SystemClock(), threading.Event())
     source.close()
     with pytest.raises(CameraError, match="camera 'left' is away"):
         source.tune(changed(exposure_us=9000.0))
@@ -266,7 +268,7 @@ def test_a_camera_that_is_away_cannot_be_changed() -> None:
 
 
 def test_a_late_watcher_sees_only_the_newest() -> None:
-    frames = passing.Passing[int]()
+    frames = frame_observer.FrameObserver[int]()
     assert frames.newest is None
     frames.put(1)
     seen = frames.following(2, 5.0)

@@ -55,10 +55,10 @@ def test_shapes_and_content_are_those_of_the_format(tmp_path: Path) -> None:
             "area_px2": (3, 6),
             "quality": (3, 6),
             "sigma_px": (3, 6),
-            "rival_uv": (3, 6, 2),
+            "alt_uv": (3, 6, 2),
         }
         assert (data["sigma_px"] > 0.0).all()
-        assert np.isnan(data["rival_uv"]).all()
+        assert np.isnan(data["alt_uv"]).all()
         assert data["t_ns"].tolist() == [0, 16_000_000, 32_000_000]
         for k in range(3):
             np.testing.assert_allclose(data["uv"][k], CENTRES + np.array([300.0 + 10.0 * k, 200.0]), atol=0.3)

@@ -44,9 +44,9 @@ def found_of(image: Image) -> Detections:
 @pytest.mark.parametrize("finger", [False, True])
 def test_a_ball_with_a_pale_top_is_where_its_outline_is(radius: float, finger: bool) -> None:
     found = found_of(ball(118.3, 101.6, radius, finger=finger))
-    away = math.hypot(found.uv[0, 0] - 118.3, found.uv[0, 1] - 101.6)
-    assert away < 0.03 * radius
-    assert away < 3.0 * found.sigma_px[0] < 0.3 * radius
+    connection_lost = math.hypot(found.uv[0, 0] - 118.3, found.uv[0, 1] - 101.6)
+    assert connection_lost < 0.03 * radius
+    assert connection_lost < 3.0 * found.sigma_px[0] < 0.3 * radius
     assert found.area[0] == pytest.approx(math.pi * radius**2, rel=0.1)
     assert found.quality[0] > 0.5
 

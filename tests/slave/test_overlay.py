@@ -12,9 +12,9 @@ from common.errors import CalibrationError
 from common.messages import Command, Preview
 from common.preview_wish import PreviewWish
 from slave.cameras.source import Frame
-from slave.markers.changing import ChangingDetector
+from slave.markers.calibrated import CalibratedDetector
 from slave.markers.detector import MarkerDetector
-from slave.markers.known import KnownDetector
+from slave.markers.reloadable import ReloadableDetector
 from slave.overlay import ARM_PX, SEVERAL, MarkerOverlay, WristOverlay, contrast_of
 from slave.preview import Previews
 from tests.network_helpers import ManualClock
@@ -27,8 +27,8 @@ SMALL = np.asarray(cv2.resize(PICTURE, (320, 240), interpolation=cv2.INTER_AREA)
 AT = np.rint((painted.CENTRES + np.array([300.0, 200.0])) / 2.0).astype(int)  # in the small picture
 
 
-def detector(**ranges: HsvRange) -> ChangingDetector:
-    made = ChangingDetector(MarkerDetector(painted.camera(ranges=painted.RANGES | ranges), NAMES))
+def detector(**ranges: HsvRange) -> ReloadableDetector:
+    made = ReloadableDetector(MarkerDetector(painted.camera(ranges=painted.RANGES | ranges), NAMES))
     made.push(PICTURE, FRAME.t_ns)
     return made
 
@@ -70,7 +70,7 @@ def replace_time(t_ns: int) -> Frame:
 
 
 def test_a_camera_without_colours_has_nothing_to_tint() -> None:
-    none = ChangingDetector(KnownDetector(replace(painted.camera(), markers=None), NAMES))
+    none = ReloadableDetector(CalibratedDetector(replace(painted.camera(), markers=None), NAMES))
     none.push(PICTURE, FRAME.t_ns)
     np.testing.assert_array_equal(MarkerOverlay(none, NAMES).draw(SMALL, FRAME, NAMES, found=True), SMALL)
 

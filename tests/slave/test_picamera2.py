@@ -133,7 +133,7 @@ def overwrite(name: str, value: object) -> Callable[[int, dict[str, Any]], None]
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "says"),
+    ("name", "value", "expected"),
     [
         ("ExposureTime", 4000, "ExposureTime: wanted 5000 us (exposure_us), got 4000 us"),
         ("AnalogueGain", 1.5, "AnalogueGain: wanted 1.25 (analogue_gain), got 1.5"),
@@ -145,12 +145,12 @@ def overwrite(name: str, value: object) -> Callable[[int, dict[str, Any]], None]
     ],
 )
 def test_a_setting_that_was_not_taken_is_named_with_wanted_and_got(
-    monkeypatch: pytest.MonkeyPatch, name: str, value: object, says: str
+    monkeypatch: pytest.MonkeyPatch, name: str, value: object, expected: str
 ) -> None:
     sensor = Sensor(tamper=overwrite(name, value))
     with pytest.raises(CameraError) as error:
         opened(monkeypatch, sensor)
-    assert says in str(error.value)
+    assert expected in str(error.value)
     assert "camera 'left'" in str(error.value)
     assert "Change the camera file" in str(error.value)
     assert sensor.opened[0].closed, "the camera is given back"
@@ -176,7 +176,7 @@ def test_settings_that_come_late_are_waited_for_and_ones_that_waver_are_refused(
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "expected"),
     [
         ({"exposure_us": 25_000.0}, "exposure_us 25000 does not fit into a frame of 20000 us"),
         ({"analogue_gain": 90.0}, "AnalogueGain 90 is not within 1 to 63.9375"),
@@ -186,11 +186,11 @@ def test_settings_that_come_late_are_waited_for_and_ones_that_waver_are_refused(
     ],
 )
 def test_what_the_camera_cannot_do_is_refused_with_its_limits(
-    monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any], says: str
+    monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any], expected: str
 ) -> None:
     with pytest.raises(CameraError) as error:
         opened(monkeypatch, Sensor(), **changes)
-    assert says in str(error.value)
+    assert expected in str(error.value)
 
 
 def test_a_stream_that_libcamera_adjusted_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ import pytest
 from common.clock import SystemClock
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
-from slave.cameras.picamera2_sync import MOST_OFF_US, PERIOD_FRAMES, SILENT_FRAMES, SyncWatch
+from slave.cameras.picamera2_sync import MOST_OFF_US, PERIOD_FRAMES, SILENT_FRAMES, SyncMonitor
 from tests.slave.fake_picamera2 import Sensor, install
 from tests.slave.test_live_settings import FILE
 
@@ -19,7 +19,7 @@ READY_AT = 100
 
 
 def frames(
-    count: int, heard: Sequence[int] | None = None, off_us: dict[int, int] | None = None
+    count: int, received: Sequence[int] | None = None, off_us: dict[int, int] | None = None
 ) -> list[dict[str, Any]]:
     """Metadata of a client's frames 0 … count - 1.
 
@@ -28,7 +28,7 @@ def frames(
         heard: Frames in which a message of the server came; None: every 30th.
         off_us: Frame -> correction that the message before it asked for [us].
     """
-    messages = set(range(30, count, PERIOD_FRAMES) if heard is None else heard)
+    messages = set(range(30, count, PERIOD_FRAMES) if received is None else received)
     found: list[dict[str, Any]] = []
     wall_us, ready_us, known = 1_700_000_000_000_000, 0, False
     for k in range(count):
@@ -47,8 +47,8 @@ def frames(
     return found
 
 
-def watched(metadata: list[dict[str, Any]]) -> tuple[SyncWatch, list[bool]]:
-    watch = SyncWatch("camera 'left'", client=True)
+def watched(metadata: list[dict[str, Any]]) -> tuple[SyncMonitor, list[bool]]:
+    watch = SyncMonitor("camera 'left'", client=True)
     locked: list[bool] = []
     for frame in metadata:
         watch.push(frame)
@@ -68,7 +68,7 @@ def test_a_server_that_is_no_longer_heard_is_a_lost_lock_and_comes_back(
     ns_per_unit: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
-    metadata = frames(1200, heard=[*range(30, 300, 30), *range(900, 1200, 30)])
+    metadata = frames(1200, received=[*range(30, 300, 30), *range(900, 1200, 30)])
     for frame in metadata:  # some versions of libcamera tell the wall clock in microseconds
         frame["FrameWallClock"] //= ns_per_unit
     watch, locked = watched(metadata)
@@ -108,7 +108,7 @@ def test_a_camera_that_begins_anew_is_not_in_step(caplog: pytest.LogCaptureFixtu
 
 
 def test_a_server_is_in_step_when_it_is_ready() -> None:
-    watch = SyncWatch("camera 'left'", client=False)
+    watch = SyncMonitor("camera 'left'", client=False)
     watch.push({"SyncReady": False})
     assert watch.figures() == {"sync_locked": 0.0}
     for _ in range(1000):

@@ -16,10 +16,10 @@ from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Command, Message
 from slave import preview
 from slave.app import run
 from slave.cameras.source import Frame
+from slave.counters import Counters
 from slave.markers.detector import MarkerDetector
-from slave.preview import LOOK_NS, PERIOD_NS, Gate, Previews, small_jpeg, whole_jpeg
+from slave.preview import PERIOD_NS, POLL_NS, Gate, Previews, small_jpeg, whole_jpeg
 from slave.report import Reporter
-from slave.tally import Tally
 from tests.network_helpers import ManualClock, until
 from tests.slave.painted import NAMES, camera, hand, render
 from tests.slave.test_app import Source, Wire
@@ -41,7 +41,7 @@ def test_never_two_within_a_tenth_of_a_second_and_none_without_a_request(
         elif gate.wants(t_ns):
             shown.append(t_ns)
     assert all(later - earlier >= PERIOD_NS for earlier, later in pairwise(shown))
-    assert all(any(0 <= t - asked <= LOOK_NS for asked in requests) for t in shown)
+    assert all(any(0 <= t - asked <= POLL_NS for asked in requests) for t in shown)
 
 
 def test_one_request_is_three_seconds_of_pictures() -> None:
@@ -84,7 +84,7 @@ def test_a_request_over_the_bus_shows_the_newest_frames_until_it_expires() -> No
     feed = bus.subscribe("preview", "left", depth=100)
     shown = Previews("left", clock)
     reporter = Reporter(
-        "left", wire, Tally(NAMES), clock, lambda _: bus.join(), lambda: None, period_s=0.005, shown=shown
+        "left", wire, Counters(NAMES), clock, lambda _: bus.join(), lambda: None, period_s=0.005, shown=shown
     )
     try:
         wire.zenoh_endpoint = "tcp/127.0.0.1:1"
@@ -132,7 +132,7 @@ def test_a_slow_bus_never_holds_the_loop_and_the_newest_frame_comes_next() -> No
     feed = bus.subscribe("preview")
     shown = Previews("left", clock)
     picture = render(hand())
-    wire, tally = Wire(), Tally(NAMES)
+    wire, counters = Wire(), Counters(NAMES)
     try:
         shown.use(bus)
         shown.ask()
@@ -145,7 +145,7 @@ def test_a_slow_bus_never_holds_the_loop_and_the_newest_frame_comes_next() -> No
             MarkerDetector(camera(), NAMES),
             wire,
             "left",
-            tally,
+            counters,
             threading.Event(),
             shown.offer,
         )

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from common.calibration import CameraCalibration, load
-from slave.markers.colour_watch import hsv
+from slave.markers.colour_monitor import hsv
 from slave.markers.detector import MarkerDetector
 from slave.markers.quality import WEIGHTS, Evidence, _hue, clarity_of, evidence_of, probability_of
-from tests.slave.painted import NAMES, RANGES, Disc, camera, paint, render
+from tests.slave.painted import NAMES, RANGES, Disc, camera, marker_hsv, render
 
 SIX = ("thumb", "index", "middle", "ring", "little", "back")
 CLEAR = Evidence(
     contrast=math.log(18.0), unclear=0.0, outlined=0.0, fullness=0.95, slender=0.1, hue=0.02,
-    rival=0.0, ragged=0.0, cut=0.0,
+    alternative=0.0, ragged=0.0, cut=0.0,
 )  # fmt: skip
 
 
@@ -61,7 +61,7 @@ def test_the_hue_is_that_of_opencv() -> None:
 
 def test_another_light_does_not_change_what_the_colour_says() -> None:
     detector = MarkerDetector(camera(), NAMES)
-    image = render([Disc(paint(1), 300.0, 240.0, 12.0)])
+    image = render([Disc(marker_hsv(1), 300.0, 240.0, 12.0)])
     blob = detector._scanner.whole(image, detector.table).blobs[1][0]
     (seen,) = detector._engine.measure(image, detector.table, [detector.table.bits[1]], [blob], [True])
     assert seen is not None
@@ -88,8 +88,8 @@ def test_a_bare_hand_has_few_likely_markers(root: Path, datasets: Path) -> None:
 
 def test_a_tracked_marker_keeps_its_quality_and_a_rival_near_it_lowers_it() -> None:
     detector = MarkerDetector(camera(), NAMES)
-    alone = render([Disc(paint(1), 300.0, 240.0, 12.0)])
-    both = render([Disc(paint(1), 300.0, 240.0, 12.0), Disc(paint(1), 345.0, 240.0, 12.0)])
+    alone = render([Disc(marker_hsv(1), 300.0, 240.0, 12.0)])
+    both = render([Disc(marker_hsv(1), 300.0, 240.0, 12.0), Disc(marker_hsv(1), 345.0, 240.0, 12.0)])
     qualities = [
         float(detector.push(image, k * 16_666_667).quality[1]) for k, image in enumerate([alone] * 8 + [both])
     ]

@@ -22,12 +22,12 @@ from slave import raw
 from slave.__main__ import main
 from slave.app import run
 from slave.cameras.source import Frame
+from slave.counters import Counters
 from slave.join import join_recordings
-from slave.markers.blind import BlindDetector
+from slave.markers.null_detector import NullDetector
 from slave.offline import detect_recording
 from slave.raw import RawFrames, RawSettings
 from slave.report import Reporter
-from slave.tally import Tally
 from slave.tuning import CameraFiles
 from tests.common.test_frame_writing import check_whole
 from tests.network_helpers import until
@@ -51,16 +51,16 @@ class Slave:
         self.raw = RawFrames(
             name, settings, lambda: self.files, SystemClock(), lambda: self.here, lambda _: self.free
         )
-        self.tally = Tally(rig.markers)
+        self.counters = Counters(rig.markers)
         self.reporter = Reporter(
-            name, Wire(), self.tally, SystemClock(), lambda _: bus.join(), lambda: None, 0.01, raw=self.raw
+            name, Wire(), self.counters, SystemClock(), lambda _: bus.join(), lambda: None, 0.01, raw=self.raw
         )
         assert until(lambda: name in bus.alive())
 
     def read(self, given: list[Frame]) -> None:
         """The loop, over these frames."""
         source = self.raw.reading(ListCamera(given))
-        run(source, BlindDetector(6), Wire(), self.name, self.tally, threading.Event())
+        run(source, NullDetector(6), Wire(), self.name, self.counters, threading.Event())
 
     def ask(self, verb: str, body: str = "") -> Health:
         return self.bus.ask(Command(self.name, verb, body), 10.0)
@@ -106,9 +106,9 @@ def test_frames_between_the_commands_are_kept_to_the_last_bit_and_join(
         left.read(frames(3))  # nobody asked: nothing is kept
         assert left.ask("report").counts["raw.frames"] == 0
         for number, one in enumerate((left, right)):
-            assert one.begin(raw_name("wave", one.name)).gauges["raw.on"] == 1.0
+            assert one.begin(raw_name("wave", one.name)).metrics["raw.on"] == 1.0
             one.read(frames(10, 3, late_ns=number))
-            assert one.begin(raw_name("wave", one.name)).gauges["raw.on"] == 1.0, "asked again: it goes on"
+            assert one.begin(raw_name("wave", one.name)).metrics["raw.on"] == 1.0, "asked again: it goes on"
             with pytest.raises(BusError, match="is being recorded: raw_stop ends it"):
                 one.begin("other")
         for one in (left, right):
@@ -119,8 +119,8 @@ def test_frames_between_the_commands_are_kept_to_the_last_bit_and_join(
                 0,
                 0,
             )
-            assert told.gauges["raw.on"] == 0.0
-            assert told.gauges["raw.megabytes"] > 0.0
+            assert told.metrics["raw.on"] == 0.0
+            assert told.metrics["raw.megabytes"] > 0.0
         with pytest.raises(BusError, match="wave-left: holds something already"):
             left.begin("wave-left")
     assert check_whole(folder / "wave-left") == check_whole(folder / "wave-right") == 10
@@ -187,7 +187,7 @@ def test_a_full_disk_ends_the_recording_and_not_the_loop(
         small = Frame(20, 10**13, 10**13, np.zeros((24, 32, 3), np.uint8))
         left.read([*frames(2, 10), small, *frames(2, 21)])
         assert until(lambda: left.ask("report").counts["raw.ended"] == 2)
-        assert left.tally.counts()["frames"] == 15, "the loop has seen all of them"
+        assert left.counters.counts()["frames"] == 15, "the loop has seen all of them"
     assert check_whole(tmp_path / "wave") == 4
     assert check_whole(tmp_path / "wave-2") == 2
 

@@ -10,10 +10,10 @@ import pytest
 from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
-from slave.cameras import real, reopening
+from slave.cameras import real, reconnecting
 from slave.cameras.grey import Pixels
 from slave.cameras.real import add_options, open_real
-from slave.cameras.reopening import ReopeningCamera
+from slave.cameras.reconnecting import ReconnectingCamera
 from slave.cameras.source import FrameSource
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
 from tests.slave.fake_picamera2 import Sensor, install
@@ -62,7 +62,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[V4l2Options]:
 )
 def test_a_usb_camera_is_named_by_number_or_path(seen: list[V4l2Options], driver: str, path: str) -> None:
     source = opened(driver, "--control", "gain=32", "--control", "white_balance_temperature=4600")
-    assert isinstance(source, ReopeningCamera)
+    assert isinstance(source, ReconnectingCamera)
     assert source.read() is not None
     source.close()
     assert str(seen[0].path) == path
@@ -111,7 +111,7 @@ def test_other_drivers_are_not_its_business() -> None:
 
 
 @pytest.mark.parametrize(
-    ("driver", "arguments", "says"),
+    ("driver", "arguments", "expected"),
     [
         ("v4l2", ("--sync", "server"), "--sync is an option of --camera picamera2"),
         ("picamera2", ("--control", "gain=1"), "--control is an option of --camera v4l2"),
@@ -128,9 +128,9 @@ def test_other_drivers_are_not_its_business() -> None:
     ],
 )
 def test_an_option_that_would_be_ignored_is_refused(
-    driver: str, arguments: tuple[str, ...], says: str
+    driver: str, arguments: tuple[str, ...], expected: str
 ) -> None:
-    with pytest.raises(CameraError, match=says):
+    with pytest.raises(CameraError, match=expected):
         opened(driver, *arguments)
 
 
@@ -143,12 +143,12 @@ def test_a_missing_camera_at_the_start_is_an_error(monkeypatch: pytest.MonkeyPat
 
 
 def test_an_unplugged_camera_comes_back_with_all_its_settings(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reopening, "FIRST_WAIT_S", 0.001)
+    monkeypatch.setattr(reconnecting, "FIRST_WAIT_S", 0.001)
     first, second = Camera(gone_after=15), Camera()
     plugged = [first, second]
     asked = V4l2Options(controls={"gain": 32, "white_balance_temperature": 4600})
     clock = SystemClock()
-    source = ReopeningCamera(
+    source = ReconnectingCamera(
         lambda file: V4l2Camera(file, asked, clock, lambda _path: FakeDevice(plugged.pop(0))),
         CALIBRATION,
         clock,
@@ -164,12 +164,12 @@ def test_an_unplugged_camera_comes_back_with_all_its_settings(monkeypatch: pytes
 
 
 def test_a_lost_grey_camera_comes_back_grey(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reopening, "FIRST_WAIT_S", 0.001)
+    monkeypatch.setattr(reconnecting, "FIRST_WAIT_S", 0.001)
     formats = {"Y10P": {(640, 480): (30.0,)}}
     plugged = [Camera(formats=formats, gone_after=14, padding=16), Camera(formats=formats, padding=16)]
     asked = V4l2Options(controls={"gain": 32, "white_balance_temperature": 4600}, pixels=Pixels.GREY)
     clock = SystemClock()
-    source = ReopeningCamera(
+    source = ReconnectingCamera(
         lambda file: V4l2Camera(file, asked, clock, lambda _path: FakeDevice(plugged.pop(0))),
         CALIBRATION,
         clock,

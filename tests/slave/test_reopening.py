@@ -8,7 +8,7 @@ import pytest
 from common.calibration import CameraCalibration
 from common.errors import CameraError
 from slave import failures
-from slave.cameras.reopening import LONGEST_WAIT_S, ReopeningCamera
+from slave.cameras.reconnecting import LONGEST_WAIT_S, ReconnectingCamera
 from slave.cameras.source import Frame
 from slave.failures import LOG_EVERY_NS
 
@@ -27,7 +27,7 @@ PERIOD_NS = 20_000_000
 IMAGE = np.zeros((2, 2, 3), np.uint8)
 
 
-class World:
+class Dispatcher:
     """Time, a socket and the camera that is or is not in it."""
 
     def __init__(self) -> None:
@@ -57,60 +57,60 @@ class World:
 
 
 class Camera:
-    def __init__(self, world: World, life: int) -> None:
-        self._world, self._life, self._seq = world, life, 0
+    def __init__(self, world: Dispatcher, life: int) -> None:
+        self._dispatcher, self._life, self._seq = world, life, 0
 
     def read(self) -> Frame | None:
         if self._seq == self._life:
             raise CameraError("unplugged")
-        self._world.t_ns += PERIOD_NS
+        self._dispatcher.t_ns += PERIOD_NS
         self._seq += 1
-        return Frame(self._seq - 1, self._world.t_ns, self._world.t_ns, IMAGE)
+        return Frame(self._seq - 1, self._dispatcher.t_ns, self._dispatcher.t_ns, IMAGE)
 
     def close(self) -> None:
-        self._world.closed += 1
+        self._dispatcher.closed += 1
 
 
 class Stop(threading.Event):
     """The slave's stop event, on the world's time."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: Dispatcher) -> None:
         super().__init__()
-        self._world = world
+        self._dispatcher = world
 
     def wait(self, timeout: float | None = None) -> bool:
         assert timeout is not None
-        return self._world.wait(timeout)
+        return self._dispatcher.wait(timeout)
 
 
-def reopening_camera(world: World) -> ReopeningCamera:
-    return ReopeningCamera(world.open, CALIBRATION, world, Stop(world))
+def reconnecting_camera(world: Dispatcher) -> ReconnectingCamera:
+    return ReconnectingCamera(world.open, CALIBRATION, world, Stop(world))
 
 
-def frames(camera: ReopeningCamera) -> Iterator[Frame]:
+def frames(camera: ReconnectingCamera) -> Iterator[Frame]:
     while (frame := camera.read()) is not None:
         yield frame
 
 
 def test_a_camera_that_stays_is_passed_through() -> None:
-    world = World()
-    source = frames(reopening_camera(world))
+    world = Dispatcher()
+    source = frames(reconnecting_camera(world))
     assert [next(source).seq for _ in range(5)] == [0, 1, 2, 3, 4]
     assert (world.opened, world.closed) == (1, 0)
 
 
 def test_an_error_at_the_start_is_an_error() -> None:
-    world = World()
+    world = Dispatcher()
     world.plugged = False
     with pytest.raises(CameraError, match="no such device"):
-        reopening_camera(world)
+        reconnecting_camera(world)
 
 
 def test_numbers_go_on_after_a_loss_and_the_gap_is_the_absence(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING)
-    world = World()
+    world = Dispatcher()
     world.lives = [4, 10**6]
-    camera = reopening_camera(world)
+    camera = reconnecting_camera(world)
     source = frames(camera)
     before = [next(source) for _ in range(4)]
     world.plugged, world.back_at_ns = False, world.t_ns + 5_000_000_000
@@ -124,9 +124,9 @@ def test_numbers_go_on_after_a_loss_and_the_gap_is_the_absence(caplog: pytest.Lo
 
 
 def test_waits_grow_to_one_second_and_begin_anew_with_a_frame() -> None:
-    world = World()
+    world = Dispatcher()
     world.lives = [1, 1, 10**6]
-    source = frames(reopening_camera(world))
+    source = frames(reconnecting_camera(world))
     next(source)
     world.plugged, world.back_at_ns = False, 20_000_000_000
     next(source)
@@ -138,9 +138,9 @@ def test_waits_grow_to_one_second_and_begin_anew_with_a_frame() -> None:
 
 
 def test_a_camera_that_opens_but_never_delivers_is_not_opened_in_a_hurry() -> None:
-    world = World()
+    world = Dispatcher()
     world.lives = [1] + [0] * 6 + [10**6]
-    source = frames(reopening_camera(world))
+    source = frames(reconnecting_camera(world))
     next(source)
     next(source)
     assert world.waits == [0.2, 0.4, 0.8, 1.0, 1.0, 1.0, 1.0]
@@ -148,10 +148,10 @@ def test_a_camera_that_opens_but_never_delivers_is_not_opened_in_a_hurry() -> No
 
 def test_a_stop_and_a_close_end_the_wait() -> None:
     for end in ("stop", "close"):
-        world = World()
+        world = Dispatcher()
         world.lives = [1]
         stop = Stop(world)
-        camera = ReopeningCamera(world.open, CALIBRATION, world, stop)
+        camera = ReconnectingCamera(world.open, CALIBRATION, world, stop)
         world.stop = stop
         assert camera.read() is not None
         world.plugged = False
@@ -161,9 +161,9 @@ def test_a_stop_and_a_close_end_the_wait() -> None:
 
 def test_a_long_absence_is_logged_now_and_then(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING, logger=failures.__name__)
-    world = World()
+    world = Dispatcher()
     world.lives = [1]
-    source = frames(reopening_camera(world))
+    source = frames(reconnecting_camera(world))
     next(source)
     away_ns = 10 * LOG_EVERY_NS
     world.plugged, world.back_at_ns = False, world.t_ns + away_ns
@@ -173,9 +173,9 @@ def test_a_long_absence_is_logged_now_and_then(caplog: pytest.LogCaptureFixture)
 
 
 def test_a_camera_that_cannot_be_given_back_is_no_end(caplog: pytest.LogCaptureFixture) -> None:
-    world = World()
+    world = Dispatcher()
     world.lives = [1]
-    camera = reopening_camera(world)
+    camera = reconnecting_camera(world)
 
     def stuck(_self: Camera) -> None:
         raise CameraError("does not let go")
@@ -189,10 +189,10 @@ def test_a_camera_that_cannot_be_given_back_is_no_end(caplog: pytest.LogCaptureF
 
 
 def test_real_waiting_ends_when_the_slave_is_stopped() -> None:
-    world = World()
+    world = Dispatcher()
     world.lives = [1]
     stop = threading.Event()
-    camera = ReopeningCamera(world.open, CALIBRATION, world, stop)
+    camera = ReconnectingCamera(world.open, CALIBRATION, world, stop)
     assert camera.read() is not None
     world.plugged = False
     threading.Timer(0.05, stop.set).start()

@@ -15,20 +15,20 @@ from bench.marker_kinds import KINDS
 from bench.marker_score import clicks
 from common.arrays import Image
 from common.frame_recording import open_recording
-from common.sim.illuminant import LightCourse
+from common.sim.illuminant import LightSchedule
 from common.sim.render import Renderer
 from slave.cameras.replay import read_png
 from slave.markers.blobs import MAX_CANDIDATES, SCALE, Blob
-from slave.markers.changing import plain_of
 from slave.markers.classify import ColourTable
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.engine import NUMPY, Engine, engine_named
-from slave.markers.following import FollowingDetector, detector_for
+from slave.markers.light_adaptive import LightAdaptiveDetector, detector_for
+from slave.markers.reloadable import plain_of
 from slave.markers.roi import Window
 from slave.markers.scan import STRIPS, Scanner, merged
 from slave.markers.workers import Inline
 from slave.offline import calibrate_colours, camera_of
-from tests.slave.painted import CENTRES, NAMES, RANGES, Disc, camera, finger, hand, paint, render
+from tests.slave.painted import CENTRES, NAMES, RANGES, Disc, camera, finger, hand, marker_hsv, render
 
 STEP_NS = 16_666_667
 ENGINES = ("numpy", "numba") if importlib.util.find_spec("numba") is not None else ("numpy",)
@@ -128,7 +128,7 @@ def test_generated_markers_are_the_same(name: str, engine: str) -> None:
             assert seen(one) == seen(other)
             same += assert_same(one, other)
             # A marker that was not tracked may be anywhere, and so may its rival, which its quality remembers.
-            np.testing.assert_array_equal(one.rival_uv[tracked], other.rival_uv[tracked])
+            np.testing.assert_array_equal(one.alt_uv[tracked], other.alt_uv[tracked])
             always &= seen(one)
             np.testing.assert_array_equal(one.quality[always], other.quality[always])
             tracked = seen(one)
@@ -137,11 +137,11 @@ def test_generated_markers_are_the_same(name: str, engine: str) -> None:
 
 
 def test_the_standard_scene_is_the_same_and_its_light_is_followed_alike() -> None:
-    course = LightCourse(((20.0, 4300.0, 1.0), (20.3, 3600.0, 1.2)))
-    scene = replace(standard_scene(7), light=course)
+    schedule = LightSchedule(((20.0, 4300.0, 1.0), (20.3, 3600.0, 1.2)))
+    scene = replace(standard_scene(7), light=schedule)
     markers = scene.rig.markers
     renderer = Renderer(scene, "left")
-    whole, windows = (FollowingDetector(scene.cameras["left"], markers, Inline()) for _ in range(2))
+    whole, windows = (LightAdaptiveDetector(scene.cameras["left"], markers, Inline()) for _ in range(2))
     windows.plain.windows_only = True
     same = 0
     for k in range(30):
@@ -154,13 +154,13 @@ def test_the_standard_scene_is_the_same_and_its_light_is_followed_alike() -> Non
 
 
 def test_a_rival_in_the_window_is_seen_and_one_beyond_it_is_not() -> None:
-    near, far = Disc(paint(1), 212.0, 125.0, 7.0), Disc(paint(1), 600.0, 420.0, 7.0)
+    near, far = Disc(marker_hsv(1), 212.0, 125.0, 7.0), Disc(marker_hsv(1), 600.0, 420.0, 7.0)
     for thing, there in ((near, True), (far, False)):
         detector = windowed()
         frames = push_all(detector, [render(hand())] * 2 + [render([*hand(), thing])] * 3)
         assert all(seen(frames[-1]))
-        assert math.isfinite(frames[-1].rival_uv[1, 0]) is there
-        assert detector.beside.frames["index"] == (3 if there else 0)
+        assert math.isfinite(frames[-1].alt_uv[1, 0]) is there
+        assert detector.ambiguity.frames["index"] == (3 if there else 0)
 
 
 # What is lost
@@ -168,7 +168,7 @@ def test_a_rival_in_the_window_is_seen_and_one_beyond_it_is_not() -> None:
 
 def still(u: float, v: float, marker: int = 1) -> Image:
     """The hand, whose index finger's cap lies elsewhere."""
-    return render([d for d in hand() if d.hsv != paint(marker)] + finger(marker, u, v))
+    return render([d for d in hand() if d.hsv != marker_hsv(marker)] + finger(marker, u, v))
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -179,7 +179,9 @@ def test_a_marker_that_jumps_out_of_its_window_is_found_within_as_many_frames_as
     waits: set[int] = set()
     for phase in range(STRIPS + 1):
         detector = windowed(engine)
-        without = [render([d for d in hand() if d.hsv != paint(1)])] * phase  # so the strips begin elsewhere
+        without = [
+            render([d for d in hand() if d.hsv != marker_hsv(1)])
+        ] * phase  # so the strips begin elsewhere
         frames = push_all(detector, [before, *without, before, before, *[jumped] * (STRIPS + 1)])
         after = frames[-STRIPS - 1 :]
         assert all(all(found) for found in (np.delete(seen(f), 1) for f in after)), "the others go on"
@@ -196,28 +198,28 @@ def test_a_marker_that_jumps_out_of_its_window_is_found_within_as_many_frames_as
 @pytest.mark.parametrize("v", [8.0, 120.0, 239.0, 240.0, 300.0, 472.0])
 def test_when_all_are_lost_a_marker_anywhere_is_found_within_all_strips(v: float, engine: str) -> None:
     detector = windowed(engine)
-    lone = render([Disc(paint(1), 320.0, v, 6.0)])
-    frames = push_all(detector, [render(hand()), *[EMPTY] * 40, *[lone] * STRIPS])
+    single = render([Disc(marker_hsv(1), 320.0, v, 6.0)])
+    frames = push_all(detector, [render(hand()), *[EMPTY] * 40, *[single] * STRIPS])
     assert not any(any(seen(f)) for f in frames[1:41])
     assert np.hypot(*(frames[-1].uv[1] - (320.0, v))) < 0.3
-    whole = DETECTORS[engine].fresh().push(lone, 0)
+    whole = DETECTORS[engine].fresh().push(single, 0)
     np.testing.assert_array_equal(frames[-1].uv[1], whole.uv[1])
 
 
 def test_a_hand_that_comes_back_is_whole_within_two_rounds_of_the_strips_and_a_mug_is_not_its_marker() -> (
     None
 ):
-    mug = Disc(paint(1), 560.0, 40.0, 17.0)  # in the first strip: it is seen before the hand
+    mug = Disc(marker_hsv(1), 560.0, 40.0, 17.0)  # in the first strip: it is seen before the hand
     gone, back = render([mug]), render([*hand(300.0, 300.0), mug])
     frames = push_all(windowed(), [render(hand()), *[gone] * 60, *[back] * (2 * STRIPS + 2)])
     assert all(seen(frames[-1]))
     assert (np.hypot(*(frames[-1].uv - CENTRES - (300.0, 300.0)).T) < 0.3).all()
 
 
-@pytest.mark.parametrize("turned", [1.0, -1.0])
-def test_a_hand_that_enters_at_the_edge_of_the_frame_is_followed_into_it(turned: float) -> None:
+@pytest.mark.parametrize("rotated", [1.0, -1.0])
+def test_a_hand_that_enters_at_the_edge_of_the_frame_is_followed_into_it(rotated: float) -> None:
     us = [-90.0 + 12.0 * k for k in range(30)]
-    images = [render(hand(u if turned > 0 else 639.0 - u)) for u in us]
+    images = [render(hand(u if rotated > 0 else 639.0 - u)) for u in us]
     whole, frames = push_all(DETECTORS["numpy"].fresh(), images), push_all(windowed(), images)
     for one, other in zip(whole, frames, strict=True):
         near = np.isfinite(one.uv[:, 0]) & np.isfinite(other.uv[:, 0])
@@ -254,14 +256,14 @@ def test_motion_of_several_windows_a_frame_is_followed_by_prediction_or_found_ag
 
 def test_a_marker_of_a_few_pixels_is_found_in_strips_as_on_all_grids() -> None:
     for u in (300.0, 301.0, 302.0, 303.0):
-        speck = render([Disc(paint(1), u, 331.0, 2.6)])
+        speck = render([Disc(marker_hsv(1), u, 331.0, 2.6)])
         frames = push_all(windowed(), [EMPTY, *[speck] * STRIPS])
         assert np.hypot(*(frames[-1].uv[1] - (u, 331.0))) < 0.5
 
 
 def test_a_surface_in_a_markers_colour_is_seen_whole_and_is_not_the_marker() -> None:
     shirt = render(
-        [*hand(), Disc(paint(1), 320.0, 600.0, 330.0)]
+        [*hand(), Disc(marker_hsv(1), 320.0, 600.0, 330.0)]
     )  # it reaches into windows, and far out of them
     frames = push_all(windowed(), [render(hand())] * 2 + [shirt] * 4)
     whole = push_all(DETECTORS["numpy"].fresh(), [render(hand())] * 2 + [shirt] * 4)
@@ -300,7 +302,7 @@ def test_windows_are_a_part_of_the_frame_and_what_is_lost_costs_a_strip() -> Non
     push_all(detector, [render(hand())] * 2)
     assert points[0] == every
     assert sum(points[1:]) < 0.3 * every
-    lost = render([d for d in hand() if d.hsv != paint(1)])
+    lost = render([d for d in hand() if d.hsv != marker_hsv(1)])
     detector.push(lost, 2 * STEP_NS)
     del points[:]
     detector.push(lost, 3 * STEP_NS)
@@ -354,7 +356,7 @@ def test_the_strips_of_one_round_hold_the_whole_frame(scanner: Scanner) -> None:
     places = [(float(u), float(v)) for u in (4, 320, 634) for v in range(4, 480, 17)]
     found: set[tuple[float, float]] = set()
     for place in places:
-        image = render([Disc(paint(1), *place, 5.0)])
+        image = render([Disc(marker_hsv(1), *place, 5.0)])
         looks = [scanner.around(image, TABLE, NOWHERE, [1]).blobs[1] for _ in range(STRIPS)]
         if any(looks):
             found.add(place)

@@ -13,12 +13,12 @@ from slave.__main__ import main
 from slave.app import run
 from slave.arguments import parser
 from slave.cameras.source import Frame
-from slave.markers.changing import ChangingDetector
+from slave.counters import Counters
+from slave.markers.calibrated import CalibratedDetector
 from slave.markers.detector import MarkerDetector
-from slave.markers.known import KnownDetector
+from slave.markers.reloadable import ReloadableDetector
 from slave.markers.scan_choice import JUDGED, PROBE_EVERY, PROBES, Scan, ScanChoice
 from slave.offline import calibrate_colours
-from slave.tally import Tally
 from tests.slave.painted import NAMES, RANGES, camera, hand, render
 from tests.slave.test_app import Source, Wire, frame
 
@@ -53,9 +53,9 @@ def test_windows_are_chosen_where_whole_frames_do_not_fit_and_left_where_they_fi
         assert modes[JUDGED : JUDGED + PROBE_EVERY] == [True] * PROBE_EVERY
         assert modes[JUDGED:].count(False) == 4, "a whole frame now and then: does it fit?"
         assert choice.frames == modes.count(True)
-        (said,) = caplog.messages
-        assert said.startswith("left: to scan a whole frame takes 21.7 ms of the 16.7 ms of a frame")
-        assert "--scan auto" in said
+        (output,) = caplog.messages
+        assert output.startswith("left: to scan a whole frame takes 21.7 ms of the 16.7 ms of a frame")
+        assert "--scan auto" in output
         machine.whole_ms = 0.5 * PERIOD_MS
         modes = machine.frames(choice, (2 * PROBES + 1) * (PROBE_EVERY + 1))
         assert modes[-PROBE_EVERY:] == [False] * PROBE_EVERY
@@ -117,29 +117,29 @@ class Clock:
         return self._now_ns
 
 
-def changing(scan: Scan, whole_ms: float = 1.0) -> tuple[ChangingDetector, MarkerDetector]:
+def reloadable(scan: Scan, whole_ms: float = 1.0) -> tuple[ReloadableDetector, MarkerDetector]:
     plain = DETECTOR.fresh()
-    return ChangingDetector(plain, ScanChoice(scan, camera()), Clock(plain, whole_ms)), plain
+    return ReloadableDetector(plain, ScanChoice(scan, camera()), Clock(plain, whole_ms)), plain
 
 
 def test_the_running_slave_measures_and_chooses_and_counts() -> None:
-    detector, plain = changing("auto", whole_ms=20.0)
-    tally = Tally(NAMES, lambda: {"windows": 0 if detector.choice is None else detector.choice.frames})
+    detector, plain = reloadable("auto", whole_ms=20.0)
+    counters = Counters(NAMES, lambda: {"windows": 0 if detector.choice is None else detector.choice.frames})
     wire, count = Wire(), JUDGED + 20
     frames: list[Frame | CameraError] = [frame(k, HAND) for k in range(count)]
-    run(Source(frames), detector, wire, "left", tally, threading.Event())
+    run(Source(frames), detector, wire, "left", counters, threading.Event())
     assert plain.windows_only
-    counts = tally.counts()
+    counts = counters.counts()
     assert (counts["frames"], counts["windows"], counts["failed"]) == (count, 20, 0)
     for message in wire.sent[1:]:
         np.testing.assert_array_equal(message.uv, wire.sent[0].uv)
-    detector, plain = changing("auto", whole_ms=2.0)
-    run(Source([frame(k, HAND) for k in range(count)]), detector, wire, "left", tally, threading.Event())
+    detector, plain = reloadable("auto", whole_ms=2.0)
+    run(Source([frame(k, HAND) for k in range(count)]), detector, wire, "left", counters, threading.Event())
     assert not plain.windows_only
 
 
 def test_the_picture_that_is_shown_and_picked_from_is_the_whole_frame() -> None:
-    detector, _ = changing("windows")
+    detector, _ = reloadable("windows")
     detector.push(HAND, 0)
     found = detector.push(HAND, STEP_NS)
     assert detector.newest is not None
@@ -148,7 +148,7 @@ def test_the_picture_that_is_shown_and_picked_from_is_the_whole_frame() -> None:
 
 
 def test_colours_and_margin_change_while_windows_are_scanned_and_the_tracks_go_on() -> None:
-    detector, old = changing("windows")
+    detector, old = reloadable("windows")
     for k in range(3):
         detector.push(HAND, k * STEP_NS)
     wider = {
@@ -173,11 +173,11 @@ def test_colours_and_margin_change_while_windows_are_scanned_and_the_tracks_go_o
 def test_a_marker_whose_colour_comes_later_is_found_and_without_any_colour_nothing_is_scanned() -> None:
     bare = msgspec.structs.replace(camera(), markers=None)
     choice = ScanChoice("windows", camera())
-    detector = ChangingDetector(KnownDetector(bare, NAMES), choice)
+    detector = ReloadableDetector(CalibratedDetector(bare, NAMES), choice)
     assert np.isnan(detector.push(HAND, 0).uv).all()
     assert choice.frames == 0
     some = {name: RANGES[name] for name in ("index", "back")}
-    detector.replace(KnownDetector(camera(ranges=some), NAMES))
+    detector.replace(CalibratedDetector(camera(ranges=some), NAMES))
     assert np.isfinite(detector.push(HAND, STEP_NS).uv[:, 0]).tolist() == [name in some for name in NAMES]
     detector.replace(MarkerDetector(camera(), NAMES))
     assert np.isfinite(detector.push(HAND, 2 * STEP_NS).uv[:, 0]).all()

@@ -13,9 +13,9 @@ import pytest
 from common.messages import Message
 from slave.app import run, wait_for_start
 from slave.cameras.source import Frame
+from slave.counters import Counters
 from slave.markers.detector import Detections
-from slave.service import AWAY_S, WAITING, Service
-from slave.tally import Tally
+from slave.service import LOST_PATIENCE_S, WAITING, Service
 
 PERIOD_US = 4_000_000
 QUARTER_NS = 1_000_000_000
@@ -41,7 +41,7 @@ class Manager:
         self._socket.bind("\0" + address[1:] if address[0] == "@" else address)
         self._socket.setblocking(False)
 
-    def heard(self) -> list[list[str]]:
+    def received(self) -> list[list[str]]:
         found: list[list[str]] = []
         try:
             while True:
@@ -68,28 +68,28 @@ def manager(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Manager]
 def begun(manager: Manager, time: Time, **more: str) -> Service:
     service = Service(manager.environment() | more, time)
     service.ready(lambda: True)
-    assert manager.heard() == [["READY=1", f"STATUS={WAITING}", "WATCHDOG=1"]]
+    assert manager.received() == [["READY=1", f"STATUS={WAITING}", "WATCHDOG=1"]]
     return service
 
 
 def test_a_loop_that_comes_round_feeds_once_in_a_quarter_of_the_period(manager: Manager) -> None:
     time = Time()
     service = begun(manager, time)
-    heard: list[list[str]] = []
+    received: list[list[str]] = []
     for _ in range(20 * 90):  # 20 s at 90 Hz
         time.passes(1.0 / 90.0)
         service.working()
-        heard += manager.heard()
-    assert 18 <= len(heard) <= 20
-    assert all("WATCHDOG=1" in one for one in heard)
-    assert heard[-1][0] == "STATUS=90 frames/s"
+        received += manager.received()
+    assert 18 <= len(received) <= 20
+    assert all("WATCHDOG=1" in one for one in received)
+    assert received[-1][0] == "STATUS=90 frames/s"
 
 
 def test_a_loop_that_hangs_says_nothing_whatever_else_lives(manager: Manager) -> None:
     time = Time()
     begun(manager, time)
     time.passes(100.0)
-    assert manager.heard() == []
+    assert manager.received() == []
 
 
 def test_waiting_for_the_master_is_no_hang(manager: Manager) -> None:
@@ -98,30 +98,30 @@ def test_waiting_for_the_master_is_no_hang(manager: Manager) -> None:
     for _ in range(50):
         time.passes(0.2)
         service.waiting()
-    heard = manager.heard()
-    assert 8 <= len(heard) <= 10
-    assert set(map(tuple, heard)) == {(f"STATUS={WAITING}", "WATCHDOG=1")}
+    received = manager.received()
+    assert 8 <= len(received) <= 10
+    assert set(map(tuple, received)) == {(f"STATUS={WAITING}", "WATCHDOG=1")}
 
 
 def test_a_lost_camera_has_more_time_and_the_first_frame_ends_it(manager: Manager) -> None:
     time = Time()
     service = begun(manager, time)
-    service.away("camera lost: no frame\nfor 2 s")
-    patience = f"WATCHDOG_USEC={round(AWAY_S * 1e6)}"
-    assert manager.heard() == [["STATUS=camera lost: no frame for 2 s", patience, "WATCHDOG=1"]]
+    service.connection_lost("camera lost: no frame\nfor 2 s")
+    patience = f"WATCHDOG_USEC={round(LOST_PATIENCE_S * 1e6)}"
+    assert manager.received() == [["STATUS=camera lost: no frame for 2 s", patience, "WATCHDOG=1"]]
     time.passes(80.0)
     service.working()
-    assert manager.heard() == [["STATUS=frames come", f"WATCHDOG_USEC={PERIOD_US}", "WATCHDOG=1"]]
+    assert manager.received() == [["STATUS=frames come", f"WATCHDOG_USEC={PERIOD_US}", "WATCHDOG=1"]]
     time.passes(2.0)
     service.working()
-    assert "WATCHDOG_USEC" not in str(manager.heard())
+    assert "WATCHDOG_USEC" not in str(manager.received())
 
 
 def test_before_it_is_ready_a_slow_opening_asks_for_time_to_start(manager: Manager) -> None:
     service = Service(manager.environment(), Time())
-    service.away("opens the camera, in step with others", 150.0)
+    service.connection_lost("opens the camera, in step with others", 150.0)
     status = "STATUS=opens the camera, in step with others: may take 150 s"  # read by slave/install/systemd
-    assert manager.heard() == [[status, "EXTEND_TIMEOUT_USEC=150000000"]]
+    assert manager.received() == [[status, "EXTEND_TIMEOUT_USEC=150000000"]]
 
 
 def test_it_says_that_nobody_takes_what_it_sends_and_how_it_ended(manager: Manager) -> None:
@@ -133,7 +133,7 @@ def test_it_says_that_nobody_takes_what_it_sends_and_how_it_ended(manager: Manag
         service.working()
     service.stopping()
     service.failed("no such IMU")
-    ready, status, stopping, failed = manager.heard()
+    ready, status, stopping, failed = manager.received()
     assert ready == ["READY=1", f"STATUS={WAITING}"]
     assert status == ["STATUS=100 samples/s, but the master is away"]
     assert stopping[0] == "STOPPING=1"
@@ -143,7 +143,7 @@ def test_it_says_that_nobody_takes_what_it_sends_and_how_it_ended(manager: Manag
 def test_the_watchdog_of_another_process_is_not_fed(manager: Manager) -> None:
     service = Service(manager.environment() | {"WATCHDOG_PID": str(os.getpid() + 1)}, Time())
     service.ready(lambda: True)
-    assert manager.heard() == [["READY=1", f"STATUS={WAITING}"]]
+    assert manager.received() == [["READY=1", f"STATUS={WAITING}"]]
 
 
 @pytest.mark.parametrize("environment", [{}, {"NOTIFY_SOCKET": ""}, {"NOTIFY_SOCKET": "vsock:2:1"}])
@@ -155,7 +155,7 @@ def test_on_a_terminal_nothing_is_told(environment: dict[str, str]) -> None:
         time.passes(60.0)
         service.working()
         service.waiting()
-        service.away("camera lost")
+        service.connection_lost("camera lost")
     service.stopping()
 
 
@@ -188,7 +188,7 @@ class Nowhere:
     def send(self, message: Message) -> None: ...
 
 
-class Blind:
+class Null:
     """Finds nothing, and hangs after so many frames, until it is let go."""
 
     def __init__(self, hang_after: int, released: threading.Event) -> None:
@@ -215,7 +215,7 @@ class Blind:
 def test_a_detection_that_hangs_feeds_nothing(manager: Manager) -> None:
     time, stop, released = Time(), threading.Event(), threading.Event()
     service = begun(manager, time)
-    detector = Blind(5, released)
+    detector = Null(5, released)
 
     def alive() -> None:
         time.passes(1.5)
@@ -223,15 +223,15 @@ def test_a_detection_that_hangs_feeds_nothing(manager: Manager) -> None:
 
     loop = threading.Thread(
         target=run,
-        args=(Frames(10, lambda: None), detector, Nowhere(), "left", Tally(("index",)), stop),
+        args=(Frames(10, lambda: None), detector, Nowhere(), "left", Counters(("index",)), stop),
         kwargs={"alive": alive},
     )
     loop.start()
     try:
         assert detector.hangs.wait(30.0)
-        assert len(manager.heard()) == 5  # each of the frames before
+        assert len(manager.received()) == 5  # each of the frames before
         time.passes(60.0)
-        assert manager.heard() == []
+        assert manager.received() == []
     finally:
         stop.set()
         released.set()
@@ -261,4 +261,4 @@ def test_the_wait_for_the_master_comes_round(manager: Manager) -> None:
         service.waiting()
 
     assert not wait_for_start(Never(stop, 50), stop, alive)
-    assert len(manager.heard()) >= 8
+    assert len(manager.received()) >= 8

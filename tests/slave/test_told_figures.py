@@ -9,7 +9,7 @@ from common.bus import LoopbackBus
 from common.camera_settings import WANTED, figures
 from common.clock import SystemClock
 from common.messages import Command, Health, decode, encode
-from master.checklist.slave_rules import BESIDE, OFF, OVERLAP, UNCOLOURED
+from master.checklist.slave_rules import AMBIGUOUS, OFF, OVERLAP, UNCOLOURED
 from master.checklist.unseen import COLOUR, SEEN
 from slave import live
 from slave.markers.engine import NUMPY
@@ -19,13 +19,13 @@ from slave.tuning import CameraTuning
 from tests.network_helpers import until
 from tests.slave.test_tuning import FILE, RIG, Knobs, Wire, tree
 
-GAUGES = {
+METRICS = {
     *(WANTED + setting for setting in OFF),
     *OFF,
     *(COLOUR + marker for marker in RIG.markers),
     *("width_px", "height_px", "light_exposure", "disk_free_mb"),
 }
-COUNTS = {"frames", "uncalibrated", *(kind + marker for kind in (SEEN, BESIDE) for marker in RIG.markers)}
+COUNTS = {"frames", "uncalibrated", *(kind + marker for kind in (SEEN, AMBIGUOUS) for marker in RIG.markers)}
 
 
 class Camera(Knobs):
@@ -48,7 +48,7 @@ def test_a_slave_tells_what_the_checklist_judges(tmp_path: Path) -> None:
         line = live._marker_line(
             "left", files, nothing, nothing, clock, "follow", "full", NUMPY, stop, workers, Service({})
         )
-    tuning = CameraTuning(files, Camera(), line.prepare, lambda: True, line.picker)
+    tuning = CameraTuning(files, Camera(), line.prepare, lambda: True, line.sampler)
     reporter = Reporter(
         "left", Alone(), line.numbers, clock, lambda _: LoopbackBus(), stop.set, 0.01, camera=tuning
     )
@@ -59,19 +59,19 @@ def test_a_slave_tells_what_the_checklist_judges(tmp_path: Path) -> None:
         return told
 
     try:
-        assert until(lambda: "disk_free_mb" in ask("report").gauges)
+        assert until(lambda: "disk_free_mb" in ask("report").metrics)
         health = ask("report")
-        assert not GAUGES - health.gauges.keys()
+        assert not METRICS - health.metrics.keys()
         assert not COUNTS - health.counts.keys()
-        assert not [name for name in health.gauges if name.startswith(OVERLAP)]
+        assert not [name for name in health.metrics if name.startswith(OVERLAP)]
         ask(
             "set",
             '{"markers": {"back": {"hsv_low": [50, 60, 60], "hsv_high": [65, 255, 255]}, "ring": null}}',
         )
-        assert until(lambda: OVERLAP + "index..back" in ask("report").gauges)
+        assert until(lambda: OVERLAP + "index..back" in ask("report").metrics)
         health = ask("report")
-        assert health.gauges[COLOUR + "back"] != 0.0
-        assert COLOUR + "ring" not in health.gauges
+        assert health.metrics[COLOUR + "back"] != 0.0
+        assert COLOUR + "ring" not in health.metrics
         assert health.counts[UNCOLOURED + "ring"] == health.counts["uncalibrated"] == 1
     finally:
         reporter.close()

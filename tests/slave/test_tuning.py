@@ -22,12 +22,12 @@ from common.sim.scene import Scene
 from slave.app import run
 from slave.cameras.source import Frame
 from slave.cameras.synthetic import SyntheticCamera
-from slave.markers.changing import ChangingDetector, marker_changes
-from slave.markers.following import detector_for
+from slave.counters import Counters
+from slave.markers.light_adaptive import detector_for
+from slave.markers.reloadable import ReloadableDetector, marker_changes
 from slave.markers.scan_choice import Scan, ScanChoice
 from slave.markers.workers import Inline
 from slave.report import Reporter
-from slave.tally import Tally
 from slave.tuning import CameraFiles, CameraTuning
 from tests.network_helpers import until
 
@@ -119,7 +119,7 @@ def test_set_changes_what_it_names_and_nothing_else(tuning: CameraTuning, knobs:
 
 
 @pytest.mark.parametrize(
-    ("verb", "body", "says"),
+    ("verb", "body", "expected"),
     [
         ("set", '{"exposure": 9000}', "set: Object contains unknown field `exposure`"),
         ("set", '{"exposure_us": -1}', r"set: Expected `float` >= 0.01 - at `\$.exposure_us`"),
@@ -148,9 +148,9 @@ def test_set_changes_what_it_names_and_nothing_else(tuning: CameraTuning, knobs:
     ],
 )
 def test_a_wrong_body_is_refused_with_the_reason(
-    verb: str, body: str, says: str, tuning: CameraTuning, knobs: Knobs
+    verb: str, body: str, expected: str, tuning: CameraTuning, knobs: Knobs
 ) -> None:
-    with pytest.raises(CalibrationError, match=says):
+    with pytest.raises(CalibrationError, match=expected):
         tuning.commands()[verb](body)
     assert knobs.tuned == []
 
@@ -259,15 +259,15 @@ class Slave:
         def make(camera: CameraCalibration, rig: RigCalibration) -> Any:
             return detector_for(camera, rig.markers, Inline(), free=rig.free_markers)
 
-        self.detector = ChangingDetector(make(FILE, RIG), ScanChoice(scan, FILE))
-        tally = Tally(RIG.markers)
+        self.detector = ReloadableDetector(make(FILE, RIG), ScanChoice(scan, FILE))
+        counters = Counters(RIG.markers)
         changes = marker_changes(self.detector, make)
-        self.tuning = CameraTuning(files, self.source, changes, lambda: tally.counts()["frames"] > 0)
+        self.tuning = CameraTuning(files, self.source, changes, lambda: counters.counts()["frames"] > 0)
         self.light = np.zeros(3)
         self.reporter = Reporter(
-            "left", self.wire, tally, clock, lambda _: self.bus.join(), stop.set, 0.05, camera=self.tuning
+            "left", self.wire, counters, clock, lambda _: self.bus.join(), stop.set, 0.05, camera=self.tuning
         )
-        loop = (self.source, self.detector, self.wire, "left", tally, stop, self._look)
+        loop = (self.source, self.detector, self.wire, "left", counters, stop, self._look)
         self.thread = threading.Thread(target=run, args=loop)
         self.thread.start()
 
@@ -301,7 +301,7 @@ def test_exposure_changed_over_the_bus_changes_the_picture_and_the_markers_stay(
     with slave(files) as left:
         before = left.light.copy()
         health = left.ask("set", '{"exposure_us": 3000}')
-        assert health.gauges["exposure_us"] == 3000.0
+        assert health.metrics["exposure_us"] == 3000.0
         assert until(lambda: bool((left.light < 0.9 * before).all()))
         sent = len(left.wire.sent)
         assert until(lambda: len(left.wire.sent) > sent + 20)
@@ -310,7 +310,7 @@ def test_exposure_changed_over_the_bus_changes_the_picture_and_the_markers_stay(
             BusError, match="'left' refused 'set': exposure_us: wanted 20000, a frame at 60 Hz"
         ):
             left.ask("set", '{"exposure_us": 20000}')
-        assert left.ask("settings").gauges["exposure_us"] == 3000.0
+        assert left.ask("settings").metrics["exposure_us"] == 3000.0
         with pytest.raises(BusError, match="there are report, stop, settings, set, load, save"):
             left.ask("dance")
 
@@ -335,7 +335,7 @@ def test_a_new_calibration_goes_over_the_bus_into_the_running_slave_and_its_file
         used = tables._detector
         track = used._detector._tracks  # pyright: ignore[reportAttributeAccessIssue]
         health = left.ask("load", text(new))
-        assert (health.gauges["exposure_us"], health.gauges["analogue_gain"]) == (4500.0, 1.5)
+        assert (health.metrics["exposure_us"], health.metrics["analogue_gain"]) == (4500.0, 1.5)
         assert load(files.camera_path, CameraCalibration) == FILE, "not asked to save"
         assert until(lambda: tables._detector is not used)
         assert tables._detector._detector._tracks is track, "tracks go on"  # pyright: ignore[reportAttributeAccessIssue]
@@ -351,11 +351,11 @@ def test_a_new_calibration_goes_over_the_bus_into_the_running_slave_and_its_file
         bad["markers"].pop("index")
         with pytest.raises(BusError, match="no HSV range for index"):
             left.ask("load", msgspec.json.encode(bad).decode())
-        blind = msgspec.json.decode(text(new))
-        blind["markers"]["index"]["reference_bgr_linear"] = None
+        null_detector = msgspec.json.decode(text(new))
+        null_detector["markers"]["index"]["reference_bgr_linear"] = None
         with pytest.raises(BusError, match="the light is followed: restart the slave"):
-            left.ask("load", msgspec.json.encode(blind).decode())
-        assert left.ask("settings").gauges["wanted.exposure_us"] == 4500.0
+            left.ask("load", msgspec.json.encode(null_detector).decode())
+        assert left.ask("settings").metrics["wanted.exposure_us"] == 4500.0
 
 
 def test_a_changed_file_brightens_the_picture_and_a_broken_one_is_reported(files: CameraFiles) -> None:
@@ -368,12 +368,15 @@ def test_a_changed_file_brightens_the_picture_and_a_broken_one_is_reported(files
         sent = len(left.wire.sent)
         assert until(lambda: len(left.wire.sent) > sent + 10), "it goes on"
         report = left.ask("report")
-        assert (report.counts["reload.applied"], report.gauges["analogue_gain"]) == (1, 2.0)
+        assert (report.counts["reload.applied"], report.metrics["analogue_gain"]) == (1, 2.0)
 
 
 def replaced(make: Callable[[], Any]) -> list[int]:
     """Markers seen in each frame while the detector is replaced in the middle."""
-    renderer, detector = Renderer(SCENE, "left"), ChangingDetector(detector_for(FILE, RIG.markers, Inline()))
+    renderer, detector = (
+        Renderer(SCENE, "left"),
+        ReloadableDetector(detector_for(FILE, RIG.markers, Inline())),
+    )
     images = [(renderer.render(k / 60.0), round(k * 1e9 / 60.0)) for k in range(20)]
     counts: list[int] = []
     for k, (image, t_ns) in enumerate(images):
@@ -421,7 +424,7 @@ def test_a_wrist_device_keeps_its_rate(files: CameraFiles, knobs: Knobs) -> None
         tuning.commands()["set"]('{"frame_rate_hz": 30}')
 
 
-def test_what_others_write_into_the_file_and_what_was_set_here_stay_beside_each_other(
+def test_what_others_write_into_the_file_and_what_was_set_here_are_both_kept(
     tuning: CameraTuning, files: CameraFiles
 ) -> None:
     """A lens is calibrated by the master, which writes it into the file, while colours are set here."""

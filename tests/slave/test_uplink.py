@@ -10,7 +10,7 @@ import pytest
 from common.clock import SystemClock
 from common.errors import BusError
 from common.messages import Health, MarkerDetections
-from slave.uplink import SAY_NS, News, Uplink
+from slave.uplink import LOG_NS, News, Uplink
 from tests.network_helpers import detections, free_udp_port, until
 
 KEY = bytes(range(32))
@@ -42,10 +42,10 @@ def test_without_a_master_it_waits_and_drops(uplink: Uplink) -> None:
 def test_two_slaves_hear_one_broadcast_on_one_port(uplink: Uplink, port: int) -> None:
     other = Uplink("right", KEY, SystemClock(), port, "127.0.0.1")
     try:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-            stranger.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-            stranger.bind(("127.0.0.1", 0))
-            stranger.sendto(b"not a beacon", ("127.255.255.255", port))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as unknown_peer:
+            unknown_peer.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+            unknown_peer.bind(("127.0.0.1", 0))
+            unknown_peer.sendto(b"not a beacon", ("127.255.255.255", port))
         for slave in (uplink, other):
             assert until(lambda one=slave: one.counts.get("refused.foreign") == 1)
     finally:
@@ -55,8 +55,8 @@ def test_two_slaves_hear_one_broadcast_on_one_port(uplink: Uplink, port: int) ->
 def test_bound_to_every_network_it_hears_loopback_too(port: int) -> None:
     slave = Uplink("left", KEY, SystemClock(), port)
     try:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-            stranger.sendto(b"not a beacon", ("127.0.0.1", port))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as unknown_peer:
+            unknown_peer.sendto(b"not a beacon", ("127.0.0.1", port))
         assert until(lambda: slave.counts.get("refused.foreign") == 1)
     finally:
         slave.close()
@@ -102,11 +102,11 @@ def test_a_line_is_said_once_and_who_alternates_two_does_not_fill_the_log() -> N
         False,
         False,
     ]
-    said = [
+    output = [
         t
-        for t in range(0, 10 * SAY_NS, SAY_NS // 100)
-        if news.is_new("ab"[t * 100 // SAY_NS % 2], SAY_NS + t)
+        for t in range(0, 10 * LOG_NS, LOG_NS // 100)
+        if news.is_new("ab"[t * 100 // LOG_NS % 2], LOG_NS + t)
     ]
-    assert 1 < len(said) <= 10
-    assert not news.is_new("c", 10 * SAY_NS + SAY_NS // 2)
+    assert 1 < len(output) <= 10
+    assert not news.is_new("c", 10 * LOG_NS + LOG_NS // 2)
     assert news.is_new("c", 0)  # a clock that was set back makes it no quieter

@@ -129,7 +129,7 @@ def test_automatics_are_off_before_values_are_written_and_all_are_as_asked() -> 
 
 
 @pytest.mark.parametrize(
-    ("name", "to", "says"),
+    ("name", "to", "expected"),
     [
         (
             "Exposure Time, Absolute",
@@ -141,11 +141,11 @@ def test_automatics_are_off_before_values_are_written_and_all_are_as_asked() -> 
         ("Exposure, Dynamic Framerate", 1, "exposure_dynamic_framerate: wanted 0 (no automatic), got 1"),
     ],
 )
-def test_a_setting_that_was_not_taken_is_named_with_wanted_and_got(name: str, to: int, says: str) -> None:
+def test_a_setting_that_was_not_taken_is_named_with_wanted_and_got(name: str, to: int, expected: str) -> None:
     camera = Camera(keeps=lambda knob, value: to if knob == name else value)
     with pytest.raises(CameraError) as error:
         opened(camera)
-    assert says in str(error.value)
+    assert expected in str(error.value)
     assert "camera 'left' (v4l2:/dev/video0)" in str(error.value)
     assert camera.closed == 1
 
@@ -202,7 +202,7 @@ def test_codes_of_the_maker_must_be_given() -> None:
 
 
 @pytest.mark.parametrize(
-    ("controls", "says"),
+    ("controls", "expected"),
     [
         (
             {"sharpness": 1},
@@ -217,8 +217,8 @@ def test_codes_of_the_maker_must_be_given() -> None:
         ({"exposure_time_absolute": 9}, "the exposure is exposure_us of the camera file"),
     ],
 )
-def test_a_wrong_control_is_refused_with_what_is_allowed(controls: dict[str, int], says: str) -> None:
-    with pytest.raises(CameraError, match=says):
+def test_a_wrong_control_is_refused_with_what_is_allowed(controls: dict[str, int], expected: str) -> None:
+    with pytest.raises(CameraError, match=expected):
         opened(Camera(), V4l2Options(controls=GIVEN | controls))
 
 

@@ -15,8 +15,8 @@ from common.calibration import RigCalibration
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.hand_model import HandJoints
-from common.round_cones import Cones, distances
-from common.sim.wrist.flesh import GROUPS, THING_GROUP, Flesh
+from common.sim.wrist.capsules import GROUPS, THING_GROUP, HandCapsules
+from common.tapered_capsules import Capsules, distances
 
 RAYS = 1536  # 1.2 mrad apart: 0.2 mm at a finger, half a pixel
 FINER = 24  # parts of a gap between rays at the end of a part
@@ -33,7 +33,7 @@ class LaserCurve:
         rays: Unit directions (K, 3) from the laser's origin, along the fan.
         points: (K, 3) [m], camera frame.
         body: Which body is lit (K,).
-        group, segment: As `Flesh.parts` says (K,).
+        group, segment: As `HandCapsules.parts` says (K,).
         seen: Whether the camera sees it (K,).
         joined: (K,) whether it and the next one are neighbours on one part of the hand.
     """
@@ -56,7 +56,7 @@ class LaserSheet:
         normal, offset_m: The plane, normal . X = offset_m.
         forward, across: Unit vectors (3,) of the plane: the middle of the fan, and towards its second edge.
         angle_rad: (RAYS,) of the rays to the middle, from one edge of the fan to the other.
-        flesh: The hand.
+        capsules: The hand.
         still: The palm of a straight wrist, which was met beforehand.
         still_m: How far along each ray that begins (RAYS,) [m]; inf: nowhere.
         still_body: Which body of it that is (RAYS,).
@@ -68,13 +68,13 @@ class LaserSheet:
     forward: Float
     across: Float
     angle_rad: Float
-    flesh: Flesh
-    still: Cones
+    capsules: HandCapsules
+    still: Capsules
     still_m: Float
     still_body: Int
 
     @classmethod
-    def of(cls, rig: RigCalibration, flesh: Flesh, joints: HandJoints) -> "LaserSheet":
+    def of(cls, rig: RigCalibration, capsules: HandCapsules, joints: HandJoints) -> "LaserSheet":
         """Of a rig whose palm stands as in `joints` while the wrist is straight.
 
         Raises:
@@ -99,21 +99,21 @@ class LaserSheet:
         forward /= np.linalg.norm(forward)
         across = np.cross(normal, forward)
         angle = np.linspace(-0.5, 0.5, RAYS) * laser.fan_rad
-        still = flesh.bodies(joints).of(slice(flesh.still))
+        still = capsules.bodies(joints).of(slice(capsules.still))
         near, body = _nearest(distances(still, origin, _fan(forward, across, angle)))
-        return cls(origin, normal, offset, forward, across, angle, flesh, still, near, body)
+        return cls(origin, normal, offset, forward, across, angle, capsules, still, near, body)
 
-    def cross(self, bodies: Cones) -> LaserCurve:
+    def cross(self, bodies: Capsules) -> LaserCurve:
         """Where it meets the hand whose flesh is at `bodies`, and the things that follow it there."""
-        flesh, first = self.flesh, self.flesh.still
+        capsules, first = self.capsules, self.capsules.still
         rays = _fan(self.forward, self.across, self.angle_rad)
-        if flesh.same_palm(bodies, self.still):
+        if capsules.same_palm(bodies, self.still):
             near, body = self._meet(bodies, rays, first)
             body = np.where(near < self.still_m, body, self.still_body)
             near = np.minimum(near, self.still_m)
         else:
             near, body = self._meet(bodies, rays)
-        met = np.where(np.isfinite(near), flesh.group_of(body), -1)
+        met = np.where(np.isfinite(near), capsules.group_of(body), -1)
         with np.errstate(invalid="ignore"):
             ends = np.flatnonzero((met[1:] != met[:-1]) | (np.abs(np.diff(near)) > JOINED_M))
         part = np.arange(1, FINER) / FINER * (self.angle_rad[1] - self.angle_rad[0])
@@ -125,13 +125,13 @@ class LaserSheet:
         lit = np.flatnonzero(np.isfinite(near))
         rays, body = np.concatenate([rays, more])[order][lit], body[lit]
         points = self.origin + near[lit, None] * rays
-        group, segment = flesh.parts(bodies, body, points)
+        group, segment = capsules.parts(bodies, body, points)
         joined = np.zeros(len(lit), dtype=np.bool_)
         chord = np.linalg.norm(np.diff(points, axis=0), axis=1)
         joined[:-1] = (np.diff(lit) == 1) & (group[1:] == group[:-1]) & (chord < JOINED_M)
         return LaserCurve(rays, points, body, group, segment, self.seen(bodies, points), joined)
 
-    def _meet(self, bodies: Cones, rays: Float, first: int = 0) -> tuple[Float, Int]:
+    def _meet(self, bodies: Capsules, rays: Float, first: int = 0) -> tuple[Float, Int]:
         """How far along rays (N, 3) of the sheet the nearest of the bodies from `first` on begins (N,) [m], and which
         that is (N,); only those that the sheet passes through are asked."""
         middle = 0.5 * (bodies.start_m + bodies.stop_m)
@@ -142,7 +142,7 @@ class LaserSheet:
         which = np.flatnonzero(cut)
         if not which.size:
             return np.full(len(rays), np.inf), np.full(len(rays), first)
-        some = Cones(
+        some = Capsules(
             bodies.start_m[which],
             bodies.stop_m[which],
             bodies.start_radius_m[which],
@@ -151,7 +151,7 @@ class LaserSheet:
         near, body = _nearest(distances(some, self.origin, rays))
         return near, which[body]
 
-    def seen(self, bodies: Cones, points: Float, within_m: float = SEEN_WITHIN_M) -> Bool:
+    def seen(self, bodies: Capsules, points: Float, within_m: float = SEEN_WITHIN_M) -> Bool:
         """Which of points (K, 3) [m] nothing hides from the camera that is more than `within_m` before them (K,)."""
         far = np.linalg.norm(points, axis=1)
         front = points[:, 2] > 0.0

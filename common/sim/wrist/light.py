@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 
 from common.arrays import Bool, Float, Image
-from common.round_cones import Cones, Plane, first_hits, terms
+from common.tapered_capsules import Capsules, Plane, first_hits, terms
 
 BLACK_LEVEL = 2.0
-LED_LEVEL = 88.0  # of skin that faces the LEDs at SKIN_AT_M on the axis
-LASER_LEVEL = 2400.0  # of the middle of the line, on skin that faces the laser at SKIN_AT_M
-SKIN_AT_M = 0.13
+LED_LEVEL = 88.0  # of skin that faces the LEDs at SURFACE_AT_M on the axis
+LASER_LEVEL = 2400.0  # of the middle of the line, on skin that faces the laser at SURFACE_AT_M
+SURFACE_AT_M = 0.13
 SHADOW_GAP_M = 0.001  # nearer to a body nothing is in its shadow: it may be on the body itself
 SHEET_SIGMA_M = 4.2e-4  # of the sheet of laser light
 GLOW = (
@@ -58,7 +58,7 @@ class Room:
         sun = np.array([rng.uniform(-1.0, 1.0), -0.8, rng.uniform(-0.5, 0.1)])
         return cls(*_LEVELS[name], sky / np.linalg.norm(sky), sun / np.linalg.norm(sun), seed)
 
-    def on_skin(self, normals: Plane) -> Plane:
+    def on_surface(self, normals: Plane) -> Plane:
         """Levels (N,) of plain skin with normals (N, 3): light from all sides, more from above, and the sun."""
         shade: Plane = self.hand * (0.75 + 0.25 * (normals @ self.to_sky.astype(np.float32)))
         if self.sun > 0.0:
@@ -103,7 +103,7 @@ class Leds:
         """Of places (L, 3) [m], camera frame."""
         self._led = led_m.astype(np.float32)
 
-    def on_skin(self, points: Plane, normals: Plane, before: Cones | None = None) -> Plane:
+    def on_surface(self, points: Plane, normals: Plane, before: Capsules | None = None) -> Plane:
         """Levels (N,) of plain skin at points (N, 3) [m]: inverse square and Lambert's cosine, summed over the LEDs.
 
         Only `before` throws shadows: those of one finger on another are narrow, so near to the lens are the LEDs.
@@ -116,10 +116,10 @@ class Leds:
             for led, place in enumerate(self._led):
                 faced[_in_shadow(before, place, points, square[:, led]), led] = 0.0
         faced /= square * np.sqrt(square)
-        return faced.sum(axis=1) * np.float32(LED_LEVEL * SKIN_AT_M**2 / len(self._led))
+        return faced.sum(axis=1) * np.float32(LED_LEVEL * SURFACE_AT_M**2 / len(self._led))
 
 
-def _in_shadow(before: Cones, origin: Plane, points: Plane, square: Plane) -> Bool:
+def _in_shadow(before: Capsules, origin: Plane, points: Plane, square: Plane) -> Bool:
     """Whether light from an origin (3,) [m] meets a body on its way to points (N, 3) [m], `square` (N,) [m^2] far."""
     far = np.sqrt(square)
     ways = np.ascontiguousarray(((points - origin) / far[:, None]).T)

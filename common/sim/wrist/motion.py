@@ -25,13 +25,13 @@ from common.sim.motion import (
     base_pose,
     smooth_step,
 )
-from common.wrist_bend import STRAIGHT, forearm_palm
+from common.wrist_joint import STRAIGHT, forearm_palm
 
 MOVE_S = 0.8  # at most: the way from one posture to the next
 CURL_S = 10.0  # there and back
 CURL_PIP_DEG = 110.0
 MCP_PER_PIP, DIP_PER_PIP = 0.54, 0.84  # row D8, Kamper's ratios
-WEARER_S = 16.0
+SUBJECT_S = 16.0
 KNUCKLES_S, FIST_S = (0.8, 7.2), (8.8, 15.2)  # of the two bends within it, there and back
 WOBBLE = np.radians(1.0)
 THUMB_OPEN_DEG, THUMB_CLOSED_DEG = (-6.0, -4.0, 0.0, 0.0), (-2.0, 18.0, 18.0, 26.0)
@@ -40,7 +40,7 @@ RANDOM_DEG, RANDOM_DIP = (
     ((-10.0, 10.0), (0.0, 80.0), (0.0, 100.0)),
     (0.5, 0.9),
 )  # abduction, MCP, PIP; DIP / PIP
-FOREARM_TURN = np.radians(12.0)
+FOREARM_ROTATION = np.radians(12.0)
 _HALF_BENT = ((8, 2, 6), (0, 22, 36), (0, 22, 36), (0, 22, 36), (0, 22, 36))
 _WIDE = ((24, -4, 0), (14, 8, 10), (0, 8, 10), (-12, 8, 10), (-15, 8, 10))
 _CLOSED = ((-6, 4, 6), (-6, 10, 14), (0, 10, 14), (4, 10, 14), (7, 10, 14))
@@ -121,8 +121,8 @@ class Stations:
         share = smooth_step((t - place * self._each_s) / self._move_s)
         before = self._postures[place - 1]  # that of the first is the last
         posture = before + share * (self._postures[place] - before)
-        wobble, shift, turn = self._drift.at(t)
-        return HandState(_forearm(self._model, t, shift, turn), angles_of(self._model, posture, wobble))
+        wobble, shift, rotation = self._drift.at(t)
+        return HandState(_forearm(self._model, t, shift, rotation), angles_of(self._model, posture, wobble))
 
 
 class GuidedCurl:
@@ -149,8 +149,8 @@ class GuidedCurl:
         return HandState(_forearm(self._model, t, np.zeros(3), np.zeros(3)), angles)
 
 
-class GuidedWearer:
-    """What `calibrate wearer` asks for: flat hand, straight fingers bent at their knuckles and back, fist and back.
+class GuidedSubject:
+    """What `calibrate subject` asks for: flat hand, straight fingers bent at their knuckles and back, fist and back.
 
     Nobody does it exactly: each seed is a person whose flat hand is not quite flat, whose straight fingers follow a
     little, and whose fist has ratios of its own. The state it holds is that person, fixed by the constructor.
@@ -172,16 +172,16 @@ class GuidedWearer:
     @property
     def period_s(self) -> float:
         """Time [s] after which the motion repeats."""
-        return WEARER_S
+        return SUBJECT_S
 
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
-        t = max(t_s, 0.0) % WEARER_S
+        t = max(t_s, 0.0) % SUBJECT_S
         bend, fist = (
             0.5 - 0.5 * np.cos(2.0 * np.pi * np.clip((t - first) / (last - first), 0.0, 1.0))
             for first, last in (KNUCKLES_S, FIST_S)
         )
-        wobble = WOBBLE * np.sin(2.0 * np.pi * self._cycles * t / WEARER_S + self._phase)
+        wobble = WOBBLE * np.sin(2.0 * np.pi * self._cycles * t / SUBJECT_S + self._phase)
         angles = np.empty((5, 4))
         angles[0] = self._open + fist * (self._closed - self._open)
         angles[1:] = self._flat + wobble + bend * self._bent + fist * self._fist
@@ -234,22 +234,22 @@ class OnForearm:
     def at(self, t_s: float) -> HandState:
         """Forearm and fingers at time `t_s` [s]; before 0 the pose of 0."""
         state = self._motion.at(t_s)
-        if not state.bend_rad.any():
+        if not state.wrist_angles_rad.any():
             return state
         back = rigid(
-            forearm_palm(state.bend_rad).T, np.zeros(3)
+            forearm_palm(state.wrist_angles_rad).T, np.zeros(3)
         )  # both frames have their origin in the wrist
-        return replace(state, T_rig_palm=state.T_rig_palm @ back, bend_rad=STRAIGHT)
+        return replace(state, T_rig_palm=state.T_rig_palm @ back, wrist_angles_rad=STRAIGHT)
 
 
 def wrist_motion(
     name: str, model: HandModel, seed: int
-) -> Stations | GuidedCurl | GuidedWearer | RandomPoses | None:
+) -> Stations | GuidedCurl | GuidedSubject | RandomPoses | None:
     """The motion of a scene's name; None: there is no such."""
     if name == "curl":
         return GuidedCurl(model)
-    if name == "wearer":
-        return GuidedWearer(model, seed)
+    if name == "subject":
+        return GuidedSubject(model, seed)
     if name == "random":
         return RandomPoses(model, seed)
     if name == "standard":
@@ -263,7 +263,9 @@ def wrist_motion(
     return None
 
 
-def _forearm(model: HandModel, t_s: float, shift_m: Float, turn_rad: Float) -> Float:
+def _forearm(model: HandModel, t_s: float, shift_m: Float, rotation_rad: Float) -> Float:
     """Palm pose in the room (4, 4): the forearm turns slowly while the fingers move."""
-    slow = FOREARM_TURN * np.sin(2.0 * np.pi * t_s / (PERIOD_S / 6) + np.array([0.0, 2.1, 4.2]))
-    return base_pose(model, np.zeros(3), shift_m, slow - FOREARM_TURN * np.sin([0.0, 2.1, 4.2]) + turn_rad)
+    slow = FOREARM_ROTATION * np.sin(2.0 * np.pi * t_s / (PERIOD_S / 6) + np.array([0.0, 2.1, 4.2]))
+    return base_pose(
+        model, np.zeros(3), shift_m, slow - FOREARM_ROTATION * np.sin([0.0, 2.1, 4.2]) + rotation_rad
+    )

@@ -18,12 +18,12 @@ from common.sim.record import (
     ANGLE_NAMES,
     FIRST_NS,
     Arrays,
-    TakenFrame,
+    RenderedFrame,
     named_angles,
     write_frames,
     write_truth,
 )
-from common.sim.wrist.flesh import GROUPS
+from common.sim.wrist.capsules import GROUPS
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 
@@ -135,12 +135,14 @@ class WristTake:
             note=f"rendered wrist scene, {scene.ambient} light, seed {scene.seed}",
         )
 
-    def frames(self) -> Iterator[TakenFrame]:
+    def frames(self) -> Iterator[RenderedFrame]:
         """All frames that are delivered."""
         renderer = WristRenderer(self._scene, self._name, self._step)
         shots = self._shots if self._faults is None else self._faults(self._shots)
         for shot, seq in _numbered(shots):
-            yield TakenFrame(self._name, seq, self._stamp(seq), shot.lit, renderer.render(shot.t_s, shot.lit))
+            yield RenderedFrame(
+                self._name, seq, self._stamp(seq), shot.lit, renderer.render(shot.t_s, shot.lit)
+            )
 
     def truth(self) -> Arrays:
         """One row per triple: the hand and the line at its laser frame, the finger tips at its LED frame."""
@@ -156,7 +158,7 @@ class WristTake:
             "ambient": np.array([scene.ambient] * len(lasers)),
             "angles": np.array([named_angles(scene.model, truth.angles_rad) for truth in at_laser]),
             "joints": np.array([truth.joints.position_m[1:] for truth in at_laser]),
-            "bend": np.array([truth.bend_rad for truth in at_laser]),
+            "flexion": np.array([truth.wrist_angles_rad for truth in at_laser]),
             "laser_uv": np.array([truth.laser_uv for truth in at_laser]),
             "laser_pt": np.array([truth.laser_pt for truth in at_laser]),
             "laser_xyz": np.array([truth.laser_xyz for truth in at_laser]),

@@ -12,20 +12,20 @@ import numpy as np
 from common.arrays import Float, Image
 from common.errors import CalibrationError
 from common.frame_recording import Illumination
-from common.round_cones import Cones, Plane
 from common.sim.wrist import light
 from common.sim.wrist.scene import WristScene
-from common.sim.wrist.skin import Skin, SkinView
 from common.sim.wrist.stripe import draw_stripe
+from common.sim.wrist.surface import HandSurface, SurfaceView
+from common.tapered_capsules import Capsules, Plane
 
-SKIN_STEP = 2  # px between the rays that shade skin; 1 is twice as sharp and four times slower
+SURFACE_STEP = 2  # px between the rays that shade skin; 1 is twice as sharp and four times slower
 # For a camera that loses what it has no time to draw. Half the time; fingertips are found as often and as well, and
 # the laser line is drawn to parts of a pixel of the picture whatever the step is.
 LIVE_STEP = 4
-LIVE_BEND_RAD = np.radians(
+LIVE_WRIST_RAD = np.radians(
     0.25
 )  # the palm of a bent wrist is drawn anew by such steps: a tenth of a millimetre, twice
-_KINDS = tuple(Illumination)  # frames of one instant differ in their noise, too
+_ILLUMINATIONS = tuple(Illumination)  # frames of one instant differ in their noise, too
 SATURATED = np.float32(300.0)  # levels: more cannot be seen, but would widen edges
 
 
@@ -34,7 +34,7 @@ class WristRenderer:
     function of t."""
 
     def __init__(
-        self, scene: WristScene, camera: str, step: int = SKIN_STEP, bend_step_rad: float = 0.0
+        self, scene: WristScene, camera: str, step: int = SURFACE_STEP, wrist_step_rad: float = 0.0
     ) -> None:
         """Prepare all that stands still (some tenths of a second).
 
@@ -42,7 +42,7 @@ class WristRenderer:
             scene: What it looks at.
             camera: The one camera of its rig.
             step: Pixels between the rays that shade skin.
-            bend_step_rad: To multiples of this the bend is rounded at which the palm is drawn; 0: not at all.
+            wrist_step_rad: To multiples of this the bend is rounded at which the palm is drawn; 0: not at all.
 
         Raises:
             CalibrationError: No such camera.
@@ -50,15 +50,15 @@ class WristRenderer:
         if camera not in scene.rig.cameras:
             raise CalibrationError(f"rig {scene.rig.name!r}: cameras: no camera {camera!r}")
         self._scene = scene
-        self._skin = Skin(scene, step, bend_step_rad)
+        self._surface = HandSurface(scene, step, wrist_step_rad)
         self._room = light.Room.of(scene.ambient, scene.seed)
         self._leds = light.Leds(np.array(scene.rig.led, dtype=np.float64))
         optics = scene.optics
         self._sensor = light.Sensor(optics.height_px, optics.width_px, scene.seed)
         self._gain = 1.0
-        self._behind = self._room.backdrop(self._skin.size, optics.width_px / self._skin.size[0])
+        self._behind = self._room.backdrop(self._surface.size, optics.width_px / self._surface.size[0])
         self._still = {
-            lit: self._shaded(self._behind, self._skin.straight.seen, lit)
+            lit: self._shaded(self._behind, self._surface.straight.seen, lit)
             for lit in (Illumination.AMBIENT, Illumination.LED)
         }
 
@@ -77,12 +77,12 @@ class WristRenderer:
         """Image (H, W), grey, of the frame at mid-exposure at scene time `t_s` [s], lit by the room and by `lit`."""
         state = self._scene.motion.at(t_s)
         bodies = self._scene.bodies_of(state)
-        palm = self._skin.palm(bodies, state.bend_rad)
-        fingers = self._skin.look(bodies, palm)
+        palm = self._surface.palm(bodies, state.wrist_angles_rad)
+        fingers = self._surface.appearance(bodies, palm)
         leds = lit is Illumination.LED
-        count = len(self._scene.flesh.group)
+        count = len(self._scene.capsules.group)
         things = bodies.of(slice(count, None)) if len(bodies.start_m) > count else None
-        if palm is self._skin.straight and not (leds and things):
+        if palm is self._surface.straight and not (leds and things):
             behind = self._still[Illumination.LED if leds else Illumination.AMBIENT]
         else:
             behind = self._shaded(self._behind, palm.seen, lit, things)
@@ -90,22 +90,27 @@ class WristRenderer:
         optics = self._scene.optics
         level = _sharp(coarse, (optics.width_px, optics.height_px))
         if lit is Illumination.LASER:
-            hand = np.zeros(self._skin.size[::-1], dtype=np.float32)
+            hand = np.zeros(self._surface.size[::-1], dtype=np.float32)
             for seen in (palm.seen, fingers):
                 hand.reshape(-1)[seen.pixel] = seen.albedo**2  # through the skin, and out again
             draw_stripe(level, self._scene, bodies, hand)
         if self._gain != 1.0:
             level *= np.float32(self._gain)
         level += np.float32(light.BLACK_LEVEL)
-        return self._sensor.bytes_of(level, 4 * round(t_s * 1e6) + _KINDS.index(lit))
+        return self._sensor.bytes_of(level, 4 * round(t_s * 1e6) + _ILLUMINATIONS.index(lit))
 
-    def _shaded(self, behind: Plane, skin: SkinView, lit: Illumination, things: Cones | None = None) -> Plane:
+    def _shaded(
+        self, behind: Plane, surface: SurfaceView, lit: Illumination, things: Capsules | None = None
+    ) -> Plane:
         """Levels on the coarse grid: `behind` with skin before it, and things in the light of the LEDs."""
-        shade = self._room.on_skin(skin.normals)
+        shade = self._room.on_surface(surface.normals)
         if lit is Illumination.LED:
-            shade += self._leds.on_skin(skin.points, skin.normals, things) * self._skin.flat[skin.pixel]
+            shade += (
+                self._leds.on_surface(surface.points, surface.normals, things)
+                * self._surface.flat[surface.pixel]
+            )
         level = behind.copy()
-        level.reshape(-1)[skin.pixel] = shade * skin.albedo * np.float32(self._scene.reflectance)
+        level.reshape(-1)[surface.pixel] = shade * surface.albedo * np.float32(self._scene.reflectance)
         return level
 
 

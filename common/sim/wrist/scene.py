@@ -12,20 +12,20 @@ from common.camera_model import CameraModel
 from common.errors import CalibrationError, PhalanxError
 from common.geometry import invert, rigid
 from common.hand_model import WRIST, HandJoints, HandModel
-from common.round_cones import Cones
 from common.sim.motion import HandMotion, HandState
 from common.sim.scene import STANDARD_SEED, CameraTiming
 from common.sim.together import TOGETHER, together_motion
-from common.sim.wrist.flesh import Flesh
+from common.sim.wrist.capsules import HandCapsules
 from common.sim.wrist.laser import LaserSheet, LineTruth
 from common.sim.wrist.motion import wrist_motion
 from common.sim.wrist.things import bodies_of, with_things
-from common.wrist_bend import forearm_palm
+from common.tapered_capsules import Capsules
+from common.wrist_joint import forearm_palm
 
 Ambient = Literal["dark", "indoor", "bright", "sun"]
 TIP_WITHIN_M = 0.003  # of its own finger before a tip: it lies 12 degrees behind the edge of a round tip
 AMBIENTS: tuple[Ambient, ...] = get_args(Ambient)
-MOTIONS = ("standard", "curl", "wearer", "poses", "spread", "random")
+MOTIONS = ("standard", "curl", "subject", "poses", "spread", "random")
 WRIST_NAMES = f"{' | '.join((*MOTIONS, *TOGETHER))}, each with @{' | @'.join(AMBIENTS)}"
 
 
@@ -45,7 +45,7 @@ class WristTruth:
         laser_seg: (7,) the segment that carries most of the line (0 metacarpal, 1 proximal ... 3 distal); -1: none.
         tip_xyz, tip_uv: (5, 3) [m], (5, 2) [px] outermost point of the skin along each last bone.
         tip_visible: (5,) whether the camera sees that point, or it lies just behind the edge of its own finger.
-        bend_rad: (2,) how the wrist is bent (`common.wrist_bend`).
+        wrist_angles_rad: (2,) how the wrist is bent (`common.wrist_joint`).
     """
 
     t_s: float
@@ -60,7 +60,7 @@ class WristTruth:
     tip_xyz: Float
     tip_uv: Float
     tip_visible: Bool
-    bend_rad: Float
+    wrist_angles_rad: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +77,7 @@ class WristScene:
         seed: Of flesh, skin, room and noise.
         reflectance: How much light the skin gives back, of whatever light, against usual skin.
         optics: The camera.
-        flesh: The hand's surface.
+        capsules: The hand's surface.
         sheet: The laser.
         T_camera_palm: (4, 4) of a straight wrist [m].
     """
@@ -90,7 +90,7 @@ class WristScene:
     seed: int = STANDARD_SEED
     reflectance: float = 1.0
     optics: CameraModel = field(init=False)
-    flesh: Flesh = field(init=False)
+    capsules: HandCapsules = field(init=False)
     sheet: LaserSheet = field(init=False)
     T_camera_palm: Float = field(init=False)
     _straight: HandJoints = field(init=False)
@@ -112,10 +112,10 @@ class WristScene:
         optics = CameraModel.of(self.cameras[name], np.eye(4))
         object.__setattr__(self, "optics", optics)
         object.__setattr__(self, "T_camera_palm", np.array(self.rig.T_camera_palm, dtype=np.float64))
-        object.__setattr__(self, "flesh", Flesh.of(self.model, self.seed))
+        object.__setattr__(self, "capsules", HandCapsules.of(self.model, self.seed))
         straight = self.model.forward(self.T_camera_palm, np.zeros((5, 4)))
         object.__setattr__(self, "_straight", straight)
-        object.__setattr__(self, "sheet", LaserSheet.of(self.rig, self.flesh, straight))
+        object.__setattr__(self, "sheet", LaserSheet.of(self.rig, self.capsules, straight))
 
     @classmethod
     def by_name(
@@ -152,21 +152,21 @@ class WristScene:
         """The joints at scene time `t_s` [s], camera frame."""
         return self._joints(self.motion.at(t_s))
 
-    def bodies_at(self, t_s: float) -> Cones:
+    def bodies_at(self, t_s: float) -> Capsules:
         """All that camera and laser meet at scene time `t_s` [s], camera frame: the flesh, after it the things."""
         return self.bodies_of(self.motion.at(t_s))
 
-    def bodies_of(self, state: HandState) -> Cones:
+    def bodies_of(self, state: HandState) -> Capsules:
         """The same of a hand in that state."""
         return self._bodies(state, self._joints(state))
 
-    def straight_bodies(self) -> Cones:
+    def straight_bodies(self) -> Capsules:
         """The flesh while wrist and fingers are straight, camera frame."""
-        return self.flesh.bodies(self._straight)
+        return self.capsules.bodies(self._straight)
 
-    def bent_bodies(self, bend_rad: Float) -> Cones:
+    def flexed_bodies(self, wrist_angles_rad: Float) -> Capsules:
         """The flesh of straight fingers while the wrist is bent by that (2,), camera frame."""
-        return self.bodies_of(HandState(np.eye(4), np.zeros((5, 4)), bend_rad))
+        return self.bodies_of(HandState(np.eye(4), np.zeros((5, 4)), wrist_angles_rad))
 
     def truth(self, t_s: float) -> WristTruth:
         """Exact state at scene time `t_s` [s]; before 0 the pose of 0."""
@@ -174,7 +174,7 @@ class WristScene:
         joints = self._joints(state)
         bodies = self._bodies(state, joints)
         line = LineTruth.of(self.sheet.cross(bodies), self.optics, self.sheet)
-        tips = self.flesh.tips(bodies)
+        tips = self.capsules.tips(bodies)
         return WristTruth(
             t_s,
             state.angles_rad,
@@ -188,19 +188,19 @@ class WristScene:
             tips,
             self.optics.project(tips),
             self.sheet.seen(bodies, tips, TIP_WITHIN_M),
-            state.bend_rad,
+            state.wrist_angles_rad,
         )
 
     def _joints(self, state: HandState) -> HandJoints:
         """Where the camera, which sits on the forearm, sees them."""
         T = self.T_camera_palm
-        if state.bend_rad.any():
-            T = T @ rigid(forearm_palm(state.bend_rad), np.zeros(3))
+        if state.wrist_angles_rad.any():
+            T = T @ rigid(forearm_palm(state.wrist_angles_rad), np.zeros(3))
         return self.model.forward(T, state.angles_rad)
 
-    def _bodies(self, state: HandState, joints: HandJoints) -> Cones:
-        R_straight = self._straight.rotation[WRIST] if state.bend_rad.any() else None
-        flesh = self.flesh.bodies(joints, R_straight)
+    def _bodies(self, state: HandState, joints: HandJoints) -> Capsules:
+        R_straight = self._straight.rotation[WRIST] if state.wrist_angles_rad.any() else None
+        capsules = self.capsules.bodies(joints, R_straight)
         if not state.things:
-            return flesh
-        return with_things(flesh, bodies_of(state.things, joints.T_rig_palm @ invert(state.T_rig_palm)))
+            return capsules
+        return with_things(capsules, bodies_of(state.things, joints.T_rig_palm @ invert(state.T_rig_palm)))

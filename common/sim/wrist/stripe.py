@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 
 from common.arrays import Float
-from common.round_cones import Cones, Plane
-from common.sim.wrist.flesh import THING_GROUP
-from common.sim.wrist.light import GLOW, LASER_LEVEL, SHEET_SIGMA_M, SKIN_AT_M
+from common.sim.wrist.capsules import THING_GROUP
+from common.sim.wrist.light import GLOW, LASER_LEVEL, SHEET_SIGMA_M, SURFACE_AT_M
 from common.sim.wrist.scene import WristScene
 from common.sim.wrist.things import ALBEDO
+from common.tapered_capsules import Capsules, Plane
 
 LAYERS = np.linspace(-2.4, 2.4, 11)  # across the sheet, in its sigmas
 LENS_SIGMA_PX = 0.9
@@ -22,7 +22,7 @@ _NUDGE_M = 1e-4
 _EDGE_PX = 40
 
 
-def draw_stripe(level: Plane, scene: WristScene, bodies: Cones, hand: Plane) -> None:
+def draw_stripe(level: Plane, scene: WristScene, bodies: Capsules, hand: Plane) -> None:
     """Add the line to levels (H, W) in place; its glow where skin is, by `hand` (h, w), a coarser grid: what skin
     gives back, about 1, and 0 where none is. Things glow as little as they give back, so not at all here."""
     sheet, optics = scene.sheet, scene.optics
@@ -41,7 +41,7 @@ def draw_stripe(level: Plane, scene: WristScene, bodies: Cones, hand: Plane) -> 
     area = np.abs(piece[:, 0] * way[:, 1] - piece[:, 1] * way[:, 0]) * (heights[1] - heights[0])
     reach = np.linalg.norm(points - sheet.origin, axis=1)
     given_back = np.where(curve.group[chords] == THING_GROUP, ALBEDO, scene.reflectance)
-    amount = (LASER_LEVEL * given_back * facing * (SKIN_AT_M / reach) * area)[:, None] * np.exp(
+    amount = (LASER_LEVEL * given_back * facing * (SURFACE_AT_M / reach) * area)[:, None] * np.exp(
         -0.5 * LAYERS**2
     )
     place = (uv + 0.5 * piece)[:, None] + heights[:, None] * way[:, None]

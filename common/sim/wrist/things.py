@@ -8,13 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from common.arrays import Float
-from common.round_cones import Cones
 from common.sim.held import Cylinder
+from common.tapered_capsules import Capsules
 
 ALBEDO = 0.05  # of matt black paint or rubber in the near infrared, against usual skin
 
 
-def bodies_of(things: Sequence[Cylinder], T_camera_rig: Float) -> Cones:
+def bodies_of(things: Sequence[Cylinder], T_camera_rig: Float) -> Capsules:
     """Round cones of equal radii that stand for closed cylinders, in the camera's frame.
 
     Their round ends hold as much as the flat ones: a hand that holds one in its middle touches none of them.
@@ -32,14 +32,14 @@ def bodies_of(things: Sequence[Cylinder], T_camera_rig: Float) -> Cones:
         half = (0.5 * one.length_m - 2.0 / 3.0 * one.radius_m) * T[:3, 2]  # 4/3 pi r^3 are in the ends
         start.append(T[:3, 3] - half[None])
         stop.append(T[:3, 3] + half[None])
-    return Cones(np.concatenate(start), np.concatenate(stop), radius, radius)
+    return Capsules(np.concatenate(start), np.concatenate(stop), radius, radius)
 
 
-def with_things(flesh: Cones, things: Cones) -> Cones:
+def with_things(capsules: Capsules, things: Capsules) -> Capsules:
     """The bodies of the flesh, and after them those of things."""
-    return Cones(
-        np.concatenate([flesh.start_m, things.start_m]),
-        np.concatenate([flesh.stop_m, things.stop_m]),
-        np.concatenate([flesh.start_radius_m, things.start_radius_m]),
-        np.concatenate([flesh.stop_radius_m, things.stop_radius_m]),
+    return Capsules(
+        np.concatenate([capsules.start_m, things.start_m]),
+        np.concatenate([capsules.stop_m, things.stop_m]),
+        np.concatenate([capsules.start_radius_m, things.start_radius_m]),
+        np.concatenate([capsules.stop_radius_m, things.stop_radius_m]),
     )

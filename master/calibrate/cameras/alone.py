@@ -9,7 +9,7 @@ from common.arrays import Float, Int
 from common.errors import FitError
 from master.calibrate.cameras.boards import board_corners
 from master.calibrate.cameras.bundle import Bundle, Free, Observation, predict, solve
-from master.calibrate.cameras.detect import Sighting
+from master.calibrate.cameras.detect import ImageObservation
 from master.calibrate.cameras.first_guess import guess_lens, place_board
 from master.calibrate.cameras.outliers import limit
 from master.calibrate.cameras.views import BoardViews
@@ -49,10 +49,10 @@ class Alone:
     sigma_px: float
 
 
-def corners_seen(sighting: Sighting) -> tuple[Int, Float]:
+def corners_seen(observation: ImageObservation) -> tuple[Int, Float]:
     """Numbers (n,) and places (n, 2) [px] of the corners seen."""
-    seen = np.flatnonzero(np.isfinite(sighting.corners_px[:, 0])).astype(np.int64)
-    return seen, sighting.corners_px[seen]
+    seen = np.flatnonzero(np.isfinite(observation.corners_px[:, 0])).astype(np.int64)
+    return seen, observation.corners_px[seen]
 
 
 def fit_alone(views: BoardViews, camera: str, held: Float | None = None) -> Alone:
@@ -71,15 +71,15 @@ def fit_alone(views: BoardViews, camera: str, held: Float | None = None) -> Alon
         FitError: Too few images, or too few that agree with each other.
     """
     drawn = board_corners(views.board)
-    sightings = views.of(camera)
-    if held is None and len(sightings) < MIN_VIEWS:
+    observations = views.of(camera)
+    if held is None and len(observations) < MIN_VIEWS:
         raise FitError(
-            f"camera {camera!r}: the board is seen in {len(sightings)} images, at least {MIN_VIEWS} are needed"
+            f"camera {camera!r}: the board is seen in {len(observations)} images, at least {MIN_VIEWS} are needed"
             " (better 15), each with the board in another place and tilt"
         )
-    names = [name for name, _ in sightings]
-    seen = [corners_seen(sighting) for _, sighting in sightings]
-    blurred = _blurred(np.array([sighting.blur_px for _, sighting in sightings]))
+    names = [name for name, _ in observations]
+    seen = [corners_seen(observation) for _, observation in observations]
+    blurred = _blurred(np.array([observation.blur_px for _, observation in observations]))
     sharp = [seen[i] for i in range(len(seen)) if i not in blurred]
     lens = guess_lens(sharp, drawn, views.sizes_px[camera]) if held is None else held
     good = [i for i in range(len(seen)) if i not in blurred]
@@ -134,10 +134,12 @@ def _robust(
 
 def _blurred(blur_px: Float) -> dict[int, str]:
     """Images that are blurred where the others are not: index -> reason."""
-    usual = float(np.median(blur_px))
+    typical = float(np.median(blur_px))
     return {
-        int(i): f"blurred: edges spread over {blur_px[i]:.1f} px (standard deviation), usually {usual:.1f} px"
-        for i in np.flatnonzero(blur_px > max(_BLURRED * usual, _BLURRED_PX))
+        int(
+            i
+        ): f"blurred: edges spread over {blur_px[i]:.1f} px (standard deviation), usually {typical:.1f} px"
+        for i in np.flatnonzero(blur_px > max(_BLURRED * typical, _BLURRED_PX))
     }
 
 

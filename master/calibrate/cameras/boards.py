@@ -129,7 +129,7 @@ def orderings(board: Board) -> tuple[Int, ...]:
         found.append(np.rot90(n, 2))
     if rows == columns and columns % 2 == 0:
         found += [np.rot90(n, 1), np.rot90(n, 3)]
-    return tuple(turned.ravel() for turned in found)
+    return tuple(rotated.ravel() for rotated in found)
 
 
 def _check_length(board: object, what: str, length_m: float) -> None:

@@ -284,13 +284,13 @@ def _moved(bundle: Bundle, shared: Float, own: Float) -> Bundle:
     return replace(
         bundle,
         lenses=bundle.lenses + shared[: 9 * cameras].reshape(cameras, 9),
-        T_camera_rig=np.stack([_turned(T, s) for T, s in zip(bundle.T_camera_rig, places, strict=True)]),
-        T_rig_board=np.stack([_turned(T, s) for T, s in zip(bundle.T_rig_board, own, strict=True)]),
+        T_camera_rig=np.stack([_rotated(T, s) for T, s in zip(bundle.T_camera_rig, places, strict=True)]),
+        T_rig_board=np.stack([_rotated(T, s) for T, s in zip(bundle.T_rig_board, own, strict=True)]),
         shape_m=bundle.shape_m + shared[15 * cameras :].reshape(-1, 3),
     )
 
 
-def _turned(T: Float, step: Float) -> Float:
+def _rotated(T: Float, step: Float) -> Float:
     return rigid(rotation_vector_to_matrix(step[:3]) @ T[:3, :3], T[:3, 3] + step[3:])
 
 

@@ -26,7 +26,7 @@ from master.ingest import Ingest
 ROUND_S = 0.3
 ANSWER_NS = 1_000_000_000
 _ASK_S = 0.5
-_SAY_NS = 2_000_000_000  # the same words are not said more often
+_LOG_NS = 2_000_000_000  # the same words are not said more often
 NOTES = "capture.json"
 
 
@@ -53,7 +53,7 @@ def capture(
     folder: Path,
     wanted: int,
     stop: threading.Event,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
     advise: Callable[[], str] = lambda: "",
 ) -> int:
     """Keep views until there are enough or `stop` is set; return how many.
@@ -70,7 +70,7 @@ def capture(
     Raises:
         CalibrationError: The folder cannot be written.
     """
-    said, said_ns = "", now_ns()
+    previous, notified_ns = "", now_ns()
     spread: list[float] = []
     while len(live.views) < wanted and not stop.is_set():
         began_ns = now_ns()
@@ -80,11 +80,11 @@ def capture(
         if verdict.kept:
             view = live.views[-1]
             spread.append(round_.spread_ms)
-            _keep(folder, view.name, {name: round_.stills[name] for name in view.sightings})
-            say(f"view {len(live.views)} of {wanted}: {text}{_then(advise())}")
-        elif text != said or began_ns - said_ns > _SAY_NS:
-            say(text)
-            said, said_ns = text, began_ns
+            _keep(folder, view.name, {name: round_.stills[name] for name in view.observations})
+            notify(f"view {len(live.views)} of {wanted}: {text}{_then(advise())}")
+        elif text != previous or began_ns - notified_ns > _LOG_NS:
+            notify(text)
+            previous, notified_ns = text, began_ns
         stop.wait(max(0.0, ROUND_S - (now_ns() - began_ns) * 1e-9))
     if live.views:
         _note(folder, live, spread)
@@ -104,11 +104,11 @@ class StillTaker:
         """
         self._bus, self._ingest, self._sizes = bus, ingest, dict(sizes)
         self._cameras = tuple(sizes)
-        self._feed: Subscription = bus.subscribe("still", depth=4 * len(sizes))
+        self._next_round: Subscription = bus.subscribe("still", depth=4 * len(sizes))
 
     def take(self) -> Round:
         """One round: ask all, then wait until all that answered have sent, at most a second."""
-        while self._feed.get(0.0) is not None:
+        while self._next_round.get(0.0) is not None:
             pass  # what came too late for its own round
         askers = [threading.Thread(target=self._ask, args=(name,), daemon=True) for name in self._cameras]
         for thread in askers:
@@ -116,7 +116,7 @@ class StillTaker:
         stills: dict[str, Still] = {}
         end_ns = now_ns() + ANSWER_NS
         while len(stills) < len(self._cameras) and (left_ns := end_ns - now_ns()) > 0:
-            message = self._feed.get(left_ns * 1e-9)
+            message = self._next_round.get(left_ns * 1e-9)
             if isinstance(message, Still) and message.camera in self._cameras:
                 stills[message.camera] = message
         for thread in askers:
@@ -127,7 +127,7 @@ class StillTaker:
 
     def close(self) -> None:
         """Listen no more. Safe to call twice."""
-        self._feed.close()
+        self._next_round.close()
 
     def _ask(self, camera: str) -> None:
         try:

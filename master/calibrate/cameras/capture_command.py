@@ -16,7 +16,7 @@ from master.calibrate.cameras.capture import StillTaker, capture, new_folder
 from master.calibrate.cameras.live_views import LiveViews
 from master.calibrate.cameras.options import Dictionary, MarkerMm, Size, SquareMm, board_of, options_of
 from master.ingest import Ingest
-from master.master_bus import carry_bus
+from master.master_bus import host_bus
 from master.options import (
     CALIB_JSON,
     HERE_BEACON,
@@ -34,7 +34,7 @@ from master.stopping import stop_on_signals
 
 FEWEST = 5  # from which a lens can be fitted at all
 _START_S = 5.0
-_LOOK_S = 0.2
+_POLL_S = 0.2
 _HINT_ROUNDS = 50  # ten seconds
 
 
@@ -72,7 +72,7 @@ def capture_views(
     new_folder(out)
     stop = stop_on_signals()
     with ExitStack() as stack:
-        link = carry_bus(bus, live.cameras)
+        link = host_bus(bus, live.cameras)
         stack.callback(link.close)
         ingest = Ingest(live.cameras, key, clock, *ends, bus, _START_S)
         stack.callback(ingest.close)
@@ -109,18 +109,18 @@ def _wait(ingest: Ingest, cameras: tuple[str, ...], stop: threading.Event) -> No
     Raises:
         CalibrationError: Told to stop before.
     """
-    said: frozenset[str] | None = None
+    previous: frozenset[str] | None = None
     rounds = 0
     while not ingest.started:
         here = ingest.connected
-        if here != said:
+        if here != previous:
             absent = ", ".join(name for name in cameras if name not in here)
             typer.echo(f"waiting for {absent or 'the start'}")
-            said = here
+            previous = here
         rounds += 1
         if rounds % _HINT_ROUNDS == 0 and not here:
             typer.echo(
                 "no slave answers: is it running, with the same rig key, and does --beacon reach it? Its log says more"
             )
-        if stop.wait(_LOOK_S):
+        if stop.wait(_POLL_S):
             raise CalibrationError("stopped before any slave was there")

@@ -86,7 +86,7 @@ def intrinsics(
     for name in views.cameras:
         fit = fit_cameras(_only(views, name), bent=_bent(flat=flat_board, bent=bent_board))
         results[name] = result(fit, {})
-        _say_all(report_lines(results[name]))
+        _print_all(report_lines(results[name]))
         _draw(picture if len(views.cameras) == 1 else _named(picture, name), fit)
     files: dict[str, CameraCalibration] = {}
     for name, own in results.items():
@@ -143,7 +143,7 @@ def stereo(
             held[name] = lens_of(file.intrinsics)
     fit = fit_cameras(views, held, bent=_bent(flat=flat_board, bent=bent_board))
     found = result(fit, held)
-    _say_all(report_lines(found))
+    _print_all(report_lines(found))
     _draw(picture, fit)
     data = (_source_name(source),)
     files = {
@@ -211,7 +211,7 @@ def _known_cameras(
 
 def _only(views: BoardViews, camera: str) -> BoardViews:
     """The views of one camera."""
-    own = tuple(View(name, {camera: sighting}) for name, sighting in views.of(camera))
+    own = tuple(View(name, {camera: observation}) for name, observation in views.of(camera))
     return replace(views, views=own, sizes_px={camera: views.sizes_px[camera]})
 
 
@@ -233,7 +233,7 @@ def _draw(picture: Path | None, fit: CamerasFit) -> None:
     typer.echo(f"drew {picture}")
 
 
-def _say_all(lines: Iterable[str]) -> None:
+def _print_all(lines: Iterable[str]) -> None:
     for line in lines:
         typer.echo(line)
 

@@ -90,7 +90,7 @@ def advice(covered: Coverage) -> str:
 def advice_so_far(views: BoardViews, camera: str) -> str:
     """`advice` while views are still being taken and no lens is known."""
     drawn = board_corners(views.board)
-    seen = [corners_seen(sighting) for _, sighting in views.of(camera)]
+    seen = [corners_seen(observation) for _, observation in views.of(camera)]
     if not seen:
         return f"show the board to {camera}"
     lens = guess_lens(seen, drawn, views.sizes_px[camera])

@@ -24,7 +24,7 @@ MIN_CORNERS = 8  # a pose and a few corners to check it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sighting:
+class ImageObservation:
     """The board in one image.
 
     Attributes:
@@ -42,7 +42,7 @@ class Sighting:
         return int(np.isfinite(self.corners_px[:, 0]).sum())
 
 
-def find_board(board: Board, image: Image) -> Sighting | None:
+def find_board(board: Board, image: Image) -> ImageObservation | None:
     """The board in an image (H, W) or (H, W, 3) BGR; None where it is not found whole (ChArUco: 8 corners of it)."""
     grey = image if image.ndim == 2 else cast(Image, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
     corners = _charuco(board, grey) if isinstance(board, Charuco) else _checkerboard(board, grey)
@@ -51,7 +51,7 @@ def find_board(board: Board, image: Image) -> Sighting | None:
     corners = _refine(board, grey, corners)
     if np.isfinite(corners[:, 0]).sum() < MIN_CORNERS:
         return None
-    return Sighting(corners, _blur(board, grey, corners))
+    return ImageObservation(corners, _blur(board, grey, corners))
 
 
 def _checkerboard(board: Checkerboard, grey: Image) -> Float | None:

@@ -11,7 +11,7 @@ from common.geometry import rigid
 _FOCAL = np.geomspace(0.35, 6.0, 24)  # of the image's width: 110 to 10 degrees of view
 
 
-def guess_lens(sightings: Sequence[tuple[Int, Float]], drawn_m: Float, size_px: tuple[int, int]) -> Float:
+def guess_lens(observations: Sequence[tuple[Int, Float]], drawn_m: Float, size_px: tuple[int, int]) -> Float:
     """A lens (9,) without distortion, by the focal length under which the middle image fits best.
 
     The middle one: up to half of the images may be wrong altogether.
@@ -26,7 +26,7 @@ def guess_lens(sightings: Sequence[tuple[Int, Float]], drawn_m: Float, size_px: 
         np.array([f * width, f * width, (width - 1) / 2, (height - 1) / 2, 0, 0, 0, 0, 0]) for f in _FOCAL
     ]
     errors = [
-        np.median([place_board(drawn_m[corners], uv, lens)[1] for corners, uv in sightings])
+        np.median([place_board(drawn_m[corners], uv, lens)[1] for corners, uv in observations])
         for lens in lenses
     ]
     return lenses[int(np.argmin(errors))]
@@ -44,13 +44,15 @@ def place_board(corners_m: Float, uv: Float, lens: Float) -> tuple[Float, float]
     """
     matrix = np.array([[lens[0], 0.0, lens[2]], [0.0, lens[1], lens[3]], [0.0, 0.0, 1.0]])
     best = np.eye(4), np.inf
-    _, turns, moves, _ = cv2.solvePnPGeneric(corners_m, uv, matrix, lens[4:], flags=cv2.SOLVEPNP_IPPE)
-    for turn, move in zip(turns, moves, strict=True):
-        turn, move = cv2.solvePnPRefineLM(corners_m, uv, matrix, lens[4:], turn, move)
-        again, _ = cv2.projectPoints(corners_m, turn, move, matrix, lens[4:])
+    _, rotation_vectors, moves, _ = cv2.solvePnPGeneric(
+        corners_m, uv, matrix, lens[4:], flags=cv2.SOLVEPNP_IPPE
+    )
+    for rotation_vector, move in zip(rotation_vectors, moves, strict=True):
+        rotation_vector, move = cv2.solvePnPRefineLM(corners_m, uv, matrix, lens[4:], rotation_vector, move)
+        again, _ = cv2.projectPoints(corners_m, rotation_vector, move, matrix, lens[4:])
         off = np.asarray(again, dtype=np.float64).reshape(-1, 2) - uv
         error = float(np.sqrt((off**2).sum(axis=1).mean()))
         if error < best[1] and float(np.asarray(move).ravel()[2]) > 0:
-            rotation = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
+            rotation = np.asarray(cv2.Rodrigues(rotation_vector)[0], dtype=np.float64)
             best = rigid(rotation, np.asarray(move, dtype=np.float64).ravel()), error
     return best

@@ -82,7 +82,7 @@ def fit_cameras(
     held = held or {}
     alone = {camera: fit_alone(views, camera, held.get(camera)) for camera in views.cameras}
     links = link(views.board, views.cameras, {camera: fit.T_camera_board for camera, fit in alone.items()})
-    seen = Seen(views, links.turned)
+    seen = Seen(views, links.corner_order)
     drawn = board_corners(views.board)
     start = Bundle(
         lenses=np.stack([alone[camera].lens for camera in views.cameras]),

@@ -37,11 +37,11 @@ class Seen:
 
     Attributes:
         views: As found in the images.
-        turned: View -> camera -> order of the corner numbers, as of `links.Links`.
+        corner_order: View -> camera -> order of the corner numbers, as of `links.Links`.
     """
 
     views: BoardViews
-    turned: Mapping[str, Mapping[str, Int]]
+    corner_order: Mapping[str, Mapping[str, Int]]
 
     def observations(self, shots: Sequence[Shot]) -> tuple[Observation, ...]:
         """The corners of the shots; views are numbered by the shots' places, in order of appearance."""
@@ -50,8 +50,8 @@ class Seen:
         by_name = {view.name: view for view in self.views.views}
         found: list[Observation] = []
         for shot in shots:
-            corners, uv = corners_seen(by_name[shot.view].sightings[shot.camera])
-            true = self.turned[shot.view][shot.camera][corners]
+            corners, uv = corners_seen(by_name[shot.view].observations[shot.camera])
+            true = self.corner_order[shot.view][shot.camera][corners]
             found.append(Observation(cameras.index(shot.camera), number[shot.place], true, uv))
         return tuple(found)
 
@@ -93,14 +93,14 @@ def judge(
         return good, rejected
     errors = _view_errors(seen, list(linked.values()), bundle, sigma)
     corners = [2.0 * sum(len(o.uv) for o in seen.observations(own)) - 6.0 for own in linked.values()]
-    bound, usual = limit(errors, np.array(corners)), float(np.median(errors))
+    bound, typical = limit(errors, np.array(corners)), float(np.median(errors))
     parted: dict[str, set[str]] = {}
     notes = list(rejected)
     for (view, own), error in zip(linked.items(), errors, strict=True):
         if error > bound:
             parted[view] = _to_part(seen, own, bundle, sigma, bound)
             cameras = "" if len(parted[view]) == len(own) else "".join(parted[view])
-            notes.append(Rejection(view, cameras, _disagreement(own, parted[view], error / usual)))
+            notes.append(Rejection(view, cameras, _disagreement(own, parted[view], error / typical)))
     placed = tuple(
         replace(shot, place=f"{shot.view} {shot.camera}")
         if shot.camera in parted.get(shot.view, ())
@@ -124,11 +124,13 @@ def _judge_images(
         own = [i for i, shot in enumerate(shots) if shot.camera == camera]
         if not own:
             continue
-        bound, usual = limit(errors[own], dof[own]), float(np.median(errors[own]))
+        bound, typical = limit(errors[own], dof[own]), float(np.median(errors[own]))
         distances = np.concatenate([np.linalg.norm(residuals[i], axis=1) for i in own])
         sigma[c] = max(float(np.median(distances)) / 1.1774, 1e-3)
         for i in (i for i in own if errors[i] > bound):
-            text = f"corners are off by {errors[i]:.2f} px rms, usually {usual:.2f} px (limit {bound:.2f} px)"
+            text = (
+                f"corners are off by {errors[i]:.2f} px rms, usually {typical:.2f} px (limit {bound:.2f} px)"
+            )
             reasons[i] = Rejection(shots[i].view, camera, text)
             good[i] = False
     kept = tuple(shot for shot, yes in zip(shots, good, strict=True) if yes)
@@ -160,7 +162,7 @@ def _to_part(seen: Seen, own: Sequence[Shot], bundle: Bundle, sigma: Float, boun
     """The cameras to part from a view: the one without which the others agree, or else all."""
     if len(own) < 3:
         return {shot.camera for shot in own}
-    without = [[shot for shot in own if shot != left_out] for left_out in own]
+    without = [[shot for shot in own if shot != rejected] for rejected in own]
     errors = [float(_view_errors(seen, [rest], bundle, sigma)[0]) for rest in without]
     best = int(np.argmin(errors))
     return {own[best].camera} if errors[best] <= bound else {shot.camera for shot in own}

@@ -20,11 +20,11 @@ class Links:
 
     Attributes:
         T_camera_rig: Camera -> (4, 4) [m]; the rig's frame is that of the first camera.
-        turned: View -> camera -> order (N,): what the camera calls corner i is corner order[i] of the view.
+        corner_order: View -> camera -> order (N,): what the camera calls corner i is corner order[i] of the view.
     """
 
     T_camera_rig: Mapping[str, Float]
-    turned: Mapping[str, Mapping[str, Int]]
+    corner_order: Mapping[str, Mapping[str, Int]]
 
 
 def link(board: Board, cameras: Sequence[str], places: Places) -> Links:
@@ -48,7 +48,7 @@ def link(board: Board, cameras: Sequence[str], places: Places) -> Links:
         if not shared[a, b]:
             raise FitError(_islands(cameras, places))
         known[b] = _relative(drawn, turns, places[b], places[a], shared[a, b]) @ known[a]
-    return Links(known, _turned(drawn, turns, known, places))
+    return Links(known, _corner_orders(drawn, turns, known, places))
 
 
 def _relative(
@@ -59,7 +59,9 @@ def _relative(
     views: list[str],
 ) -> Float:
     """T_to_of (4, 4) [m]: of all views' estimates, the one from which the others are least far in the middle."""
-    candidates = [np.stack([to[view] @ turn @ invert(of[view]) for _, turn in turns]) for view in views]
+    candidates = [
+        np.stack([to[view] @ rotation @ invert(of[view]) for _, rotation in turns]) for view in views
+    ]
     points = [transform(of[view], drawn) for view in views]
 
     def distance(T: Float) -> float:
@@ -73,26 +75,26 @@ def _relative(
     return min((T for own in candidates for T in own), key=distance)
 
 
-def _turned(
+def _corner_orders(
     drawn: Float, turns: list[tuple[Int, Float]], known: Mapping[str, Float], places: Places
 ) -> dict[str, dict[str, Int]]:
     """For each view the order of each camera's corners that agrees best with the first camera of the view."""
-    turned: dict[str, dict[str, Int]] = {}
+    corner_order: dict[str, dict[str, Int]] = {}
     for view in sorted(set[str]().union(*places.values())):
         first: Float | None = None
-        turned[view] = {}
+        corner_order[view] = {}
         for camera in known:
             if view not in places[camera]:
                 continue
-            in_rig = [invert(known[camera]) @ places[camera][view] @ turn for _, turn in turns]
+            in_rig = [invert(known[camera]) @ places[camera][view] @ rotation for _, rotation in turns]
             best = 0
             if first is None:
                 first = in_rig[0]
             else:
                 there = transform(first, drawn)
                 best = int(np.argmin([np.linalg.norm(transform(T, drawn) - there) for T in in_rig]))
-            turned[view][camera] = turns[best][0]
-    return turned
+            corner_order[view][camera] = turns[best][0]
+    return corner_order
 
 
 def _islands(cameras: Sequence[str], places: Places) -> str:

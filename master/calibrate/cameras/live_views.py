@@ -13,7 +13,7 @@ import numpy as np
 from common.arrays import Float, Image
 from master.calibrate.cameras.boards import Board
 from master.calibrate.cameras.coverage import advice_so_far
-from master.calibrate.cameras.detect import Sighting, find_board
+from master.calibrate.cameras.detect import ImageObservation, find_board
 from master.calibrate.cameras.views import BoardViews, View
 
 STILL_PX = 0.5
@@ -41,12 +41,12 @@ class LiveViews:
         self.board, self.cameras = board, cameras
         self.views: list[View] = []
         self._sizes: dict[str, tuple[int, int]] = {}
-        self._last: dict[str, Sighting] = {}
+        self._last: dict[str, ImageObservation] = {}
 
     def push(self, images: Mapping[str, Image]) -> Verdict:
         """Judge the pictures (camera -> (H, W) or (H, W, 3)) of one round."""
         found = {name: find_board(self.board, image) for name, image in images.items()}
-        seen = {name: sighting for name, sighting in found.items() if sighting is not None}
+        seen = {name: observation for name, observation in found.items() if observation is not None}
         last, self._last = self._last, seen
         for name, image in images.items():
             self._sizes[name] = (image.shape[1], image.shape[0])
@@ -72,27 +72,27 @@ class LiveViews:
             if wish := advice_so_far(views, name):
                 return f"for {name}, {wish}" if views.of(name) else wish
         alone = [
-            name for name in self.cameras if not any({name} < set(view.sightings) for view in self.views)
+            name for name in self.cameras if not any({name} < set(view.observations) for view in self.views)
         ]
         if alone and len(self.cameras) > 1:
             return f"show the board to {alone[0]} and another camera at once"
         return "nothing is missing any more; more views make it more certain"
 
-    def _is_new(self, seen: Mapping[str, Sighting]) -> bool:
+    def _is_new(self, seen: Mapping[str, ImageObservation]) -> bool:
         """Whether some camera sees the board as in no view before; a set of cameras that is new is news as well."""
         for view in self.views:
-            if not set(seen) <= set(view.sightings):
+            if not set(seen) <= set(view.observations):
                 continue
             change = [
-                _moved(sighting, view.sightings[name]) / self._sizes[name][0]
-                for name, sighting in seen.items()
+                _moved(observation, view.observations[name]) / self._sizes[name][0]
+                for name, observation in seen.items()
             ]
             if max(change) < NEW_SHARE:
                 return False
         return True
 
 
-def _moved(now: Sighting, then: Sighting) -> float:
+def _moved(now: ImageObservation, then: ImageObservation) -> float:
     """How far the corners seen both times moved [px]: root mean square; inf where there are none."""
     step: Float = now.corners_px - then.corners_px
     both = np.isfinite(step[:, 0])

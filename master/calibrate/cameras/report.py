@@ -14,10 +14,10 @@ def report_lines(result: CamerasResult) -> Iterator[str]:
         yield from _lens_lines(name, lens)
     for name, pair_sd in result.baseline_sd_m.items():
         if pair_sd > 0.0:
-            centre, turn = result.place_sd[name][:3] * 1e3, result.place_sd[name][3:] * 57.2958
+            centre, rotation = result.place_sd[name][:3] * 1e3, result.place_sd[name][3:] * 57.2958
             yield (
                 f"{name}: place known to {centre[0]:.3f} {centre[1]:.3f} {centre[2]:.3f} mm,"
-                f" {turn[0]:.4f} {turn[1]:.4f} {turn[2]:.4f}° (standard deviations)"
+                f" {rotation[0]:.4f} {rotation[1]:.4f} {rotation[2]:.4f}° (standard deviations)"
             )
     for pair in result.pairs:
         sd = result.baseline_sd_m[pair.second] if pair.first == next(iter(result.lenses)) else 0.0
@@ -87,7 +87,7 @@ def report_json(result: CamerasResult) -> dict[str, object]:
         "cameras": {name: _lens_json(lens) for name, lens in result.lenses.items()},
         "T_first_camera": {name: [list(row) for row in place] for name, place in result.T_rig_camera.items()},
         "place_sd": {
-            name: {"centre_m": sd[:3].tolist(), "turn_rad": sd[3:].tolist()}
+            name: {"centre_m": sd[:3].tolist(), "rotation_rad": sd[3:].tolist()}
             for name, sd in result.place_sd.items()
         },
         "pairs": [

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from common.arrays import Image
 from common.errors import CalibrationError, FitError
 from master.calibrate.cameras.boards import Board, Charuco, Checkerboard
-from master.calibrate.cameras.detect import Sighting, find_board
+from master.calibrate.cameras.detect import ImageObservation, find_board
 
 ImageSet = Mapping[str, Callable[[], Image]]
 """Images taken at one instant: camera -> how to load its image."""
@@ -22,7 +22,7 @@ class View:
     """
 
     name: str
-    sightings: Mapping[str, Sighting]
+    observations: Mapping[str, ImageObservation]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,9 +46,11 @@ class BoardViews:
         """Names of the cameras."""
         return tuple(self.sizes_px)
 
-    def of(self, camera: str) -> tuple[tuple[str, Sighting], ...]:
+    def of(self, camera: str) -> tuple[tuple[str, ImageObservation], ...]:
         """Name and sighting of every view that `camera` has."""
-        return tuple((view.name, view.sightings[camera]) for view in self.views if camera in view.sightings)
+        return tuple(
+            (view.name, view.observations[camera]) for view in self.views if camera in view.observations
+        )
 
 
 def look(
@@ -72,7 +74,7 @@ def look(
     unseen: list[str] = []
     first: list[Image] = []
     for name, images in sets:
-        sightings: dict[str, Sighting] = {}
+        observations: dict[str, ImageObservation] = {}
         for camera, load in images.items():
             image = load()
             size = (image.shape[1], image.shape[0])
@@ -81,15 +83,15 @@ def look(
                     f"camera {camera!r}: view {name} is {size[0]} x {size[1]} px, the views before it"
                     f" {sizes[camera][0]} x {sizes[camera][1]}: take all images of a camera in one mode"
                 )
-            if (sighting := find_board(board, image)) is None:
+            if (observation := find_board(board, image)) is None:
                 unseen.append(f"{name} {camera}")
                 if len(first) < 4:
                     first.append(image)
             else:
-                sightings[camera] = sighting
+                observations[camera] = observation
             progress(f"{name} {camera}")
-        if sightings:
-            views.append(View(name, sightings))
+        if observations:
+            views.append(View(name, observations))
     if not sizes:
         raise FitError("there is no image")
     if not views:

@@ -55,7 +55,7 @@ def sweep_live(
             seconds=seconds,
             clock=clock,
             ask=_ask,
-            say=_say,
+            notify=_print,
             progress=_progress,
             keep=keep,
         )
@@ -73,7 +73,7 @@ def _ask(prompt: str) -> str | None:
     return line.rstrip("\n") if line else None
 
 
-def _say(line: str) -> None:
+def _print(line: str) -> None:
     if sys.stderr.isatty():
         typer.echo("\r\033[K", nl=False, err=True)  # the progress goes
     typer.echo(line)

@@ -30,7 +30,7 @@ class DepthReport:
         used: (N,) False: contradicts the others and was left out of the fits.
         power_law, affine_disparity: Fitted.
         errors: Law -> relative error of depth (N,), of the laws before the fit and after.
-        left_out: Fitted law -> relative error (K,) of each used point by the law of the others.
+        rejected: Fitted law -> relative error (K,) of each used point by the law of the others.
     """
 
     sweep: Sweep
@@ -38,12 +38,12 @@ class DepthReport:
     power_law: PowerLaw
     affine_disparity: AffineDisparity
     errors: Mapping[str, Float]
-    left_out: Mapping[str, Float]
+    rejected: Mapping[str, Float]
 
     @property
     def best(self) -> str:
         """The fitted law whose mean error for distances that it has not seen is smaller."""
-        return min(self.left_out, key=lambda name: float(np.abs(self.left_out[name]).mean()))
+        return min(self.rejected, key=lambda name: float(np.abs(self.rejected[name]).mean()))
 
     def mean_max(self, name: str) -> tuple[float, float]:
         """Mean and largest |error| of a law over the used distances, as a share of the distance."""
@@ -102,7 +102,7 @@ def report_lines(report: DepthReport) -> list[str]:
         cells = (f"{100 * report.mean_max(n)[which]:.2f} %" for n in names)
         lines.append(f"  {title:21s}  " + "  ".join(f"{c:>{w}s}" for c, w in zip(cells, widths, strict=True)))
     cells = (
-        f"{100 * np.abs(report.left_out[n]).mean():.2f} %" if n in report.left_out else "" for n in names
+        f"{100 * np.abs(report.rejected[n]).mean():.2f} %" if n in report.rejected else "" for n in names
     )
     lines.append(
         f"  {'mean, left out in turn':21s} "
@@ -124,8 +124,8 @@ def report_json(report: DepthReport) -> dict[str, object]:
     def law(name: str) -> dict[str, float]:
         mean, largest = report.mean_max(name)
         out = {"mean_percent": 100 * mean, "max_percent": 100 * largest}
-        if name in report.left_out:
-            out["leave_one_out_mean_percent"] = 100 * float(np.abs(report.left_out[name]).mean())
+        if name in report.rejected:
+            out["leave_one_out_mean_percent"] = 100 * float(np.abs(report.rejected[name]).mean())
         return out
 
     points = [

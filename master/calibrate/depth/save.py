@@ -54,7 +54,7 @@ def write_laws(
         residual = {
             "mean_percent": round(100 * mean, 4),
             "max_percent": round(100 * largest, 4),
-            "leave_one_out_mean_percent": round(100 * float(np.abs(report.left_out[name]).mean()), 4),
+            "leave_one_out_mean_percent": round(100 * float(np.abs(report.rejected[name]).mean()), 4),
         }
         note = f"{int(report.used.sum())} distances, {low:.3g} to {high:.3g} m{dropped}"
         return provenance("calibrate depth", measured.data, residual, note)
@@ -64,16 +64,16 @@ def write_laws(
         power_law=PowerLawCalibration(k_m=power.k_m, z=power.z),
         affine_disparity=AffineDisparityCalibration(a_m_px=affine.a_m_px, x0_px=affine.x0_px),
         depth_model=rig.depth_model if use is None else use,
-        provenance=rig.provenance | {name: how(name) for name in report.left_out},
+        provenance=rig.provenance | {name: how(name) for name in report.rejected},
     )
     return write_rig(out, measured.pair.file_name, new)
 
 
 def conclusion(report: DepthReport, rig: RigCalibration | None, use: str | None, written: Path | None) -> str:
     """Before and after, what was written, and which depth model would be better."""
-    before = [name for name in report.errors if name not in report.left_out]
+    before = [name for name in report.errors if name not in report.rejected]
     was = f"before {100 * report.mean_max(before[-1])[0]:.2f} % ({before[-1]}), " if before else ""
-    after = ", ".join(f"{100 * report.mean_max(name)[0]:.2f} % ({name})" for name in report.left_out)
+    after = ", ".join(f"{100 * report.mean_max(name)[0]:.2f} % ({name})" for name in report.rejected)
     text = f"mean error: {was}after {after}"
     if written is None:
         return f"{text}\nnothing written: give --out DIR"

@@ -138,7 +138,7 @@ def run_session(
     seconds: float,
     clock: Clock,
     ask: Callable[[str], str | None],
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
     progress: Callable[[float], None],
     keep: Callable[[Sweep], None],
 ) -> Sweep:
@@ -172,16 +172,16 @@ def run_session(
             if answer == "s":
                 waiting.popleft()
             else:
-                say(f"{answer!r}: neither a distance in metres, nor s, nor q")
+                notify(f"{answer!r}: neither a distance in metres, nor s, nor q")
             continue
         try:
             reading = measure(source, Meter(cameras, marker, frames, seconds), clock, progress)
         except FitError as error:
-            say(f"{distance:.3f} m: not measured: {error}; try again")
+            notify(f"{distance:.3f} m: not measured: {error}; try again")
             continue
         waiting.popleft()
         done.append((distance, reading))
-        say(_told(distance, reading, cameras))
+        notify(_told(distance, reading, cameras))
         keep(_sweep(done))
     return _sweep(done)
 

@@ -183,9 +183,9 @@ def _check_whole(sweep: Sweep, cameras: tuple[str, str], size_px: tuple[int, int
     nominal = sweep.area_px2 * sweep.distance_m**2
     if sweep.size == 0 or not np.isfinite(nominal).all():
         return
-    usual = np.median(nominal, axis=1, keepdims=True)
+    typical = np.median(nominal, axis=1, keepdims=True)
     gap = np.minimum(sweep.uv, np.array(size_px) - 1.0 - sweep.uv).min(axis=2)
-    cut = (nominal < _WHOLE * usual) & (gap < _HALF_LENGTH * np.sqrt(usual) / sweep.distance_m)
+    cut = (nominal < _WHOLE * typical) & (gap < _HALF_LENGTH * np.sqrt(typical) / sweep.distance_m)
     for index, camera in enumerate(cameras):
         if cut[index].any():
             raise FitError(

@@ -61,7 +61,7 @@ class Beliefs:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Course:
+class RoutineTargets:
     """What the routine asks for at each knot.
 
     Attributes:
@@ -75,7 +75,7 @@ class Course:
     straight: Bool
 
     @classmethod
-    def of(cls, script_s: Float) -> "Course":
+    def of(cls, script_s: Float) -> "RoutineTargets":
         """At routine times (K,) [s]; what may be moving by then counts as moving, since times are known roughly."""
         around = [[move_at(t + d) for d in (-_ROUGHLY_S, 0.0, _ROUGHLY_S)] for t in script_s.tolist()]
         return cls(

@@ -83,7 +83,7 @@ class BorderedNormal:
         self.pull: Float = np.zeros((count, channels))
         self.pull_constants: Float = np.zeros(constants)
 
-    def add_instants(self, knots: Knots, jacobian: Float, by_constants: Float, off: Float) -> None:
+    def add_epochs(self, knots: Knots, jacobian: Float, by_constants: Float, off: Float) -> None:
         """Add residuals of every instant.
 
         Args:

@@ -27,7 +27,7 @@ class ShapeFit:
         palm: (K, 6) turn [rad] and shift [m] of the palm against its first pose.
         spread: Root of the mean squared whitened residual: 1 where the stated covariances are true.
         alike: By what the standard deviations were raised because errors last longer than a frame.
-        steps: Taken.
+        steps: SensorMessage.
     """
 
     shape: Shape

@@ -7,7 +7,7 @@ from common.errors import CalibrationError
 from common.hand_model import HandModel
 from common.messages import HandPose
 from master.calibrate.hand.observed import Observed, marker_rows
-from master.calibrate.hand.session import lead
+from master.calibrate.hand.session import guide
 from master.master_bus import join_bus
 
 _DEPTH = 256  # poses that may wait while a line is printed
@@ -42,7 +42,7 @@ def observe_live(bus: str, names: tuple[str, ...], model: HandModel) -> Observed
                 )
             return message
 
-        track = lead(receive, tips, names, SystemClock(), typer.echo)
+        track = guide(receive, tips, names, SystemClock(), typer.echo)
     finally:
         link.close()
     return Observed.of(*track.arrays(), names, model)

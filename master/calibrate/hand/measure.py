@@ -16,7 +16,7 @@ from common.errors import FitError
 from common.hand_model import FINGERS, TIPS, WRIST, HandModel
 from common.hand_profiles import mirrored_profile, scaled_profile
 from master.calibrate.hand.align import GRID_S, Alignment, align, flat_scale, missing_steps
-from master.calibrate.hand.beliefs import Beliefs, Course
+from master.calibrate.hand.beliefs import Beliefs, RoutineTargets
 from master.calibrate.hand.curves import Knots
 from master.calibrate.hand.fit import ShapeFit, fit_shape
 from master.calibrate.hand.observed import Observed
@@ -150,7 +150,7 @@ def problem_of(
         points_m=observed.points_m,
         whiten=whitening(observed.cov_m2, beliefs.model_m),
         knots=knots,
-        course=Course.of(alignment.at(knots.time_s)),
+        targets=RoutineTargets.of(alignment.at(knots.time_s)),
         start=alignment.T_rig_palm,
         palm_free=bool(np.quantile(seen_back, 0.1) >= _FREE_WITH),
         beliefs=beliefs,
@@ -228,8 +228,9 @@ def _check_palm(problem: HandRoutineProblem, fit: ShapeFit) -> None:
     believed = np.repeat([beliefs.palm_rad_s, beliefs.palm_m_s], 3) * step_s
     wander = np.sqrt((np.diff(fit.palm, axis=0) ** 2).mean(axis=0)) / believed
     if wander.max() > _RESTLESS:
-        turn, shift = (float(np.ptp(part, axis=0).max()) for part in (fit.palm[:, :3], fit.palm[:, 3:]))
+        rotation, shift = (float(np.ptp(part, axis=0).max()) for part in (fit.palm[:, :3], fit.palm[:, 3:]))
         raise FitError(
-            f"the palm did not rest: it moved by {1e3 * shift:.0f} mm and turned by {np.degrees(turn):.0f} degrees; lay"
+            f"the palm did not rest: it moved by {1e3 * shift:.0f} mm and turned by {np.degrees(rotation):.0f} degrees;"
+            " lay"
             " the back of the hand on a table, or paint three markers on it and show them"
         )

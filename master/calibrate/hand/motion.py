@@ -114,8 +114,8 @@ def _good(palm: Palm) -> Bool:
         return whole
     middle = np.median(lengths[whole], axis=0)
     spread = np.median(np.abs(lengths[whole] - middle), axis=0)
-    usual = np.abs(lengths - middle) < np.maximum(_OUTLIER * spread, _FLOOR_M)
-    return whole & np.asarray(usual.all(axis=(1, 2)), np.bool_)
+    typical = np.abs(lengths - middle) < np.maximum(_OUTLIER * spread, _FLOOR_M)
+    return whole & np.asarray(typical.all(axis=(1, 2)), np.bool_)
 
 
 def _metacarpals(shape_m: Float) -> dict[str, RestJoint]:
@@ -164,9 +164,9 @@ def motion_lines(hand: MotionHand) -> list[str]:
     """The report for a person."""
     palm, found = hand.palm, hand.couplings
     lines = [*hand.motion.remarks]
-    said = "as its names or --side say" if hand.motion.side else "as its fingers bend"
+    text = "as its names or --side say" if hand.motion.side else "as its fingers bend"
     lines.append(
-        f"{palm.side} hand ({said}), {1e3 * hand.length_m:.0f} mm long, from {hand.frames} of {len(palm.outlier)}"
+        f"{palm.side} hand ({text}), {1e3 * hand.length_m:.0f} mm long, from {hand.frames} of {len(palm.outlier)}"
         f" frames; the palm's joints keep their places to {1e3 * palm.rms_m:.1f} mm"
     )
     if palm.mirrored:

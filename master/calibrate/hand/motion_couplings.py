@@ -128,8 +128,8 @@ def _ratio(angle: Float, pip: Float, noise_rad: tuple[float, float]) -> Ratio:
         off = np.asarray(np.abs(y - slope * x), np.float64)
         spread = max(1.4826 * float(np.median(off)), 1e-6)
         weight = np.minimum(1.0, _HUBER * spread / np.maximum(off, 1e-12))
-    usual = off < _OUTLIER * spread
-    spread = float(np.sqrt((off[usual] ** 2).mean()))
+    typical = off < _OUTLIER * spread
+    spread = float(np.sqrt((off[typical] ** 2).mean()))
     noise = float(np.hypot(noise_rad[0], slope * noise_rad[1]))
     left = spread * spread - noise * noise
     return Ratio(slope, float(np.sqrt(left)) if left > _TOLD * spread * spread else 0.0, noise)

@@ -69,9 +69,9 @@ def find_palm(joints_m: Float, side: Side | None, where: str) -> Palm:
     outlier[~whole] = True
     outlier[np.flatnonzero(whole)[distance > max(_OUTLIER * float(np.median(distance)), _FLOOR_M)]] = True
     in_shape = np.full_like(joints_m, np.nan)
-    turned = np.swapaxes(T_file_shape[:, :3, :3], 1, 2)
+    transposed = np.swapaxes(T_file_shape[:, :3, :3], 1, 2)
     moved = joints_m[whole] - T_file_shape[:, None, :3, 3]
-    in_shape[whole] = np.einsum("tij,tkj->tki", turned, moved)
+    in_shape[whole] = np.einsum("tij,tkj->tki", transposed, moved)
     fits: dict[Side, Float] = {one: palm_axes(shape, there, one) for one in _SIDES}
     shown = _side_shown(in_shape[~outlier], fits, where)
     wanted = side or shown
@@ -114,9 +114,9 @@ def _side_shown(in_shape: Float, fits: dict[Side, Float], where: str) -> Side:
     chains = chains[known(chains).all(axis=(1, 2))]
     bones = np.diff(chains, axis=2)
     bones /= np.linalg.norm(bones, axis=3, keepdims=True)
-    turned = np.cross(bones[:, :, :2], bones[:, :, 1:]).sum(axis=(0, 1, 2))
-    length = float(np.linalg.norm(turned))
-    along = {side: float(turned @ R[:, 0]) / max(length, 1e-12) for side, R in fits.items()}
+    normal = np.cross(bones[:, :, :2], bones[:, :, 1:]).sum(axis=(0, 1, 2))
+    length = float(np.linalg.norm(normal))
+    along = {side: float(normal @ R[:, 0]) / max(length, 1e-12) for side, R in fits.items()}
     right: list[Side] = [side for side in _SIDES if along[side] > _SURE]
     if len(right) != 1:
         raise FitError(

@@ -12,9 +12,9 @@ import numpy as np
 from common.arrays import Float
 from common.geometry import rotation_vector_to_matrix, skew, transform
 from common.hand_model import HandModel
-from master.calibrate.hand.beliefs import Beliefs, Course
+from master.calibrate.hand.beliefs import Beliefs, RoutineTargets
 from master.calibrate.hand.curves import BorderedNormal, Knots
-from master.calibrate.hand.shape import BIAS, LENGTH, PER_FINGER, RATIO, ROOT, TURN, Shape, caps_of
+from master.calibrate.hand.shape import BIAS, LENGTH, PER_FINGER, RATIO, ROOT, ROTATION, Shape, caps_of
 
 CHANNELS = 26
 _PALM, _ANGLES = 6, 20
@@ -42,7 +42,7 @@ class HandRoutineProblem:
         points_m: (T, 5 + B, 3) caps thumb ... little, then the markers on the back, rig frame; NaN: not seen.
         whiten: (T, 5 + B, 3, 3): whiten @ off has unit covariance.
         knots: Of the curves.
-        course: What the routine asks for at each of them.
+        targets: What the routine asks for at each of them.
         start: (4, 4) palm pose about which the curves are.
         palm_free: The palm may move, since it is measured.
         beliefs: Widths.
@@ -54,7 +54,7 @@ class HandRoutineProblem:
     points_m: Float
     whiten: Float
     knots: Knots
-    course: Course
+    targets: RoutineTargets
     start: Float
     palm_free: bool
     beliefs: Beliefs
@@ -63,7 +63,7 @@ class HandRoutineProblem:
         """The routine as it is asked for, by the believed shape."""
         coefficients = np.zeros((len(self.knots.time_s), CHANNELS))
         angles = coefficients[:, _PALM:].reshape(-1, 5, 4)
-        angles[..., :3] = self.course.posture_rad
+        angles[..., :3] = self.targets.posture_rad
         angles[..., 3] = self.prior.dip_ratio * angles[..., 2]
         return State(self.prior, coefficients)
 
@@ -83,7 +83,7 @@ class HandRoutineProblem:
         rows = len(off), -1
         scale = np.sqrt(seen)[..., None]
         off = off * scale
-        out.add_instants(
+        out.add_epochs(
             self.knots,
             (jacobian * scale[..., None]).reshape(*rows, CHANNELS),
             (by_shape * scale[..., None]).reshape(*rows, size),
@@ -116,8 +116,8 @@ class HandRoutineProblem:
         caps = caps_of(self.model, self.cap_m, state.shape, curves[:, _PALM:].reshape(-1, 5, 4))
         back = np.broadcast_to(state.shape.back_m, (count, markers - 5, 3))
         palm = np.concatenate([caps.place_m, back], axis=1)
-        turn = rotation_vector_to_matrix(curves[:, :3])
-        rotation = turn @ self.start[:3, :3]
+        change = rotation_vector_to_matrix(curves[:, :3])
+        rotation = change @ self.start[:3, :3]
         middle = 0.5 * self.model.rest_position_m.max(axis=0) * [0.0, 0.0, 1.0]
         arm = (palm - middle) @ np.swapaxes(rotation, -1, -2)
         predicted = arm + (transform(self.start, middle) + curves[:, 3:6])[:, None]
@@ -157,33 +157,33 @@ class HandRoutineProblem:
             off[:, c] = -change[:, c] * (x[1:, c] - x[:-1, c])
             jacobian[:, CHANNELS + c, 0, c] = level[:, c]
             off[:, CHANNELS + c] = level[:, c] * (mean[:, c] - x[:-1, c])
-        stray = x[:, dip] - shape.dip_ratio * x[:, pip] - shape.dip_bias_rad
+        outlier = x[:, dip] - shape.dip_ratio * x[:, pip] - shape.dip_bias_rad
         for f, (d, p) in enumerate(zip(dip, pip, strict=True)):
             ratio, own = shape.dip_ratio[f], PER_FINGER * f
             jacobian[:, d, 0, d], jacobian[:, d, 1, d] = -change[:, d], change[:, d]
             jacobian[:, d, 0, p], jacobian[:, d, 1, p] = ratio * change[:, d], -ratio * change[:, d]
             by_shape[:, d, own + RATIO] = -change[:, d] * (x[1:, p] - x[:-1, p])
-            off[:, d] = -change[:, d] * (stray[1:, f] - stray[:-1, f])
+            off[:, d] = -change[:, d] * (outlier[1:, f] - outlier[:-1, f])
             row = CHANNELS + d
             jacobian[:, row, 0, d], jacobian[:, row, 0, p] = level[:, d], -ratio * level[:, d]
             by_shape[:, row, own + RATIO] = -level[:, d] * x[:-1, p]
             by_shape[:, row, own + BIAS] = -level[:, d]
-            off[:, row] = -level[:, d] * stray[:-1, f]
+            off[:, row] = -level[:, d] * outlier[:-1, f]
         return jacobian, by_shape, off
 
     def _widths(self) -> tuple[Float, Float, Float]:
         """Inverse sd of changes (K - 1, 26), means (K - 1, 26), and inverse sd of levels (K - 1, 26)."""
         b, h = self.beliefs, self.knots.spacing_s
         count = len(self.knots.time_s) - 1
-        moving = (self.course.moving[1:] | self.course.moving[:-1]).reshape(count, 5, 3)
-        straight = self.course.straight[:-1]
+        moving = (self.targets.moving[1:] | self.targets.moving[:-1]).reshape(count, 5, 3)
+        straight = self.targets.straight[:-1]
         wander = np.empty((count, CHANNELS))  # [1/sqrt(s)]
         mean, sigma = np.zeros((count, CHANNELS)), np.full((count, CHANNELS), np.inf)
         wander[:, :3] = b.free_palm_rad_s if self.palm_free else b.palm_rad_s
         wander[:, 3:6] = b.free_palm_m_s if self.palm_free else b.palm_m_s
         angles, means, sigmas = (a[:, _PALM:].reshape(count, 5, 4) for a in (wander, mean, sigma))
         angles[..., :3] = np.where(moving, b.moving_rad_s, b.held_rad_s)
-        means[..., :3] = self.course.posture_rad[:-1]
+        means[..., :3] = self.targets.posture_rad[:-1]
         sigmas[..., :3] = np.where(moving, b.moving_level_rad, b.level_rad)
         means[..., _PIP] = np.where(straight, b.straight_rad[0], means[..., _PIP])
         sigmas[..., _PIP] = np.where(straight, b.straight_rad[1], sigmas[..., _PIP])
@@ -198,8 +198,8 @@ class HandRoutineProblem:
         own_sd, own = (a[: 5 * PER_FINGER].reshape(5, PER_FINGER) for a in (sd, away))
         own_sd[:, LENGTH], own[:, LENGTH] = b.bone * prior.length_m, shape.length_m - prior.length_m
         own_sd[:, ROOT], own[:, ROOT] = b.root_m, shape.root_m - prior.root_m
-        own_sd[:, TURN] = np.array([b.thumb_rad, *[b.root_rad] * 4])[:, None]
-        own[:, TURN] = _turn_between(shape.root_rotation, prior.root_rotation)
+        own_sd[:, ROTATION] = np.array([b.thumb_rad, *[b.root_rad] * 4])[:, None]
+        own[:, ROTATION] = _rotation_between(shape.root_rotation, prior.root_rotation)
         own_sd[:, RATIO] = np.array([b.thumb_ratio[1], *[b.dip_ratio[1]] * 4])
         own[:, RATIO] = shape.dip_ratio - prior.dip_ratio
         own_sd[:, BIAS], own[:, BIAS] = b.dip_bias_rad, shape.dip_bias_rad - prior.dip_bias_rad
@@ -213,7 +213,7 @@ def weigh(whitened: Float) -> Float:
     return np.minimum(1.0, _OUTLIER / np.maximum(np.linalg.norm(whitened, axis=-1), 1e-12))
 
 
-def _turn_between(rotation: Float, other: Float) -> Float:
+def _rotation_between(rotation: Float, other: Float) -> Float:
     """(5, 3) small turns about the palm's axes from `other` to `rotation` (5, 3, 3)."""
     relative = rotation @ np.swapaxes(other, -1, -2)
     return 0.5 * np.stack(

@@ -53,8 +53,8 @@ class Track:
         return np.array(self.t_ns, np.int64), np.array(self.points_m), np.array(self.cov_m2)
 
 
-def lead(
-    receive: Receive, tips: Sequence[int], names: Sequence[str], clock: Clock, say: Callable[[str], None]
+def guide(
+    receive: Receive, tips: Sequence[int], names: Sequence[str], clock: Clock, notify: Callable[[str], None]
 ) -> Track:
     """Lead a person through the routine.
 
@@ -69,25 +69,25 @@ def lead(
         FitError: No pose comes, or a step was not seen three times.
     """
     track = Track()
-    say("lay the back of the hand on the table, palm to the cameras; it stays there until the end")
+    notify("lay the back of the hand on the table, palm to the cameras; it stays there until the end")
     for count in range(_COUNT_DOWN_S, 0, -1):
-        say(f"{count} ...")
+        notify(f"{count} ...")
         _during(receive, clock, 1.0)
     for number, step in enumerate(STEPS):
         for _ in range(_TRIES):
-            say(f"{number + 1} of {len(STEPS)}: {step.told} ({step.seconds:.0f} s)")
+            notify(f"{number + 1} of {len(STEPS)}: {step.told} ({step.seconds:.0f} s)")
             poses = _during(receive, clock, step.seconds + _LATE_S)
             lacking = unseen(step, number, poses, tips, names)
             if not lacking:
                 track.keep(poses)
                 break
-            say(f"{lacking}; back to the flat hand, and this step again")
+            notify(f"{lacking}; back to the flat hand, and this step again")
             _during(receive, clock, 1.0)
         else:
             raise FitError(
                 f"{step.name}: not seen in {_TRIES} tries; turn the hand or a camera, and begin again"
             )
-    say("done")
+    notify("done")
     return track
 
 

@@ -14,7 +14,7 @@ from common.geometry import cross, rotation_vector_to_matrix, skew
 from common.hand_model import CHAINS, HandModel
 
 PER_FINGER = 11
-LENGTH, ROOT, TURN, RATIO, BIAS = slice(0, 3), slice(3, 6), slice(6, 9), 9, 10
+LENGTH, ROOT, ROTATION, RATIO, BIAS = slice(0, 3), slice(3, 6), slice(6, 9), 9, 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,11 +56,11 @@ class Shape:
     def stepped(self, step: Float) -> "Shape":
         """With a step (size,) [m, rad] added; turns are about the palm's axes."""
         own, back = step[: 5 * PER_FINGER].reshape(5, PER_FINGER), step[5 * PER_FINGER :]
-        turns = np.stack([rotation_vector_to_matrix(turn) for turn in own[:, TURN]])
+        change = np.stack([rotation_vector_to_matrix(vector) for vector in own[:, ROTATION]])
         return Shape(
             length_m=self.length_m + own[:, LENGTH],
             root_m=self.root_m + own[:, ROOT],
-            root_rotation=turns @ self.root_rotation,
+            root_rotation=change @ self.root_rotation,
             dip_ratio=self.dip_ratio + own[:, RATIO],
             dip_bias_rad=self.dip_bias_rad + own[:, BIAS],
             back_m=self.back_m + back.reshape(-1, 3),
@@ -100,13 +100,13 @@ def caps_of(model: HandModel, cap_m: Float, shape: Shape, angles_rad: Float) -> 
     first[:, 0] = first[:, 0] @ abduct[:, 0]
     rotations = [first @ bend[:, :, 0]]
     for k in (1, 2):
-        rotations.append(rotations[-1] @ model.turn[:, k - 1] @ bend[:, :, k])
+        rotations.append(rotations[-1] @ model.link_rotation[:, k - 1] @ bend[:, :, k])
     along = model.bone_m / np.linalg.norm(model.bone_m, axis=-1, keepdims=True)
-    ways = [_turned(rotation, along[:, k]) for k, rotation in enumerate(rotations)]  # (T, 5, 3) unit
+    ways = [_rotate(rotation, along[:, k]) for k, rotation in enumerate(rotations)]  # (T, 5, 3) unit
     joints = [np.broadcast_to(shape.root_m, (count, 5, 3))]
     for k in range(3):
         joints.append(joints[-1] + shape.length_m[:, k, None] * ways[k])
-    tip = joints[3] + _turned(rotations[2], (model.turn[:, 2] @ cap_m[..., None])[..., 0])
+    tip = joints[3] + _rotate(rotations[2], (model.link_rotation[:, 2] @ cap_m[..., None])[..., 0])
     axis = np.empty((count, 5, 4, 3))
     axis[:, :, 0] = model.side_sign * np.array([0.0, 1.0, 0.0])
     axis[:, 0, 0] = model.side_sign * (first[:, 0] @ np.array([0.0, 1.0, 0.0]))
@@ -117,11 +117,11 @@ def caps_of(model: HandModel, cap_m: Float, shape: Shape, angles_rad: Float) -> 
     by_shape = np.zeros((count, 5, 3, PER_FINGER))
     by_shape[..., LENGTH] = np.stack(ways, axis=-1)
     by_shape[..., ROOT] = np.eye(3)
-    by_shape[..., TURN] = -skew(tip - joints[0]) @ before
+    by_shape[..., ROTATION] = -skew(tip - joints[0]) @ before
     return Caps(tip, by_angle, by_shape)
 
 
-def _turned(rotation: Float, vector: Float) -> Float:
+def _rotate(rotation: Float, vector: Float) -> Float:
     return (rotation @ vector[..., None])[..., 0]
 
 

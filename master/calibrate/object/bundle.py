@@ -23,7 +23,7 @@ _MOST = 1500  # instants: more of the same motion adds time, not knowledge
 _ROUNDS = 40
 _SETTLED_M = 1e-7
 _SOFT_2 = 12.0  # chi square of three numbers at which a bead counts a quarter
-STRAY = 0.1  # weight below which a bead at an instant counts as a stray
+OUTLIER = 0.1  # weight below which a bead at an instant counts as a stray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,9 +49,9 @@ class Bundle:
     spread: float
 
     @property
-    def stray(self) -> Bool:
+    def outlier(self) -> Bool:
         """(T, B) which sightings the body does not explain."""
-        return self.seen.known & (self.weight < STRAY)
+        return self.seen.known & (self.weight < OUTLIER)
 
 
 def usable(seen: Seen) -> Bool:
@@ -85,9 +85,9 @@ def fit_bundle(seen: Seen, rows: Int | None = None) -> Bundle:
         weight = np.where(own.known, (1.0 + chi / (_SOFT_2 * scale_2)) ** -2.0, 0.0)
         step, poses, cov = _solved(beads, T, off, weight[..., None, None] * info)
         beads = beads + step
-        turn = rotation_vector_to_matrix(poses[:, :3])
+        rotation = rotation_vector_to_matrix(poses[:, :3])
         T = T.copy()
-        T[:, :3, :3], T[:, :3, 3] = turn @ T[:, :3, :3], T[:, :3, 3] + poses[:, 3:]
+        T[:, :3, :3], T[:, :3, 3] = rotation @ T[:, :3, :3], T[:, :3, 3] + poses[:, 3:]
         if float(np.abs(step).max()) < _SETTLED_M:
             break
     off = _off(beads, T, points)

@@ -6,14 +6,14 @@ from common.calibration import RigCalibration
 from common.clock import SystemClock
 from common.messages import HandPose
 from master.calibrate.object.seen import Seen
-from master.calibrate.object.session import lead
+from master.calibrate.object.session import guide
 from master.master_bus import join_bus
 
 _DEPTH = 512  # poses that may wait while a line is printed
 
 
 def observe_live(
-    bus: str, rig: RigCalibration, names: Sequence[str], longest_s: float, say: Callable[[str], None]
+    bus: str, rig: RigCalibration, names: Sequence[str], longest_s: float, notify: Callable[[str], None]
 ) -> Seen:
     """Lead the user through the motion.
 
@@ -38,6 +38,6 @@ def observe_live(
             # A wrist device alone tells of hands without markers.
             return message if isinstance(message, HandPose) and len(message.markers_raw_m) else None
 
-        return lead(receive, rig, names, SystemClock(), say, longest_s)
+        return guide(receive, rig, names, SystemClock(), notify, longest_s)
     finally:
         link.close()

@@ -57,13 +57,13 @@ class Measurement:
     @property
     def rms_m(self) -> Float:
         """(B,) by how much each misses the body, root of the mean square; strays left out."""
-        kept = np.where((self.bundle.weight > 0) & ~self.bundle.stray, 1.0, np.nan)
+        kept = np.where((self.bundle.weight > 0) & ~self.bundle.outlier, 1.0, np.nan)
         return np.sqrt(np.nanmean(kept * (self.bundle.off_m**2).sum(axis=-1), axis=0))
 
     @property
     def strays(self) -> Float:
         """(B,) share of sightings of each that the body does not explain."""
-        return self.bundle.stray.sum(axis=0) / np.maximum(self.bundle.seen.known.sum(axis=0), 1)
+        return self.bundle.outlier.sum(axis=0) / np.maximum(self.bundle.seen.known.sum(axis=0), 1)
 
 
 def measure_object(seen: Seen) -> Measurement:
@@ -166,8 +166,8 @@ def changes(seen: Seen) -> dict[tuple[int, int], tuple[float, float]]:
         if not known.any():
             continue
         # What is half hidden is less sure, and elsewhere than it seems.
-        usual = float(np.percentile(variance[known], 25.0))
-        known &= variance <= _SURE * usual
+        typical = float(np.percentile(variance[known], 25.0))
+        known &= variance <= _SURE * typical
         medians = [
             np.median(distance[known & (window == w)])
             for w in np.unique(window[known])
@@ -176,7 +176,7 @@ def changes(seen: Seen) -> dict[tuple[int, int], tuple[float, float]]:
         if len(medians) < _WINDOWS:
             continue
         low, high = np.percentile(medians, (10.0, 90.0))
-        out[a, b] = float(high - low), _RIGID_M + _RIGID_SIGMAS * float(np.sqrt(usual))
+        out[a, b] = float(high - low), _RIGID_M + _RIGID_SIGMAS * float(np.sqrt(typical))
     return out
 
 
@@ -184,10 +184,10 @@ def looks_of(T: Float) -> int:
     """In how many ways poses (T, 4, 4) differ enough that cameras see something else: greedily, the first ones kept."""
     kept = np.empty((0, 4, 4))
     for pose in T:
-        turn = np.linalg.norm(
+        rotation = np.linalg.norm(
             matrix_to_rotation_vector(kept[:, :3, :3].swapaxes(1, 2) @ pose[:3, :3]), axis=-1
         )
         way = np.linalg.norm(kept[:, :3, 3] - pose[:3, 3], axis=1)
-        if not ((turn < _LOOK_RAD) & (way < _LOOK_M)).any():
+        if not ((rotation < _LOOK_RAD) & (way < _LOOK_M)).any():
             kept = np.concatenate([kept, pose[None]])
     return len(kept)

@@ -18,8 +18,8 @@ def draw_object(path: Path, found: Measurement, profile: ObjectProfile) -> None:
     """
     bundle, own = found.bundle, np.array([profile.markers[name].position_m for name in found.names])
     # Where each sighting lies in the object: the bead less what is left, turned into its frame.
-    turn = fit_rigid(own, bundle.beads_m)[:3, :3]
-    left = np.einsum("ij,tkj,tbk->tbi", turn, bundle.T[:, :3, :3], bundle.off_m)
+    rotation = fit_rigid(own, bundle.beads_m)[:3, :3]
+    left = np.einsum("ij,tkj,tbk->tbi", rotation, bundle.T[:, :3, :3], bundle.off_m)
     figure = figure_of((16.0, 8.4))
     figure.suptitle(f"{profile.name}: {len(bundle.T)} instants in {found.looks} ways of turning and places")
     *sides, time = figure.subplots(2, 2).ravel()
@@ -35,9 +35,11 @@ def draw_object(path: Path, found: Measurement, profile: ObjectProfile) -> None:
     for row, name in enumerate(found.names):
         colour = FINGER_COLOURS[row % len(FINGER_COLOURS)]
         size = 1e3 * np.linalg.norm(bundle.off_m[:, row], axis=1)
-        stray = bundle.stray[:, row]
-        time.plot(bundle.seen.t_s, np.where(stray, np.nan, size), ".", markersize=3, color=colour, label=name)
-        time.plot(bundle.seen.t_s[stray], size[stray], "x", markersize=4, color=GREY)
+        outlier = bundle.outlier[:, row]
+        time.plot(
+            bundle.seen.t_s, np.where(outlier, np.nan, size), ".", markersize=3, color=colour, label=name
+        )
+        time.plot(bundle.seen.t_s[outlier], size[outlier], "x", markersize=4, color=GREY)
     time.set(title="from the rigid body [mm]; crosses: strays", xlabel="time [s]")
     time.set_ylim(0.0, max(1.0, 1.2 * float(np.nanpercentile(1e3 * np.abs(bundle.off_m), 99.0)) * 1.7))
     time.legend(fontsize=8, markerscale=3)

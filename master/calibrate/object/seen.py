@@ -91,7 +91,7 @@ def seen_by(
         uv, sigma = _clear(frames, uv)[:, rows], frames.sigma_px[:, rows]
         found = triangulate(arrays, uv, sigma, rays_px)
         times.append(frames.t_ns)
-        points.append(np.where(found.apart[:, None], np.nan, found.points_m))
+        points.append(np.where(found.outliers[:, None], np.nan, found.points_m))
         covs.append(found.cov_m2)
     return _seen(tuple(names), times, points, covs)
 
@@ -120,9 +120,9 @@ def seen_in(poses: Sequence[HandPose], rig: RigCalibration, names: Sequence[str]
 
 def _clear(frames: FrameSet, uv: Float) -> Float:
     """Pixels (C, M, 2) without those that have a rival."""
-    if frames.rival_uv is None:
+    if frames.alt_uv is None:
         return uv
-    return np.where(np.isfinite(frames.rival_uv[..., :1]), np.nan, uv)
+    return np.where(np.isfinite(frames.alt_uv[..., :1]), np.nan, uv)
 
 
 def _seen(names: tuple[str, ...], times: list[int], points: list[Float], covs: list[Float]) -> Seen:

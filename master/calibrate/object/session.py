@@ -19,12 +19,12 @@ _SHOWN = 200  # instants from which ways of turning are counted while it goes on
 Receive = Callable[[float], HandPose | None]
 
 
-def lead(
+def guide(
     receive: Receive,
     rig: RigCalibration,
     names: Sequence[str],
     clock: Clock,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
     longest_s: float,
 ) -> Seen:
     """Lead a person through the motion until it is enough, or the time is over.
@@ -42,7 +42,7 @@ def lead(
         FitError: No pose came.
     """
     poses = list[HandPose]()
-    say(MOTION)
+    notify(MOTION)
     begin_ns = told_ns = clock.now_ns()
     while clock.now_ns() - begin_ns < longest_s * 1e9:
         pose = receive(_WAIT_S)
@@ -53,10 +53,10 @@ def lead(
             continue
         told_ns = now_ns
         if not poses:
-            say("no pose comes: is `phalanx-master run` running, on this --bus?")
+            notify("no pose comes: is `phalanx-master run` running, on this --bus?")
             continue
         line, enough = progress(seen_in(poses, rig, names))
-        say(line)
+        notify(line)
         if enough:
             break
     if not poses:

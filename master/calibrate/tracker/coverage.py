@@ -6,16 +6,16 @@ import numpy as np
 
 from common.arrays import Float
 from common.geometry import matrix_to_rotation_vector
-from master.calibrate.tracker.tracks import PoseTrack, shared_instants
+from master.calibrate.tracker.tracks import PoseTrack, shared_epochs
 
-LEAST_S, LEAST_TURN_RAD, LEAST_WAY_M = 8.0, np.radians(45.0), 0.10
+LEAST_S, LEAST_ROTATION_RAD, LEAST_WAY_M = 8.0, np.radians(45.0), 0.10
 LEAST_PACE_RAD_S, LEAST_PACE_M_S = np.radians(20.0), 0.05
 _ENDS = (0.03, 0.97)  # quantiles: a stray pose is no motion
 _PACE_S = 0.2
 _BEGUN_S = 1.0  # before that there is no motion to speak of
 _ADVICE = {
     "seconds": f"go on until cameras and tracker have seen it together for {LEAST_S:.0f} s",
-    "turn": "turn it about its {axes} axis as well, a quarter turn and back",
+    "rotation": "turn it about its {axes} axis as well, a quarter turn and back",
     "way": "carry it a hand's width and more to all sides, nearer and farther",
     "pace": "move it faster, about once to and fro in two seconds: nothing else tells the lag of the clocks",
 }
@@ -28,7 +28,7 @@ class Coverage:
     Attributes:
         seen_s, tracked_s: How long cameras saw the object, and the tracker knew where it was [s].
         shared_s: How long both [s].
-        turn_rad: By how much it was turned about its own x, y, z, from one end to the other.
+        rotation_rad: By how much it was turned about its own x, y, z, from one end to the other.
         way_m: How far it was carried along the rig's x, y, z, from one end to the other.
         pace_rad_s, pace_m_s: Its speeds, root of the mean square.
     """
@@ -36,7 +36,7 @@ class Coverage:
     seen_s: float
     tracked_s: float
     shared_s: float
-    turn_rad: tuple[float, float, float]
+    rotation_rad: tuple[float, float, float]
     way_m: tuple[float, float, float]
     pace_rad_s: float
     pace_m_s: float
@@ -47,9 +47,13 @@ class Coverage:
         if self.shared_s < _BEGUN_S:
             return (_ADVICE["seconds"],)
         wanting: list[str] = []
-        poor = [axis for axis, turn in zip("xyz", self.turn_rad, strict=True) if turn < LEAST_TURN_RAD]
+        poor = [
+            axis
+            for axis, rotation in zip("xyz", self.rotation_rad, strict=True)
+            if rotation < LEAST_ROTATION_RAD
+        ]
         if poor:
-            wanting.append(_ADVICE["turn"].format(axes=" and its ".join(poor)))
+            wanting.append(_ADVICE["rotation"].format(axes=" and its ".join(poor)))
         if max(self.way_m) < LEAST_WAY_M:
             wanting.append(_ADVICE["way"])
         if self.pace_rad_s < LEAST_PACE_RAD_S and self.pace_m_s < LEAST_PACE_M_S:
@@ -62,12 +66,12 @@ class Coverage:
     def share(self) -> float:
         """How much of all that is wanted is there, 0 .. 1."""
         parts = [self.shared_s / LEAST_S, max(self.way_m) / LEAST_WAY_M]
-        parts += [turn / LEAST_TURN_RAD for turn in self.turn_rad]
+        parts += [rotation / LEAST_ROTATION_RAD for rotation in self.rotation_rad]
         return float(np.mean(np.minimum(parts, 1.0)))
 
     def line(self) -> str:
         """One line for a person."""
-        x, y, z = np.degrees(self.turn_rad)
+        x, y, z = np.degrees(self.rotation_rad)
         return (
             f"both {self.shared_s:.0f} s (cameras {self.seen_s:.0f}, tracker {self.tracked_s:.0f}); turned about its x"
             f" {x:.0f}, y {y:.0f}, z {z:.0f} deg; carried {100 * max(self.way_m):.0f} cm"
@@ -76,7 +80,7 @@ class Coverage:
 
 def coverage_of(seen: PoseTrack, tracker: PoseTrack, late_s: float = 0.0) -> Coverage:
     """What cameras and tracker saw together, at a lag that is right to a tenth of a second."""
-    rows = shared_instants(seen, tracker, late_s, len(seen))
+    rows = shared_epochs(seen, tracker, late_s, len(seen))
     times = (_known_s(seen.t_s), _known_s(tracker.t_s), _known_s(seen.t_s[rows]))
     if len(rows) < 3:
         return Coverage(*times, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 0.0)
@@ -84,9 +88,9 @@ def coverage_of(seen: PoseTrack, tracker: PoseTrack, late_s: float = 0.0) -> Cov
     total = R.sum(axis=0)
     left, _, right = np.linalg.svd(total)
     mean = left @ np.diag([1.0, 1.0, float(np.linalg.det(left @ right))]) @ right
-    turns = matrix_to_rotation_vector(mean.T @ R)
+    rotation_vectors = matrix_to_rotation_vector(mean.T @ R)
     pace = _pace(seen, seen.t_s[rows])
-    return Coverage(*times, _span(turns), _span(p), *pace)
+    return Coverage(*times, _span(rotation_vectors), _span(p), *pace)
 
 
 def _known_s(t_s: Float) -> float:
@@ -107,9 +111,9 @@ def _pace(track: PoseTrack, t_s: Float) -> tuple[float, float]:
     both = known & also
     if not both.any():
         return 0.0, 0.0
-    turned = matrix_to_rotation_vector(first[both].swapaxes(1, 2) @ last[both]) / _PACE_S
+    rotated = matrix_to_rotation_vector(first[both].swapaxes(1, 2) @ last[both]) / _PACE_S
     moved = (ended[both] - begun[both]) / _PACE_S
-    return _rms(turned), _rms(moved)
+    return _rms(rotated), _rms(moved)
 
 
 def _rms(vectors: Float) -> float:

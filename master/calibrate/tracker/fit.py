@@ -18,13 +18,13 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.geometry import invert, matrix_to_rotation_vector, rigid, rotation_vector_to_matrix, skew
 from master.calibrate.tracker.start import Placed, foretold
-from master.calibrate.tracker.tracks import PoseTrack, shared_instants
+from master.calibrate.tracker.tracks import PoseTrack, shared_epochs
 
 MOST = 900  # instants
 BLOCKS = 12
 TRACKER_M, TRACKER_RAD = 1e-3, np.radians(0.15)
 UNTOLD_M, UNTOLD_RAD = 3e-3, np.radians(1.5)  # of an object's pose without covariance
-STRAY = (
+OUTLIER = (
     4.1  # times sigma: 0.999 of chi with six degrees of freedom is within 4.7, at the scale of the good half
 )
 _HALF = 5.348  # median of chi square with six degrees of freedom
@@ -49,7 +49,7 @@ class Fit:
         stray: (N,) which instants no registration explains.
         scale: By how much more than foretold the good half is off.
         cov: (13, 13) of the unknowns, by the normal equations.
-        left_out: (B, 13) how the unknowns change when a block of time is left out.
+        rejected: (B, 13) how the unknowns change when a block of time is left out.
     """
 
     placed: Placed
@@ -58,10 +58,10 @@ class Fit:
     R: Float
     p_m: Float
     off: Float
-    stray: Bool
+    outlier: Bool
     scale: float
     cov: Float
-    left_out: Float
+    rejected: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,12 +102,12 @@ class _Problem:
         return _Lines(R, p, off, slope)
 
     def _foretold(self, placed: Placed, at_s: Float) -> tuple[Float, Float]:
-        turned, place, _ = self._tracker.at(at_s)
-        return foretold(placed.T_rig_tracking, placed.T_object_tracker, turned, place)
+        rotation, place, _ = self._tracker.at(at_s)
+        return foretold(placed.T_rig_tracking, placed.T_object_tracker, rotation, place)
 
     def moved(self, placed: Placed, by: Float) -> Placed:
-        turn = rotation_vector_to_matrix(by[:3])
-        X = rigid(turn, self.middle_m - turn @ self.middle_m + by[3:6]) @ placed.T_rig_tracking
+        rotation = rotation_vector_to_matrix(by[:3])
+        X = rigid(rotation, self.middle_m - rotation @ self.middle_m + by[3:6]) @ placed.T_rig_tracking
         Z = invert(placed.T_object_tracker) @ rigid(rotation_vector_to_matrix(by[6:9]), by[9:12])
         return Placed(X, invert(Z), placed.late_s + float(by[12]))
 
@@ -120,16 +120,16 @@ def fit_registration(seen: PoseTrack, tracker: PoseTrack, first: Placed) -> Fit:
         tracker: The device, by its system.
         first: Right to some centimetres, degrees and ten milliseconds.
     """
-    rough = _Problem(seen, tracker, shared_instants(seen, tracker, first.late_s, MOST))
+    rough = _Problem(seen, tracker, shared_epochs(seen, tracker, first.late_s, MOST))
     better, _ = _refined(rough, first)
     # Again, because the lag decides which instants are known.
-    problem = _Problem(seen, tracker, shared_instants(seen, tracker, better.late_s, MOST))
+    problem = _Problem(seen, tracker, shared_epochs(seen, tracker, better.late_s, MOST))
     placed, scale = _refined(problem, better)
     lines = problem.lines(placed)
     sizes = _sizes(problem.weight, lines.off) / scale
     counts = _counts(sizes)
     normal = _normal(problem.weight, lines, counts) / scale**2 + np.diag(_PRIOR)
-    left_out = [_without(problem, lines, counts / scale**2, block) for block in _blocks(problem.t_s)]
+    rejected = [_without(problem, lines, counts / scale**2, block) for block in _blocks(problem.t_s)]
     return Fit(
         placed,
         problem.middle_m,
@@ -137,10 +137,10 @@ def fit_registration(seen: PoseTrack, tracker: PoseTrack, first: Placed) -> Fit:
         lines.R,
         lines.p_m,
         lines.off,
-        sizes > STRAY,
+        sizes > OUTLIER,
         scale,
         np.asarray(np.linalg.inv(normal), np.float64),
-        np.array(left_out).reshape(-1, _UNKNOWNS),
+        np.array(rejected).reshape(-1, _UNKNOWNS),
     )
 
 
@@ -154,18 +154,18 @@ def sigma_at(fit: Fit, R: Float, p_m: Float) -> tuple[float, float]:
     slope[:, :3, 3:6] = slope[:, 3:, 0:3] = np.eye(3)
     slope[:, 3:, 6:9] = slope[:, :3, 9:12] = R
     formal = np.einsum("tij,jk,tik->ti", slope, fit.cov, slope)
-    count = len(fit.left_out)
-    change = np.einsum("tij,bj->tbi", slope, fit.left_out - fit.left_out.mean(axis=0))
+    count = len(fit.rejected)
+    change = np.einsum("tij,bj->tbi", slope, fit.rejected - fit.rejected.mean(axis=0))
     left = (count - 1) / count * (change**2).sum(axis=1) if count > 1 else np.zeros_like(formal)
     both = np.maximum(formal, left)
-    place, turn = both[:, :3].sum(axis=1).mean(), both[:, 3:].sum(axis=1).mean()
-    return float(np.sqrt(place)), float(np.sqrt(turn))
+    place, rotation = both[:, :3].sum(axis=1).mean(), both[:, 3:].sum(axis=1).mean()
+    return float(np.sqrt(place)), float(np.sqrt(rotation))
 
 
 def late_sigma_s(fit: Fit) -> float:
     """Standard deviation of the lag [s]."""
-    count = len(fit.left_out)
-    off = fit.left_out[:, 12] - fit.left_out[:, 12].mean()
+    count = len(fit.rejected)
+    off = fit.rejected[:, 12] - fit.rejected[:, 12].mean()
     left = (count - 1) / count * float((off**2).sum()) if count > 1 else 0.0
     return float(np.sqrt(max(left, fit.cov[12, 12])))
 
@@ -194,7 +194,7 @@ def _sizes(weight: Float, off: Float) -> Float:
 
 def _counts(sizes: Float) -> Float:
     """(N,) how much an instant counts: Tukey's biweight, nothing where it strays by twice as much as strays do."""
-    return np.clip(1.0 - (sizes / (2.0 * STRAY)) ** 2, 0.0, 1.0) ** 2
+    return np.clip(1.0 - (sizes / (2.0 * OUTLIER)) ** 2, 0.0, 1.0) ** 2
 
 
 def _normal(weight: Float, lines: _Lines, counts: Float) -> Float:

@@ -5,13 +5,15 @@ from collections.abc import Callable
 from common.clock import SystemClock
 from common.messages import ObjectPose, TrackerPose
 from common.object_profile import ObjectProfile
-from master.calibrate.tracker.session import Session, lead
+from master.calibrate.tracker.session import Session, guide
 from master.master_bus import join_bus
 
 _DEPTH = 1024  # poses that may wait while a line is printed
 
 
-def observe_live(bus: str, profile: ObjectProfile, longest_s: float, say: Callable[[str], None]) -> Session:
+def observe_live(
+    bus: str, profile: ObjectProfile, longest_s: float, notify: Callable[[str], None]
+) -> Session:
     """Lead the user through the motion.
 
     Args:
@@ -33,6 +35,6 @@ def observe_live(bus: str, profile: ObjectProfile, longest_s: float, say: Callab
             message = objects.get(0.0) or devices.get(timeout_s)
             return message if isinstance(message, ObjectPose | TrackerPose) else None
 
-        return lead(receive, SystemClock(), say, longest_s)
+        return guide(receive, SystemClock(), notify, longest_s)
     finally:
         link.close()

@@ -19,7 +19,7 @@ def draw_registration(path: Path, found: Registration) -> None:
     fit = found.fit
     figure = figure_of((17.0, 8.4))
     figure.suptitle("\n".join(found.report[:2]))
-    above, side, place, turn = figure.subplots(2, 2).ravel()
+    above, side, place, rotation = figure.subplots(2, 2).ravel()
     seen = 1e3 * (fit.p_m + fit.off[:, :3])
     told = 1e3 * fit.p_m.copy()
     told[np.diff(fit.t_s, prepend=fit.t_s[0]) > 0.2] = np.nan  # a gap is no way
@@ -28,17 +28,19 @@ def draw_registration(path: Path, found: Registration) -> None:
         (side, (2, 1), "from the side [mm]"),
     ):
         axes.plot(told[:, a], told[:, b], "-", color=GREY, linewidth=0.8, label="tracker")
-        axes.plot(seen[~fit.stray, a], seen[~fit.stray, b], ".", color=BLUE, markersize=3, label="cameras")
-        axes.plot(seen[fit.stray, a], seen[fit.stray, b], "x", color=ORANGE, markersize=4, label="stray")
+        axes.plot(
+            seen[~fit.outlier, a], seen[~fit.outlier, b], ".", color=BLUE, markersize=3, label="cameras"
+        )
+        axes.plot(seen[fit.outlier, a], seen[fit.outlier, b], "x", color=ORANGE, markersize=4, label="stray")
         axes.set(title=f"{title}: rig {'xyz'[a]}, {'xyz'[b]}")
         axes.set_aspect("equal", adjustable="datalim")
         axes.legend(fontsize=8)
     side.invert_yaxis()  # y of the rig points down
     for axes, columns, unit, title in (
         (place, slice(0, 3), 1e3, "cameras against tracker: place [mm]"),
-        (turn, slice(3, 6), np.degrees(1.0), "cameras against tracker: turn [deg]"),
+        (rotation, slice(3, 6), np.degrees(1.0), "cameras against tracker: turn [deg]"),
     ):
-        left = unit * np.where(fit.stray[:, None], np.nan, fit.off[:, columns])
+        left = unit * np.where(fit.outlier[:, None], np.nan, fit.off[:, columns])
         for values, colour, name in zip(left.T, (BLUE, ORANGE, _GREEN), "xyz", strict=True):
             axes.plot(fit.t_s, values, ".", color=colour, markersize=3, label=name)
         axes.axhline(0.0, color=GREY, linewidth=0.8)

@@ -21,7 +21,7 @@ from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.tracker.coverage import Coverage, coverage_of
 from master.calibrate.tracker.fit import Fit, fit_registration, late_sigma_s, sigma_at
 from master.calibrate.tracker.start import first_lag, first_places
-from master.calibrate.tracker.tracks import object_track, shared_instants, tracker_track
+from master.calibrate.tracker.tracks import object_track, shared_epochs, tracker_track
 from master.calibrate.tree_files import provenance
 
 TOOL = "calibrate tracker"
@@ -35,7 +35,7 @@ _LEFT_M, _LEFT_RAD, _STRAYS = 0.012, np.radians(5.0), 0.4
 # What is off in the same way all the time, a tag that sits a little aside, no leaving out of a part shows: of what is
 # left it counts as if it averaged out over so many looks only.
 _LOOKS = 24
-_REACH_M, _TURN_RAD = 0.12, np.radians(50.0)  # of the poses at which the result must be known
+_REACH_M, _ROTATION_RAD = 0.12, np.radians(50.0)  # of the poses at which the result must be known
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +76,7 @@ def register(objects: Sequence[ObjectPose], tracked: Sequence[TrackerPose]) -> R
         )
     late_s = first_lag(seen, device)
     first = None if late_s is None else first_places(seen, device, late_s)
-    if first is None or len(shared_instants(seen, device, first.late_s, _FEWEST)) < _FEWEST:
+    if first is None or len(shared_epochs(seen, device, first.late_s, _FEWEST)) < _FEWEST:
         raise FitError(f"cameras and tracker hardly saw the object at the same time: {MOTION}")
     coverage = coverage_of(seen, device, first.late_s)
     fit = fit_registration(seen, device, first)
@@ -88,23 +88,23 @@ def register(objects: Sequence[ObjectPose], tracked: Sequence[TrackerPose]) -> R
 def figures_of(fit: Fit) -> dict[str, float]:
     """What is left of instants that do not stray, and how sure the result is, by quantity with its unit.
 
-    `position_mm` and `turn_deg` are roots of the mean square of the whole offset; the sigmas are of an object's pose by
+    `position_mm` and `rotation_deg` are roots of the mean square of the whole offset; sigmas are of an object's pose by
     the tracker, wherever it may be within the motion's reach, turned by up to 50 degrees, from the registration alone.
     """
-    left = fit.off[~fit.stray]
-    place, turn = (np.sqrt((part**2).sum(axis=1).mean()) for part in (left[:, :3], left[:, 3:]))
+    left = fit.off[~fit.outlier]
+    place, rotation = (np.sqrt((part**2).sum(axis=1).mean()) for part in (left[:, :3], left[:, 3:]))
     R, p = _reach(fit)
-    place_sigma, turn_sigma = sigma_at(fit, R, p)
-    place_sigma, turn_sigma = (
+    place_sigma, rotation_sigma = sigma_at(fit, R, p)
+    place_sigma, rotation_sigma = (
         np.hypot(place_sigma, place / _LOOKS**0.5),
-        np.hypot(turn_sigma, turn / _LOOKS**0.5),
+        np.hypot(rotation_sigma, rotation / _LOOKS**0.5),
     )
     return {
         "position_mm": 1e3 * float(place),
-        "turn_deg": float(np.degrees(turn)),
-        "strays": float(fit.stray.mean()),
+        "rotation_deg": float(np.degrees(rotation)),
+        "strays": float(fit.outlier.mean()),
         "position_sigma_mm": 1e3 * float(place_sigma),
-        "turn_sigma_deg": float(np.degrees(turn_sigma)),
+        "rotation_sigma_deg": float(np.degrees(rotation_sigma)),
         "late_sigma_ms": 1e3 * late_sigma_s(fit),
     }
 
@@ -113,9 +113,9 @@ def _reach(fit: Fit) -> tuple[Float, Float]:
     """Poses (T, 3, 3), (T, 3) at which the result must be known: to all sides of the middle, turned about all axes."""
     ways = np.concatenate([np.eye(3), -np.eye(3)])
     mean = fit.R[len(fit.R) // 2]
-    turned = np.concatenate([mean[None], rotation_vector_to_matrix(_TURN_RAD * ways) @ mean])
+    rotated = np.concatenate([mean[None], rotation_vector_to_matrix(_ROTATION_RAD * ways) @ mean])
     places = fit.middle_m + _REACH_M * np.concatenate([np.zeros((1, 3)), ways])
-    return np.repeat(turned, len(places), axis=0), np.tile(places, (len(turned), 1))
+    return np.repeat(rotated, len(places), axis=0), np.tile(places, (len(rotated), 1))
 
 
 def refuse(fit: Fit, figures: dict[str, float], coverage: Coverage) -> None:
@@ -124,18 +124,22 @@ def refuse(fit: Fit, figures: dict[str, float], coverage: Coverage) -> None:
     Raises:
         FitError: With what to do.
     """
-    left_m, left_rad = 1e-3 * figures["position_mm"], np.radians(figures["turn_deg"])
+    left_m, left_rad = 1e-3 * figures["position_mm"], np.radians(figures["rotation_deg"])
     if figures["strays"] > _STRAYS or left_m > _LEFT_M or left_rad > _LEFT_RAD:
         raise FitError(
-            f"no registration explains what was seen: {figures['position_mm']:.0f} mm and {figures['turn_deg']:.1f} deg"
+            f"no registration explains what was seen: {figures['position_mm']:.0f} mm"
+            f" and {figures['rotation_deg']:.1f} deg"
             f" are left, {100 * figures['strays']:.0f} % strays. Does the tracker sit firmly on this object, is it the"
             " right device, are object file and cameras calibrated, and did the base stations stay where they are?"
         )
     wanting: list[str] = []
-    if 1e-3 * figures["position_sigma_mm"] > _SIGMA_M or np.radians(figures["turn_sigma_deg"]) > _SIGMA_RAD:
+    if (
+        1e-3 * figures["position_sigma_mm"] > _SIGMA_M
+        or np.radians(figures["rotation_sigma_deg"]) > _SIGMA_RAD
+    ):
         wanting.append(
             f"poses would be known to {figures['position_sigma_mm']:.1f} mm,"
-            f" {figures['turn_sigma_deg']:.1f} deg only"
+            f" {figures['rotation_sigma_deg']:.1f} deg only"
         )
     if 1e-3 * figures["late_sigma_ms"] > _LATE_S:
         wanting.append(f"the clocks are known to {figures['late_sigma_ms']:.1f} ms only: move it faster")
@@ -148,9 +152,11 @@ def report_lines(fit: Fit, figures: dict[str, float], coverage: Coverage) -> tup
     placed = fit.placed
     system, device = (1e3 * T[:3, 3] for T in (placed.T_rig_tracking, placed.T_object_tracker))
     shown = {name: f"{value:.2f}" for name, value in figures.items()}
-    left = f"left: {shown['position_mm']} mm, {shown['turn_deg']} deg; {100 * figures['strays']:.0f} % stray"
+    left = (
+        f"left: {shown['position_mm']} mm, {shown['rotation_deg']} deg; {100 * figures['strays']:.0f} % stray"
+    )
     lag = f"its poses hold {1e3 * placed.late_s:+.1f} ms after their stamps"
-    sure = f"{shown['position_sigma_mm']} mm, {shown['turn_sigma_deg']} deg"
+    sure = f"{shown['position_sigma_mm']} mm, {shown['rotation_sigma_deg']} deg"
     return (
         f"{len(fit.t_s)} instants; {coverage.line()}",
         f"{left}; off by {fit.scale:.2f} times what was foretold",

@@ -1,6 +1,6 @@
 """The guided motion with a person: what was seen so far is told every second, and what is still missing.
 
-The machine that counts is `Session`; `lead` gives it what comes and talks.
+The machine that counts is `Session`; `guide` gives it what comes and talks.
 """
 
 from collections.abc import Callable
@@ -64,7 +64,7 @@ class Session:
         return ""
 
 
-def lead(receive: Receive, clock: Clock, say: Callable[[str], None], longest_s: float) -> Session:
+def guide(receive: Receive, clock: Clock, notify: Callable[[str], None], longest_s: float) -> Session:
     """Lead a person through the motion until it is enough, or the time is over.
 
     Args:
@@ -77,7 +77,7 @@ def lead(receive: Receive, clock: Clock, say: Callable[[str], None], longest_s: 
         FitError: Cameras or tracker said nothing all the time.
     """
     session = Session()
-    say(MOTION)
+    notify(MOTION)
     begin_ns = told_ns = clock.now_ns()
     enough = False
     while not enough and clock.now_ns() - begin_ns < longest_s * 1e9:
@@ -92,13 +92,13 @@ def lead(receive: Receive, clock: Clock, say: Callable[[str], None], longest_s: 
         if now_ns - begin_ns > SILENT_S * 1e9:
             silent = session.silent(now_ns)
         if coverage is None:
-            say(silent or "waiting for cameras and tracker")
+            notify(silent or "waiting for cameras and tracker")
             continue
         enough = not coverage.missing and coverage.shared_s >= ENOUGH_S
         hint = silent or (
             coverage.missing[0] if coverage.missing else "go on like this" if not enough else "done"
         )
-        say(f"{100 * coverage.share:3.0f} %  {coverage.line()}. {hint}")
+        notify(f"{100 * coverage.share:3.0f} %  {coverage.line()}. {hint}")
     if not (session.objects and session.tracked):
         raise FitError(session.silent(clock.now_ns()) or f"nothing was seen: {MOTION}")
     return session

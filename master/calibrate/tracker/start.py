@@ -14,12 +14,12 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.geometry import matrix_to_rotation_vector, rigid
-from master.calibrate.tracker.tracks import PoseTrack, shared_instants
+from master.calibrate.tracker.tracks import PoseTrack, shared_epochs
 
 MOST_LAG_S = 0.5
 _GRID_S, _CHORD_S = 0.01, 0.2
 _LEAST_OVERLAP = 100  # of the grid: one second
-_INSTANTS, _DRAWS, _DRAWN = 240, 120, 6
+_EPOCHS, _DRAWS, _DRAWN = 240, 120, 6
 _NEAR_M, _NEAR_RAD = 0.03, np.radians(6.0)
 
 
@@ -42,7 +42,7 @@ def first_lag(seen: PoseTrack, tracker: PoseTrack) -> float | None:
     """How much later the tracker's poses hold than they say [s], to some milliseconds; None: they hardly overlap."""
     begin = min(seen.t_s[0], tracker.t_s[0]) - MOST_LAG_S
     grid = np.arange(begin, max(seen.t_s[-1], tracker.t_s[-1]) + MOST_LAG_S, _GRID_S)
-    ours, theirs = _turned(seen, grid), _turned(tracker, grid)
+    ours, theirs = _rotated(seen, grid), _rotated(tracker, grid)
     steps = round(MOST_LAG_S / _GRID_S)
     costs: list[float] = []
     for lag in range(-steps, steps + 1):
@@ -60,12 +60,12 @@ def first_lag(seen: PoseTrack, tracker: PoseTrack) -> float | None:
     fine = 0.0
     if 0 < best < len(costs) - 1 and np.isfinite([costs[best - 1], costs[best + 1]]).all():
         before, here, after = costs[best - 1 : best + 2]
-        bent = before - 2.0 * here + after
-        fine = 0.5 * (before - after) / bent if bent > 0.0 else 0.0
+        curvature = before - 2.0 * here + after
+        fine = 0.5 * (before - after) / curvature if curvature > 0.0 else 0.0
     return (best - steps + fine) * _GRID_S
 
 
-def _turned(track: PoseTrack, t_s: Float) -> Float:
+def _rotated(track: PoseTrack, t_s: Float) -> Float:
     """By how much it turned about each instant [rad]; NaN where that is not known."""
     first, _, known = track.at(t_s - 0.5 * _CHORD_S)
     last, _, also = track.at(t_s + 0.5 * _CHORD_S)
@@ -82,7 +82,7 @@ def first_places(seen: PoseTrack, tracker: PoseTrack, late_s: float, seed: int =
         late_s: How much later its poses hold than they say [s].
         seed: Of the draws.
     """
-    rows = shared_instants(seen, tracker, late_s, _INSTANTS)
+    rows = shared_epochs(seen, tracker, late_s, _EPOCHS)
     if len(rows) < 2 * _DRAWN:
         return None
     RA, pA = seen.R[rows], seen.p_m[rows]
@@ -107,16 +107,16 @@ def first_places(seen: PoseTrack, tracker: PoseTrack, late_s: float, seed: int =
 
 
 def _agree(X: Float, Y: Float, RA: Float, pA: Float, RB: Float, pB: Float) -> Bool:
-    turn, place = foretold(X, Y, RB, pB)
-    off = np.linalg.norm(matrix_to_rotation_vector(RA @ turn.swapaxes(1, 2)), axis=1)
+    rotation, place = foretold(X, Y, RB, pB)
+    off = np.linalg.norm(matrix_to_rotation_vector(RA @ rotation.swapaxes(1, 2)), axis=1)
     return (off < _NEAR_RAD) & (np.linalg.norm(pA - place, axis=1) < _NEAR_M)
 
 
 def foretold(X: Float, Y: Float, RB: Float, pB: Float) -> tuple[Float, Float]:
     """The object's turns (N, 3, 3) and places (N, 3) in the rig where the device is at (RB, pB): X B inv(Y)."""
-    turn = X[:3, :3] @ RB @ Y[:3, :3].T
+    rotation = X[:3, :3] @ RB @ Y[:3, :3].T
     device = pB @ X[:3, :3].T + X[:3, 3]
-    return turn, device - turn @ Y[:3, 3]
+    return rotation, device - rotation @ Y[:3, 3]
 
 
 def closed_form(RA: Float, pA: Float, RB: Float, pB: Float) -> tuple[Float, Float]:

@@ -38,9 +38,9 @@ class PoseTrack:
         after, share, known = self._between(t_s)
         before = after - 1
         step = matrix_to_rotation_vector(self.R[before].swapaxes(1, 2) @ self.R[after])
-        turned = self.R[before] @ rotation_vector_to_matrix(share[:, None] * step)
+        rotation = self.R[before] @ rotation_vector_to_matrix(share[:, None] * step)
         place = self.p_m[before] + share[:, None] * (self.p_m[after] - self.p_m[before])
-        return turned, place, known
+        return rotation, place, known
 
     def _between(self, t_s: Float) -> tuple[Int, Float, Bool]:
         after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self.t_s) - 1)
@@ -71,21 +71,21 @@ def tracker_track(poses: Iterable[TrackerPose], zero_ns: int) -> PoseTrack:
     )
 
 
-def _track(t_ns: list[int], place: list[Float], turn: list[Float], cov: list[Float]) -> PoseTrack:
+def _track(t_ns: list[int], place: list[Float], quaternion: list[Float], cov: list[Float]) -> PoseTrack:
     """Rising in time, each instant once, without what is NaN."""
     times = np.array(t_ns, np.int64)
     order = np.argsort(times, kind="stable")
     places = np.array(place, dtype=np.float64).reshape(-1, 3)
-    turns = np.array(turn, dtype=np.float64).reshape(-1, 4)
-    known = np.isfinite(places.sum(axis=1) + turns.sum(axis=1))
+    quaternions = np.array(quaternion, dtype=np.float64).reshape(-1, 4)
+    known = np.isfinite(places.sum(axis=1) + quaternions.sum(axis=1))
     kept = order[known[order]]
     kept = kept[np.diff(times[kept], prepend=np.iinfo(np.int64).min) > 0] if len(kept) else kept
-    turned = quaternion_to_matrix(turns[kept]) if len(kept) else np.zeros((0, 3, 3))
+    rotation = quaternion_to_matrix(quaternions[kept]) if len(kept) else np.zeros((0, 3, 3))
     covs = np.array(cov, dtype=np.float64).reshape(-1, 6, 6)
-    return PoseTrack(np.multiply(times[kept], 1e-9, dtype=np.float64), turned, places[kept], covs[kept])
+    return PoseTrack(np.multiply(times[kept], 1e-9, dtype=np.float64), rotation, places[kept], covs[kept])
 
 
-def shared_instants(seen: PoseTrack, tracker: PoseTrack, late_s: float, most: int) -> Int:
+def shared_epochs(seen: PoseTrack, tracker: PoseTrack, late_s: float, most: int) -> Int:
     """Which of the seen poses count: those at whose instants the tracker knows where it is; at most so many, spread.
 
     Args:

@@ -14,7 +14,7 @@ MIN_POINTS = 20  # two thirds of a second of triples
 MIN_MOTION_M = (
     0.015  # of 60 to 100 mm: below it was no curl, and a short line's direction is that of the noise
 )
-_STRAY_M = 3e-3  # from the line: it is a little bent, and the finger goes aside by a millimetre
+_OUTLIER_M = 3e-3  # from the line: it is a little bent, and the finger goes aside by a millimetre
 _ALONE_M = 3e-3  # beyond all but one per cent of the points along the line
 _PAIRS = 300
 
@@ -90,8 +90,8 @@ def _together(points: Float) -> Bool:
     a, way = a[far], way[far] / length[far, None]
     arm = points[:, None] - a
     off = np.linalg.norm(arm - np.vecdot(arm, way)[..., None] * way, axis=2)
-    near = off < _STRAY_M
-    best = int(np.argmax(near.sum(axis=0) - 0.1 * np.minimum(off, _STRAY_M).sum(axis=0) / _STRAY_M))
+    near = off < _OUTLIER_M
+    best = int(np.argmax(near.sum(axis=0) - 0.1 * np.minimum(off, _OUTLIER_M).sum(axis=0) / _OUTLIER_M))
     along = (points - a[best]) @ way[best]
     low, high = np.quantile(along[near[:, best]], [0.01, 0.99])
     return near[:, best] & (along > low - _ALONE_M) & (along < high + _ALONE_M)

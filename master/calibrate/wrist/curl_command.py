@@ -12,7 +12,7 @@ from common.wrist_calibration import FingerLine
 from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.curl import FingerCurl, fit_curls
 from master.calibrate.wrist.curled import read_curled
-from master.calibrate.wrist.device import Device, device_of, say, write_device
+from master.calibrate.wrist.device import Device, device_of, print_line, write_device
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.summary import write_summary
 
@@ -51,7 +51,7 @@ def curl(
         curls = fit_curls(seen.laser_m)
     except FitError as error:
         raise FitError(f"{recording}: {error}") from error
-    say(report_lines(curls))
+    print_line(report_lines(curls))
     if picture is not None:
         from master.calibrate.wrist.picture import draw_curls  # matplotlib takes a second to import
 

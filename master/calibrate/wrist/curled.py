@@ -9,7 +9,7 @@ from common.arrays import Float
 from common.geometry import intersect_plane
 from common.wrist_device import laser_plane_of
 from master.calibrate.wrist.device import Device
-from master.recorded import recorded_triples
+from master.recorded import recorded_cycles
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,8 +33,8 @@ def read_curled(detections: Path, device: Device) -> Curled:
         CalibrationError: The rig has no laser plane yet, or one that crosses no finger.
     """
     normal, offset_m = laser_plane_of(device.rig, f"rig {device.file_name!r}")
-    triples = list(recorded_triples(detections, device.camera.name))
-    uv = np.array([triple.laser_uv for triple in triples]).reshape(-1, 5, 2)
-    tips = np.array([triple.tip_uv for triple in triples]).reshape(-1, 5, 2)
+    cycles = list(recorded_cycles(detections, device.camera.name))
+    uv = np.array([cycle.laser_uv for cycle in cycles]).reshape(-1, 5, 2)
+    tips = np.array([cycle.tip_uv for cycle in cycles]).reshape(-1, 5, 2)
     points = intersect_plane(np.zeros(3), device.optics.ray(uv), normal, offset_m)
     return Curled(points, tips)

@@ -73,7 +73,7 @@ def device_of(source: Path, rig_name: str | None, calibration: Path, out: Path |
     return Device(rig_in_tree(out, name, rig), name, camera, optics, source.resolve().name)
 
 
-def say(lines: Iterable[str]) -> None:
+def print_line(lines: Iterable[str]) -> None:
     """Lines for a person."""
     for line in lines:
         typer.echo(line)

@@ -17,11 +17,11 @@ from common.frame_recording import Illumination
 from master.calibrate.cameras.boards import Board
 from master.calibrate.cameras.options import Dictionary, MarkerMm, Size, SquareMm, board_of
 from master.calibrate.tree_files import provenance
-from master.calibrate.wrist.device import Device, device_of, say, write_device
+from master.calibrate.wrist.board_pose import board_pose
+from master.calibrate.wrist.device import Device, device_of, print_line, write_device
 from master.calibrate.wrist.flat_field import FlatFit, WhiteSamples, fit_flat_field, gathered, white_samples
 from master.calibrate.wrist.laser_command import Source
 from master.calibrate.wrist.lit_views import LitView, lit_views, told_by_reason
-from master.calibrate.wrist.placed import placed_board
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.summary import write_summary
 
@@ -72,7 +72,7 @@ def flat_field(
     except FitError as error:
         reasons = "".join(f"\n  {reason}" for reason in told_by_reason(seen.refused))
         raise FitError(f"{source}: {error}{reasons}") from error
-    say(report_lines(fit, seen, len(views), known_leds=bool(device.rig.led)))
+    print_line(report_lines(fit, seen, len(views), known_leds=bool(device.rig.led)))
     if picture is not None:
         from master.calibrate.wrist.picture import draw_flat_field  # matplotlib takes a second to import
 
@@ -105,7 +105,7 @@ def white_of(views: tuple[LitView, ...], board: Board, optics: CameraModel, led_
         assert led is not None  # `lit_views` gives whole ones
         assert ambient is not None
         try:
-            placed = placed_board(view, board, optics)
+            placed = board_pose(view, board, optics)
             found.append(white_samples(led, ambient, placed, board, optics, led_m))
         except FitError as error:
             refused[view.name] = str(error)

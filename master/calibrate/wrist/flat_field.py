@@ -25,7 +25,7 @@ from common.flat_field import terms_of
 from common.geometry import transform
 from common.wrist_calibration import FlatField
 from master.calibrate.cameras.boards import Board, grid_shape
-from master.calibrate.wrist.placed import PlacedBoard
+from master.calibrate.wrist.board_pose import BoardPose
 
 _SATURATED = 250
 _DARKEST = 8.0  # levels above ambient: below, noise and the byte's steps are several per cent
@@ -82,7 +82,7 @@ class FlatFit:
 
 
 def white_samples(
-    led: Image, ambient: Image, placed: PlacedBoard, board: Board, optics: CameraModel, led_m: Float
+    led: Image, ambient: Image, placed: BoardPose, board: Board, optics: CameraModel, led_m: Float
 ) -> tuple[Float, Float, Float]:
     """Samples of the white squares of one view: xy (s, 2), uv (s, 2), light (s,) as in `WhiteSamples`.
 
@@ -118,7 +118,7 @@ def white_samples(
     return points[good, :2] / points[good, 2:], uv[good], level[good] / expected[good]
 
 
-def _squares(board: Board, placed: PlacedBoard, optics: CameraModel, led: Image) -> tuple[Float, Int]:
+def _squares(board: Board, placed: BoardPose, optics: CameraModel, led: Image) -> tuple[Float, Int]:
     """Places (n, 3) on the board within its whole squares, and the numbers of those that are white."""
     rows, columns = grid_shape(board)
     j, i = np.mgrid[0 : rows - 1, 0 : columns - 1] + 0.5

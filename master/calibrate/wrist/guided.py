@@ -1,4 +1,4 @@
-"""The guided motion of a wearer, taken apart: flat hand, knuckles bent with straight fingers, flat hand, fist.
+"""The guided motion of a subject, taken apart: flat hand, knuckles bent with straight fingers, flat hand, fist.
 
 How far the laser points lie tells how open the hand is, whatever else is still unknown: they are farthest on a flat
 hand and come nearer with every joint that bends. So a motion falls into its openings and what lies between them, and

@@ -16,10 +16,10 @@ from common.frame_recording import Illumination
 from master.calibrate.cameras.boards import Board
 from master.calibrate.cameras.options import Dictionary, MarkerMm, Size, SquareMm, board_of
 from master.calibrate.tree_files import provenance
-from master.calibrate.wrist.device import Device, device_of, say, write_device
+from master.calibrate.wrist.board_pose import board_pose
+from master.calibrate.wrist.device import Device, device_of, print_line, write_device
 from master.calibrate.wrist.line import line_on_board
 from master.calibrate.wrist.lit_views import LitView, lit_views, told_by_reason
-from master.calibrate.wrist.placed import placed_board
 from master.calibrate.wrist.plane import PlaneFit, ViewLine, fit_plane
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.summary import write_summary
@@ -75,7 +75,7 @@ def laser_plane(
     except FitError as error:
         reasons = "".join(f"\n  {reason}" for reason in told_by_reason(seen.refused))
         raise FitError(f"{source}: {error}{reasons}") from error
-    say(report_lines(fit, seen, len(views)))
+    print_line(report_lines(fit, seen, len(views)))
     if picture is not None:
         from master.calibrate.wrist.picture import draw_plane  # matplotlib takes a second to import
 
@@ -101,7 +101,7 @@ def lines_of(views: tuple[LitView, ...], board: Board, optics: CameraModel) -> L
         assert laser is not None  # `lit_views` gives whole ones
         assert ambient is not None
         try:
-            placed = placed_board(view, board, optics)
+            placed = board_pose(view, board, optics)
             if laser.shape != ambient.shape:
                 raise FitError("its frames differ in size")
             line = line_on_board(laser, ambient, placed, board, optics)

@@ -17,7 +17,7 @@ from common.camera_model import CameraModel
 from common.errors import FitError
 from common.geometry import transform
 from master.calibrate.cameras.boards import Board, grid_shape
-from master.calibrate.wrist.placed import PlacedBoard
+from master.calibrate.wrist.board_pose import BoardPose
 
 Grey = npt.NDArray[np.float32]
 
@@ -54,7 +54,7 @@ class BoardLine:
 
 
 def line_on_board(
-    laser: Image, ambient: Image, placed: PlacedBoard, board: Board, optics: CameraModel
+    laser: Image, ambient: Image, placed: BoardPose, board: Board, optics: CameraModel
 ) -> BoardLine:
     """Points of the laser's line on the board.
 
@@ -134,7 +134,7 @@ def _profiles(
     along: Float,
     pixel_m: float,
     noise: float,
-    placed: PlacedBoard,
+    placed: BoardPose,
     board: Board,
     optics: CameraModel,
 ) -> _Centred:
@@ -169,8 +169,8 @@ def _profiles(
         centre = np.where(total > 0, (weight * d).sum(axis=1) / np.where(total > 0, total, 1.0), np.nan)
     height = light[np.arange(len(s)), np.abs(d - np.nan_to_num(centre)[:, None]).argmin(axis=1)]
     # A line stands out from what is beside it; an even light, as that of the LEDs, does not.
-    beside = np.abs(light[:, np.abs(d) > 0.6 * _REACH_PX]).max(axis=1, initial=0.0)
-    good = (np.abs(centre) < 0.5 * _REACH_PX) & (height > _NOISE_TIMES * noise) & (height > 3.0 * beside)
+    flank = np.abs(light[:, np.abs(d) > 0.6 * _REACH_PX]).max(axis=1, initial=0.0)
+    good = (np.abs(centre) < 0.5 * _REACH_PX) & (height > _NOISE_TIMES * noise) & (height > 3.0 * flank)
     s, centre = s[good], centre[good]
     if len(s) < _MIN_PROFILES or np.ptp(s) < side:
         raise FitError(_TOO_SHORT)
@@ -187,9 +187,9 @@ def _profiles(
     rms = float(np.sqrt(np.mean(off[kept] ** 2)))
     xy = point + s[kept, None] * along + (centre[kept, None] * pixel_m) * across
     points = transform(placed.T_camera_board, np.concatenate([xy, np.zeros((len(xy), 1))], axis=1))
-    turned = along + slope * pixel_m * across
+    tilted = along + slope * pixel_m * across
     sigma = float(np.hypot(rms / np.sqrt(kept.sum()), _LINE_FLOOR_PX))
-    return _Centred(point + level * pixel_m * across, turned / np.linalg.norm(turned), points, sigma, rms)
+    return _Centred(point + level * pixel_m * across, tilted / np.linalg.norm(tilted), points, sigma, rms)
 
 
 def _sampled(image: Grey, uv: Float) -> Float:

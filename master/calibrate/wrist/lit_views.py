@@ -75,13 +75,13 @@ def _recorded(folder: Path, camera: str) -> list[LitView]:
     for i, row in enumerate(rows):
         if row.illumination is not Illumination.AMBIENT:
             continue
-        triple: dict[Illumination, FrameRow] = {row.illumination: row}
+        cycle: dict[Illumination, FrameRow] = {row.illumination: row}
         for near in rows[i + 1 : i + 1 + _APART]:
             if near.illumination is Illumination.AMBIENT or near.seq - row.seq > _APART:
                 break
-            triple.setdefault(near.illumination, near)
+            cycle.setdefault(near.illumination, near)
         views.append(
-            LitView(str(row.seq), {lit: partial(load_grey, folder / one.file) for lit, one in triple.items()})
+            LitView(str(row.seq), {lit: partial(load_grey, folder / one.file) for lit, one in cycle.items()})
         )
     return views
 

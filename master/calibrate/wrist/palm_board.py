@@ -21,16 +21,16 @@ from common.arrays import Float
 from common.errors import FitError
 from common.geometry import invert, matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
 from master.calibrate.cameras.boards import Board, grid_shape
-from master.calibrate.wrist.placed import PlacedBoard
+from master.calibrate.wrist.board_pose import BoardPose
 
 _FLAT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # board axes -> palm axes
 _MOVED_M = 0.003  # between views: the hand shifted in the device
 _MOVED_RAD = np.radians(2.0)
-_TURN_LIMIT_RAD, _SHIFT_LIMIT_M = np.radians(1.0), 1e-3  # how sure the pose must be
+_ROTATION_LIMIT_RAD, _SHIFT_LIMIT_M = np.radians(1.0), 1e-3  # how sure the pose must be
 
 
 @dataclass(frozen=True, slots=True)
-class Mounting:
+class BoardOffset:
     """How the board lies, see above. `thumb_side`: +1 where the thumb is at +x of the palm (right hand), else -1."""
 
     wrist_m: float
@@ -52,20 +52,20 @@ class PalmFit:
 
     Attributes:
         T_camera_palm: (4, 4) [m].
-        turn_sigma_rad, shift_sigma_m: Standard deviation in the least certain direction, of the measurement itself;
+        rotation_sigma_rad, shift_sigma_m: Standard deviation in the least certain direction, of the measurement itself;
             what the ruler or the hand's shape adds is not in it.
         residual: Quantity with its unit -> value.
         note: What it is from.
     """
 
     T_camera_palm: Float
-    turn_sigma_rad: float
+    rotation_sigma_rad: float
     shift_sigma_m: float
     residual: dict[str, float]
     note: str
 
 
-def palm_from_board(placed: Sequence[PlacedBoard], board: Board, mounting: Mounting) -> PalmFit:
+def palm_from_board(placed: Sequence[BoardPose], board: Board, offset: BoardOffset) -> PalmFit:
     """The palm's pose, as mean over views in which the hand did not move.
 
     Raises:
@@ -77,40 +77,40 @@ def palm_from_board(placed: Sequence[PlacedBoard], board: Board, mounting: Mount
         )
     poses = [_upright(one.T_camera_board, board) for one in placed]
     first = poses[0]
-    turns = np.array([matrix_to_rotation_vector(pose[:3, :3] @ first[:3, :3].T) for pose in poses])
+    rotation_vectors = np.array([matrix_to_rotation_vector(pose[:3, :3] @ first[:3, :3].T) for pose in poses])
     middle = np.append((np.array(grid_shape(board)[::-1]) - 1) * board.square_m / 2.0, [0.0, 1.0])
     at = np.array([(pose @ middle)[:3] for pose in poses])
-    turned = float(np.linalg.norm(turns - np.median(turns, axis=0), axis=1).max())
+    spread = float(np.linalg.norm(rotation_vectors - np.median(rotation_vectors, axis=0), axis=1).max())
     shifted = float(np.linalg.norm(at - np.median(at, axis=0), axis=1).max())
-    if turned > _MOVED_RAD or shifted > _MOVED_M:
+    if spread > _MOVED_RAD or shifted > _MOVED_M:
         raise FitError(
-            f"the board moved by {1e3 * shifted:.1f} mm and {np.degrees(turned):.1f} deg between the views: hold the"
+            f"the board moved by {1e3 * shifted:.1f} mm and {np.degrees(spread):.1f} deg between the views: hold the"
             " hand still in the device, and fix the board to it"
         )
-    turn = rotation_vector_to_matrix(turns.mean(axis=0)) @ first[:3, :3]
-    T_camera_board = rigid(turn, at.mean(axis=0) - turn @ middle[:3])
+    rotation = rotation_vector_to_matrix(rotation_vectors.mean(axis=0)) @ first[:3, :3]
+    T_camera_board = rigid(rotation, at.mean(axis=0) - rotation @ middle[:3])
     # One thing seen several times in one place: corners err alike, so the views do not average it away.
     cov = np.mean([one.covariance for one in placed], axis=0)
-    turn_sigma, shift_sigma = (
+    rotation_sigma, shift_sigma = (
         float(np.sqrt(np.linalg.eigvalsh(part)[-1])) for part in (cov[:3, :3], cov[3:, 3:])
     )
-    if turn_sigma > _TURN_LIMIT_RAD or shift_sigma > _SHIFT_LIMIT_M:
+    if rotation_sigma > _ROTATION_LIMIT_RAD or shift_sigma > _SHIFT_LIMIT_M:
         raise FitError(
-            f"the board's pose is known to {np.degrees(turn_sigma):.1f} deg and {1e3 * shift_sigma:.1f} mm only"
-            f" (limits {np.degrees(_TURN_LIMIT_RAD):.0f} deg, {1e3 * _SHIFT_LIMIT_M:.0f} mm): take a larger board,"
+            f"the board's pose is known to {np.degrees(rotation_sigma):.1f} deg and {1e3 * shift_sigma:.1f} mm only"
+            f" (limits {np.degrees(_ROTATION_LIMIT_RAD):.0f} deg, {1e3 * _SHIFT_LIMIT_M:.0f} mm): take a larger board,"
             " sharp and well lit"
         )
     return PalmFit(
-        T_camera_board @ invert(mounting.T_palm_board(board)),
-        turn_sigma,
+        T_camera_board @ invert(offset.T_palm_board(board)),
+        rotation_sigma,
         shift_sigma,
         {
             "rms_px": round(float(np.sqrt(np.mean([one.rms_px**2 for one in placed]))), 4),
             "between_views_mm": round(1e3 * shifted, 4),
-            "between_views_deg": round(float(np.degrees(turned)), 4),
+            "between_views_deg": round(float(np.degrees(spread)), 4),
         },
-        f"{len(placed)} views of a board on the palm: {1e3 * mounting.wrist_m:g} mm from the wrist,"
-        f" {1e3 * mounting.aside_m:g} mm aside, {1e3 * mounting.depth_m:g} mm above the joint",
+        f"{len(placed)} views of a board on the palm: {1e3 * offset.wrist_m:g} mm from the wrist,"
+        f" {1e3 * offset.aside_m:g} mm aside, {1e3 * offset.depth_m:g} mm above the joint",
     )
 
 

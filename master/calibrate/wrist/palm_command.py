@@ -17,10 +17,10 @@ from master.calibrate.cameras.boards import Board
 from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.cameras.options import Dictionary, MarkerMm, board_of
 from master.calibrate.tree_files import provenance
-from master.calibrate.wrist.device import Device, device_of, say, write_device
+from master.calibrate.wrist.board_pose import BoardPose, board_pose
+from master.calibrate.wrist.device import Device, device_of, print_line, write_device
 from master.calibrate.wrist.lit_views import lit_views, told_by_reason
-from master.calibrate.wrist.palm_board import Mounting, PalmFit, palm_from_board
-from master.calibrate.wrist.placed import PlacedBoard, placed_board
+from master.calibrate.wrist.palm_board import BoardOffset, PalmFit, palm_from_board
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.summary import write_summary
 
@@ -60,7 +60,7 @@ def palm(
     out: ResultTree = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Measure where the palm is before the wrist camera, by a board that lies on it; without one: calibrate wearer.
+    """Measure where the palm is before the wrist camera, by a board that lies on it; without one: calibrate subject.
 
     The board lies flat on palm and straight fingers, print to the camera, columns along the middle finger. Nothing is
     written without --out.
@@ -71,17 +71,17 @@ def palm(
     """
     device = device_of(source, rig, calibration, out)
     model = HandModel.of(load(hand or calibration / "hands" / f"{device.rig.hand}.json", HandProfile))
-    mounting = Mounting(1e-3 * wrist_mm, 1e-3 * aside_mm, 1e-3 * depth_mm, model.side_sign)
+    offset = BoardOffset(1e-3 * wrist_mm, 1e-3 * aside_mm, 1e-3 * depth_mm, model.side_sign)
     try:
-        fit = _by_board(source, board_of(board, square_mm, marker_mm, dictionary), mounting, device)
+        fit = _by_board(source, board_of(board, square_mm, marker_mm, dictionary), offset, device)
     except FitError as error:
         raise FitError(f"{source}: {error}") from error
-    say(report_lines(fit))
+    print_line(report_lines(fit))
     written = write_device(out, device, rig_with_palm(device, fit), "T_camera_palm")
     if json_file is not None:
         told: dict[str, object] = {
             "T_camera_palm": fit.T_camera_palm.tolist(),
-            "turn_sigma_deg": float(np.degrees(fit.turn_sigma_rad)),
+            "rotation_sigma_deg": float(np.degrees(fit.rotation_sigma_rad)),
             "shift_sigma_mm": 1e3 * fit.shift_sigma_m,
             "residual": fit.residual,
             "written": None if written is None else str(written),
@@ -89,16 +89,16 @@ def palm(
         write_summary(json_file, told)
 
 
-def _by_board(source: Path, board: Board, mounting: Mounting, device: Device) -> PalmFit:
-    placed: list[PlacedBoard] = []
+def _by_board(source: Path, board: Board, offset: BoardOffset, device: Device) -> PalmFit:
+    placed: list[BoardPose] = []
     refused: dict[str, str] = {}
     for view in lit_views(source, device.camera.name, Illumination.LED):
         try:
-            placed.append(placed_board(view, board, device.optics))
+            placed.append(board_pose(view, board, device.optics))
         except FitError as error:
             refused[view.name] = str(error)
-    say(f"left out: {reason}" for reason in told_by_reason(refused))
-    return palm_from_board(placed, board, mounting)
+    print_line(f"left out: {reason}" for reason in told_by_reason(refused))
+    return palm_from_board(placed, board, offset)
 
 
 def report_lines(fit: PalmFit) -> list[str]:
@@ -111,7 +111,7 @@ def report_lines(fit: PalmFit) -> list[str]:
     lines = [
         f"palm from {fit.note}",
         f"  the camera is {where}; it looks {down:.1f} deg down to the palm",
-        f"  ± {np.degrees(fit.turn_sigma_rad):.2f} deg, ± {1e3 * fit.shift_sigma_m:.2f} mm",
+        f"  ± {np.degrees(fit.rotation_sigma_rad):.2f} deg, ± {1e3 * fit.shift_sigma_m:.2f} mm",
     ]
     lines.append("  " + ", ".join(f"{name} {value:g}" for name, value in fit.residual.items()))
     return lines
@@ -120,7 +120,7 @@ def report_lines(fit: PalmFit) -> list[str]:
 def rig_with_palm(device: Device, fit: PalmFit) -> RigCalibration:
     """The device's rig with the new pose and where it comes from."""
     residual = fit.residual | {
-        "turn_sigma_deg": round(float(np.degrees(fit.turn_sigma_rad)), 4),
+        "rotation_sigma_deg": round(float(np.degrees(fit.rotation_sigma_rad)), 4),
         "shift_sigma_mm": round(1e3 * fit.shift_sigma_m, 4),
     }
     how = provenance("calibrate palm", (device.source,), residual, fit.note)

@@ -17,8 +17,8 @@ from common.arrays import Bool, Float
 from common.errors import FitError
 from common.geometry import cross
 from common.wrist_calibration import LaserPlane
+from master.calibrate.wrist.board_pose import BoardPose
 from master.calibrate.wrist.line import BoardLine
-from master.calibrate.wrist.placed import PlacedBoard
 
 MIN_VIEWS = 3
 NORMAL_LIMIT_RAD = np.radians(0.1)
@@ -45,12 +45,12 @@ class ViewLine:
     name: str
     points_m: Float
     ends_m: Float
-    placed: PlacedBoard
+    placed: BoardPose
     sigma_px: float
     focal_px: float
 
     @classmethod
-    def of(cls, name: str, line: BoardLine, placed: PlacedBoard, focal_px: float) -> "ViewLine":
+    def of(cls, name: str, line: BoardLine, placed: BoardPose, focal_px: float) -> "ViewLine":
         """Reduce a line to two points."""
         mean = line.points_m.mean(axis=0)
         _, sizes, axes = np.linalg.svd(line.points_m - mean, full_matrices=False)

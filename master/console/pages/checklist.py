@@ -3,8 +3,8 @@
 from nicegui import ui
 
 from common.messages import CheckItem, Checklist
+from master.console.labels import readable
 from master.console.state import ConsoleState
-from master.console.words import readable
 
 _UPDATE_S = 0.5
 

@@ -13,19 +13,19 @@ from common.calibration import load
 from common.errors import CalibrationError, PhalanxError
 from common.gesture_settings import GestureSettings, default_gestures
 from common.messages import Gesture
+from master.console.labels import gesture_line, readable
 from master.console.state import ConsoleState
-from master.console.words import gesture_line, readable
 
 _UPDATE_S = 0.2
 _NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
-_TEACH = "teach a pose"
+_RECORD_TEMPLATE = "teach a pose"
 
 
 def build(state: ConsoleState) -> None:
     """Fill the page."""
     with ui.element("div").classes("gesture-grid"):
         _now(state)
-        _said(state)
+        _show_events(state)
         _poses(state)
 
 
@@ -86,7 +86,7 @@ def _dial(angle_rad: float | None) -> str:
     )
 
 
-def _said(state: ConsoleState) -> None:
+def _show_events(state: ConsoleState) -> None:
     with ui.element("section").classes("panel").props('aria-label="Said last"'):
         ui.label("Said last").classes("panel-title")
         content = ui.html("", sanitize=False).classes("gesture-said")
@@ -94,9 +94,9 @@ def _said(state: ConsoleState) -> None:
     def update() -> None:
         now_s = time.monotonic()
         lines = [
-            f"<li><span class='soft'>{now_s - said.heard_s:.0f} s ago</span> {escape(readable(said.gesture.hand))}:"
-            f" {escape(_phase(said.gesture))}</li>"
-            for said in state.gestures_heard.events()[:14]
+            f"<li><span class='soft'>{now_s - received.received_s:.0f} s ago</span>"
+            f" {escape(readable(received.gesture.hand))}: {escape(_phase(received.gesture))}</li>"
+            for received in state.received_gestures.events()[:14]
         ]
         content.set_content(
             "<ul>" + "".join(lines) + "</ul>" if lines else "<p class='soft'>Nothing yet.</p>"
@@ -135,11 +135,11 @@ def _poses(state: ConsoleState) -> None:
     def start(words: list[str]) -> None:
         async def work() -> None:
             try:
-                await asyncio.to_thread(state.local.start, _TEACH, words, {})
+                await asyncio.to_thread(state.local.start, _RECORD_TEMPLATE, words, {})
             except PhalanxError as error:
                 progress.set_text(str(error))
 
-        background_tasks.create(work(), name=_TEACH)
+        background_tasks.create(work(), name=_RECORD_TEMPLATE)
 
     def teach() -> None:
         wanted = (name.value or "").strip()
@@ -156,7 +156,7 @@ def _poses(state: ConsoleState) -> None:
         names = list(poses_of(state))
         if known.options != names:
             known.set_options(names, value=known.value if known.value in names else None)
-        process = state.local.get(_TEACH)
+        process = state.local.get(_RECORD_TEMPLATE)
         if process is not None:
             progress.set_text("\n".join(process.tail(8)))
 

@@ -6,8 +6,8 @@ from nicegui import ui
 
 from common.messages import HandPose
 from master.console.elements import CameraView, HandBox
+from master.console.labels import gesture_lines, hand_line, joint_states, object_line, readable
 from master.console.state import ConsoleState
-from master.console.words import gesture_lines, hand_line, joint_states, object_line, readable
 
 _UPDATE_S = 0.5
 _FIGURES = (
@@ -92,8 +92,8 @@ def _hands(state: ConsoleState) -> None:
         parts: list[str] = []
         for hand, pose in sorted(state.poses.items()):
             parts.append(f"<h2>{escape(readable(hand))}</h2><p>{escape(hand_line(pose))}</p>{joints(pose)}")
-            said = gesture_lines(state.gestures, hand)
-            parts.append("<h3>Gestures</h3>" + _items(said or ["none now"]))
+            lines = gesture_lines(state.gestures, hand)
+            parts.append("<h3>Gestures</h3>" + _items(lines or ["none now"]))
         for name, one in sorted(state.objects.items()):
             near = [contact for contact in state.contacts.values() if contact.object == name]
             parts.append(f"<h2>{escape(readable(name))}</h2><p>{escape(object_line(one, near))}</p>")

@@ -14,7 +14,7 @@ from master.console.local import LocalProcess, LocalProcesses
 from master.console.setup.files import replace_file
 from master.console.setup.progress import fault, progress
 
-_LOOK_S = 0.1
+_POLL_S = 0.1
 _KINDS = {
     "cameras": CameraCalibration,
     "rigs": RigCalibration,
@@ -186,7 +186,7 @@ class Job:
         }
         while any(one.ended() is None for one in self._now.values()):
             failed = any(one.ended() not in (None, 0) for one in self._now.values())
-            if failed or self._stop.wait(_LOOK_S):
+            if failed or self._stop.wait(_POLL_S):
                 break
         codes = {name: self._end(name, one) for name, one in self._now.items()}
         for one in self._now.values():

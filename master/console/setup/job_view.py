@@ -8,7 +8,7 @@ from nicegui import ui
 from master.console.setup.job import Job, JobState
 from master.console.setup.parts import Desk, png_url
 
-_LOOK_S = 0.4
+_POLL_S = 0.4
 _SHOWN = 60
 _HEAD = {
     JobState.RUNNING: "running",
@@ -68,7 +68,7 @@ def job_view(
                     _result(desk, now, used, words)
 
     follow()
-    ui.timer(_LOOK_S, follow)
+    ui.timer(_POLL_S, follow)
 
 
 def _buttons(desk: Desk, row: ui.row, job: Job, *, early: bool) -> None:

@@ -12,7 +12,7 @@ from common.errors import PhalanxError
 from common.keys import link_key
 from master.calibrate.cameras.capture_command import cameras_of
 from master.ingest import Ingest
-from master.master_bus import carry_bus
+from master.master_bus import host_bus
 from master.options import (
     CALIB_JSON,
     HERE_BEACON,
@@ -29,7 +29,7 @@ from master.options import (
 from master.stopping import stop_on_signals
 
 _START_S = 5.0
-_LOOK_S = 0.2
+_POLL_S = 0.2
 
 
 def meet(
@@ -45,18 +45,18 @@ def meet(
     ends = address(beacon, "--beacon"), address(bind, "--bind")
     stop = stop_on_signals()
     with ExitStack() as stack:
-        link = carry_bus(bus, cameras)
+        link = host_bus(bus, cameras)
         stack.callback(link.close)
         ingest = Ingest(cameras, link_key(os.environ, key_file), SystemClock(), *ends, bus, _START_S)
         stack.callback(ingest.close)
-        said: frozenset[str] | None = None
-        while not stop.wait(_LOOK_S):
+        previous: frozenset[str] | None = None
+        while not stop.wait(_POLL_S):
             while ingest.get(0.0) is not None:
                 pass  # nothing is tracked
-            if (here := ingest.connected) != said:
+            if (here := ingest.connected) != previous:
                 absent = ", ".join(name for name in cameras if name not in here)
                 typer.echo(f"waiting for {absent}" if absent else f"all {len(cameras)} cameras are there")
-                said = here
+                previous = here
 
 
 def main() -> None:

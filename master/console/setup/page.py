@@ -20,7 +20,7 @@ from master.console.setup.session import Session, session_of, wizard_named
 from master.console.setup.steps import Done, Step
 from master.console.state import ConsoleState
 
-_LOOK_S = 1.0
+_POLL_S = 1.0
 PANELS: dict[str, Callable[[Desk], None]] = {
     "cameras": panel_cameras.build,
     "rig": panel_rig.build,
@@ -55,7 +55,7 @@ def build(state: ConsoleState) -> None:
     steps = _Steps(session, nav, panel, desk)
     desk.go = steps.go
     steps.go(session.here or steps.first())
-    ui.timer(_LOOK_S, steps.update)
+    ui.timer(_POLL_S, steps.update)
 
 
 class _Steps:

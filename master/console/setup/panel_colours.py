@@ -8,8 +8,8 @@ from common.calibration import CameraCalibration, RigCalibration, load
 from common.errors import CalibrationError
 from common.messages import Command, Preview
 from common.picture_size import jpeg_size
+from master.console.setup.colour_sampling import keep_colours, pick, pixel_of, ranges_of
 from master.console.setup.parts import Desk, heading, jpeg_url
-from master.console.setup.picking import keep_colours, pick, pixel_of, ranges_of
 
 _PICTURE_S = 0.2
 _STEP_PX, _FINE_PX = 8.0, 1.0
@@ -41,7 +41,7 @@ def build(desk: Desk) -> None:
         ui.label(f"{error}; first do the steps before").classes("setup-error")
         return
     _serve(desk)
-    picker = _Picker(desk, rig)
+    choice = _ColourChoice(desk, rig)
     with ui.row().classes("items-end"):
         ui.label("Camera").props('id="setup-camera"')
         camera = ui.toggle(list(rig.cameras), value=rig.cameras[0]).props('aria-labelledby="setup-camera"')
@@ -50,9 +50,9 @@ def build(desk: Desk) -> None:
         marker = ui.toggle(list(rig.markers), value=rig.markers[0]).props(
             'aria-labelledby="setup-marker" no-caps'
         )
-    camera.on_value_change(lambda event: picker.choose(str(event.value), rig.markers[0], marker))
-    marker.on_value_change(lambda event: picker.aim(str(event.value)))
-    picker.build(marker)
+    camera.on_value_change(lambda event: choice.choose(str(event.value), rig.markers[0], marker))
+    marker.on_value_change(lambda event: choice.aim(str(event.value)))
+    choice.build(marker)
 
 
 def _serve(desk: Desk) -> None:
@@ -76,7 +76,7 @@ def _known(desk: Desk, camera: str) -> set[str]:
         return set()  # the first step says what is wrong with it
 
 
-class _Picker:
+class _ColourChoice:
     """The picture to click on. Holds what is being picked and which markers each camera knows."""
 
     def __init__(self, desk: Desk, rig: RigCalibration) -> None:
@@ -198,10 +198,10 @@ class _Picker:
             return
         u, v = self._choice.at
         arms = "".join(
-            f'<line x1="{u - 9 * dx}" y1="{v - 9 * dy}" x2="{u + 9 * dx}" y2="{v + 9 * dy}" stroke="{paint}"'
+            f'<line x1="{u - 9 * dx}" y1="{v - 9 * dy}" x2="{u + 9 * dx}" y2="{v + 9 * dy}" stroke="{stroke}"'
             f' stroke-width="{width}"/>'
             for dx, dy in ((1, 0), (0, 1))
-            for paint, width in (("black", 2.5), ("white", 1))
+            for stroke, width in (("black", 2.5), ("white", 1))
         )
         self._image.set_content(arms)
 

@@ -5,7 +5,7 @@ from nicegui import ui
 from master.console.setup.commands import VIEWS
 from master.console.setup.parts import Desk, command_line, heading, previews
 
-_LOOK_S = 0.5
+_POLL_S = 0.5
 
 
 def build(desk: Desk) -> None:
@@ -61,4 +61,4 @@ def build(desk: Desk) -> None:
         wrong.set_text("\n".join(session.failures()))
 
     look()
-    ui.timer(_LOOK_S, look)
+    ui.timer(_POLL_S, look)

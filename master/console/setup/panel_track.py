@@ -6,7 +6,7 @@ from nicegui import ui
 from common.messages import HandPose
 from master.console.setup.parts import Desk, heading
 
-_LOOK_S = 0.5
+_POLL_S = 0.5
 
 
 def build(desk: Desk) -> None:
@@ -59,7 +59,7 @@ def build(desk: Desk) -> None:
                     ui.label(line).classes("setup-text")
 
     look()
-    ui.timer(_LOOK_S, look)
+    ui.timer(_POLL_S, look)
 
 
 def _state(desk: Desk, posing: bool) -> str:

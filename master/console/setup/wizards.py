@@ -206,9 +206,9 @@ _WRIST = (
         seconds=12.0,
     ),
     Wizard(
-        "wearer",
+        "subject",
         "Who wears the device",
-        "Palm pose, knuckles, thickness and lengths of fingers of the wearer.",
+        "Palm pose, knuckles, thickness and lengths of fingers of the subject.",
         "The laser's plane, a pose of the palm, a hand file of the user's size.",
         (
             "Open the hand flat; bend the straight fingers at the knuckles towards 90° and back.",
@@ -216,11 +216,11 @@ _WRIST = (
         ),
         first=(*_RECORD, "name"),
         prepared="wrist",
-        scene="wearer",
+        scene="subject",
         seconds=16.0,
     ),
     Wizard(
-        "mounting",
+        "extrinsics",
         "How the wrist device sits",
         "Palm, IMU and clocks of the device, by what marker cameras and device both see.",
         "Marker cameras and wrist device calibrated by themselves.",

@@ -66,7 +66,7 @@ class SlaveEnd:
     ) -> bytes:
         sessions = {"left": self.key_id} if listed else {}
         datagram = datagram or seal(self.sealer, Beacon(nonce or self.nonce, "", sessions))
-        self.link.hear_beacon(datagram, MASTER, self.clock.now_ns())
+        self.link.receive_beacon(datagram, MASTER, self.clock.now_ns())
         self.collect()
         return datagram
 
@@ -75,11 +75,11 @@ class SlaveEnd:
             self.sent.append((datagram, to))
             header = parse(datagram, self.keys.rig_tag)
             if not isinstance(header, str) and header.kind is Kind.HELLO:
-                hello = self.keys.hear(header, datagram, Hello)
+                hello = self.keys.open_as(header, datagram, Hello)
                 assert isinstance(hello, Hello)
                 self.hellos.append(hello)
 
-    def say(self, message: Handshake, sealer: Sealer | None = None) -> None:
+    def send(self, message: Handshake, sealer: Sealer | None = None) -> None:
         self.link.receive(seal(sealer or self.sealer, message), MASTER, self.clock.now_ns())
         self.collect()
 
@@ -89,14 +89,14 @@ class SlaveEnd:
 
     def welcome(self) -> Welcome:
         welcome, keys = self.welcome_of(self.hellos[-1])
-        self.say(welcome)
+        self.send(welcome)
         self.to_slave = self.keys.session_sealer(keys.to_slave, keys.key_id)
         self.key_id = keys.key_id
         return welcome
 
     def ask(self) -> None:
         assert self.to_slave is not None
-        self.say(EchoAsk(self.clock.now_ns()), self.to_slave)
+        self.send(EchoAsk(self.clock.now_ns()), self.to_slave)
 
     def bring_to(self, state: State, offer: bool) -> None:
         if state is not State.IDLE:
@@ -124,19 +124,19 @@ class SlaveEnd:
             case Event.WELCOME:
                 self.welcome()
             case Event.WELCOME_AGAIN:
-                self.say(self.last)
+                self.send(self.last)
             case Event.WELCOME_UNASKED:
-                self.say(Welcome(self.nonce, b"x" * 16, self.session_nonce, b"p" * 16))
+                self.send(Welcome(self.nonce, b"x" * 16, self.session_nonce, b"p" * 16))
             case Event.WELCOME_STALE:
                 welcome, _ = self.welcome_of(self.hellos[-1])
-                self.say(replace(welcome, master_nonce=b"o" * 16))
+                self.send(replace(welcome, master_nonce=b"o" * 16))
             case Event.WELCOME_UNPROVEN:
                 welcome, _ = self.welcome_of(self.hellos[-1])
-                self.say(replace(welcome, proof=b"p" * 16))
+                self.send(replace(welcome, proof=b"p" * 16))
             case Event.UNPROVEN:
-                self.say(Unproven(self.nonce, self.hellos[-1].slave_nonce, True))
+                self.send(Unproven(self.nonce, self.hellos[-1].slave_nonce, True))
             case Event.UNPROVEN_UNASKED:
-                self.say(Unproven(self.nonce, b"x" * 16, True))
+                self.send(Unproven(self.nonce, b"x" * 16, True))
             case Event.SEALED:
                 self.ask()
             case Event.SILENCE:
@@ -183,7 +183,7 @@ class MasterEnd:
         self.collect()
         header = parse(self.sent[0][0], self.keys.rig_tag)
         assert not isinstance(header, str)
-        beacon = self.keys.hear(header, self.sent[0][0], Beacon)
+        beacon = self.keys.open_as(header, self.sent[0][0], Beacon)
         assert isinstance(beacon, Beacon)
         self.nonce = beacon.master_nonce
 
@@ -192,7 +192,7 @@ class MasterEnd:
             self.sent.append((datagram, to))
             header = parse(datagram, self.keys.rig_tag)
             if not isinstance(header, str) and header.kind is Kind.WELCOME:
-                welcome = self.keys.hear(header, datagram, Welcome)
+                welcome = self.keys.open_as(header, datagram, Welcome)
                 assert isinstance(welcome, Welcome)
                 self.welcomes.append(welcome)
 
@@ -200,10 +200,10 @@ class MasterEnd:
         self.drawn += 1
         nonce = self.drawn.to_bytes(16, "big")
         hello = self.keys.hello("left", process, nonce, master_nonce or self.nonce)
-        self.say(hello)
+        self.send(hello)
         return hello
 
-    def say(self, message: Handshake, sealer: Sealer | None = None) -> None:
+    def send(self, message: Handshake, sealer: Sealer | None = None) -> None:
         self.link.receive(seal(sealer or self.sealer, message), SLAVE, self.clock.now_ns())
         self.collect()
 
@@ -211,7 +211,7 @@ class MasterEnd:
         """Answer the last echo of the session whose keys this slave has."""
         session = next(one for one in self.link._sessions.values() if one.hello == self.last)
         t_ns = next(reversed(session.asked))
-        self.say(EchoAnswer(t_ns, t_ns, t_ns), self.to_master)
+        self.send(EchoAnswer(t_ns, t_ns, t_ns), self.to_master)
 
     def bring_to(self, state: State, pending: bool) -> None:
         if state is not State.IDLE:
@@ -232,16 +232,16 @@ class MasterEnd:
             case Event.HELLO:
                 self.hello()
             case Event.HELLO_AGAIN:
-                self.say(self.last)
+                self.send(self.last)
             case Event.HELLO_USED:
                 assert self.used is not None
-                self.say(self.used)
+                self.send(self.used)
             case Event.HELLO_OTHER_MASTER:
                 self.hello(master_nonce=b"o" * 16)
             case Event.HELLO_OTHER_PROCESS:
                 self.hello(process=OTHER_PROCESS)
             case Event.HELLO_UNPROVEN:
-                self.say(Hello("left", 7, b"u" * 16, self.nonce, b"p" * 16))
+                self.send(Hello("left", 7, b"u" * 16, self.nonce, b"p" * 16))
             case Event.SEALED:
                 self.clock.t_ns += 10_000_000
                 self.collect()

@@ -182,20 +182,23 @@ def test_on_a_bus_the_scene_says_what_it_waits_for_and_follows(
     show.flush(timeout_sec=5.0)
     show.disconnect()
     bus.close()
-    said, turns = texts(file), [c for c in rr.chunk.RrdReader(file).stream() if c.entity_path == "/model"]
-    assert said[0] == "waiting for a master ..."
-    assert sum(chunk.num_rows for chunk in turns) > 3
+    annotations, rotations = (
+        texts(file),
+        [c for c in rr.chunk.RrdReader(file).stream() if c.entity_path == "/model"],
+    )
+    assert annotations[0] == "waiting for a master ..."
+    assert sum(chunk.num_rows for chunk in rotations) > 3
 
 
 def texts(file: Path) -> list[str]:
     """What the line below the model said."""
-    said: list[str] = []
+    annotations: list[str] = []
     for chunk in rr.chunk.RrdReader(file).stream():
         if chunk.entity_path == "/said" and not chunk.is_static:
             table = chunk.to_record_batch()
             name = next(key for key in table.schema.names if key.endswith(":text"))
-            said += [row[0] for row in table.column(name).to_pylist()]
-    return said
+            annotations += [row[0] for row in table.column(name).to_pylist()]
+    return annotations
 
 
 def test_with_a_master_it_asks_for_a_pinch(app: ModuleType, tmp_path: Path) -> None:

@@ -42,10 +42,10 @@ def test_it_prints_the_tip_of_the_index_finger(root: Path, tmp_path: Path, schem
         text=True,
         cwd=root / "docs",  # from where nothing of ours can be imported
     )
-    heard = threading.Event()
+    received = threading.Event()
 
     def publish() -> None:
-        while not heard.wait(0.05):
+        while not received.wait(0.05):
             bus.publish("hand", "my-right", pose)
 
     thread = threading.Thread(target=publish)
@@ -54,7 +54,7 @@ def test_it_prints_the_tip_of_the_index_finger(root: Path, tmp_path: Path, schem
         assert program.stdout is not None
         line = program.stdout.readline()
     finally:
-        heard.set()
+        received.set()
         thread.join()
         program.kill()
         program.wait()

@@ -53,7 +53,7 @@ def pose_of(model: HandModel, state: HandState, t_s: float) -> HandPose:
     )
 
 
-def heard(
+def received(
     model: HandModel, at: Callable[[float], HandState], start_s: float, stop_s: float
 ) -> Iterator[Gesture]:
     """What comes out of the bus while the hand moves."""
@@ -71,17 +71,17 @@ def heard(
 def test_a_knob_in_the_air_sets_the_volume_and_nothing_else_does(root: Path, setup: RigSetup) -> None:
     app = example(root, "volume_dial")
     motion = Gestures(setup.hand, view_centre(setup.rig), 7)
-    made = [one for one in motion.said if one.kind == "dial"]
+    made = [one for one in motion.annotations if one.kind == "dial"]
     first = next(one for one in made if one.stop_s - one.start_s < 5.0)  # one grip, to and fro
     dial, detents, outside = app.Dial(6.0), 0, 0
     end_s = first.stop_s + 4.0
-    for one in heard(setup.hand, motion.at, first.start_s - 3.0, end_s):
+    for one in received(setup.hand, motion.at, first.start_s - 3.0, end_s):
         count, t_s = dial.push(one), (one.t_ns - START_NS) * 1e-9
         detents += count
         outside += abs(count) * (not first.start_s <= t_s <= first.stop_s + 0.5)
-    turned = np.degrees(motion.dial_rad(first.stop_s) - motion.dial_rad(first.start_s))
-    assert abs(turned) > 10.0
-    assert abs(6.0 * detents - turned) <= 6.0 + 3.0  # a detent, and what the dial may be off
+    rotated = np.degrees(motion.dial_rad(first.stop_s) - motion.dial_rad(first.start_s))
+    assert abs(rotated) > 10.0
+    assert abs(6.0 * detents - rotated) <= 6.0 + 3.0  # a detent, and what the dial may be off
     assert outside == 0
 
 
@@ -98,7 +98,7 @@ def test_a_pinch_that_is_moved_turns_the_model_and_letting_go_leaves_it(root: Pa
         return HandState(moved @ start, angles_of(model, posture, np.zeros((5, 4))))
 
     orbit, seen, modes = app.Orbit(), [], set[str]()
-    for one in heard(model, at, 0.0, 4.5):
+    for one in received(model, at, 0.0, 4.5):
         orbit.push(one)
         orbit.glide(1.0 / HZ)
         modes.add(orbit.mode)

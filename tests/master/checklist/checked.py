@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 
 from common.messages import CheckItem, Health
 from master.checklist.facts import CameraPlan, MasterNow, Plan, SenderNow
-from master.checklist.watch import ChecklistWatch
-from master.turned_away import Away, MarkerCounts
+from master.checklist.monitor import ChecklistMonitor
+from master.rejected_peers import MarkerCounts, RejectedPeer
 
 MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
 CAMERAS = (
@@ -15,7 +15,7 @@ CAMERAS = (
     CameraPlan("wrist", 90.0, (640, 480), True, ()),
 )
 PLAN = Plan(CAMERAS, ("imu",), ((("left", "right"), len(MARKERS)),))
-LOOK_NS = 250_000_000
+POLL_NS = 250_000_000
 NAMES = ("left", "right", "wrist", "imu")
 
 
@@ -23,20 +23,20 @@ NAMES = ("left", "right", "wrist", "imu")
 class Bench:
     """Holds a watch, the time, all counters, and what is wrong; `seconds` lets time go by."""
 
-    watch: ChecklistWatch = field(default_factory=lambda: ChecklistWatch(PLAN))
+    watch: ChecklistMonitor = field(default_factory=lambda: ChecklistMonitor(PLAN))
     t_ns: int = 10**12
     away: set[str] = field(default_factory=set[str])
     loss: dict[str, float] = field(default_factory=dict[str, float])
     rate: dict[str, float] = field(default_factory=dict[str, float])
-    twin: dict[str, Away | None] = field(default_factory=dict[str, Away | None])
-    stranger: dict[str, Away | None] = field(default_factory=dict[str, Away | None])
-    unproven: dict[str, Away | None] = field(default_factory=dict[str, Away | None])
+    duplicate: dict[str, RejectedPeer | None] = field(default_factory=dict[str, RejectedPeer | None])
+    unknown_peer: dict[str, RejectedPeer | None] = field(default_factory=dict[str, RejectedPeer | None])
+    unproven: dict[str, RejectedPeer | None] = field(default_factory=dict[str, RejectedPeer | None])
     markers: dict[str, MarkerCounts] = field(default_factory=dict[str, MarkerCounts])
     sigma_ns: dict[str, float | None] = field(default_factory=dict[str, float | None])
     disk_mb: float = 9000.0
     apart: float = 0.0
     files: tuple[CheckItem, ...] = ()
-    gauges: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
+    metrics: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
     counts: dict[str, dict[str, int]] = field(default_factory=dict[str, dict[str, int]])
     per_s: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
     session: dict[str, int] = field(default_factory=dict[str, int])
@@ -47,7 +47,7 @@ class Bench:
         """Look four times a second; what each look told, with the time since now [s]."""
         told: list[tuple[float, tuple[CheckItem, ...]]] = []
         for k in range(round(seconds * 4)):
-            self.t_ns += LOOK_NS
+            self.t_ns += POLL_NS
             self._looks += 1
             for name in NAMES:
                 self._count(name, 0.25)
@@ -73,23 +73,23 @@ class Bench:
         lost = self.loss.get(name, 0.0)
         self._add(name, "received", dt_s * rate * (1.0 - lost))
         self._add(name, "lost", dt_s * rate * lost)
-        usual = {f"seen.{marker}": rate for marker in MARKERS} | {
-            f"beside.{marker}": 0.0 for marker in MARKERS
+        typical = {f"seen.{marker}": rate for marker in MARKERS} | {
+            f"ambiguous.{marker}": 0.0 for marker in MARKERS
         }
         if name == "wrist":
-            usual = dict.fromkeys(("strobe.out_of_step", "strobe.unlit"), 0.0)
+            typical = dict.fromkeys(("strobe.out_of_step", "strobe.unlit"), 0.0)
         frames = {"frames": self.rate.get(name, 90.0) if name == "wrist" else rate}
-        for event, number in (frames | usual | self.per_s.get(name, {})).items():
+        for event, number in (frames | typical | self.per_s.get(name, {})).items():
             self._add(name, event, dt_s * number)
 
     def _health(self, name: str) -> Health:
         counts = {
             event: int(n + 1e-6) for (who, event), n in self._sums.items() if who == name and who != "master"
         }
-        gauges = {"width_px": 640.0, "height_px": 480.0, "light_exposure": 1.0, "temperature_c": 50.0}
-        gauges |= {"temperature_limit_c": 80.0, "disk_free_mb": 8000.0, "exposure_us": 5000.0}
-        gauges |= {"wanted.exposure_us": 5000.0} | {f"colour.{marker}": 1.0 for marker in MARKERS}
-        told = gauges | self.gauges.get(name, {})
+        metrics = {"width_px": 640.0, "height_px": 480.0, "light_exposure": 1.0, "temperature_c": 50.0}
+        metrics |= {"temperature_limit_c": 80.0, "disk_free_mb": 8000.0, "exposure_us": 5000.0}
+        metrics |= {"wanted.exposure_us": 5000.0} | {f"colour.{marker}": 1.0 for marker in MARKERS}
+        told = metrics | self.metrics.get(name, {})
         counts |= self.counts.get(name, {})
         return Health(name, self.session.get(name, 1), self.t_ns + 10**9, counts, told)
 
@@ -100,8 +100,8 @@ class Bench:
                 self._add(name, "received", 0.0),
                 self._add(name, "lost", 0.0),
                 self.sigma_ns.get(name, 5e4),
-                self.twin.get(name),
-                self.stranger.get(name),
+                self.duplicate.get(name),
+                self.unknown_peer.get(name),
                 self.unproven.get(name),
                 self.markers.get(name),
             )

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from master.checklist.facts import Plan, plan_of
-from master.checklist.files import FileWatch
+from master.checklist.files import FileMonitor
 from master.rig import load_setups
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -86,17 +86,17 @@ def _put(path: Path, text: str) -> None:
     path.write_text(text)
 
 
-@pytest.mark.parametrize(("code", "subject", "says", "change"), CHANGES)
+@pytest.mark.parametrize(("code", "subject", "expected", "change"), CHANGES)
 def test_a_file_that_is_wrong_is_told_and_mended_it_is_not(
-    code: str, subject: str, says: str, change: Callable[[Path], None], tree: Path, tmp_path: Path
+    code: str, subject: str, expected: str, change: Callable[[Path], None], tree: Path, tmp_path: Path
 ) -> None:
-    plan, watch = _plan(tree), FileWatch(tree, ("desk",))
+    plan, watch = _plan(tree), FileMonitor(tree, ("desk",))
     assert watch.look(plan) == ()
     shutil.copytree(tree, tmp_path / "before")
     change(tree)
     (item,) = watch.look(plan)
     assert (item.code, item.subject) == (code, subject)
-    assert says in item.sentence
+    assert expected in item.sentence
     assert item.fix
     shutil.copytree(tmp_path / "before", tree, dirs_exist_ok=True)
     assert watch.look(plan) == ()
@@ -105,4 +105,4 @@ def test_a_file_that_is_wrong_is_told_and_mended_it_is_not(
 @pytest.mark.parametrize("rig", ["desk", "desk4", "wrist", "desk-wand"])
 def test_the_tree_as_it_comes_has_nothing_wrong(rig: str) -> None:
     plan = plan_of(load_setups(ROOT / "calib_json", (rig,)))
-    assert FileWatch(ROOT / "calib_json", (rig,)).look(plan) == ()
+    assert FileMonitor(ROOT / "calib_json", (rig,)).look(plan) == ()

@@ -7,9 +7,9 @@ import pytest
 
 from common.messages import CheckItem
 from master.checklist.facts import Verdict
+from master.checklist.monitor import CODES
 from master.checklist.moved_rule import MovedRule
-from master.checklist.watch import CODES
-from master.turned_away import Away, MarkerCounts
+from master.rejected_peers import MarkerCounts, RejectedPeer
 from tests.master.checklist.checked import MARKERS, Bench
 
 WITHIN_S = 2.0
@@ -23,16 +23,16 @@ class Case:
     subject: str
     put: Callable[[Bench], object]
     take: Callable[[Bench], object]
-    says: str
+    expected: str
     fix: str
 
 
-def _gauge(name: str, **gauges: float) -> Callable[[Bench], object]:
-    return lambda bench: bench.gauges.setdefault(name, {}).update(gauges)
+def _metric(name: str, **metrics: float) -> Callable[[Bench], object]:
+    return lambda bench: bench.metrics.setdefault(name, {}).update(metrics)
 
 
-def _named(name: str, gauges: dict[str, float]) -> Callable[[Bench], object]:
-    return lambda bench: bench.gauges.setdefault(name, {}).update(gauges)
+def _named(name: str, metrics: dict[str, float]) -> Callable[[Bench], object]:
+    return lambda bench: bench.metrics.setdefault(name, {}).update(metrics)
 
 
 def _event(name: str, event: str, per_s: float) -> Callable[[Bench], object]:
@@ -46,7 +46,7 @@ def _set(what: str, name: str, value: object) -> Callable[[Bench], object]:
 def _unseen(bench: Bench) -> None:
     """Another range for the index finger, in which nothing is."""
     bench.seconds(0.25)  # between two reports: in the next one there are frames of before
-    bench.gauges.setdefault("left", {})["colour.index"] = 2.0
+    bench.metrics.setdefault("left", {})["colour.index"] = 2.0
     _event("left", "seen.index", 0.0)(bench)
 
 
@@ -60,12 +60,12 @@ def _disk(free_mb: float) -> Callable[[Bench], object]:
 
 def _stranger(bench: Bench) -> None:
     """Who speaks another version has no session: it is away, too."""
-    bench.stranger["right"] = Away("10.0.0.8", 9)
+    bench.unknown_peer["right"] = RejectedPeer("10.0.0.8", 9)
     bench.away.add("right")
 
 
 def _unproven(bench: Bench) -> None:
-    bench.unproven["right"] = Away("10.0.0.9", 11)
+    bench.unproven["right"] = RejectedPeer("10.0.0.9", 11)
     bench.away.add("right")
 
 
@@ -80,7 +80,7 @@ def _same_rig(bench: Bench) -> None:
 
 
 def _as_ours(bench: Bench) -> None:
-    bench.stranger.clear()
+    bench.unknown_peer.clear()
     bench.unproven.clear()
     bench.away.clear()
 
@@ -99,22 +99,22 @@ CASES = [
         "left",
         lambda b: b.away.add("left"),
         lambda b: b.away.clear(),
-        "not heard any more",
+        "not received any more",
         "slave",
     ),
     Case(
         "auto_mode",
         "left",
-        _gauge("left", exposure_us=7000.0),
-        _gauge("left", exposure_us=5000.0),
+        _metric("left", exposure_us=7000.0),
+        _metric("left", exposure_us=5000.0),
         "7000, not 5000",
         "automatic",
     ),
     Case(
         "exposure_drift",
         "left",
-        _gauge("left", light_exposure=0.5),
-        _gauge("left", light_exposure=1.0),
+        _metric("left", light_exposure=0.5),
+        _metric("left", light_exposure=1.0),
         "0.5 times",
         "calibrate",
     ),
@@ -122,7 +122,7 @@ CASES = [
         "colour_collision",
         "left.index-back",
         _named("left", {"overlap.index..back": 3.0}),
-        lambda b: b.gauges["left"].clear(),
+        lambda b: b.metrics["left"].clear(),
         "index and back overlap by 3 hues",
         "repaint",
     ),
@@ -130,7 +130,7 @@ CASES = [
         "colour_collision",
         "left.index-ring",
         _named("left", {"twins.index..ring": 4.0}),
-        lambda b: b.gauges["left"].clear(),
+        lambda b: b.metrics["left"].clear(),
         "look alike, 4 hues apart",
         "repaint",
     ),
@@ -145,8 +145,8 @@ CASES = [
     Case(
         "background_in_range",
         "left.back",
-        _event("left", "beside.back", 60.0),
-        _event("left", "beside.back", 0.0),
+        _event("left", "ambiguous.back", 60.0),
+        _event("left", "ambiguous.back", 0.0),
         "colour of marker back",
         "cover it",
     ),
@@ -163,8 +163,8 @@ CASES = [
     Case(
         "calibration_stale",
         "left",
-        _gauge("left", width_px=1280.0),
-        _gauge("left", width_px=640.0),
+        _metric("left", width_px=1280.0),
+        _metric("left", width_px=640.0),
         "1280 x 480",
         "same cameras/left.json",
     ),
@@ -205,24 +205,24 @@ CASES = [
     Case(
         "too_hot",
         "left",
-        _gauge("left", temperature_c=86.0),
-        _gauge("left", temperature_c=50.0),
+        _metric("left", temperature_c=86.0),
+        _metric("left", temperature_c=50.0),
         "86 °C",
         "fan",
     ),
     Case(
         "too_hot",
         "imu",
-        _gauge("imu", throttled=1.0),
-        _gauge("imu", throttled=0.0),
+        _metric("imu", throttled=1.0),
+        _metric("imu", throttled=0.0),
         "supply is too weak",
         "supply",
     ),
     Case(
         "disk_full",
         "left",
-        _gauge("left", disk_free_mb=60.0),
-        _gauge("left", disk_free_mb=900.0),
+        _metric("left", disk_free_mb=60.0),
+        _metric("left", disk_free_mb=900.0),
         "60 MB",
         "recordings",
     ),
@@ -240,14 +240,14 @@ CASES = [
         "imu",
         lambda b: b.away.add("imu"),
         lambda b: b.away.clear(),
-        "not heard any more",
+        "not received any more",
         "phalanx-slave imu",
     ),
     Case(
         "twin_sender",
         "left",
-        _set("twin", "left", Away("10.0.0.7", 10)),
-        _set("twin", "left", None),
+        _set("duplicate", "left", RejectedPeer("10.0.0.7", 10)),
+        _set("duplicate", "left", None),
         "the one at 10.0.0.7 is not taken",
         "--name",
     ),
@@ -294,7 +294,7 @@ def test_a_fault_shows_alone_within_two_seconds_and_is_gone_within_two(case: Cas
         if s >= first:
             assert [(item.code, item.subject) for item in items] == [(case.code, case.subject)], s
     item = told[-1][1][0]
-    assert case.says in item.sentence
+    assert case.expected in item.sentence
     assert case.subject.split(".")[0].split("-")[0] in item.sentence
     assert case.fix in item.fix
     case.take(bench)
@@ -308,7 +308,7 @@ def test_who_never_came_is_told_after_a_grace() -> None:
     told = bench.seconds(8.0)
     assert not any(items for s, items in told if s < 5.0)
     assert [(i.code, i.subject) for i in told[-1][1]] == [("camera_absent", "right"), ("imu_silent", "imu")]
-    assert "never heard" in told[-1][1][0].sentence
+    assert "never received" in told[-1][1][0].sentence
 
 
 def test_a_camera_that_gives_no_frames_is_absent_though_its_slave_is_there() -> None:
@@ -352,7 +352,7 @@ def test_between_two_bounds_nothing_flickers() -> None:
     bench.seconds(8.0)
     shown: list[bool] = []
     for exposure in (1.4, 1.45, 1.6, 1.45, 1.4, 1.45, 1.3, 1.4, 1.45):
-        bench.gauges["left"] = {"light_exposure": exposure}
+        bench.metrics["left"] = {"light_exposure": exposure}
         shown.append(bool(bench.seconds(1.0)[-1][1]))
     assert shown == [False, False, True, True, True, True, False, False, False]
 
@@ -360,8 +360,8 @@ def test_between_two_bounds_nothing_flickers() -> None:
 def test_causes_silence_what_follows_from_them_and_nothing_else() -> None:
     bench = Bench()
     bench.seconds(8.0)
-    bench.gauges["left"] = {"overlap.index..back": 3.0}
-    bench.per_s["left"] = {"beside.back": 60.0, "beside.ring": 60.0}
+    bench.metrics["left"] = {"overlap.index..back": 3.0}
+    bench.per_s["left"] = {"ambiguous.back": 60.0, "ambiguous.ring": 60.0}
     bench.loss["right"] = 0.2
     bench.apart = 0.9
     items = bench.seconds(4.0)[-1][1]
@@ -387,7 +387,7 @@ def test_of_three_cameras_the_one_that_moved_is_named() -> None:
 def test_what_a_slave_reports_of_invented_markers_costs_nothing_and_hides_nothing() -> None:
     bench = Bench()
     assert not any(items for _, items in bench.seconds(12.0))
-    bench.gauges["left"] = {f"overlap.a{k}..b{k}": 1.0 for k in range(250)}
+    bench.metrics["left"] = {f"overlap.a{k}..b{k}": 1.0 for k in range(250)}
     bench.counts["left"] = {f"uncalibrated.m{k}": 1 for k in range(100)}
-    bench.per_s["left"] = {f"beside.m{k}": 60.0 for k in range(100)}
+    bench.per_s["left"] = {f"ambiguous.m{k}": 60.0 for k in range(100)}
     assert not any(items for _, items in bench.seconds(3.0))

@@ -104,13 +104,13 @@ class FakeSlave:
         )
 
     def health(self) -> Health:
-        gauges = figures(self.camera) | {"roi_margin": self.roi_margin, "rate_hz": 90.0, "soc_celsius": 48.5}
-        gauges |= {f"wanted.{name}": value for name, value in gauges.items()}
+        metrics = figures(self.camera) | {"roi_margin": self.roi_margin, "rate_hz": 90.0, "soc_celsius": 48.5}
+        metrics |= {f"wanted.{name}": value for name, value in metrics.items()}
         for name, colour in (self.camera.markers or {}).items():
             for end, values in (("low", colour.hsv_low), ("high", colour.hsv_high)):
                 for channel, value in zip("hsv", values, strict=True):
-                    gauges[f"marker.{name}.{channel}_{end}"] = float(value)
-        return Health(self.name, 5, now_ns(), {"frames": self._sent}, gauges)
+                    metrics[f"marker.{name}.{channel}_{end}"] = float(value)
+        return Health(self.name, 5, now_ns(), {"frames": self._sent}, metrics)
 
     def tick(self) -> None:
         if self.shows:
@@ -171,15 +171,15 @@ class FakeMaster:
                 self._bus.publish("checklist", "master", Checklist("master", 4, now_ns(), self.items))
 
     def _health(self, number: int) -> Health:
-        gauges = {"latency_p50_ms": 7.0} | self.extra
+        metrics = {"latency_p50_ms": 7.0} | self.extra
         counts: dict[str, int] = {}
         for k, slave in enumerate(self._slaves):
-            gauges[f"camera_hz.{slave.name}"] = 89.9 - k + 0.3 * np.sin(number / 40)
-            gauges[f"{slave.name}.clock_offset_us"] = 3200.0 * (k + 1)
-            gauges[f"{slave.name}.clock_sigma_us"] = 40.0 + 10 * k + 5 * np.sin(number / 60)
+            metrics[f"camera_hz.{slave.name}"] = 89.9 - k + 0.3 * np.sin(number / 40)
+            metrics[f"{slave.name}.clock_offset_us"] = 3200.0 * (k + 1)
+            metrics[f"{slave.name}.clock_sigma_us"] = 40.0 + 10 * k + 5 * np.sin(number / 60)
             counts[f"{slave.name}.lost"] = number // 60
             counts[f"{slave.name}.received"] = round(4.5 * number)
-        return Health("master", 4, now_ns(), counts, {name: float(value) for name, value in gauges.items()})
+        return Health("master", 4, now_ns(), counts, {name: float(value) for name, value in metrics.items()})
 
 
 def pose(number: int) -> HandPose:

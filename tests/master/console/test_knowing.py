@@ -13,17 +13,17 @@ from common.messages import Command, Gesture, Health
 from common.output_settings import OutputSettings
 from master.console.elements import full_frame_uv
 from master.console.filter_trial import save_filter, try_filter
-from master.console.gestures_heard import KEPT, GesturesHeard
-from master.console.guard import names_of, refusal
 from master.console.history import History
-from master.console.looking import Looking
+from master.console.labels import hand_line
+from master.console.local_mirror import update_copy
 from master.console.output_files import change_output
-from master.console.own_copy import update_copy
 from master.console.play_panel import start_playing
+from master.console.preview_leases import PreviewLeases
+from master.console.received_gestures import KEPT, ReceivedGestures
 from master.console.recording_panel import recording_path
+from master.console.request_filter import names_of, refusal
 from master.console.state import ConsoleSettings, ConsoleState, Newest
 from master.console.tuner import Range, Tuner
-from master.console.words import hand_line
 from tests.master.console.fakes import FakeSlave, pose, tree
 from tests.network_helpers import until
 
@@ -118,22 +118,22 @@ def test_looking_asks_for_all_that_anybody_wants_tinted_and_ends() -> None:
         asked.append(command)
         raise BusError("nobody there")
 
-    looking = Looking(ask)
-    looking.look("left")
-    looking.look("left", ("index",))
+    preview_leases = PreviewLeases(ask)
+    preview_leases.look("left")
+    preview_leases.look("left", ("index",))
     assert until(lambda: any("index" in one.body for one in asked))
-    assert looking.error("left") == "nobody there"
-    assert looking.looked_at == {"left"}
-    assert until(lambda: not looking.looked_at), "no thread is left when nobody looks"
-    assert not looking.error("left")
+    assert preview_leases.error("left") == "nobody there"
+    assert preview_leases.looked_at == {"left"}
+    assert until(lambda: not preview_leases.looked_at), "no thread is left when nobody looks"
+    assert not preview_leases.error("left")
 
 
 def test_history_keeps_a_minute_and_parts_what_masters_and_senders_say() -> None:
     history = History()
     for k in range(300):
-        gauges = {"camera_hz.left": 90.0, "left.clock_offset_us": 1500.0, "left.clock_sigma_us": 30.0}
+        metrics = {"camera_hz.left": 90.0, "left.clock_offset_us": 1500.0, "left.clock_sigma_us": 30.0}
         counts = {"left.received": 45 * k} | ({"left.lost": 2 * (k - 100)} if k > 100 else {})
-        master = Health("master", 1, k * 500_000_000, counts, gauges)
+        master = Health("master", 1, k * 500_000_000, counts, metrics)
         slave = Health("left", 1, k, {}, {"soc_celsius": 50.0})
         history.push(0.5 * k, [5.0, 7.0, 100.0], {"master": master, "left": slave})
     assert history.latest("latency_p50_ms") == 7.0
@@ -149,21 +149,21 @@ def test_history_keeps_a_minute_and_parts_what_masters_and_senders_say() -> None
 
 
 def test_gestures_last_until_they_end_or_are_not_heard_and_events_are_bounded() -> None:
-    heard = GesturesHeard()
+    received = ReceivedGestures()
 
-    def say(phase: str, now_s: float, kind: str = "pinch") -> None:
-        heard.push(Gesture("me", 0, kind, "index", phase, 0, 1.0), now_s)  # pyright: ignore[reportArgumentType]
+    def publish(phase: str, now_s: float, kind: str = "pinch") -> None:
+        received.push(Gesture("me", 0, kind, "index", phase, 0, 1.0), now_s)  # pyright: ignore[reportArgumentType]
 
-    say("begin", 1.0)
-    say("update", 1.2)
-    assert set(heard.lasting(1.4)) == {("me", "pinch")}
-    assert not heard.lasting(1.8), "not repeated: over"
-    say("end", 2.0)
-    assert not heard.lasting(2.0)
+    publish("begin", 1.0)
+    publish("update", 1.2)
+    assert set(received.held(1.4)) == {("me", "pinch")}
+    assert not received.held(1.8), "not repeated: over"
+    publish("end", 2.0)
+    assert not received.held(2.0)
     for k in range(100):
-        say("end", 3.0 + k, "tap")
-    assert len(heard.events()) == KEPT
-    assert heard.events()[0].heard_s == 102.0
+        publish("end", 3.0 + k, "tap")
+    assert len(received.events()) == KEPT
+    assert received.events()[0].received_s == 102.0
 
 
 def test_the_bus_cannot_fill_the_memory_with_names() -> None:

@@ -17,7 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from common.bus import LoopbackBus
 from common.errors import PhalanxError
-from master.console.app import PAGES, Door, console_app, door_of, register
+from master.console.app import PAGES, LoginPage, console_app, login_of, register
 from master.console.login import HASH_FILE, PasswordHash, kept_password, new_password, password_from
 from master.console.login_page import LoginRequired
 from master.console.login_sessions import LONGEST_WAIT_S, Backoff, Sessions
@@ -104,7 +104,7 @@ async def behind(scope: Scope, receive: Receive, send: Send) -> None:
     await send({"type": "http.response.body", "body": b"secret"})
 
 
-def door(time: Time | None = None, app: ASGIApp = behind, secure: bool = False) -> LoginRequired:
+def login(time: Time | None = None, app: ASGIApp = behind, secure: bool = False) -> LoginRequired:
     return LoginRequired(app, CHEAP, "phalanx-8080", secure, ["/live"], time or Time())
 
 
@@ -120,17 +120,17 @@ def test_a_password_fits_itself_alone_and_its_hash_survives_a_file() -> None:
 
 
 def test_a_password_is_made_and_said_once(tmp_path: Path) -> None:
-    said: list[str] = []
+    output: list[str] = []
     folder = tmp_path / "phalanx"
-    made = kept_password(folder, said.append)
-    password = said[0].split("password is ")[1].split()[0]
+    made = kept_password(folder, output.append)
+    password = output[0].split("password is ")[1].split()[0]
     assert made.fits(password)
     assert made.n >= 2**15
     assert len(set(password.replace("-", ""))) > 5
     assert stat.S_IMODE((folder / HASH_FILE).stat().st_mode) == 0o600
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-    assert kept_password(folder, said.append) == made
-    assert password not in said[1]
+    assert kept_password(folder, output.append) == made
+    assert password not in output[1]
     assert new_password() != new_password()
 
 
@@ -217,15 +217,15 @@ def test_tries_take_a_bounded_memory_and_any_address(addresses: list[str]) -> No
 
 def test_the_right_password_opens_and_logout_closes() -> None:
     async def story() -> None:
-        app = door()
+        app = login()
         assert status(await ask(app, "/live")) == 303
         assert header(await ask(app, "/live"), b"location") == "/login?next=/live"
         assert status(await ask(app, "/login", "POST", body=form("wrong"))) == 403
         opened = await ask(app, "/login?next=/live", "POST", body=form(PASSWORD))
         assert (status(opened), header(opened, b"location")) == (303, "/live")
-        said = header(opened, b"set-cookie").lower()
-        assert "httponly" in said
-        assert "samesite=strict" in said
+        output = header(opened, b"set-cookie").lower()
+        assert "httponly" in output
+        assert "samesite=strict" in output
         cookie = token(opened)
         assert status(await ask(app, "/live", cookie=cookie)) == 299
         assert status(await ask(app, "/live", cookie=f"a=b; {cookie}; c=d")) == 299
@@ -239,7 +239,7 @@ def test_the_right_password_opens_and_logout_closes() -> None:
 
 
 def test_over_tls_the_cookie_never_leaves_without_it() -> None:
-    opened = asyncio.run(ask(door(secure=True), "/login", "POST", body=form(PASSWORD)))
+    opened = asyncio.run(ask(login(secure=True), "/login", "POST", body=form(PASSWORD)))
     assert token(opened, "__Host-phalanx-8080")
     assert "; secure" in header(opened, b"set-cookie").lower()
 
@@ -247,7 +247,7 @@ def test_over_tls_the_cookie_never_leaves_without_it() -> None:
 def test_a_session_is_over_after_half_a_day() -> None:
     async def story() -> None:
         time = Time()
-        app = door(time)
+        app = login(time)
         cookie = token(await ask(app, "/login", "POST", body=form(PASSWORD)))
         time.s += 11.9 * 3600
         assert status(await ask(app, "/live", cookie=cookie)) == 299
@@ -259,7 +259,7 @@ def test_a_session_is_over_after_half_a_day() -> None:
 
 @pytest.mark.parametrize("goal", ["//evil.example", "https://evil.example", "/login", "/..//evil", "live"])
 def test_after_the_login_one_stays_here(goal: str) -> None:
-    opened = asyncio.run(ask(door(), f"/login?{urlencode({'next': goal})}", "POST", body=form(PASSWORD)))
+    opened = asyncio.run(ask(login(), f"/login?{urlencode({'next': goal})}", "POST", body=form(PASSWORD)))
     assert header(opened, b"location") == "/"
 
 
@@ -268,7 +268,7 @@ def test_after_the_login_one_stays_here(goal: str) -> None:
 )
 def test_a_form_of_junk_is_answered_and_costs_no_try(body: bytes) -> None:
     async def story() -> None:
-        app = door()
+        app = login()
         for _ in range(5):
             assert status(await ask(app, "/login", "POST", body=body)) == 400
         assert status(await ask(app, "/login", "POST", body=form(PASSWORD))) == 303
@@ -279,7 +279,7 @@ def test_a_form_of_junk_is_answered_and_costs_no_try(body: bytes) -> None:
 def test_guessing_is_slowed_down_also_when_it_comes_at_once() -> None:
     async def story() -> None:
         time = Time()
-        app = door(time)
+        app = login(time)
         guesses = (ask(app, "/login", "POST", body=form(f"guess {k}")) for k in range(50))
         told = [status(one) for one in await asyncio.gather(*guesses)]
         assert told.count(403) == 3
@@ -295,23 +295,23 @@ def test_guessing_is_slowed_down_also_when_it_comes_at_once() -> None:
 
 
 def test_a_socket_ends_with_its_session() -> None:
-    heard: list[Message] = []
+    received: list[Message] = []
     app = FastAPI(openapi_url=None)
 
     async def echo(socket: WebSocket) -> None:
         await socket.accept()
         while (message := await socket.receive())["type"] != "websocket.disconnect":
-            heard.append(message)
+            received.append(message)
 
     app.add_api_websocket_route("/echo", echo)
 
     async def story() -> None:
-        guarded = door(app=app)
+        guarded = login(app=app)
         assert status(await ask(guarded, "/echo", kind="websocket")) == 403
         cookie = token(await ask(guarded, "/login", "POST", body=form(PASSWORD)))
-        said = [{"type": "websocket.receive", "text": "hello"}]
-        open_socket = asyncio.create_task(ask(guarded, "/echo", kind="websocket", cookie=cookie, then=said))
-        while not heard:
+        output = [{"type": "websocket.receive", "text": "hello"}]
+        open_socket = asyncio.create_task(ask(guarded, "/echo", kind="websocket", cookie=cookie, then=output))
+        while not received:
             await asyncio.sleep(0.001)
         await ask(guarded, "/logout", "POST", cookie=cookie)
         told = await asyncio.wait_for(open_socket, 30.0)
@@ -334,10 +334,10 @@ def paths(routes: Iterable[BaseRoute], before: str = "") -> Iterator[tuple[str, 
             yield ("websocket" if isinstance(route, WebSocketRoute) else "http"), path
 
 
-def open_to_strangers(app: ASGIApp, found: Iterable[tuple[str, str]]) -> set[str]:
+def open_to_anybody(app: ASGIApp, found: Iterable[tuple[str, str]]) -> set[str]:
     """Paths that answer somebody who did not log in with anything but a refusal or the way to the login."""
 
-    async def walk() -> set[str]:
+    async def process_noise() -> set[str]:
         wrong: set[str] = set()
         for kind, path in found:
             for method in ("GET", "POST") if kind == "http" else ("GET",):
@@ -347,7 +347,7 @@ def open_to_strangers(app: ASGIApp, found: Iterable[tuple[str, str]]) -> set[str
                     wrong.add(f"{method} {path} {status(told)}")
         return wrong
 
-    return asyncio.run(walk())
+    return asyncio.run(process_noise())
 
 
 @pytest.fixture(scope="module")
@@ -360,38 +360,38 @@ def state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ConsoleState]:
 
 
 def test_nothing_is_reached_without_the_login(state: ConsoleState) -> None:
-    app = console_app(state, "0.0.0.0", 8080, Door(CHEAP))
+    app = console_app(state, "0.0.0.0", 8080, LoginPage(CHEAP))
     found = list(paths(app.routes))
     known = {path for _, path in found}
     assert {page.route for page in PAGES} | {"/console/hands", "/console/camera/{camera}"} <= known
     assert any(path.startswith("/_nicegui_ws") for path in known)
     assert sum("/_nicegui/" in path for path in known) >= 5
-    assert open_to_strangers(app, [*found, ("http", "/nowhere"), ("http", "/openapi.json")]) == set()
-    assert open_to_strangers(app, [("http", "/login")]) == {"GET /login 200", "POST /login 400"}
+    assert open_to_anybody(app, [*found, ("http", "/nowhere"), ("http", "/openapi.json")]) == set()
+    assert open_to_anybody(app, [("http", "/login")]) == {"GET /login 200", "POST /login 400"}
     assert status(asyncio.run(ask(app, "/logout", "POST"))) == 303
 
 
 def test_the_walk_sees_a_path_that_is_open() -> None:
     app = FastAPI(openapi_url=None)
     app.add_api_route("/leak", lambda: "secret")
-    assert open_to_strangers(app, paths(app.routes)) == {"GET /leak 200", "POST /leak 405"}
+    assert open_to_anybody(app, paths(app.routes)) == {"GET /leak 200", "POST /leak 405"}
 
 
 # What the door is
 
 
 def test_elsewhere_there_is_a_password_and_tls_unless_it_is_open(tmp_path: Path) -> None:
-    said: list[str] = []
-    here = door_of(ConsoleSettings(tmp_path), tmp_path, said.append)
-    assert (here, said) == (Door(), [])
-    elsewhere = door_of(ConsoleSettings(tmp_path, host="192.0.2.1"), tmp_path, said.append)
+    output: list[str] = []
+    here = login_of(ConsoleSettings(tmp_path), tmp_path, output.append)
+    assert (here, output) == (LoginPage(), [])
+    elsewhere = login_of(ConsoleSettings(tmp_path, host="192.0.2.1"), tmp_path, output.append)
     assert elsewhere.password is not None
     assert elsewhere.tls is not None
-    assert "SHA-256" in said[-1]
-    plain = door_of(ConsoleSettings(tmp_path, host="0.0.0.0", open_links=True), tmp_path, said.append)
+    assert "SHA-256" in output[-1]
+    plain = login_of(ConsoleSettings(tmp_path, host="0.0.0.0", open_links=True), tmp_path, output.append)
     assert plain.password is not None
     assert plain.tls is None
-    assert "WARNING" in said[-1]
+    assert "WARNING" in output[-1]
 
 
 def test_only_the_own_user_is_answered_without_a_password(tmp_path: Path) -> None:

@@ -79,10 +79,10 @@ def sent_away(one: socket.socket) -> bool:
         return True
 
 
-@pytest.mark.parametrize("said", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: x\r\nX: y"])
-def test_who_does_not_finish_a_question_is_sent_away(plain: Console, said: bytes) -> None:
+@pytest.mark.parametrize("output", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: x\r\nX: y"])
+def test_who_does_not_finish_a_question_is_sent_away(plain: Console, output: bytes) -> None:
     with plain.connect() as one:
-        one.sendall(said)
+        one.sendall(output)
         assert sent_away(one)
     assert plain.answers()
 
@@ -97,7 +97,7 @@ def test_so_is_who_begins_a_second_question_and_does_not_finish_it(plain: Consol
         assert sent_away(one)
 
 
-def said(one: socket.socket, line: bytes, most: int) -> int:
+def output(one: socket.socket, line: bytes, most: int) -> int:
     """How much of it is taken before the other end closes."""
     taken = 0
     with suppress(ConnectionError):
@@ -115,7 +115,7 @@ def test_headers_do_not_grow_without_an_end(
     most = 500 * MOST_HEAD_BYTES  # the sockets' buffers swallow a part
     with plain.connect() as one:
         one.sendall(b"GET /" + (b" HTTP/1.1\r\n" if line.endswith(b"\n") else b""))
-        assert said(one, line, most) < most
+        assert output(one, line, most) < most
 
 
 def test_what_comes_together_with_the_headers_is_no_part_of_them(plain: Console) -> None:

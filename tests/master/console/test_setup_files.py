@@ -20,6 +20,7 @@ from common.hand_model import HandModel
 from common.keys import rig_key
 from common.messages import Health
 from master.calibrate.tree_files import provenance
+from master.console.setup.colour_sampling import keep_colours, pixel_of, ranges_of
 from master.console.setup.files import (
     KEY_FILE,
     PLAN,
@@ -32,7 +33,6 @@ from master.console.setup.files import (
     write_rig,
 )
 from master.console.setup.modes import KINDS, MODES, modes_of, new_file
-from master.console.setup.picking import keep_colours, pixel_of, ranges_of
 from master.console.setup.steps import Done, steps_of, usable
 
 LENS = Intrinsics(fx_px=500.0, fy_px=500.0, cx_px=320.0, cy_px=240.0)
@@ -180,8 +180,8 @@ def test_a_click_on_half_a_picture_is_a_pixel_of_the_whole() -> None:
 
 
 def test_colours_that_a_camera_tells() -> None:
-    gauges = {f"marker.index.{letter}_{end}": float(value) for letter, end, value in _TOLD}
-    health = Health("left", 1, 0, {}, {**gauges, "rate_hz": 60.0})
+    metrics = {f"marker.index.{letter}_{end}": float(value) for letter, end, value in _TOLD}
+    health = Health("left", 1, 0, {}, {**metrics, "rate_hz": 60.0})
     assert ranges_of(health) == {"index": HsvRange(hsv_low=(170, 60, 61), hsv_high=(9, 255, 254))}
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from common.errors import PhalanxError
 from master.console.local import LocalProcesses
-from master.console.warden import watch
+from master.console.process_supervisor import watch
 
 WAIT_S = 60.0
 
@@ -53,8 +53,8 @@ def test_lines_input_and_exit_code(local: LocalProcesses) -> None:
 def test_a_question_without_an_end_of_line_is_heard_and_a_line_that_is_written_over_is_its_last(
     local: LocalProcesses,
 ) -> None:
-    says = "import sys\nsys.stdout.write('1 %\\r2 %\\n')\nx = input('how far, in Å? ')"
-    code = f"{says}\nprint(x)\nsys.stdout.write('end')"
+    expected = "import sys\nsys.stdout.write('1 %\\r2 %\\n')\nx = input('how far, in Å? ')"
+    code = f"{expected}\nprint(x)\nsys.stdout.write('end')"
     one = local.start("ask", [sys.executable, "-c", code], {"PYTHONIOENCODING": "utf-8"})
     until(lambda: one.prompt == "how far, in Å? ")
     assert list(one.lines) == ["2 %"]

@@ -10,13 +10,13 @@ from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 from common.geometry import matrix_to_rotation_vector
 from common.hand_model import CHAINS, FINGER_JOINTS, HandJoints, HandModel
-from master.estimator.epoch import Epoch, Fitted, FittedHand, Turn
+from master.estimator.epoch import Epoch, Fitted, FittedHand, OrientationMeasurement
 from master.estimator.estimator import Estimator
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT, Settings
 from master.fabrik.estimate import SolvedHand
 from tests.hand_helpers import (
-    FACING,
+    BACK_NORMAL,
     MARKERS,
     RIGHT,
     camera_models,
@@ -62,12 +62,12 @@ def fit(
     cov: Float,
     *,
     by: Estimator | None = None,
-    facing: Float = FACING,
-    turn: Turn | None = None,
+    back_normal: Float = BACK_NORMAL,
+    orientation: OrientationMeasurement | None = None,
     start: SolvedHand | None = None,
 ) -> FittedHand | None:
     """The hand of points (M, 3) [m] of one epoch alone."""
-    epoch = Epoch(10**9, points, facing, cov_m2=cov, turn=turn, start=start)
+    epoch = Epoch(10**9, points, back_normal, cov_m2=cov, orientation=orientation, start=start)
     return (by or forgetful()).push(epoch).solution
 
 
@@ -82,9 +82,9 @@ def places(T: Float, angles: Float, model: HandModel = RIGHT, markers: tuple[str
     return model.marker_points(model.forward(T, angles), markers)
 
 
-def turned(rotation: Float, cov_rad2: Float, *, sure: bool = True) -> Turn:
+def orientation_of(rotation: Float, cov_rad2: Float, *, sure: bool = True) -> OrientationMeasurement:
     """A palm's rotation (3, 3) by an IMU, with its covariance (3, 3)."""
-    return Turn(rotation, np.asarray(np.linalg.inv(cov_rad2), np.float64), sure)
+    return OrientationMeasurement(rotation, np.asarray(np.linalg.inv(cov_rad2), np.float64), sure)
 
 
 def residual_m(hand: FittedHand, points: Float, model: HandModel = RIGHT) -> Float:
@@ -137,7 +137,7 @@ class Seen:
         cameras: Sequence[int] | None = None,
         gone: Sequence[int] = (),
         sigma_px: float = 0.1,
-        turn: Turn | None = None,
+        orientation: OrientationMeasurement | None = None,
         start: SolvedHand | None = None,
     ) -> Epoch:
         """The epoch as these cameras see it, without some markers; the centroids are exact."""
@@ -150,11 +150,11 @@ class Seen:
         return Epoch(
             t_ns,
             points,
-            FACING,
+            BACK_NORMAL,
             uv=uv,
             variance_px2=variance,
             own_m2=np.zeros((uv.shape[1], 3, 3)),
-            turn=turn,
+            orientation=orientation,
             start=start,
         )
 
@@ -181,11 +181,18 @@ def push(
     points: Float,
     cov: Float | None = None,
     *,
-    turn: Turn | None = None,
+    orientation: OrientationMeasurement | None = None,
     start: SolvedHand | None = None,
 ) -> Fitted:
     """Push points (M, 3) [m]."""
-    epoch = Epoch(t_ns, points, FACING, cov_m2=small_cov() if cov is None else cov, turn=turn, start=start)
+    epoch = Epoch(
+        t_ns,
+        points,
+        BACK_NORMAL,
+        cov_m2=small_cov() if cov is None else cov,
+        orientation=orientation,
+        start=start,
+    )
     return machine.push(epoch)
 
 

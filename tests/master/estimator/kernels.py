@@ -10,7 +10,7 @@ from master.estimator.arcs import add_arcs
 from master.estimator.cameras import CameraArrays, project
 from master.estimator.certainty import Certainty, linear, surer
 from master.estimator.extras import keep_extras, predict_extras
-from master.estimator.finger_surface import MOVES, cut, look
+from master.estimator.finger_surface import MOVES, laser_centroid, look
 from master.estimator.kinematics import Scratch, angles_of, chains, twist_hand
 from master.estimator.priors import Habits
 from master.estimator.problem import Rig
@@ -19,8 +19,8 @@ from master.estimator.solve import linearise
 from master.estimator.state import grow, hide
 from master.estimator.truncated import mean_within
 from master.estimator.workspace import Model
-from master.estimator.wrist_device import bent_palm
-from master.estimator.wrist_rows import turn_slope
+from master.estimator.wrist_device import flexed_palm
+from master.estimator.wrist_rows import rotation_vector_jacobian
 
 __all__ = ["Certainty", "Scratch"]
 
@@ -67,9 +67,9 @@ def mean_within_at(
 
 
 @kernel
-def surer_at(now: Float, past: Float, boxed_room: Any, out: Float) -> None:
+def surer_at(now: Float, past: Float, boxed_scratch: Any, out: Float) -> None:
     """`master.estimator.certainty.surer`; the record in its array."""
-    surer(now, past, boxed_room[0], out)
+    surer(now, past, boxed_scratch[0], out)
 
 
 @kernel
@@ -103,31 +103,31 @@ def joint_covariances(
     seen: Bool,
     information: Float,
     boxed_work: Any,
-    boxed_room: Any,
+    boxed_scratch: Any,
     straight: Float,
     whole: Float,
 ) -> None:
     """Write the joints' covariances (26, 3, 3) [m^2] by derivatives alone, and with arcs."""
-    hand, settings, work, room = model.hand[0], model.settings[0], boxed_work[0], boxed_room[0]
+    hand, settings, work, scratch = model.hand[0], model.settings[0], boxed_work[0], boxed_scratch[0]
     rig = Rig(hand, model.mounts, model.cameras, model.device[0])
     angles_of(hand, x, work.angles, work.by)
     chains(hand, T, work.angles, work.R, work.P)
-    linear(hand, T, cov, work, room, straight)
-    linear(hand, T, cov, work, room, whole)
-    add_arcs(rig, settings, T, cov, seen, information, work, room, whole)
+    linear(hand, T, cov, work, scratch, straight)
+    linear(hand, T, cov, work, scratch, whole)
+    add_arcs(rig, settings, T, cov, seen, information, work, scratch, whole)
 
 
 @kernel
-def turn_slope_at(turn: Float, J: Float) -> None:
-    """`master.estimator.wrist_rows.turn_slope`."""
-    turn_slope(turn, J)
+def rotation_vector_jacobian_at(rotation: Float, J: Float) -> None:
+    """`master.estimator.wrist_rows.rotation_vector_jacobian`."""
+    rotation_vector_jacobian(rotation, J)
 
 
 @kernel
 def look_at(
     boxed_hand: Any,
     boxed_device: Any,
-    bend: Float,
+    wrist_angles: Float,
     twist: Float,
     angles: Float,
     f: int,
@@ -136,22 +136,29 @@ def look_at(
     """`master.estimator.finger_surface.look` at a wrist that is bent by (2,) and hinges rolled by (5,)."""
     T, axes, hand, device = np.zeros((4, 4)), np.zeros((2, 3)), boxed_hand[0], boxed_device[0]
     twist_hand(hand, twist)
-    bent_palm(device.palm, bend[0], bend[1], T, axes)
+    flexed_palm(device.palm, wrist_angles[0], wrist_angles[1], T, axes)
     return look(hand, device, T, axes, angles, f, MOVES, boxed_work[0])
 
 
 @kernel
-def cut_at(boxed_device: Any, f: int, boxed_work: Any) -> float:
-    """`master.estimator.finger_surface.cut`, after `look_at`."""
-    return cut(boxed_device[0], f, boxed_work[0])
+def laser_centroid_at(boxed_device: Any, f: int, boxed_work: Any) -> float:
+    """`master.estimator.finger_surface.laser_centroid`, after `look_at`."""
+    return laser_centroid(boxed_device[0], f, boxed_work[0])
 
 
 @kernel
 def predict_extras_at(
-    boxed_settings: Any, boxed_state: Any, dt_s: float, walked_rad2: float, boxed_belief: Any, boxed_room: Any
+    boxed_settings: Any,
+    boxed_state: Any,
+    dt_s: float,
+    process_noise_rad2: float,
+    boxed_belief: Any,
+    boxed_scratch: Any,
 ) -> None:
     """`master.estimator.extras.predict_extras`; records in their arrays."""
-    predict_extras(boxed_settings[0], boxed_state[0], dt_s, walked_rad2, boxed_belief[0], boxed_room[0])
+    predict_extras(
+        boxed_settings[0], boxed_state[0], dt_s, process_noise_rad2, boxed_belief[0], boxed_scratch[0]
+    )
 
 
 @kernel
@@ -163,7 +170,7 @@ def keep_extras_at(
     z: Float,
     cov: Float,
     scale: float,
-    boxed_room: Any,
+    boxed_scratch: Any,
 ) -> None:
     """`master.estimator.extras.keep_extras`; records in their arrays."""
-    keep_extras(boxed_settings[0], boxed_state[0], dt_s, boxed_belief[0], z, cov, scale, boxed_room[0])
+    keep_extras(boxed_settings[0], boxed_state[0], dt_s, boxed_belief[0], z, cov, scale, boxed_scratch[0])

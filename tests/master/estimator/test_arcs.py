@@ -8,7 +8,7 @@ from common.arrays import Bool, Float
 from common.geometry import rotation_vector_to_matrix
 from common.hand_model import CHAINS, TIPS, WRIST, HandModel
 from common.records import boxed
-from master.estimator.attached import Attached
+from master.estimator.body_points import BodyPoints
 from master.estimator.cameras import CameraArrays
 from master.estimator.certainty import Certainty
 from master.estimator.epoch import FittedHand
@@ -45,9 +45,9 @@ def covariances(hand: FittedHand, cov: Float, seen: Bool, model: HandModel = RIG
         boxed(Device.none()),
     )
     straight, whole = np.empty((26, 3, 3)), np.empty((26, 3, 3))
-    room, information = Certainty.empty(len(cov), 16), np.asarray(np.linalg.inv(small_cov()), np.float64)
-    T, scratch = hand.T_rig_palm, boxed(Scratch.empty())
-    joint_covariances(rig, T, hand.x, cov, seen, information, scratch, boxed(room), straight, whole)
+    storage, information = Certainty.empty(len(cov), 16), np.asarray(np.linalg.inv(small_cov()), np.float64)
+    T, work = hand.T_rig_palm, boxed(Scratch.empty())
+    joint_covariances(rig, T, hand.x, cov, seen, information, work, boxed(storage), straight, whole)
     return straight, whole
 
 
@@ -62,7 +62,7 @@ def drawn(hand: FittedHand, step: Float, model: HandModel = RIGHT) -> Float:
     parameters = HandParameters.of(model)
     angles = parameters.angles(hand.x + step[:, 6:])
     R = rotation_vector_to_matrix(step[:, :3]) @ hand.T_rig_palm[:3, :3]
-    local = Attached.joints(model, parameters).place(model.chains(angles))
+    local = BodyPoints.joints(model, parameters).place(model.chains(angles))
     return local @ np.swapaxes(R, 1, 2) + (hand.T_rig_palm[:3, 3] + step[:, 3:6])[:, None]
 
 
@@ -72,9 +72,11 @@ def slopes(hand: FittedHand, model: HandModel = RIGHT) -> Float:
     return np.moveaxis(drawn(hand, step, model) - drawn(hand, -step, model), 0, 2) / 2e-6
 
 
-def unsure(hand: FittedHand, turn_rad: float, angle_rad: float) -> Float:
+def unsure(hand: FittedHand, rotation_rad: float, angle_rad: float) -> Float:
     n = len(hand.alone)
-    return np.diag(np.concatenate([np.full(3, turn_rad), np.full(3, 1e-4), np.full(n - 6, angle_rad)]) ** 2)
+    return np.diag(
+        np.concatenate([np.full(3, rotation_rad), np.full(3, 1e-4), np.full(n - 6, angle_rad)]) ** 2
+    )
 
 
 def test_what_is_left_of_the_tangent_is_that_of_drawn_hands() -> None:

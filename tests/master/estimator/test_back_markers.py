@@ -9,7 +9,7 @@ from common.back_markers import with_three_back_markers
 from common.hand_model import HandModel
 from common.hand_profiles import generated_profile
 from tests.hand_helpers import MARKERS, natural_angles, palm
-from tests.master.estimator.fitted import fit, forgetful, palm_deg, turned
+from tests.master.estimator.fitted import fit, forgetful, orientation_of, palm_deg
 
 MODELS = {
     side: HandModel.of(with_three_back_markers(generated_profile("made", side), "made-back3"))
@@ -27,11 +27,13 @@ def palm_errors_deg(side: str, names: tuple[str, ...], *, imu: bool = False) -> 
     for _ in range(POSES):
         T = palm(rng.uniform(-35.0, 35.0, 3))
         joints = model.forward(T, natural_angles(rng))
-        noise, turn = rng.normal(0.0, NOISE_M, (len(EIGHT), 3)), rng.normal(0.0, IMU_RAD, 3)
+        noise, orientation = rng.normal(0.0, NOISE_M, (len(EIGHT), 3)), rng.normal(0.0, IMU_RAD, 3)
         points = model.marker_points(joints, EIGHT) + noise
         seen = points[[EIGHT.index(name) for name in names]]
-        told = turned(Rotation.from_rotvec(turn).as_matrix() @ T[:3, :3], IMU_RAD**2 * np.eye(3))
-        errors.append(palm_deg(fit(seen, cov, by=machine, turn=told if imu else None), T))
+        told = orientation_of(
+            Rotation.from_rotvec(orientation).as_matrix() @ T[:3, :3], IMU_RAD**2 * np.eye(3)
+        )
+        errors.append(palm_deg(fit(seen, cov, by=machine, orientation=told if imu else None), T))
     return np.array(errors)
 
 

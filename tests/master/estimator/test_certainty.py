@@ -80,7 +80,7 @@ def test_directions_err_as_much_as_is_claimed() -> None:
         angles[1:, 1] = (RIGHT.mcp_per_pip or 0.0) * angles[1:, 2] + rng.normal(0.0, s.natural_flexion_rad, 4)
         angles[1:, 3] = (RIGHT.dip_per_pip or 0.0) * angles[1:, 2]
         angles = np.clip(angles, low, high)
-        T = palm(np.degrees(rng.normal(0.0, s.facing_rad / np.sqrt(2.0), 3)))
+        T = palm(np.degrees(rng.normal(0.0, s.back_normal_rad / np.sqrt(2.0), 3)))
         truth = RIGHT.forward(T, angles)
         points = places(T, angles) + rng.multivariate_normal(np.zeros(3), small_cov()[0], 6)
         hand = found(fit(points, small_cov()))

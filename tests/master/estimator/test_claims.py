@@ -62,7 +62,7 @@ def test_an_epoch_that_says_nothing_leaves_the_state_as_it_was() -> None:
     np.testing.assert_array_equal(surer(np.full((22, 22), -1.0), past), past)
 
 
-def course(gone: tuple[int, ...], frames: int, speed_m_s: float = 0.0, still: int = 20) -> list[Float]:
+def history(gone: tuple[int, ...], frames: int, speed_m_s: float = 0.0, still: int = 20) -> list[Float]:
     """Covariances (26, 3, 3) [m^2], first of the last frame with all markers, then of those without some."""
     machine, angles, out = estimator(), natural_angles(np.random.default_rng(3)), list[Float]()
     for k in range(still + frames):
@@ -91,7 +91,7 @@ def test_a_pose_that_is_held_makes_no_joint_surer() -> None:
 
 
 def test_uncertainty_of_a_hidden_finger_grows_and_stays_within_its_reach() -> None:
-    covs = course((INDEX,), 300)
+    covs = history((INDEX,), 300)
     tip = sigma_m(covs, TIPS[INDEX])
     assert (np.diff(tip[:60]) > 0.0).all()
     assert tip[18] > 3.0 * tip[0]  # 300 ms
@@ -101,7 +101,7 @@ def test_uncertainty_of_a_hidden_finger_grows_and_stays_within_its_reach() -> No
 
 
 def test_uncertainty_of_a_lost_hand_grows_the_faster_the_faster_it_went() -> None:
-    still, moving = (sigma_m(course(NOBODY, 28, speed), PALM) for speed in (0.0, 0.5))
+    still, moving = (sigma_m(history(NOBODY, 28, speed), PALM) for speed in (0.0, 0.5))
     for claims in (still, moving):
         assert (np.diff(claims)[1:] > 0.0).all()
         assert claims[1] > 0.95 * claims[0]  # no marker tells any more about which point the palm turns

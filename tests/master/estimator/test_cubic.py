@@ -10,12 +10,12 @@ from common.hand_model import FINGERS
 from common.wrist_calibration import FingerLine
 from master.estimator.cubic import ROOT_MM, CubicLaw, cubic_pip, simulated_lines
 from master.estimator.finger_lines import on_line
-from tests.master.estimator.worn import Worn, natural
+from tests.master.estimator.wrist_case import WristCase, natural
 
 
 @pytest.fixture(scope="module")
-def worn(root: Path) -> Worn:
-    return Worn.of(root)
+def wrist_case(root: Path) -> WristCase:
+    return WristCase.of(root)
 
 
 def test_the_printed_cubic() -> None:
@@ -32,11 +32,11 @@ def test_the_cubic_is_clamped_and_falls() -> None:
     assert np.isnan(pip[7])
 
 
-def test_the_lines_of_a_device_run_from_its_straight_fingers_to_its_bent_ones(worn: Worn) -> None:
-    lines = simulated_lines(worn.setup)
+def test_the_lines_of_a_device_run_from_its_straight_fingers_to_its_bent_ones(wrist_case: WristCase) -> None:
+    lines = simulated_lines(wrist_case.setup)
     for pip, end in ((0.0, 0.0), (85.0, 1.0)):
-        ray = np.column_stack([worn.looks(natural(pip)).laser, np.ones(5)])
-        points = ray * (worn.setup.offset_m / (ray @ worn.setup.normal))[:, None]
+        ray = np.column_stack([wrist_case.looks(natural(pip)).laser, np.ones(5)])
+        points = ray * (wrist_case.setup.offset_m / (ray @ wrist_case.setup.normal))[:, None]
         for f in range(1, 5):
             along, aside = on_line(points[f : f + 1], lines[f])
             assert along[0] == pytest.approx(end, abs=0.06)
@@ -45,12 +45,12 @@ def test_the_lines_of_a_device_run_from_its_straight_fingers_to_its_bent_ones(wo
         assert 0.03 < line.range_m[1] - line.range_m[0] < 0.08
 
 
-def test_a_line_that_was_measured_counts_before_the_simulated_one(worn: Worn) -> None:
-    simulated = CubicLaw(worn.setup).lines
+def test_a_line_that_was_measured_counts_before_the_simulated_one(wrist_case: WristCase) -> None:
+    simulated = CubicLaw(wrist_case.setup).lines
     index = FingerLine(
         origin_m=(0.02, 0.05, 0.2), direction=(0.0, 0.0, -1.0), range_m=(0.0, 0.06), residual_m=1e-4
     )
-    law = CubicLaw(replace(worn.setup, lines={"index": index}))
+    law = CubicLaw(replace(wrist_case.setup, lines={"index": index}))
     assert law.lines[1] == index
     assert law.lines[2:] == simulated[2:]
     points = np.tile([0.02, 0.05, 0.14], (5, 1))  # at its bent end

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.records import boxed
-from master.estimator.extras import ExtrasRoom, usual_of
+from master.estimator.extras import ExtrasScratch, stationary_of
 from master.estimator.problem import Belief
 from master.estimator.settings import DEFAULT
 from master.estimator.state import HandState
-from master.estimator.wrist_device import BEND, EXTRAS, HEADING, LIGHT, RATE, TILT
+from master.estimator.wrist_device import EXTRAS, HEADING, LED_SCALE, RATE, TILT, WRIST_ANGLES
 from tests.master.estimator.kernels import keep_extras_at, predict_extras_at
 
 N = 8
@@ -27,9 +27,9 @@ class Extras:
 
     def __init__(self, *, loose: bool = True) -> None:
         self.state = HandState.unknown(N, EXTRAS)
-        self.state.usual[:] = usual_of(DEFAULT, loose=loose, tilt_rad=TILT_RAD)
-        self.state.z_cov[:] = np.diag(self.state.usual)
-        self.belief, self.room = Belief.none(N, EXTRAS), ExtrasRoom.empty(EXTRAS)
+        self.state.stationary[:] = stationary_of(DEFAULT, loose=loose, tilt_rad=TILT_RAD)
+        self.state.z_cov[:] = np.diag(self.state.stationary)
+        self.belief, self.scratch = Belief.none(N, EXTRAS), ExtrasScratch.empty(EXTRAS)
 
     @property
     def mean(self) -> Float:
@@ -43,10 +43,10 @@ class Extras:
         self.state.z[:], self.state.z_cov[:] = mean, cov
         return self
 
-    def after(self, dt_s: float, walked_rad2: float = 0.0) -> "Extras":
+    def after(self, dt_s: float, process_noise_rad2: float = 0.0) -> "Extras":
         """Step them, in place."""
         boxes = boxed(SETTINGS), boxed(self.state)
-        predict_extras_at(*boxes, dt_s, walked_rad2, boxed(self.belief), boxed(self.room))
+        predict_extras_at(*boxes, dt_s, process_noise_rad2, boxed(self.belief), boxed(self.scratch))
         return self
 
     def told(self, dt_s: float, information: Float, measured: Float, scale: float = 1.0) -> "Extras":
@@ -56,16 +56,18 @@ class Extras:
         cov = np.eye(6 + N + EXTRAS)
         cov[-EXTRAS:, -EXTRAS:] = scale * whole
         boxes = boxed(SETTINGS), boxed(self.state)
-        keep_extras_at(*boxes, dt_s, boxed(self.belief), mean, cov, scale, boxed(self.room))
+        keep_extras_at(*boxes, dt_s, boxed(self.belief), mean, cov, scale, boxed(self.scratch))
         return self
 
 
 def drawn(seed: int) -> tuple[Float, Float]:
     """A mean and a covariance, none more doubtful than usual."""
     rng = np.random.default_rng(seed)
-    usual = np.sqrt(Extras().state.usual)
+    stationary = np.sqrt(Extras().state.stationary)
     root = rng.normal(size=(EXTRAS, EXTRAS)) * 0.2
-    return usual * rng.normal(size=EXTRAS), usual[:, None] * (root @ root.T + 1e-4 * np.eye(EXTRAS)) * usual
+    return stationary * rng.normal(size=EXTRAS), stationary[:, None] * (
+        root @ root.T + 1e-4 * np.eye(EXTRAS)
+    ) * stationary
 
 
 @given(st.floats(1e-3, 3.0))
@@ -73,19 +75,21 @@ def drawn(seed: int) -> tuple[Float, Float]:
 def test_a_bend_moves_as_its_closed_form(dt_s: float) -> None:
     """Matern 3/2: mean and variance of bend and rate that were known exactly (Hartikainen, Saerkkae 2010)."""
     mean = np.zeros(EXTRAS)
-    mean[[BEND, RATE]] = 0.3, -0.8
+    mean[[WRIST_ANGLES, RATE]] = 0.3, -0.8
     found = Extras().set(mean, 1e-18 * np.eye(EXTRAS)).after(dt_s)
     paced, sigma2 = DEFAULT.pace_1_s * dt_s, DEFAULT.flexion_rad**2
     decay = exp(-paced)
-    bend = decay * ((1.0 + paced) * 0.3 - 0.8 * dt_s)
+    wrist_angles = decay * ((1.0 + paced) * 0.3 - 0.8 * dt_s)
     rate = decay * (-(DEFAULT.pace_1_s**2) * dt_s * 0.3 - 0.8 * (1.0 - paced))
-    np.testing.assert_allclose(found.mean[[BEND, RATE]], [bend, rate], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.mean[[WRIST_ANGLES, RATE]], [wrist_angles, rate], rtol=1e-9, atol=1e-12)
     variance = sigma2 * (1.0 - decay**2 * ((1.0 + paced) ** 2 + paced**2))
     of_rate = DEFAULT.pace_1_s**2 * sigma2 * (1.0 - decay**2 * ((1.0 - paced) ** 2 + paced**2))
     both = 2.0 * sigma2 * DEFAULT.pace_1_s * paced**2 * decay**2
     expected = [[variance, both], [both, of_rate]]
-    np.testing.assert_allclose(found.cov[np.ix_([BEND, RATE], [BEND, RATE])], expected, rtol=1e-6, atol=1e-12)
-    np.testing.assert_allclose(found.mean[[BEND + 1, RATE + 1]], 0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        found.cov[np.ix_([WRIST_ANGLES, RATE], [WRIST_ANGLES, RATE])], expected, rtol=1e-6, atol=1e-12
+    )
+    np.testing.assert_allclose(found.mean[[WRIST_ANGLES + 1, RATE + 1]], 0.0, atol=1e-12)
 
 
 @given(st.floats(0.0, 3.0), st.floats(0.0, 3.0), seeds)
@@ -103,18 +107,20 @@ def test_doubt_ends_at_what_is_usual_and_the_heading_walks_on() -> None:
     far = Extras().set(mean, cov)
     for _ in range(100):
         far.after(1e3, 1e-3)
-    quick = [*range(BEND, HEADING)]
-    np.testing.assert_allclose(far.cov[quick][:, quick], np.diag(far.state.usual)[quick][:, quick], atol=1e-9)
+    quick = [*range(WRIST_ANGLES, HEADING)]
+    np.testing.assert_allclose(
+        far.cov[quick][:, quick], np.diag(far.state.stationary)[quick][:, quick], atol=1e-9
+    )
     np.testing.assert_allclose(far.mean[quick], 0.0, atol=1e-9)
     assert far.mean[HEADING] == pytest.approx(mean[HEADING])
     assert far.cov[HEADING, HEADING] == pytest.approx(cov[HEADING, HEADING] + 0.1)
-    assert np.abs(far.mean[LIGHT]) < 1e-3 * np.abs(mean[LIGHT])
+    assert np.abs(far.mean[LED_SCALE]) < 1e-3 * np.abs(mean[LED_SCALE])
 
 
 def test_what_is_constant_is_so_for_a_session() -> None:
     mean, cov = drawn(2)
     later = Extras().set(mean, cov).after(600.0)
-    kept = [*range(5), LIGHT]
+    kept = [*range(5), LED_SCALE]
     np.testing.assert_allclose(later.mean[kept], mean[kept], rtol=0.07)
 
 
@@ -122,17 +128,17 @@ def test_a_bend_goes_back_to_the_posture_that_is_kept() -> None:
     extras = Extras()
     extras.state.habit[:] = -0.4, 0.1
     mean = np.zeros(EXTRAS)
-    mean[BEND : BEND + 2] = 0.2, 0.2
+    mean[WRIST_ANGLES : WRIST_ANGLES + 2] = 0.2, 0.2
     extras.set(mean, 1e-6 * np.eye(EXTRAS))
     extras.after(0.3 / DEFAULT.pace_1_s)
-    assert -0.4 < extras.mean[BEND] < 0.2
+    assert -0.4 < extras.mean[WRIST_ANGLES] < 0.2
     extras.after(15.0 / DEFAULT.pace_1_s)
-    np.testing.assert_allclose(extras.mean[BEND : BEND + 2], [-0.4, 0.1], atol=1e-3)
+    np.testing.assert_allclose(extras.mean[WRIST_ANGLES : WRIST_ANGLES + 2], [-0.4, 0.1], atol=1e-3)
 
 
 def test_a_posture_that_is_kept_is_learnt() -> None:
     extras, information, measured = Extras(), np.zeros((EXTRAS, EXTRAS)), np.zeros(EXTRAS)
-    information[BEND, BEND], measured[BEND] = 1e4, -0.5
+    information[WRIST_ANGLES, WRIST_ANGLES], measured[WRIST_ANGLES] = 1e4, -0.5
     for _ in range(60):
         extras.after(1.0).told(1.0, information, measured)
     assert extras.state.habit[0] == pytest.approx(-0.5, abs=0.04)
@@ -159,7 +165,7 @@ def test_an_epoch_long_after_the_last_counts_as_a_whole_and_one_at_once_not_at_a
     np.testing.assert_allclose(np.diag(long.cov), np.diag(kalman), rtol=0.01)
     before = again.cov
     alone = np.zeros((EXTRAS, EXTRAS))
-    alone[LIGHT, LIGHT] = 1.0 / cov[LIGHT, LIGHT]
+    alone[LED_SCALE, LED_SCALE] = 1.0 / cov[LED_SCALE, LED_SCALE]
     again.told(0.0, alone, measured, scale)
     np.testing.assert_allclose(again.cov, before, rtol=1e-6, atol=1e-12)
 
@@ -193,12 +199,17 @@ def test_it_stays_a_covariance_whatever_comes(seed: int) -> None:
         assert (size > 0.0).all()
         assert np.linalg.eigvalsh(cov / np.outer(size, size)).min() > -1e-7
         assert (
-            size[[*range(HEADING), LIGHT]] < 1.01 * np.sqrt(extras.state.usual[[*range(HEADING), LIGHT]])
+            size[[*range(HEADING), LED_SCALE]]
+            < 1.01 * np.sqrt(extras.state.stationary[[*range(HEADING), LED_SCALE]])
         ).all()
 
 
 def test_a_palm_that_was_calibrated_does_not_bend_and_a_tilt_is_at_least_of_a_milliradian() -> None:
-    worn, loose = (usual_of(DEFAULT, loose=loose, tilt_rad=0.0) for loose in (False, True))
-    np.testing.assert_allclose(np.sqrt(worn[BEND : BEND + 2]), DEFAULT.worn_rad)
-    np.testing.assert_allclose(np.sqrt(loose[BEND : BEND + 2]), [DEFAULT.flexion_rad, DEFAULT.deviation_rad])
+    strapped, loose = (stationary_of(DEFAULT, loose=loose, tilt_rad=0.0) for loose in (False, True))
+    np.testing.assert_allclose(
+        np.sqrt(strapped[WRIST_ANGLES : WRIST_ANGLES + 2]), DEFAULT.calibrated_palm_rad
+    )
+    np.testing.assert_allclose(
+        np.sqrt(loose[WRIST_ANGLES : WRIST_ANGLES + 2]), [DEFAULT.flexion_rad, DEFAULT.deviation_rad]
+    )
     np.testing.assert_allclose(np.sqrt(loose[TILT : TILT + 2]), 1e-3)

@@ -40,7 +40,7 @@ def test_deviation_keeps_its_sign_and_size() -> None:
 
 
 @pytest.mark.parametrize(
-    ("points", "says"),
+    ("points", "expected"),
     [
         (np.full((30, 3), np.nan), "0 points"),
         (np.linspace([0, 0, 0.1], [0, 0, 0.2], 4), "4 points"),
@@ -48,6 +48,6 @@ def test_deviation_keeps_its_sign_and_size() -> None:
         (np.random.default_rng(1).normal(size=(50, 3)) * 0.01 + [0, 0, 0.15], "stray"),
     ],
 )
-def test_what_is_no_line_is_refused(points: np.ndarray, says: str) -> None:
-    with pytest.raises(FitError, match=says):
+def test_what_is_no_line_is_refused(points: np.ndarray, expected: str) -> None:
+    with pytest.raises(FitError, match=expected):
         principal_line(points)

@@ -11,7 +11,7 @@ from bench.fusion_solved import Solved, solve
 from bench.played import START_NS
 from common.arrays import Bool
 from common.hand_model import CHAINS
-from common.messages import HandPose, ImuSample, Level, MarkerDetections, Source, WristDetections
+from common.messages import HandPose, ImuSample, MarkerDetections, SolverMode, Source, WristDetections
 from master.estimator.fused import FusedPipeline
 from master.estimator.settings import DEFAULT
 from master.rig_pipeline import pipeline_of
@@ -34,9 +34,9 @@ def gone(message: Observed) -> bool:
     return GONE_S < 1e-9 * (message.t_ns - START_NS) < BACK_S
 
 
-def without(seen: Seen, left_out: Callable[[Observed], bool]) -> Solved:
+def without(seen: Seen, rejected: Callable[[Observed], bool]) -> Solved:
     both, messages = seen
-    return Solved.of(both, solve(both.fused, [one for one in messages if not left_out(one)]), both.fused)
+    return Solved.of(both, solve(both.fused, [one for one in messages if not rejected(one)]), both.fused)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def away(cut: Solved) -> Bool:
     return (cut.t_s > GONE_S + 0.05) & (cut.t_s < BACK_S - 0.05)
 
 
-def test_poses_come_at_the_triples_while_the_cameras_are_silent(whole: Solved, cut: Solved) -> None:
+def test_poses_come_at_the_cycles_while_the_cameras_are_silent(whole: Solved, cut: Solved) -> None:
     assert (np.diff(cut.poses.t_ns) > 0).all()
     alone = cut.t_s[away(cut)]
     assert np.diff(alone) == pytest.approx(1.0 / 30.0, abs=2e-3)
@@ -89,29 +89,29 @@ def test_a_palm_that_nobody_sees_is_doubted_more_and_more(cut: Solved) -> None:
 
 
 def test_bend_and_turn_of_the_palm_are_told_with_their_doubt(seen: Seen, whole: Solved) -> None:
-    truth = np.array([seen[0].scene.motion.at(t).bend_rad for t in whole.t_s.tolist()])
-    off = np.abs(whole.poses.wrist_bend_rad - truth)
-    assert np.isfinite(whole.poses.wrist_bend_sigma_rad).all()
-    assert (off < 4.0 * whole.poses.wrist_bend_sigma_rad).mean() > 0.9
+    truth = np.array([seen[0].scene.motion.at(t).wrist_angles_rad for t in whole.t_s.tolist()])
+    off = np.abs(whole.poses.wrist_angles_rad - truth)
+    assert np.isfinite(whole.poses.wrist_angles_sigma_rad).all()
+    assert (off < 4.0 * whole.poses.wrist_angles_sigma_rad).mean() > 0.9
     assert np.isfinite(whole.poses.palm_world_wxyz).all()
 
 
 def test_without_the_wrist_device_the_cameras_go_on_by_themselves(seen: Seen, whole: Solved) -> None:
-    lone = without(seen, lambda message: isinstance(message, WristDetections) and gone(message))
-    at = (lone.t_s > GONE_S + 0.1) & (lone.t_s < BACK_S)
-    np.testing.assert_array_equal(lone.t_s, whole.t_s)
-    assert not (lone.poses.level[at] > 0).any()
-    assert lone.poses.valid[at].all()
-    assert np.nanmedian(lone.off_mm[at]) < 8.0
-    assert (lone.poses.level[lone.t_s > BACK_S + 0.1] > 0).any()
+    single = without(seen, lambda message: isinstance(message, WristDetections) and gone(message))
+    at = (single.t_s > GONE_S + 0.1) & (single.t_s < BACK_S)
+    np.testing.assert_array_equal(single.t_s, whole.t_s)
+    assert not (single.poses.solver_mode[at] > 0).any()
+    assert single.poses.valid[at].all()
+    assert np.nanmedian(single.off_mm[at]) < 8.0
+    assert (single.poses.solver_mode[single.t_s > BACK_S + 0.1] > 0).any()
 
 
 def test_without_the_imu_the_palm_is_that_of_the_markers(seen: Seen, whole: Solved) -> None:
-    lone = without(seen, lambda message: isinstance(message, ImuSample) and gone(message))
-    at = (lone.t_s > GONE_S + 0.1) & (lone.t_s < BACK_S - 0.1)
-    assert np.isnan(lone.poses.palm_world_wxyz[at]).all()
-    assert np.isfinite(lone.poses.palm_world_wxyz[lone.t_s > BACK_S + 0.1]).all()
-    assert np.nanmedian(lone.off_mm[at]) < 1.5 * np.nanmedian(whole.off_mm[at]) + 1.0
+    single = without(seen, lambda message: isinstance(message, ImuSample) and gone(message))
+    at = (single.t_s > GONE_S + 0.1) & (single.t_s < BACK_S - 0.1)
+    assert np.isnan(single.poses.palm_world_wxyz[at]).all()
+    assert np.isfinite(single.poses.palm_world_wxyz[single.t_s > BACK_S + 0.1]).all()
+    assert np.nanmedian(single.off_mm[at]) < 1.5 * np.nanmedian(whole.off_mm[at]) + 1.0
 
 
 def test_fingers_are_better_with_the_wrist_device_than_without(seen: Seen, whole: Solved) -> None:
@@ -136,7 +136,7 @@ def pushed(pipeline: FusedPipeline, messages: list[Observed]) -> list[HandPose]:
     return out
 
 
-def test_late_and_doubled_triples_are_counted_and_change_nothing(seen: Seen) -> None:
+def test_late_and_doubled_cycles_are_counted_and_change_nothing(seen: Seen) -> None:
     some = [message for message in seen[1] if 1e-9 * (message.t_ns - START_NS) < 1.0]
     doubled: list[Observed] = []
     before: WristDetections | None = None
@@ -164,7 +164,7 @@ def test_the_same_messages_make_the_same_poses(seen: Seen) -> None:
 
 
 def test_levels_are_told_with_the_poses(whole: Solved) -> None:
-    told = whole.poses.level[whole.t_s > 1.2]
+    told = whole.poses.solver_mode[whole.t_s > 1.2]
     assert (told[:, 1:] > 0).mean() > 0.8
-    assert (told[:, 1:] == Level.IK).any()
+    assert (told[:, 1:] == SolverMode.IK).any()
     assert np.isfinite(whole.poses.laser_m[whole.t_s > 1.2]).mean() > 0.7

@@ -75,8 +75,8 @@ def test_the_other_camera_tells_a_thing_from_the_marker(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(20))
 def test_the_slaves_are_believed_where_their_choice_fits(seed: int) -> None:
     first, second = seen(PAIR, MARKER, MARKER, seed=seed), seen(PAIR, MUG, MUG, seed=seed + 100)
-    for rivals in (second, seen(PAIR, None, MUG), seen(PAIR, IN_ROW, None), seen(PAIR, IN_ROW, IN_ROW)):
-        chosen = choose(PAIR, first, rivals)
+    for alternatives in (second, seen(PAIR, None, MUG), seen(PAIR, IN_ROW, None), seen(PAIR, IN_ROW, IN_ROW)):
+        chosen = choose(PAIR, first, alternatives)
         np.testing.assert_array_equal(chosen.uv, first)
         assert not chosen.taken.any()
 

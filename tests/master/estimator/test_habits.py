@@ -13,7 +13,7 @@ from common.calibration import Couplings
 from common.geometry import rotation_vector_to_matrix
 from common.hand_model import PALM, HandModel
 from common.messages import Source
-from master.estimator.epoch import FittedHand, Turn
+from master.estimator.epoch import FittedHand, OrientationMeasurement
 from master.estimator.estimator import Estimator
 from master.estimator.settings import DEFAULT
 from tests.hand_helpers import RIGHT, natural_angles, palm, small_cov, walls
@@ -23,15 +23,15 @@ from tests.master.estimator.fitted import (
     fit,
     forgetful,
     found,
+    orientation_of,
     palm_deg,
     pip_deg,
     places,
     push,
     residual_m,
-    turned,
 )
 
-ANYWAY = DEFAULT._replace(facing_rad=inf)  # the back may look anywhere
+ANYWAY = DEFAULT._replace(back_normal_rad=inf)  # the back may look anywhere
 SOLVER, NATURAL_ONLY = forgetful(settings=ANYWAY), forgetful(natural=True, settings=ANYWAY)
 SIGMA_M = 1e-3
 COV = np.repeat(SIGMA_M**2 * np.eye(3)[None], 6, axis=0)
@@ -50,8 +50,14 @@ def with_couplings(**keys: object) -> HandModel:
     return HandModel.of(msgspec.structs.replace(RIGHT.profile, couplings=couplings))
 
 
-def solved(machine: Estimator, T: Float, angles: Float, noise: Float, turn: Turn | None = None) -> FittedHand:
-    return found(fit(places(T, angles) + noise, COV, by=machine, turn=turn))
+def solved(
+    machine: Estimator,
+    T: Float,
+    angles: Float,
+    noise: Float,
+    orientation: OrientationMeasurement | None = None,
+) -> FittedHand:
+    return found(fit(places(T, angles) + noise, COV, by=machine, orientation=orientation))
 
 
 # -- natural or free --------------------------------------------------------------------------------------------
@@ -164,14 +170,14 @@ def test_the_dip_follows_exactly_loosely_or_not_at_all(spread_deg: float, free: 
     truth[1:, 1], truth[1:, 2], truth[1:, 3] = 0.4, 0.8, 0.8 * 2 / 3
     truth[2, 3] += np.radians(8.0)
     machine = forgetful(model)
-    sure = turned(palm()[:3, :3], 1e-6 * np.eye(3))
-    hand = found(fit(places(palm(), truth, model), small_cov(), by=machine, turn=sure))
-    strayed = np.degrees(hand.angles_rad[1:, 3] - hand.angles_rad[1:, 2] * 2 / 3)
+    sure = orientation_of(palm()[:3, :3], 1e-6 * np.eye(3))
+    hand = found(fit(places(palm(), truth, model), small_cov(), by=machine, orientation=sure))
+    growth = np.degrees(hand.angles_rad[1:, 3] - hand.angles_rad[1:, 2] * 2 / 3)
     if spread_deg == 0.0 and not free:
-        np.testing.assert_allclose(strayed, 0.0, atol=1e-9)
+        np.testing.assert_allclose(growth, 0.0, atol=1e-9)
     else:
-        assert strayed[1] > 0.1
-        assert strayed[1] > np.abs(strayed[[0, 2, 3]]).max()
+        assert growth[1] > 0.1
+        assert growth[1] > np.abs(growth[[0, 2, 3]]).max()
 
 
 def test_neighbours_can_be_strangers() -> None:
@@ -262,7 +268,7 @@ def test_a_measured_orientation_turns_the_palm() -> None:
         noise = rng.normal(0.0, SIGMA_M, (6, 3))
         seen = rotation_vector_to_matrix(rng.normal(0.0, sigma, 3)) @ T[:3, :3]
         alone.append(palm_deg(solved(SOLVER, T, truth, noise), T))
-        told.append(palm_deg(solved(SOLVER, T, truth, noise, turned(seen, sigma**2 * np.eye(3))), T))
+        told.append(palm_deg(solved(SOLVER, T, truth, noise, orientation_of(seen, sigma**2 * np.eye(3))), T))
     assert np.mean(told) < 3.0
     assert np.mean(told) < 0.6 * np.mean(alone)
 
@@ -279,7 +285,7 @@ def test_an_axis_about_which_nothing_is_known_is_left_to_the_markers() -> None:
         noise = rng.normal(0.0, SIGMA_M, (6, 3))
         wrong = rotation_vector_to_matrix(np.radians(150.0) * up) @ T[:3, :3]
         alone.append(palm_deg(solved(SOLVER, T, truth, noise), T))
-        told.append(palm_deg(solved(SOLVER, T, truth, noise, turned(wrong, cov, sure=False)), T))
+        told.append(palm_deg(solved(SOLVER, T, truth, noise, orientation_of(wrong, cov, sure=False)), T))
     assert np.mean(told) < np.mean(alone)
 
 
@@ -289,10 +295,10 @@ def test_one_marker_is_enough_where_the_orientation_is_known() -> None:
     points = places(T, truth)
     points[:5] = np.nan
     assert fit(points, small_cov()) is None
-    hand = found(fit(points, small_cov(), turn=turned(T[:3, :3], 1e-4 * np.eye(3))))
+    hand = found(fit(points, small_cov(), orientation=orientation_of(T[:3, :3], 1e-4 * np.eye(3))))
     assert palm_deg(hand, T) < 1.0
     assert np.linalg.norm(hand.joints.position_m[1] - T[:3, 3]) < 5e-3
-    assert fit(points, small_cov(), turn=turned(T[:3, :3], np.eye(3), sure=False)) is None
+    assert fit(points, small_cov(), orientation=orientation_of(T[:3, :3], np.eye(3), sure=False)) is None
 
 
 def test_a_palm_turns_with_the_imu_between_frames() -> None:
@@ -304,6 +310,6 @@ def test_a_palm_turns_with_the_imu_between_frames() -> None:
         points = places(T, truth)
         if k >= 20:
             points[:5] = np.nan
-        hand = push(machine, k * STEP_NS, points, turn=turned(T[:3, :3], wide, sure=True))
+        hand = push(machine, k * STEP_NS, points, orientation=orientation_of(T[:3, :3], wide, sure=True))
         assert palm_deg(hand.solution, T) < 12.0
         assert hand.source[PALM] == Source.SOLVED

@@ -30,11 +30,11 @@ from tests.master.estimator.fitted import (
     forgetful,
     found,
     joint_mm,
+    orientation_of,
     palm_deg,
     places,
     push,
     residual_m,
-    turned,
 )
 from tests.master.estimator.whole import MODELS
 
@@ -73,7 +73,7 @@ def test_a_hand_that_obeys_habits_is_found_exactly_in_any_orientation(model: Han
     rng = np.random.default_rng(seed)
     T = rigid(any_rotation(rng), rng.normal(0.0, 0.5, 3))
     points = places(T, angles, model)
-    hand = found(fit(points, small_cov(), by=machine, facing=T[:3, 1]))
+    hand = found(fit(points, small_cov(), by=machine, back_normal=T[:3, 1]))
     assert joint_mm(hand, model.forward(T, angles).position_m).max() < 0.05
     np.testing.assert_allclose(np.degrees(hand.angles_rad), np.degrees(angles), atol=0.1)
     assert hand.surprise.sum() < 1e-3
@@ -85,21 +85,21 @@ def test_a_turned_palm_does_not_become_a_wrong_hand() -> None:
     rng = np.random.default_rng(11)
     ours: list[float] = []
     theirs: list[float] = []
-    turns: list[float] = []
-    straight = turned(palm()[:3, :3], 1e-6 * np.eye(3))
+    rotations: list[float] = []
+    straight = orientation_of(palm()[:3, :3], 1e-6 * np.eye(3))
     for _ in range(120):
-        angles, turn = natural_angles(rng), rng.uniform(-20.0, 20.0, 3)
-        T = palm(turn)
+        angles, orientation = natural_angles(rng), rng.uniform(-20.0, 20.0, 3)
+        T = palm(orientation)
         truth = RIGHT.forward(T, angles).position_m
         points = places(T, angles) + rng.normal(0.0, 1.0, (6, 3)) * [3e-4, 3e-4, 1e-3]
-        hand, assumed = (fit(points, small_cov(), turn=one) for one in (None, straight))
+        hand, assumed = (fit(points, small_cov(), orientation=one) for one in (None, straight))
         ours.append(joint_mm(hand, truth)[1:].mean())
         theirs.append(joint_mm(assumed, truth)[1:].mean())
-        turns.append(palm_deg(hand, T))
+        rotations.append(palm_deg(hand, T))
     assert np.mean(ours) < 6.0
     assert np.percentile(ours, 95) < 12.0
     assert np.mean(theirs) > 2.0 * np.mean(ours)
-    assert np.median(turns) < 8.0
+    assert np.median(rotations) < 8.0
 
 
 @pytest.mark.parametrize("gone", range(6))
@@ -302,31 +302,35 @@ def test_covariances_of_joints_and_directions_are_those_of_numpy() -> None:
     np.testing.assert_allclose(hand.cov_m2, expected, atol=1e-5 * np.abs(expected).max())
     ends, before = CHAINS[:, 3], CHAINS[:, 2]
     p = hand.joints.position_m
-    turn = (J[ends] - J[before]) / np.linalg.norm(p[ends] - p[before], axis=1)[:, None, None]
-    expected = turn @ hand.alone @ turn.swapaxes(1, 2)
+    orientation = (J[ends] - J[before]) / np.linalg.norm(p[ends] - p[before], axis=1)[:, None, None]
+    expected = orientation @ hand.alone @ orientation.swapaxes(1, 2)
     np.testing.assert_allclose(hand.tilt_cov_rad2, expected, atol=1e-5 * np.abs(expected).max())
     # A bending joint turns the end of its finger as fast as it bends itself: MCP, PIP and DIP = 2/3 PIP together.
-    rate = np.concatenate([np.full(6, DEFAULT.palm_walk_rad_s), np.full(FREE, DEFAULT.walk_rad_s)])
-    np.testing.assert_allclose(hand.tilt_walk_rad2_s2, ((turn * rate) ** 2).sum(axis=(1, 2)), rtol=1e-4)
+    rate = np.concatenate(
+        [np.full(6, DEFAULT.palm_process_noise_rad_s), np.full(FREE, DEFAULT.process_noise_rad_s)]
+    )
+    np.testing.assert_allclose(
+        hand.tilt_process_noise_rad2_s2, ((orientation * rate) ** 2).sum(axis=(1, 2)), rtol=1e-4
+    )
 
 
 # -- where the search begins ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("turned_deg", [0.0, 20.0, 120.0, 180.0])
+@pytest.mark.parametrize("rotated_deg", [0.0, 20.0, 120.0, 180.0])
 @given(seeds)
 @settings(max_examples=8)
-def test_where_a_search_begins_does_not_tell_where_it_ends(turned_deg: float, seed: int) -> None:
+def test_where_a_search_begins_does_not_tell_where_it_ends(rotated_deg: float, seed: int) -> None:
     """Nothing of a hand that may be near is believed: one that is not near leads to the same markers."""
     rng = np.random.default_rng(seed)
     T, cov = palm(), small_cov()
     points = places(T, natural_angles(rng))
-    turn = rotation_vector_to_matrix(np.radians(turned_deg) * np.array([0.6, 0.8, 0.0]))
-    there = rigid(turn @ T[:3, :3], T[:3, 3] + 0.02)
-    other = found(fit(places(there, natural_angles(rng)), cov, facing=there[:3, 1]))
-    near, afresh = (found(fit(points, cov, start=start)) for start in (other, None))
-    assert near.surprise.sum() < afresh.surprise.sum() + 1.0
-    assert residual_m(near, points).max() < residual_m(afresh, points).max() + 1e-3
+    orientation = rotation_vector_to_matrix(np.radians(rotated_deg) * np.array([0.6, 0.8, 0.0]))
+    there = rigid(orientation @ T[:3, :3], T[:3, 3] + 0.02)
+    other = found(fit(places(there, natural_angles(rng)), cov, back_normal=there[:3, 1]))
+    near, reinitialise = (found(fit(points, cov, start=start)) for start in (other, None))
+    assert near.surprise.sum() < reinitialise.surprise.sum() + 1.0
+    assert residual_m(near, points).max() < residual_m(reinitialise, points).max() + 1e-3
 
 
 @pytest.mark.parametrize("posture_deg", [5.0, 40.0, 80.0])
@@ -343,15 +347,15 @@ def test_a_first_frame_is_found_from_several_starts_open_to_closed(posture_deg: 
         assert residual_m(found(hand.solution), points).max() < 4e-3
         assert palm_deg(hand.solution, T) < 25.0
         assert joint_mm(hand.solution, RIGHT.forward(T, angles).position_m)[1:].mean() < 15.0
-        assert not hand.anew
+        assert not hand.reinitialised
 
 
 def test_a_first_frame_begins_from_the_line_s_hand_where_that_explains_it() -> None:
     points = places(palm(), natural_angles(np.random.default_rng(7)))
-    afresh = found(fit(points, small_cov()))
-    begun = found(fit(points, small_cov(), start=afresh))
-    np.testing.assert_allclose(begun.joints.position_m, afresh.joints.position_m, atol=1e-3)
-    assert begun.steps <= afresh.steps
+    reinitialise = found(fit(points, small_cov()))
+    begun = found(fit(points, small_cov(), start=reinitialise))
+    np.testing.assert_allclose(begun.joints.position_m, reinitialise.joints.position_m, atol=1e-3)
+    assert begun.steps <= reinitialise.steps
 
 
 def test_free_angles_are_those_of_the_parameters() -> None:

@@ -66,17 +66,17 @@ def bent(degrees: Float | float) -> Float:
 
 def after(
     gone: frozenset[int],
-    course_deg: Sequence[Float | float],
+    history_deg: Sequence[Float | float],
     before_deg: tuple[float, float] = (40.0, 40.0),
     natural: float = 1.0,
 ) -> list[HiddenFingers]:
-    """Beliefs while `gone` are hidden and the last pose is, frame by frame, that of `course_deg`."""
+    """Beliefs while `gone` are hidden and the last pose is, frame by frame, that of `history_deg`."""
     memory = Memory(natural)
     for _ in range(10):
         memory.moved(bent(before_deg[0]), bent(before_deg[1]), STEP_NS * 1e-9)
     seen = ALL - gone
     return [
-        memory.belief((k + 1) * STEP_NS, k * STEP_NS, bent(pip), seen) for k, pip in enumerate(course_deg)
+        memory.belief((k + 1) * STEP_NS, k * STEP_NS, bent(pip), seen) for k, pip in enumerate(history_deg)
     ]
 
 
@@ -86,9 +86,9 @@ def pip_deg(hidden: HiddenFingers, finger: int = RING) -> float:
 
 def test_a_hidden_ring_finger_closes_with_its_neighbours() -> None:
     closing = [np.array([p, p, 40.0, p]) for p in np.linspace(40.0, 80.0, 30)]
-    course = [pip_deg(hidden) for hidden in after(frozenset({RING}), closing)]
-    assert np.all(np.diff(course) > 0.0)
-    assert 70.0 < course[-1] < 82.0
+    history = [pip_deg(hidden) for hidden in after(frozenset({RING}), closing)]
+    assert np.all(np.diff(history) > 0.0)
+    assert 70.0 < history[-1] < 82.0
 
 
 def test_one_at_the_side_follows_less_and_the_thumb_not_at_all() -> None:
@@ -108,15 +108,15 @@ def test_a_hand_that_defies_habits_moves_its_fingers_one_by_one() -> None:
 @pytest.mark.parametrize("speed_deg_s", [90.0, 200.0, -200.0])
 def test_with_all_hidden_a_finger_goes_on_for_a_moment(speed_deg_s: float) -> None:
     step = speed_deg_s * STEP_NS * 1e-9
-    course = [pip_deg(h) for h in after(ALL, [40.0] * 60, (40.0 - step, 40.0))]
-    assert abs(course[1] - 40.0) > 0.5 * 2 * abs(step)
-    assert course[-1] - 40.0 == pytest.approx(DEFAULT.coast_s * speed_deg_s, rel=0.01)
+    history = [pip_deg(h) for h in after(ALL, [40.0] * 60, (40.0 - step, 40.0))]
+    assert abs(history[1] - 40.0) > 0.5 * 2 * abs(step)
+    assert history[-1] - 40.0 == pytest.approx(DEFAULT.coast_s * speed_deg_s, rel=0.01)
 
 
 def test_it_stops_where_the_others_stop() -> None:
     step = 200.0 * STEP_NS * 1e-9
-    course = [pip_deg(h) for h in after(frozenset({RING}), [40.0] * 60, (40.0 - step, 40.0))]
-    assert max(course) < 40.0 + 0.2 * DEFAULT.coast_s * 200.0
+    history = [pip_deg(h) for h in after(frozenset({RING}), [40.0] * 60, (40.0 - step, 40.0))]
+    assert max(history) < 40.0 + 0.2 * DEFAULT.coast_s * 200.0
 
 
 def test_uncertainty_grows_with_time_and_less_between_neighbours_that_show() -> None:
@@ -125,7 +125,7 @@ def test_uncertainty_grows_with_time_and_less_between_neighbours_that_show() -> 
     assert (np.diff(alone) > 0.0).all()
     assert (np.diff(between) > 0.0).all()
     assert (between < alone).all()
-    assert alone[-1] < 1.01 * DEFAULT.stray_rad
+    assert alone[-1] < 1.01 * DEFAULT.growth_rad
     # what is seen of the other three halves the variance, and more
     assert between[60] ** 2 < 0.5 * alone[60] ** 2
 
@@ -167,5 +167,5 @@ def test_a_step_of_a_millisecond_throws_no_finger() -> None:
     for _ in range(10):
         memory.moved(bent(40.0), bent(40.0), STEP_NS * 1e-9)
     memory.moved(bent(40.0), bent(41.5), 1e-3)
-    course = [memory.belief((k + 1) * STEP_NS, k * STEP_NS, bent(41.5), frozenset()) for k in range(60)]
-    assert max(abs(pip_deg(hidden) - 41.5) for hidden in course) < 10.0
+    history = [memory.belief((k + 1) * STEP_NS, k * STEP_NS, bent(41.5), frozenset()) for k in range(60)]
+    assert max(abs(pip_deg(hidden) - 41.5) for hidden in history) < 10.0

@@ -11,12 +11,12 @@ from common.arrays import Float
 from common.camera_model import CameraModel
 from common.geometry import rigid, rotation_vector_to_matrix
 from common.records import boxed
-from master.estimator.attached import Attached
+from master.estimator.body_points import BodyPoints
 from master.estimator.cameras import CameraArrays
 from master.estimator.kinematics import Scratch
 from master.estimator.parameters import HandParameters
 from master.estimator.residuals import Observations
-from tests.hand_helpers import FACING, MARKERS, any_rotation
+from tests.hand_helpers import BACK_NORMAL, MARKERS, any_rotation
 from tests.master.estimator.fitted import PAIR
 from tests.master.estimator.kernels import marker_rows_at, project_at
 from tests.master.estimator.whole import CAMERAS, MODELS, H, Whole, silent
@@ -124,9 +124,9 @@ def test_points_move_with_the_angles_as_the_jacobian_says(name: str, seed: int) 
     model = MODELS[name]
     parameters = HandParameters.of(model)
     x = np.random.default_rng(seed).uniform(parameters.low, parameters.high)
-    for points in (Attached.markers(model, parameters, MARKERS), Attached.joints(model, parameters)):
+    for points in (BodyPoints.markers(model, parameters, MARKERS), BodyPoints.joints(model, parameters)):
 
-        def place(x: Float, points: Attached = points) -> Float:
+        def place(x: Float, points: BodyPoints = points) -> Float:
             return points.place(model.chains(parameters.angles(x)))
 
         chains = model.chains(parameters.angles(x))
@@ -144,19 +144,19 @@ def past(whole: Whole) -> None:
     near = rotation_vector_to_matrix(rng.normal(0.0, 1e-3, 3)) @ whole.T[:3, :3]
     belief.palm[:] = rigid(near, whole.T[:3, 3] + rng.normal(0.0, 0.01, 3))
     belief.palm_w2[:] = np.repeat([20.0, 3e3], 3)
-    belief.sight[:], belief.depth_w2[0] = any_rotation(rng)[:, 0], 5e4
+    belief.line_of_sight[:], belief.depth_w2[0] = any_rotation(rng)[:, 0], 5e4
 
 
-def facing(whole: Whole) -> None:
-    whole.belief.facing[:], whole.belief.facing_w2[0] = FACING, 7.0
+def back_normal(whole: Whole) -> None:
+    whole.belief.back_normal[:], whole.belief.back_normal_w2[0] = BACK_NORMAL, 7.0
 
 
-def turn(whole: Whole) -> None:
+def orientation(whole: Whole) -> None:
     """Of an IMU on the palm."""
     rng, belief = whole.rng, whole.belief
     belief.forearm[:3, :3] = rotation_vector_to_matrix(rng.normal(0.0, 0.8, 3)) @ whole.T[:3, :3]
     root = rng.normal(size=(3, 3))
-    belief.turn_info[:], belief.turned[0] = root @ root.T, 1.0
+    belief.orientation_info[:], belief.oriented[0] = root @ root.T, 1.0
 
 
 def place(whole: Whole) -> None:
@@ -170,7 +170,7 @@ def extras(whole: Whole) -> None:
 
 def points(whole: Whole) -> None:
     rng, observed = whole.rng, whole.observed
-    observed.seen[:] = observed.placed[:] = True
+    observed.seen[:] = observed.triangulated[:] = True
     observed.point[:] = whole.points + rng.normal(0.0, 0.02, (6, 3))
     root = rng.normal(0.0, 300.0, (6, 3, 3))
     observed.information[:] = root @ root.swapaxes(1, 2)
@@ -189,8 +189,8 @@ def rays(whole: Whole) -> None:
     ("what", "share"),
     [
         (past, 1e-4),
-        (facing, 1e-6),
-        (turn, 1e-5),
+        (back_normal, 1e-6),
+        (orientation, 1e-5),
         (place, 1e-6),
         (extras, 1e-6),
         (points, 1e-5),
@@ -216,7 +216,7 @@ def test_the_gradient_of_habits_is_the_derivative_of_their_cost(name: str) -> No
 @pytest.mark.parametrize("name", MODELS)
 def test_all_kinds_of_rows_add_up(name: str) -> None:
     """Each by itself, with numbers drawn anew, and then all of them on one hand."""
-    whole, kinds = Whole(MODELS[name], 3), (past, facing, turn, place, extras, points)
+    whole, kinds = Whole(MODELS[name], 3), (past, back_normal, orientation, place, extras, points)
     habits = whole.habits
     _, total, _ = whole.cost()
     for kind in kinds:

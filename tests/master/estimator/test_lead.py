@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from master.estimator.lead import Lead
+from master.estimator.blend import Blend
 
 STEP_S, SPEED = 1 / 60, 0.12
 ON_PALM = np.array([False, True])
@@ -15,15 +15,15 @@ class Shown:
     """A hand of which the place is shown; its markers go along."""
 
     def __init__(self) -> None:
-        self.lead, self.values, self.gap_s = Lead(SPEED, ON_PALM), np.zeros(26), 0.0
+        self.blend, self.values, self.gap_s = Blend(SPEED, ON_PALM), np.zeros(26), 0.0
 
     def push(self, place: float, rests: int, marker: float = np.nan) -> float:
         """What is shown of a place that was solved, by a marker on the back that is seen there."""
         solved, points = np.zeros(26), np.full((2, 3), np.nan)
         solved[0], points[1] = place, (marker, 0.0, 0.0)
         before = self.values[0]
-        self.values = solved + self.lead.push(self.gap_s, np.full(6, rests), self.values, solved, points)
-        self.lead.moved(self.gap_s, np.append(self.values[0] - before, np.zeros(25)))
+        self.values = solved + self.blend.push(self.gap_s, np.full(6, rests), self.values, solved, points)
+        self.blend.moved(self.gap_s, np.append(self.values[0] - before, np.zeros(25)))
         self.gap_s = STEP_S
         return float(self.values[0])
 

@@ -14,7 +14,7 @@ from common.geometry import rigid, rotation_vector_to_matrix
 from master.estimator.epoch import Epoch, FittedHand
 from master.estimator.priors import habits_of
 from master.estimator.settings import DEFAULT
-from tests.hand_helpers import FACING, MARKERS, RIGHT, natural_angles, palm, small_cov
+from tests.hand_helpers import BACK_NORMAL, MARKERS, RIGHT, natural_angles, palm, small_cov
 from tests.master.estimator.fitted import FREE, PAIR, PARAMETERS, fit, forgetful, found, places, seen
 
 SIGMA_PX = 0.5
@@ -36,7 +36,7 @@ class Residuals:
         return rigid(R, self.near[:3, 3] + at[3:6]), at[6 : 6 + FREE]
 
     def believed(self, T: Float, x: Float) -> Float:
-        return np.append(self.root.T @ (x - self.mean), (T[:3, 1] - FACING) / FINE.facing_rad)
+        return np.append(self.root.T @ (x - self.mean), (T[:3, 1] - BACK_NORMAL) / FINE.back_normal_rad)
 
     def solve(self, start: Float, spare: int = 0) -> tuple[Float, Float, float]:
         """Palm, angles and cost of the least squares from free angles (n,); `spare`: unknowns without limits."""
@@ -89,8 +89,17 @@ class OfPixels(Residuals):
 
 def compare(hand: FittedHand, T: Float, x: Float, share: float) -> None:
     """To a share of what each unknown is sure of."""
-    turn = hand.T_rig_palm[:3, :3] @ T[:3, :3].T
-    off = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2.0
+    rotation = hand.T_rig_palm[:3, :3] @ T[:3, :3].T
+    off = (
+        np.array(
+            [
+                rotation[2, 1] - rotation[1, 2],
+                rotation[0, 2] - rotation[2, 0],
+                rotation[1, 0] - rotation[0, 1],
+            ]
+        )
+        / 2.0
+    )
     step = np.concatenate([off, hand.T_rig_palm[:3, 3] - T[:3, 3], hand.x - x])
     assert (np.abs(step) / np.sqrt(np.diag(hand.alone))).max() < share
 

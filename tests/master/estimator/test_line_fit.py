@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.hand_model import HandModel
-from master.estimator.attached import Attached
+from master.estimator.body_points import BodyPoints
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT
 from tests.hand_helpers import LEFT, MARKERS, RIGHT, natural_angles, palm, small_cov
@@ -15,7 +15,7 @@ from tests.master.estimator.fitted import STEP_NS, estimator, fit, forgetful, fo
 
 @pytest.mark.parametrize("model", [RIGHT, LEFT])
 def test_a_natural_hand_is_found_from_its_markers_alone(model: HandModel) -> None:
-    rng, machine, off, turn = (
+    rng, machine, off, rotation = (
         np.random.default_rng(2),
         forgetful(model, natural=True),
         list[float](),
@@ -26,17 +26,17 @@ def test_a_natural_hand_is_found_from_its_markers_alone(model: HandModel) -> Non
         T = palm(rng.uniform(-25, 25, 3))
         hand = found(fit(places(T, natural_angles(rng), model), small_cov(), by=machine))
         off.append(float(np.linalg.norm(hand.T_rig_palm[:3, 3] - T[:3, 3])))
-        turn.append(palm_deg(hand, T))
+        rotation.append(palm_deg(hand, T))
         assert (hand.x >= parameters.low - 1e-12).all()
         assert (hand.x <= parameters.high + 1e-12).all()
         assert hand.surprise.max() < DEFAULT.explained
         assert hand.natural == 1.0
     assert np.median(off) < 8e-3
-    assert np.median(turn) < 6.0
+    assert np.median(rotation) < 6.0
 
 
 def test_too_few_markers_and_none_are_no_palm_and_a_known_one_goes_on_by_one() -> None:
-    anyway = DEFAULT._replace(facing_rad=inf)
+    anyway = DEFAULT._replace(back_normal_rad=inf)
     points = places(palm(), natural_angles(np.random.default_rng(3)))
     for kept, expected in ((0, False), (1, False), (2, False), (3, True)):
         few = points.copy()
@@ -46,7 +46,7 @@ def test_too_few_markers_and_none_are_no_palm_and_a_known_one_goes_on_by_one() -
         push(machine, 0, points)
         hand = push(machine, STEP_NS, few)
         assert hand.solution is not None
-        assert (hand.rests > 0).any() == (kept > 0)
+        assert (hand.sources > 0).any() == (kept > 0)
 
 
 def test_the_pose_is_that_of_the_model_and_markers_are_where_it_mounts_them() -> None:
@@ -56,8 +56,8 @@ def test_the_pose_is_that_of_the_model_and_markers_are_where_it_mounts_them() ->
         expected = model.forward(palm(), angles)
         np.testing.assert_allclose(joints.position_m, expected.position_m, atol=1e-12)
         np.testing.assert_allclose(joints.rotation, expected.rotation, atol=1e-12)
-        attached = Attached.markers(model, HandParameters.of(model), MARKERS)
-        rotated = attached.place(model.chains(angles)) @ palm()[:3, :3].T
+        body_points = BodyPoints.markers(model, HandParameters.of(model), MARKERS)
+        rotated = body_points.place(model.chains(angles)) @ palm()[:3, :3].T
         np.testing.assert_allclose(at, rotated + palm()[:3, 3], atol=1e-12)
 
 

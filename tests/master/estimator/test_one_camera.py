@@ -35,9 +35,9 @@ def test_a_hand_that_one_camera_sees_is_less_sure_along_the_sight_the_longer_it_
     sigma = np.sqrt(value[:, -1])
     age_s = (np.arange(70) - 9) * STEP_NS * 1e-9
     late = age_s > 0.5
-    assert (sigma[late] >= 0.99 * DEFAULT.drift_m_s * age_s[late]).all()
-    sight = truth.joints.position_m[PALM] - PAIR[0].centre
-    assert abs(axis[-1][:, -1] @ sight) / np.linalg.norm(sight) > 0.99
+    assert (sigma[late] >= 0.99 * DEFAULT.unobserved_depth_m_s * age_s[late]).all()
+    line_of_sight = truth.joints.position_m[PALM] - PAIR[0].centre
+    assert abs(axis[-1][:, -1] @ line_of_sight) / np.linalg.norm(line_of_sight) > 0.99
     assert not hands[-1].tracked.any()
 
 

@@ -21,13 +21,13 @@ from tests.master.estimator.fitted import (
     bent,
     bent_points,
     estimator,
+    orientation_of,
     places,
     push,
     region_m,
     run,
     seen,
     sure,
-    turned,
 )
 
 INDEX, MARKER_INDEX = 1, 1
@@ -81,11 +81,11 @@ def test_a_finger_that_is_lost_alone_goes_on_with_the_others(speed: float) -> No
     run(machine, range(frames), speed_deg_s=speed)
     lost = run(machine, range(frames, frames + 18), gone=(MARKER_INDEX,), speed_deg_s=speed)
     truth = [min(20.0 + speed * k / 60.0, 110.0) for k in range(frames, frames + 18)]
-    course = [pip_deg(hand) for hand in lost]
-    assert max(course) <= 110.0 + 1e-9
+    history = [pip_deg(hand) for hand in lost]
+    assert max(history) <= 110.0 + 1e-9
     moved = truth[-1] - truth[0]
     # It is the first finger, and follows the second by 0.7 of its way; what it did itself before adds to that.
-    assert abs(course[-1] - truth[-1]) < 0.45 * moved + 3.0
+    assert abs(history[-1] - truth[-1]) < 0.45 * moved + 3.0
 
 
 @pytest.mark.parametrize("speed", [90.0, 200.0, 600.0])
@@ -94,19 +94,19 @@ def test_a_hand_that_is_lost_goes_on_a_little_and_stays_inside_its_limits(speed:
     frames = 8
     before = run(machine, range(frames), speed_deg_s=speed)[-1]
     lost = run(machine, range(frames, frames + 20), gone=tuple(range(6)), speed_deg_s=speed)
-    course = np.array([pip_deg(before)] + [pip_deg(hand) for hand in lost])
-    assert course[4] > course[0] + 1.0
-    assert course.max() <= 110.0 + 1e-9
+    history = np.array([pip_deg(before)] + [pip_deg(hand) for hand in lost])
+    assert history[4] > history[0] + 1.0
+    assert history.max() <= 110.0 + 1e-9
     # The motion fades: it ends at most about 0.12 s of its speed farther on.
-    assert course[-1] - course[0] < 0.12 * speed + 12.0
+    assert history[-1] - history[0] < 0.12 * speed + 12.0
 
 
 def test_doubt_grows_while_a_finger_is_lost() -> None:
     machine = estimator()
     seen = run(machine, range(15))[-1]
     lost = run(machine, range(15, 45), gone=(MARKER_INDEX,), speed_deg_s=60.0)
-    course = [sigma_m(hand, TIPS[INDEX]) for hand in (seen, lost[0], lost[8], lost[25])]
-    assert course[0] < course[1] < course[2] < course[3]
+    history = [sigma_m(hand, TIPS[INDEX]) for hand in (seen, lost[0], lost[8], lost[25])]
+    assert history[0] < history[1] < history[2] < history[3]
     assert sigma_m(lost[25], TIPS[2]) < 1.5 * sigma_m(seen, TIPS[2])
 
 
@@ -246,7 +246,7 @@ def test_a_marker_without_covariance_does_not_count_as_seen() -> None:
     cov[MARKER_INDEX] = np.nan
     hand = push(machine, 5 * STEP_NS, bent_points(bent(5 / 60)), cov)
     assert (hand.source[CHAINS[INDEX]] == Source.HELD).all()
-    assert not hand.rests[INDEX]
+    assert not hand.sources[INDEX]
 
 
 def test_the_message_holds_the_solution() -> None:
@@ -326,10 +326,10 @@ def test_an_orientation_without_heading_does_not_tell_the_palm_by_one_finger(
     run(machine, range(5))
     cov = 0.03**2 * np.eye(3) + (heading_rad**2 - 0.03**2) * np.outer(up, up)
     points = bent_points(bent(5 / 60.0), tuple(m for m in range(6) if m != MARKER_INDEX))
-    said = turned(palm()[:3, :3], cov, sure=told)
-    hand = [push(machine, k * STEP_NS, points, turn=said) for k in range(5, 10)][-1]
+    output = orientation_of(palm()[:3, :3], cov, sure=told)
+    hand = [push(machine, k * STEP_NS, points, orientation=output) for k in range(5, 10)][-1]
     assert region_m(hand)[TIPS[INDEX]] < DEFAULT.tracked_m
-    assert (hand.rests[5] > 0) == told
+    assert (hand.sources[5] > 0) == told
     assert hand.source[PALM] == (Source.SOLVED if told else Source.HELD)
     assert hand.tracked[PALM] == (told and sure(hand)[PALM])
 
@@ -396,7 +396,7 @@ def test_a_state_that_is_wrong_is_left_at_once_for_the_hand_of_the_line() -> Non
             push(machine, k * STEP_NS, places(shifted, angles))
         hand = push(machine, 5 * STEP_NS, points, start=line if helped else None)
         assert hand.solution is not None
-        assert hand.anew is helped
+        assert hand.reinitialised is helped
         truth = RIGHT.forward(palm(), angles).position_m
         errors[helped] = float(np.linalg.norm(hand.solution.joints.position_m - truth, axis=1).mean())
     assert errors[True] < 8e-3
@@ -408,7 +408,7 @@ def test_a_hand_that_moves_on_is_not_begun_anew() -> None:
     for k in range(40):
         points = bent_points(bent(k / 60.0))
         line = push(estimator(), 0, points).solution
-        assert not push(machine, k * STEP_NS, points, start=line).anew
+        assert not push(machine, k * STEP_NS, points, start=line).reinitialised
 
 
 def test_a_hand_of_habits_begins_anew_by_itself_where_the_last_does_not_explain_a_leap() -> None:
@@ -445,4 +445,4 @@ def test_a_copied_state_goes_on_with_the_same_bytes() -> None:
         for name in ("T_rig_palm", "angles_rad", "cov_m2", "tilt_cov_rad2", "alone", "surprise"):
             np.testing.assert_array_equal(getattr(one.solution, name), getattr(same.solution, name))
         np.testing.assert_array_equal(one.tracked, same.tracked)
-        np.testing.assert_array_equal(one.rests, same.rests)
+        np.testing.assert_array_equal(one.sources, same.sources)

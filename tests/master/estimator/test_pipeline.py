@@ -110,9 +110,9 @@ def mistaken(
             out.append(m)
             continue
         new = changed(m, 1, run.setup.models[m.camera].project(thing_m))
-        rivals = np.full((6, 2), np.nan)
-        rivals[1] = m.uv[1]
-        out.append(msgspec.structs.replace(new, rival_uv=rivals) if doubt else new)
+        alternatives = np.full((6, 2), np.nan)
+        alternatives[1] = m.uv[1]
+        out.append(msgspec.structs.replace(new, alt_uv=alternatives) if doubt else new)
     return out
 
 
@@ -129,7 +129,7 @@ def test_a_thing_that_one_slave_takes_for_a_marker_is_told_by_the_other_camera(
     for pose, true in zip(poses, clear, strict=True):
         np.testing.assert_allclose(pose.markers_raw_m, true.markers_raw_m, atol=2e-3)
     assert all(pose.tracked[SURE].all() for pose in poses[3:])
-    assert pipeline.counts["rival.index"] >= 18
+    assert pipeline.counts["alternative.index"] >= 18
     assert pipeline.counts["epipolar_misfits"] == pipeline.counts["unclear.index"] == 0
     sure = build_pipeline(exact_run.setup, StageTimes())  # without the slave's doubt nothing can be chosen
     lost = solve_all(sure, mistaken(exact_run, THING, ("right",), doubt=False))
@@ -154,7 +154,7 @@ def test_a_thing_that_both_slaves_take_for_a_marker_is_told_by_where_the_hand_is
     pipeline = build_pipeline(exact_run.setup, StageTimes())
     poses = solve_all(pipeline, mistaken(exact_run, OUT_OF_REACH, ("left", "right"), doubt=True))
     assert all(marker_mm(p)[1] < 3.0 for p in poses[3:])
-    assert pipeline.counts["rival.index"] >= 18
+    assert pipeline.counts["alternative.index"] >= 18
 
 
 def test_what_was_mistaken_long_ago_is_not_the_past_of_a_marker(exact_run: SyntheticRun) -> None:
@@ -172,7 +172,8 @@ def test_what_fits_no_camera_is_dropped_with_its_rays_and_counted_by_name(exact_
     false = mistaken(exact_run, THING, ("left",), doubt=True)
     false = [
         msgspec.structs.replace(
-            changed(m, 1, exact_run.setup.models["right"].project(other)), rival_uv=np.full((6, 2), np.nan)
+            changed(m, 1, exact_run.setup.models["right"].project(other)),
+            alt_uv=np.full((6, 2), np.nan),
         )
         if m.camera == "right" and m.seq >= 20
         else m
@@ -232,8 +233,10 @@ def test_a_silent_camera_leaves_poses_and_is_counted(exact_run: SyntheticRun) ->
 
 
 def test_nothing_seen_at_all_is_a_pose_that_is_not_valid(exact_run: SyntheticRun) -> None:
-    blind = [detections(m.camera, m.seq, m.t_ns, np.full((6, 2), np.nan)) for m in exact_run.messages[:10]]
-    poses = solve_all(build_pipeline(exact_run.setup, StageTimes()), blind)
+    no_observation = [
+        detections(m.camera, m.seq, m.t_ns, np.full((6, 2), np.nan)) for m in exact_run.messages[:10]
+    ]
+    poses = solve_all(build_pipeline(exact_run.setup, StageTimes()), no_observation)
     assert len(poses) == 5
     assert not any(p.valid.any() for p in poses)
 
@@ -253,7 +256,7 @@ def test_unrelated_frames_are_not_filtered(exact_run: SyntheticRun) -> None:
 def test_every_stage_is_measured(exact_run: SyntheticRun) -> None:
     stages = StageTimes()
     solve_all(build_pipeline(exact_run.setup, stages), exact_run.messages[:8])
-    assert set(stages.mean_us()) == {"pairing", "triangulate", "filter", "fabrik", "hand"}
+    assert set(stages.mean_us()) == {"frame_sync", "triangulate", "filter", "fabrik", "hand"}
     assert all(value > 0 for value in stages.mean_us().values())
 
 
@@ -303,7 +306,7 @@ def test_a_hand_that_one_camera_sees_is_sure_of_its_depth_for_as_long_as_it_was_
     age_s = np.array([(pose.t_ns - last_ns) * 1e-9 for pose in poses])
     late = age_s > 0.5
     assert late.sum() > 10
-    assert np.all(sigma_m[late] >= 0.99 * DEFAULT.drift_m_s * (age_s[late] - 0.05))
+    assert np.all(sigma_m[late] >= 0.99 * DEFAULT.unobserved_depth_m_s * (age_s[late] - 0.05))
     region_m = np.sqrt([7.815 * np.linalg.eigvalsh(pose.cov_m2)[:, -1] for pose in poses])
     tracked = np.array([pose.tracked for pose in poses])
     assert tracked[0].any()
@@ -311,5 +314,5 @@ def test_a_hand_that_one_camera_sees_is_sure_of_its_depth_for_as_long_as_it_was_
     assert not tracked[late].any()
     assert all(pose.valid.all() for pose in poses)
     axis = np.linalg.eigh(poses[-1].cov_m2[1])[1][:, -1]
-    sight = poses[-1].position_m[1] - exact_run.setup.models[first].centre
-    assert abs(axis @ sight) / np.linalg.norm(sight) > 0.99
+    line_of_sight = poses[-1].position_m[1] - exact_run.setup.models[first].centre
+    assert abs(axis @ line_of_sight) / np.linalg.norm(line_of_sight) > 0.99

@@ -21,7 +21,9 @@ def test_every_setting_has_a_range_that_holds_its_own_value_and_refuses_others(n
 
 
 def test_a_setting_that_does_not_exist_is_refused() -> None:
-    with pytest.raises(CalibrationError, match=r"estimator\.walk: no such setting; there are .*walk_rad_s"):
+    with pytest.raises(
+        CalibrationError, match=r"estimator\.walk: no such setting; there are .*process_noise_rad_s"
+    ):
         DEFAULT.changed("walk", 1.0)
 
 

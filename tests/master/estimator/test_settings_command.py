@@ -7,9 +7,14 @@ from master.estimator.settings import DEFAULT, Settings
 
 
 def test_changes_are_taken_in_their_order() -> None:
-    settings = Settings.of(["estimator.tracked_m=0.012", "estimator.walk_rad_s=6", "estimator.walk_rad_s=7"])
-    assert (settings.tracked_m, settings.walk_rad_s) == (0.012, 7.0)
-    assert settings._replace(tracked_m=DEFAULT.tracked_m, walk_rad_s=DEFAULT.walk_rad_s) == DEFAULT
+    settings = Settings.of(
+        ["estimator.tracked_m=0.012", "estimator.process_noise_rad_s=6", "estimator.process_noise_rad_s=7"]
+    )
+    assert (settings.tracked_m, settings.process_noise_rad_s) == (0.012, 7.0)
+    assert (
+        settings._replace(tracked_m=DEFAULT.tracked_m, process_noise_rad_s=DEFAULT.process_noise_rad_s)
+        == DEFAULT
+    )
 
 
 @pytest.mark.parametrize(

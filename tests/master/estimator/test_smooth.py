@@ -13,7 +13,7 @@ from master.estimator.estimator import Estimator
 from master.estimator.settings import DEFAULT
 from master.estimator.smooth import HandOneEuro
 from master.fabrik.one_euro import OneEuroParameters
-from tests.hand_helpers import FACING, MARKERS, RIGHT, camera_models, palm, rig_file, within
+from tests.hand_helpers import BACK_NORMAL, MARKERS, RIGHT, camera_models, palm, rig_file, within
 
 DT_NS = 16_666_667
 SIGMA_M = 1e-3
@@ -68,7 +68,7 @@ class Run:
             cov = COV.copy()
             for m in (hidden or {}).get(k, ()):
                 seen[m], cov[m] = np.nan, np.nan
-            self.solved.append(estimator.push(Epoch(k * DT_NS, seen, FACING, cov)))
+            self.solved.append(estimator.push(Epoch(k * DT_NS, seen, BACK_NORMAL, cov)))
             self.shown.append(smooth.push(k * DT_NS, self.solved[-1], cov))
 
 
@@ -97,9 +97,9 @@ def test_a_held_hand_keeps_within_half_a_millimetre_and_a_degree(name: str) -> N
         place = positions(hands).var(axis=0).sum(axis=1).mean()
         angles = np.array([s.angles_rad for s in solutions]).var(axis=0).mean()
         R = np.array([s.joints.rotation for s in solutions])
-        turns = Rotation.from_matrix((R @ np.swapaxes(R[:1], -1, -2)).reshape(-1, 3, 3)).as_rotvec()
-        turn = turns.reshape(len(R), 26, 3).var(axis=0).sum(axis=1).mean()
-        return 1e3 * place**0.5, float(np.degrees(angles**0.5)), float(np.degrees(turn**0.5))
+        rotations = Rotation.from_matrix((R @ np.swapaxes(R[:1], -1, -2)).reshape(-1, 3, 3)).as_rotvec()
+        rotation = rotations.reshape(len(R), 26, 3).var(axis=0).sum(axis=1).mean()
+        return 1e3 * place**0.5, float(np.degrees(angles**0.5)), float(np.degrees(rotation**0.5))
 
     before, after = jitter(run.solved), jitter(run.shown)
     assert before[0] > 1.0  # there is something to filter
@@ -201,11 +201,11 @@ def test_a_finger_that_moved_unseen_is_led_over() -> None:
 
 def test_a_whole_hand_that_moved_unseen_is_led_over() -> None:
     share = way()
-    turn = Rotation.from_rotvec(share[:, None] * [0.0, 0.4, 0.2]).as_matrix()
+    rotation = Rotation.from_rotvec(share[:, None] * [0.0, 0.4, 0.2]).as_matrix()
     poses = np.array(
         [
             rigid(R @ palm()[:3, :3], palm()[:3, 3] + [0.12 * s, 0.0, 0.0])
-            for R, s in zip(turn, share, strict=True)
+            for R, s in zip(rotation, share, strict=True)
         ]
     )
     _, leap, shown = led(share, tuple(range(6)), poses, np.tile(RELAXED, (120, 1, 1)))
@@ -221,7 +221,7 @@ def test_frames_that_fail_to_come_are_as_good_as_a_hand_unseen() -> None:
     tips: list[float] = []
     for t_ns, x in at:
         points = RIGHT.marker_points(RIGHT.forward(palm(at_m=np.array([x, 0.08, 0.5])), RELAXED), MARKERS)
-        hand = smooth.push(t_ns, estimator.push(Epoch(t_ns, points, FACING, COV)), COV)
+        hand = smooth.push(t_ns, estimator.push(Epoch(t_ns, points, BACK_NORMAL, COV)), COV)
         assert hand.solution is not None
         tips.append(float(hand.solution.joints.position_m[TIPS[2], 0]))
     assert max(abs(step) for step in np.diff(tips)) < 0.05 / 3.0
@@ -239,10 +239,10 @@ def test_a_hand_that_was_forgotten_begins_anew_where_it_is() -> None:
 
 def test_no_hand_and_a_time_that_stands_still_are_passed_on() -> None:
     estimator, smooth = machines()
-    nothing = estimator.push(Epoch(0, np.full((6, 3), np.nan), FACING, np.full((6, 3, 3), np.nan)))
+    nothing = estimator.push(Epoch(0, np.full((6, 3), np.nan), BACK_NORMAL, np.full((6, 3, 3), np.nan)))
     assert smooth.push(0, nothing, np.full((6, 3, 3), np.nan)) is nothing
     points = RIGHT.marker_points(RIGHT.forward(palm(), RELAXED), MARKERS)
-    hand = estimator.push(Epoch(DT_NS, points, FACING, COV))
+    hand = estimator.push(Epoch(DT_NS, points, BACK_NORMAL, COV))
     smooth.push(DT_NS, hand, COV)
     assert smooth.push(DT_NS, hand, COV) is hand
 
@@ -264,7 +264,7 @@ def test_a_hand_that_was_shown_stays_as_it_was() -> None:
         points = RIGHT.marker_points(
             RIGHT.forward(palm(at_m=np.array([0.01 * k, 0.08, 0.5])), RELAXED), MARKERS
         )
-        hand = smooth.push(k * DT_NS, estimator.push(Epoch(k * DT_NS, points, FACING, COV)), COV)
+        hand = smooth.push(k * DT_NS, estimator.push(Epoch(k * DT_NS, points, BACK_NORMAL, COV)), COV)
         hands.append((hand, positions([hand])))
     for hand, place in hands:
         np.testing.assert_array_equal(positions([hand]), place)

@@ -7,11 +7,11 @@ from common.arrays import Float
 from common.hand_model import HandModel
 from common.hand_profiles import generated_profile
 from master.estimator.parameters import REACH, HandParameters
-from tests.hand_helpers import FACING, MARKERS, RIGHT, palm
+from tests.hand_helpers import BACK_NORMAL, MARKERS, RIGHT, palm
 
 SOFT = HandModel.of(generated_profile("soft", "right"))
 COV = np.tile(1e-8 * np.eye(3), (6, 1, 1))
-TURN = palm()[:3, :3], 1e-6 * np.eye(3)
+ROTATION = palm()[:3, :3], 1e-6 * np.eye(3)
 
 
 def bent_back(degrees: float) -> Float:
@@ -23,7 +23,7 @@ def bent_back(degrees: float) -> Float:
 
 def solved(model: HandModel, angles: Float) -> Float:
     points = model.marker_points(model.forward(palm(), angles), MARKERS)
-    hand = PointHand(model, MARKERS).push(0, points, COV, FACING, TURN).solution
+    hand = PointHand(model, MARKERS).push(0, points, COV, BACK_NORMAL, ROTATION).solution
     assert hand is not None
     return hand.angles_rad
 

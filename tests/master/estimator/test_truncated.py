@@ -19,11 +19,11 @@ SIZE = PALM + FREE
 
 
 def mean_within(
-    normal: Float, gradient: Float, x: Float, low: Float, high: Float, rests: bool = False
+    normal: Float, gradient: Float, x: Float, low: Float, high: Float, at_low_limit: bool = False
 ) -> Float:
-    """The step (22,) to the mean of a hand with those limits; `rests`: its fingers rest at their low ones."""
+    """The step (22,) to the mean of a hand with those limits; `at_low_limit`: its fingers rest at their low ones."""
     tables, mean = HandTables.of(RIGHT, PARAMETERS), np.empty(SIZE)
-    tables.low[:], tables.high[:], tables.rests[:] = low, high, rests
+    tables.low[:], tables.high[:], tables.at_low_limit[:] = low, high, at_low_limit
     mean_within_at(boxed(tables), normal, gradient, x, boxed(Cut.empty(FREE, SIZE)), mean)
     return mean
 
@@ -51,7 +51,7 @@ def test_nothing_piles_up_where_a_straight_finger_rests() -> None:
     """At the low limit of a finger that rests there: it does not move up, however poorly it is known."""
     normal, x = np.diag([1.0] * PALM + [16.0] * FREE), np.zeros(FREE)
     zero, far = np.zeros(SIZE), np.full(FREE, 50.0)
-    assert np.abs(mean_within(normal, zero, x, x, far, rests=True)).max() < 1e-9
+    assert np.abs(mean_within(normal, zero, x, x, far, at_low_limit=True)).max() < 1e-9
     assert mean_within(normal, zero, x, x, far)[PALM:].min() > 0.15
 
 
@@ -87,9 +87,9 @@ def test_far_from_its_limits_a_hand_stays_where_it_is() -> None:
 @settings(max_examples=50)
 def test_no_step_leaves_the_limits_and_what_cannot_move_does_not(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    low, room = rng.uniform(-1.0, 0.0, FREE), np.ones(FREE)
-    room[2] = 0.0
-    high = low + rng.uniform(0.0, 2.0, FREE) * room
+    low, scratch = rng.uniform(-1.0, 0.0, FREE), np.ones(FREE)
+    scratch[2] = 0.0
+    high = low + rng.uniform(0.0, 2.0, FREE) * scratch
     x = rng.uniform(low, high)
     x[0] = low[0]
     normal = problem(rng) * 10.0 ** rng.uniform(-3, 6)

@@ -10,30 +10,30 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.geometry import axis_rotation, matrix_to_rotation_vector, rotation_vector_to_matrix
-from common.wrist_bend import forearm_palm
-from master.estimator.wrist_device import BEND, HEADING, LIGHT, TILT
+from common.wrist_joint import forearm_palm
+from master.estimator.wrist_device import HEADING, LED_SCALE, TILT, WRIST_ANGLES
 from tests.hand_helpers import any_rotation
-from tests.master.estimator.kernels import turn_slope_at
+from tests.master.estimator.kernels import rotation_vector_jacobian_at
 from tests.master.estimator.whole import Whole, silent
-from tests.master.estimator.worn import Seen, Worn
+from tests.master.estimator.wrist_case import Seen, WristCase
 
 seeds = st.integers(0, 2**32 - 1)
-BENT = np.radians([-8.0, 4.0])
+FLEXED = np.radians([-8.0, 4.0])
 
 
 @pytest.fixture(scope="module")
-def worn(root: Path) -> Worn:
-    return Worn.of(root)
+def wrist_case(root: Path) -> WristCase:
+    return WristCase.of(root)
 
 
-def hand(worn: Worn, seed: int) -> tuple[Whole, Seen]:
+def hand(wrist_case: WristCase, seed: int) -> tuple[Whole, Seen]:
     """One before the device, of which nothing is believed, and what is seen of it."""
-    whole = Whole(worn.model, seed, worn.device)
+    whole = Whole(wrist_case.model, seed, wrist_case.device)
     silent(whole)
-    whole.z[:5], whole.z[BEND : BEND + 2] = whole.rng.normal(0.0, 0.05, 5), BENT
-    whole.z[LIGHT] = whole.rng.normal()
+    whole.z[:5], whole.z[WRIST_ANGLES : WRIST_ANGLES + 2] = whole.rng.normal(0.0, 0.05, 5), FLEXED
+    whole.z[LED_SCALE] = whole.rng.normal()
     angles = whole.parameters.angles(whole.x)
-    return whole, worn.looks(angles, BENT, whole.z[:5])
+    return whole, wrist_case.looks(angles, FLEXED, whole.z[:5])
 
 
 def spd(rng: np.random.Generator, n: int) -> Float:
@@ -42,33 +42,33 @@ def spd(rng: np.random.Generator, n: int) -> Float:
 
 
 def laser(whole: Whole, seen: Seen, off: float) -> None:
-    sights = whole.belief.sights
-    sights.rows[0], sights.lit[:], sights.teaches[:] = 1.0, 1.0, 1.0
-    sights.lack[:] = whole.rng.normal(0.0, 0.02, (5, 2))
-    sights.laser[:] = seen.ridge + sights.lack + off * whole.rng.normal(size=(5, 2))
-    sights.laser_W[:] = [spd(whole.rng, 2) for _ in range(5)]
+    lines_of_sight = whole.belief.lines_of_sight
+    lines_of_sight.rows[0], lines_of_sight.lit[:], lines_of_sight.teaches[:] = 1.0, 1.0, 1.0
+    lines_of_sight.lack[:] = whole.rng.normal(0.0, 0.02, (5, 2))
+    lines_of_sight.laser[:] = seen.predicted_laser + lines_of_sight.lack + off * whole.rng.normal(size=(5, 2))
+    lines_of_sight.laser_W[:] = [spd(whole.rng, 2) for _ in range(5)]
 
 
 def tip(whole: Whole, seen: Seen, off: float) -> None:
-    sights = whole.belief.sights
-    sights.rows[0], sights.shown[:], sights.teaches[:] = 1.0, 1.0, 1.0
-    sights.tip[:] = seen.tip + off * whole.rng.normal(size=(5, 2))
-    sights.tip_W[:] = [spd(whole.rng, 2) for _ in range(5)]
+    lines_of_sight = whole.belief.lines_of_sight
+    lines_of_sight.rows[0], lines_of_sight.shown[:], lines_of_sight.teaches[:] = 1.0, 1.0, 1.0
+    lines_of_sight.tip[:] = seen.tip + off * whole.rng.normal(size=(5, 2))
+    lines_of_sight.tip_W[:] = [spd(whole.rng, 2) for _ in range(5)]
 
 
 def tip_depth(whole: Whole, seen: Seen, off: float) -> None:
     tip(whole, seen, off)
-    sights = whole.belief.sights
-    sights.depth[:] = np.log(seen.depth_m) + whole.z[LIGHT] + off * whole.rng.normal(size=5)
-    sights.depth_w2[:] = whole.rng.uniform(1.0, 9.0, 5)
+    lines_of_sight = whole.belief.lines_of_sight
+    lines_of_sight.depth[:] = np.log(seen.depth_m) + whole.z[LED_SCALE] + off * whole.rng.normal(size=5)
+    lines_of_sight.depth_w2[:] = whole.rng.uniform(1.0, 9.0, 5)
 
 
-def turn(whole: Whole, seen: Seen, off: float) -> None:
+def orientation(whole: Whole, seen: Seen, off: float) -> None:
     """Of a forearm that is turned `off` from where it would put the palm; tilt and heading are as they were."""
     belief, rng = whole.belief, whole.rng
     palm = rotation_vector_to_matrix(off * rng.normal(size=3)) @ whole.T[:3, :3]
-    belief.forearm[:3, :3] = palm @ forearm_palm(BENT).T
-    belief.turn_info[:], belief.turned[0], belief.on_forearm[0] = spd(rng, 3), 1.0, 1.0
+    belief.forearm[:3, :3] = palm @ forearm_palm(FLEXED).T
+    belief.orientation_info[:], belief.oriented[0], belief.on_forearm[0] = spd(rng, 3), 1.0, 1.0
     belief.axes[:] = any_rotation(rng)
     whole.z[TILT : HEADING + 1] = belief.z[TILT : HEADING + 1] = rng.normal(0.0, 0.2, 3)
 
@@ -80,15 +80,15 @@ def largest(whole: Whole, numeric: Float) -> Float:
     return np.repeat([max(float(part.max()), 1e-3) for part in parts], size)
 
 
-KINDS = [(laser, 0.35), (tip, 1e-5), (tip_depth, 1e-5), (turn, 1e-5)]
+KINDS = [(laser, 0.35), (tip, 1e-5), (tip_depth, 1e-5), (orientation, 1e-5)]
 
 
 @pytest.mark.parametrize(("kind", "share"), KINDS[1:])
 def test_the_gradient_of_each_kind_of_row_is_the_derivative_of_its_cost(
-    worn: Worn, kind: Callable[[Whole, Seen, float], None], share: float
+    wrist_case: WristCase, kind: Callable[[Whole, Seen, float], None], share: float
 ) -> None:
     for seed in range(6):
-        whole, seen = hand(worn, seed)
+        whole, seen = hand(wrist_case, seed)
         kind(whole, seen, 0.3)
         _, gradient, normal = whole.cost()
         numeric = whole.slope()
@@ -98,21 +98,21 @@ def test_the_gradient_of_each_kind_of_row_is_the_derivative_of_its_cost(
         assert np.linalg.eigvalsh(normal).min() > -1e-9 * np.abs(normal).max()
 
 
-def test_the_laser_row_is_that_of_ridge_and_lack(worn: Worn) -> None:
+def test_the_laser_row_is_that_of_closed_form_and_lack(wrist_case: WristCase) -> None:
     """Of what `look` says of angles, twist and bend, by plain algebra."""
     for seed in range(4):
-        whole, seen = hand(worn, seed)
+        whole, seen = hand(wrist_case, seed)
         laser(whole, seen, 0.3)
-        sights, n = whole.belief.sights, whole.n
+        lines_of_sight, n = whole.belief.lines_of_sight, whole.n
         by_free = whole.parameters.by_angles(whole.x).reshape(5, 4, n)
         expected, cost = np.zeros(6 + n + len(whole.z)), 0.0
         for f in range(5):
-            r = seen.ridge[f] + sights.lack[f] - sights.laser[f]
-            pull = seen.by[f, :2].T @ sights.laser_W[f] @ r
+            r = seen.predicted_laser[f] + lines_of_sight.lack[f] - lines_of_sight.laser[f]
+            pull = seen.by[f, :2].T @ lines_of_sight.laser_W[f] @ r
             expected[6 : 6 + n] += by_free[f].T @ pull[:4]
             expected[6 + n + f] += pull[4]
-            expected[6 + n + BEND : 6 + n + BEND + 2] += pull[5:]
-            cost += 0.5 * r @ sights.laser_W[f] @ r
+            expected[6 + n + WRIST_ANGLES : 6 + n + WRIST_ANGLES + 2] += pull[5:]
+            cost += 0.5 * r @ lines_of_sight.laser_W[f] @ r
         found, gradient, _ = whole.cost()
         assert found == pytest.approx(cost, rel=1e-9)
         np.testing.assert_allclose(gradient, expected, atol=1e-9)
@@ -120,23 +120,23 @@ def test_the_laser_row_is_that_of_ridge_and_lack(worn: Worn) -> None:
 
 @pytest.mark.parametrize(("kind", "share"), KINDS)
 def test_the_normal_matrix_is_the_bend_of_the_cost_where_nothing_is_off(
-    worn: Worn, kind: Callable[[Whole, Seen, float], None], share: float
+    wrist_case: WristCase, kind: Callable[[Whole, Seen, float], None], share: float
 ) -> None:
     for seed in range(3):
-        whole, seen = hand(worn, seed)
+        whole, seen = hand(wrist_case, seed)
         kind(whole, seen, 0.0)
         cost, gradient, normal = whole.cost()
         assert abs(cost) < 1e-12
         np.testing.assert_allclose(gradient, 0.0, atol=1e-6)
-        numeric = whole.bend_of_cost()
+        numeric = whole.hessian_of_cost()
         np.testing.assert_allclose(normal, numeric, atol=share * np.abs(numeric).max())
 
 
-def test_rows_that_are_not_seen_say_nothing(worn: Worn) -> None:
-    whole, seen = hand(worn, 1)
+def test_rows_that_are_not_seen_say_nothing(wrist_case: WristCase) -> None:
+    whole, seen = hand(wrist_case, 1)
     tip_depth(whole, seen, 0.3)
     laser(whole, seen, 0.3)
-    whole.belief.sights.lit[:] = whole.belief.sights.shown[:] = 0.0
+    whole.belief.lines_of_sight.lit[:] = whole.belief.lines_of_sight.shown[:] = 0.0
     cost, gradient, normal = whole.cost()
     assert cost == 0.0
     assert not gradient.any()
@@ -144,28 +144,28 @@ def test_rows_that_are_not_seen_say_nothing(worn: Worn) -> None:
 
 
 @pytest.mark.parametrize("teaches", [True, False])
-def test_a_finger_tells_its_own_angles_and_twist_and_the_bend(worn: Worn, teaches: bool) -> None:
+def test_a_finger_tells_its_own_angles_and_twist_and_the_bend(wrist_case: WristCase, teaches: bool) -> None:
     """One that is in doubt teaches nothing of its hinges."""
-    whole, seen = hand(worn, 2)
+    whole, seen = hand(wrist_case, 2)
     tip_depth(whole, seen, 0.3)
     laser(whole, seen, 0.3)
-    sights = whole.belief.sights
-    sights.lit[:] = sights.shown[:] = np.arange(5) == 2
-    sights.teaches[:] = teaches
+    lines_of_sight = whole.belief.lines_of_sight
+    lines_of_sight.lit[:] = lines_of_sight.shown[:] = np.arange(5) == 2
+    lines_of_sight.teaches[:] = teaches
     _, gradient, _ = whole.cost()
     own, extras = np.flatnonzero(whole.parameters.free // 4 == 2), 6 + whole.n
     moved = set(np.flatnonzero(gradient).tolist())
-    allowed = {*(6 + own).tolist(), extras + BEND, extras + BEND + 1, extras + LIGHT}
+    allowed = {*(6 + own).tolist(), extras + WRIST_ANGLES, extras + WRIST_ANGLES + 1, extras + LED_SCALE}
     assert moved <= (allowed | {extras + 2})
-    assert {extras + BEND, extras + BEND + 1, extras + LIGHT} <= moved
+    assert {extras + WRIST_ANGLES, extras + WRIST_ANGLES + 1, extras + LED_SCALE} <= moved
     assert (extras + 2 in moved) == teaches
 
 
-def test_tilt_and_heading_away_from_the_believed_turn_the_palm(worn: Worn) -> None:
+def test_tilt_and_heading_away_from_the_believed_turn_the_palm(wrist_case: WristCase) -> None:
     """To second order: of a few degrees the cost's slope is right to a few percent."""
     for seed in range(4):
-        whole, seen = hand(worn, seed)
-        turn(whole, seen, 0.1)
+        whole, seen = hand(wrist_case, seed)
+        orientation(whole, seen, 0.1)
         whole.z[TILT : HEADING + 1] += whole.rng.normal(0.0, 0.05, 3)
         _, gradient, _ = whole.cost()
         numeric = whole.slope()
@@ -178,7 +178,7 @@ def test_a_small_turn_changes_the_rotation_vector_as_its_derivative_says(seed: i
     axis = rng.normal(size=3)
     vector = angle_rad * axis / np.linalg.norm(axis)
     by, rotation = np.empty((3, 3)), rotation_vector_to_matrix(vector)
-    turn_slope_at(vector, by)
+    rotation_vector_jacobian_at(vector, by)
     for k in range(3):
         ends = [
             matrix_to_rotation_vector(axis_rotation(k, way * 1e-5) @ rotation) / 2e-5 for way in (1.0, -1.0)

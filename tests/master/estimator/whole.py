@@ -87,7 +87,7 @@ class Whole:
         steps = step_size * np.eye(N)
         return np.array([(self.cost(e)[0] - self.cost(-e)[0]) / (2.0 * step_size) for e in steps])
 
-    def bend_of_cost(self, step_size: float = H) -> Float:
+    def hessian_of_cost(self, step_size: float = H) -> Float:
         """The second derivatives (N, N) of the cost, as central differences of its gradient."""
         N = 6 + self.n + len(self.z)
         steps = step_size * np.eye(N)

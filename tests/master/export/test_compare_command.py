@@ -15,7 +15,7 @@ from master.export.command import export as export_command
 from master.mocap.joint_motion import MARKERS
 from tests.master.export.test_export_command import recording_of
 from tests.master.export.test_export_tables import run_of
-from tests.master.mocap.moved import RIGHT, SHIFT, TURN, hand_at, poses_of, write_table
+from tests.master.mocap.moved import RIGHT, ROTATION, SHIFT, hand_at, poses_of, write_table
 
 T_S = 5.0 + np.arange(600) / 60.0
 TRUTH_S = np.arange(1700) / 120.0 + 3.0
@@ -40,7 +40,7 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Turned, moved, 11.5 s late, with names of another program, some joints missing and a gap."""
     folder = tmp_path_factory.mktemp("truth")
     names = tuple(name for name in JOINTS if "metacarpal" not in name and name != "palm")
-    joints = hand_at(TRUTH_S).position_m[:, [JOINTS.index(name) for name in names]] @ TURN.T + SHIFT
+    joints = hand_at(TRUTH_S).position_m[:, [JOINTS.index(name) for name in names]] @ ROTATION.T + SHIFT
     joints[500:520] = np.nan
     called = tuple(f"R_{name.replace('-finger', '').replace('phalanx-', '')}" for name in names)
     return write_table(folder / "truth.csv", TRUTH_S + 11.5, called, joints)
@@ -109,7 +109,7 @@ def test_markers_of_a_rig_are_compared(source: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "kind", "said"),
+    ("options", "kind", "output"),
     [
         ([], PhalanxError, "give --to FORMAT to export, or --compare FILE"),
         (["--compare", "EXACT", "--to", "csv"], PhalanxError, "--to is for exporting"),
@@ -122,7 +122,7 @@ def test_markers_of_a_rig_are_compared(source: Path, tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_is_refused(
-    source: Path, exact: Path, tmp_path: Path, options: list[str], kind: type[Exception], said: str
+    source: Path, exact: Path, tmp_path: Path, options: list[str], kind: type[Exception], output: str
 ) -> None:
     joints = hand_at(TRUTH_S).position_m
     files = {
@@ -134,4 +134,4 @@ def test_what_cannot_be_is_refused(
     }
     with pytest.raises(kind) as caught:
         run(str(source), *(str(files.get(option, option)) for option in options))
-    assert said in str(caught.value)
+    assert output in str(caught.value)

@@ -78,16 +78,16 @@ def test_at_rest_the_bones_are_those_of_the_profile_and_end_beyond_the_tips(tmp_
     assert bvh.FrameCount == 1
     found: dict[str, Float] = {}
 
-    def walk(joint: bvhio.BvhJoint, at: Float) -> None:
+    def process_noise(joint: bvhio.BvhJoint, at: Float) -> None:
         found[joint.Name] = at + np.array(list(joint.Offset))
         if joint.Name.endswith("-tip"):
             ahead = np.array(list(joint.EndSite))
             radius = REST.radius_m[JOINTS.index(joint.Name)]
             assert np.linalg.norm(ahead) == pytest.approx(100.0 * radius, rel=1e-4)
         for child in joint.Children:
-            walk(child, found[joint.Name])
+            process_noise(child, found[joint.Name])
 
-    walk(bvh.Root, np.zeros(3))
+    process_noise(bvh.Root, np.zeros(3))
     assert set(found) == set(JOINTS)
     places = np.array([found[name] for name in JOINTS])
     np.testing.assert_allclose(places, 100.0 * REST.position_m, atol=1e-4)
@@ -114,10 +114,10 @@ def test_the_angles_of_a_joint_are_those_of_another_library() -> None:
 
 def test_a_right_angle_about_x_and_a_full_turn_do_no_harm() -> None:
     steps = np.radians(np.arange(0.0, 720.0, 30.0))
-    turning = quaternion_to_matrix(
+    rotating = quaternion_to_matrix(
         np.stack([np.cos(steps / 2), 0 * steps, np.sin(steps / 2), 0 * steps], axis=1)
     )
-    angles = euler_zxy_deg(turning)
+    angles = euler_zxy_deg(rotating)
     np.testing.assert_allclose(angles[:, 2], np.degrees(steps), atol=1e-9)  # two turns, no leap
     lock = Rotation.from_euler("ZXY", [[20.0, 90.0, 30.0], [20.0, -90.0, 30.0]], degrees=True).as_matrix()
     again = Rotation.from_euler("ZXY", euler_zxy_deg(lock), degrees=True).as_matrix()

@@ -106,9 +106,9 @@ def test_a_cut_recording_is_exported_up_to_the_cut_and_it_is_said(tmp_path: Path
     source = recording_of(tmp_path / "wave.mcap", list(poses_of(3, 200)), tree_folder(tmp_path))
     data = source.read_bytes()
     source.write_bytes(data[: len(data) * 2 // 3])
-    said: list[str] = []
-    export(source, Wanted("csv"), said.append, lambda _what, _done, _total: None)
-    assert "no end" in said[0]
+    output: list[str] = []
+    export(source, Wanted("csv"), output.append, lambda _what, _done, _total: None)
+    assert "no end" in output[0]
     assert 0 < len(rows_of(tmp_path / "wave.csv")) < 200
 
 
@@ -164,11 +164,11 @@ def test_an_empty_run_makes_no_motion_and_leaves_no_file(tmp_path: Path) -> None
 
 def test_of_two_hands_the_one_that_was_never_seen_is_said(tmp_path: Path) -> None:
     unseen = poses_of(2, 3, LEFT, valid=np.zeros((3, 26), np.bool_))
-    said: list[str] = []
+    output: list[str] = []
     wanted = Wanted("bvh", calibration=tree_folder(tmp_path))
-    paths = export(run_of(tmp_path, poses_of(1, 2), unseen), wanted, said.append, lambda _w, _d, _t: None)
+    paths = export(run_of(tmp_path, poses_of(1, 2), unseen), wanted, output.append, lambda _w, _d, _t: None)
     assert [path.name for path in paths] == ["poses.bvh"]
-    assert "made-left" in said[-1]
+    assert "made-left" in output[-1]
 
 
 def test_a_profile_is_found_by_its_name_whatever_its_file_is_called(tmp_path: Path) -> None:

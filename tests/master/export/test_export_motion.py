@@ -8,7 +8,16 @@ from hypothesis import strategies as st
 from common.arrays import Float
 from common.errors import RecordingError
 from common.hand_model import TIPS, WRIST
-from master.export.motion import FRAMES_OF_POSE, FREE_FRAMES, Motion, complete, local, resample, slerp, world
+from master.export.motion import (
+    FRAMES_OF_POSE,
+    FREE_FRAMES,
+    Motion,
+    complete,
+    local,
+    resample,
+    slerp,
+    world,
+)
 from master.export.skeleton import ORDER, PARENT
 from tests.master.export.made import BEGIN_NS, REST, STEP_NS, poses_of, positions, stacked
 

@@ -40,8 +40,8 @@ def anything(message: MarkerDetections, rng: np.random.Generator) -> MarkerDetec
     """What a sender may say and the master takes in: pixels of the picture, areas and sigmas from bound to bound."""
     m, far = len(message.area), np.array([639.5, 479.5])
     uv = rng.uniform(-0.5, far, (m, 2))
-    near = rng.random(m) < 0.5
-    uv[near] = message.uv[near] + rng.normal(0.0, 10.0 ** rng.uniform(-1, 4), (m, 2))[near]
+    warm_start = rng.random(m) < 0.5
+    uv[warm_start] = message.uv[warm_start] + rng.normal(0.0, 10.0 ** rng.uniform(-1, 4), (m, 2))[warm_start]
     uv = np.clip(uv, -0.5, far)
     kind = rng.random()
     if kind < 0.2:
@@ -54,7 +54,7 @@ def anything(message: MarkerDetections, rng: np.random.Generator) -> MarkerDetec
     area = rng.choice([0.0, 1e-9, 400.0, float(MAX_PICTURE) ** 2, np.nan], m)
     sigma = np.where(seen, rng.choice([1e-6, 0.1, 30.0, float(MAX_PICTURE)], m), np.nan)
     return msgspec.structs.replace(
-        message, uv=uv, area=area, quality=np.ones(m), sigma_px=sigma, rival_uv=np.full((m, 2), np.nan)
+        message, uv=uv, area=area, quality=np.ones(m), sigma_px=sigma, alt_uv=np.full((m, 2), np.nan)
     )
 
 
@@ -77,9 +77,9 @@ def test_whatever_senders_say_nothing_raises_and_the_hand_comes_back(
         known = np.isfinite(pose.position_m.sum(axis=1))
         assert known[pose.valid].all()
         assert np.isfinite(pose.cov_m2[pose.valid]).all()
-        placed = np.isfinite(pose.markers_raw_m).all(axis=1)
-        np.testing.assert_array_equal(placed, np.isfinite(pose.markers_cov_m2).all(axis=(1, 2)))
-        np.testing.assert_array_equal(placed, np.isfinite(pose.markers_m).all(axis=1))
+        triangulated = np.isfinite(pose.markers_raw_m).all(axis=1)
+        np.testing.assert_array_equal(triangulated, np.isfinite(pose.markers_cov_m2).all(axis=(1, 2)))
+        np.testing.assert_array_equal(triangulated, np.isfinite(pose.markers_m).all(axis=1))
     for pose in poses[-5:]:
         assert pose.valid.all()
         assert (pose.source != Source.HELD).all()
@@ -92,7 +92,7 @@ def test_a_point_is_placed_with_its_covariance_or_not_at_all(law: PowerLaw, run:
     """Also where it is nearer to the cameras than a cap is large, and where nothing is known of the hand's tilt."""
     cameras, caps = tuple(run.setup.models.values()), CapTables.of(RIGHT, MARKERS)
     place = DepthTriangulator(disparity_tables(cameras, law, 0.01, 1e6, 1e9), caps)
-    solver, rng, placed = line_of(run.setup, StageTimes()), np.random.default_rng(9), 0
+    solver, rng, triangulated = line_of(run.setup, StageTimes()), np.random.default_rng(9), 0
     hands = [hand.solution for message in run.messages[:20] for hand in solver.push(message)]
     hand = hands[-1]
     assert hand is not None
@@ -104,17 +104,17 @@ def test_a_point_is_placed_with_its_covariance_or_not_at_all(law: PowerLaw, run:
         whole = np.isfinite(found.points_m.sum(axis=1))
         np.testing.assert_array_equal(whole, np.isfinite(found.cov_m2).all(axis=(1, 2)))
         np.testing.assert_array_equal(whole, np.isfinite(found.noise_m2).all(axis=(1, 2)))
-        placed += int(whole.sum())
+        triangulated += int(whole.sum())
         assert not whole[:5].any() or k % 3 > 0
-    assert placed > 500
+    assert triangulated > 500
 
 
 def test_caps_are_looked_at_as_of_the_hand_that_is_given_and_its_age(run: SyntheticRun) -> None:
     """A tracker's hand is newer than the line's last one where one camera was lost."""
     solver = line_of(run.setup, StageTimes())
-    instants = [instant for message in run.messages[:30] for instant in solver.sync.push(message)]
-    hands = [solver.solve(instant).solution for instant in instants[:-1]]
-    late = replace(instants[-1], t_ns=instants[-2].t_ns + 300_000_000)
+    epochs = [epoch for message in run.messages[:30] for epoch in solver.sync.push(message)]
+    hands = [solver.solve(epoch).solution for epoch in epochs[:-1]]
+    late = replace(epochs[-1], t_ns=epochs[-2].t_ns + 300_000_000)
     fresh, old = (
         line_of(run.setup, StageTimes()).solve(late, hands[-1], age_s).markers for age_s in (1 / 60, 0.3)
     )
@@ -127,7 +127,7 @@ def compiled() -> dict[str, int]:
     """How many types of arguments each kernel of line and estimator is compiled for."""
     counts: dict[str, int] = {}
     rooms = (master.fabrik.__path__, "master.fabrik."), (master.estimator.__path__, "master.estimator.")
-    for module in (module for room in rooms for module in pkgutil.iter_modules(*room)):
+    for module in (module for scratch in rooms for module in pkgutil.iter_modules(*scratch)):
         if not module.name.endswith("__main__"):
             kernels: dict[str, Any] = vars(importlib.import_module(module.name))
             counts |= {
@@ -155,7 +155,7 @@ def test_no_kernel_is_compiled_while_a_hand_is_tracked(
     assert before["master.estimator.update.fit_epoch"] >= 1
     for k, message in enumerate(run.messages):
         sent = anything(message, rng) if k % 5 == 0 else message
-        rival = np.where(rng.random((6, 1)) < 0.1, np.minimum(sent.uv + 30.0, [639.5, 479.5]), np.nan)
-        pipeline.push(msgspec.structs.replace(sent, rival_uv=rival))
+        alternative = np.where(rng.random((6, 1)) < 0.1, np.minimum(sent.uv + 30.0, [639.5, 479.5]), np.nan)
+        pipeline.push(msgspec.structs.replace(sent, alt_uv=alternative))
     pipeline.flush()
     assert compiled() == before

@@ -100,7 +100,7 @@ def test_a_flat_marker_and_one_not_found_have_no_bias() -> None:
 def test_markers_without_caps_have_no_tables_and_the_same_hand_has_its_own_once() -> None:
     back = CapTables.of(RIGHT, ("back", "cube"))
     assert back.row.tolist() == [-1, -1]
-    assert len(back.looks) == len(back.radius_m) == 0
+    assert len(back.appearances) == len(back.radius_m) == 0
     points = np.array([[0.0, 0.0, 0.5]] * 2)
     np.testing.assert_array_equal(hidden_px(np.full((2, 2), 3.0), points, np.zeros((1, 2, 2)), back), 0.0)
     assert CapTables.of(RIGHT, MARKERS) is CAPS
@@ -153,8 +153,8 @@ def test_a_cap_of_another_radius_is_whole_and_one_that_two_cameras_see_unlike_is
     smaller[1] *= 0.75
     found = hidden_px(smaller, points, expected_m2)[:, 1]
     np.testing.assert_allclose(found, np.array([0.05, 0.25]) * RADIUS_M * np.sqrt(px2_m2))
-    turned = expected_m2 * np.array([[[1.0], [1.0]], [[1.0], [0.75]]])  # or it points away from one of them
-    np.testing.assert_array_equal(hidden_px(1.1 * smaller / 0.75, points, turned)[:, 1], 0.0)
+    rotated = expected_m2 * np.array([[[1.0], [1.0]], [[1.0], [0.75]]])  # or it points away from one of them
+    np.testing.assert_array_equal(hidden_px(1.1 * smaller / 0.75, points, rotated)[:, 1], 0.0)
 
 
 def test_a_cap_shows_a_disc_from_its_end_and_its_whole_length_from_the_side() -> None:

@@ -122,10 +122,10 @@ def test_a_state_that_is_wrong_is_left_within_two_frames_because_of_the_line(
         out[:3, 3] += shift_m
         return out
 
-    usual = errors_after(run, lambda T: T, start=True)
+    typical = errors_after(run, lambda T: T, start=True)
     left = errors_after(run, wrong, start=True)
     misled = errors_after(run, wrong, start=False)
-    assert left[1] < max(usual) + 3.0 < 5.0
+    assert left[1] < max(typical) + 3.0 < 5.0
     assert min(misled[:6]) > 2.0 * left[1]
 
 
@@ -148,7 +148,7 @@ def test_without_a_planted_jump_nothing_begins_anew(run: SyntheticRun, fitted: l
     pipeline = build_pipeline(run.setup, StageTimes())
     assert len([solved for message in run.messages for solved in pipeline.push(message)]) > 30
     assert len(fitted) > 30
-    assert not any(hand.anew for hand in fitted)
+    assert not any(hand.reinitialised for hand in fitted)
 
 
 def test_what_was_shown_of_a_wrong_hand_does_not_linger(run: SyntheticRun, fitted: list[Fitted]) -> None:
@@ -161,8 +161,8 @@ def test_what_was_shown_of_a_wrong_hand_does_not_linger(run: SyntheticRun, fitte
         shown += [one.pose.position_m for one in pipeline.push(told)]
     solved = [hand.solution.joints.position_m for hand in fitted if hand.solution is not None]
     assert len(solved) == len(shown)
-    assert fitted[10].anew
-    assert any(hand.anew for hand in fitted[25:28])
+    assert fitted[10].reinitialised
+    assert any(hand.reinitialised for hand in fitted[25:28])
     assert np.linalg.norm(shown[12] - shown[8], axis=1).mean() > 0.1
     late = np.linalg.norm(np.array(shown) - np.array(solved), axis=2).mean(axis=1)
     assert late[25:].max() < 8e-3  # without, 20 mm for six frames

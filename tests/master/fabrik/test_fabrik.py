@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from common.hand_model import FINGERS, HandModel
 from common.hand_presets import preset_couplings, preset_limits
 from common.hand_profiles import generated_profile
-from master.fabrik.chain import Chain, Coupling, Link, nearest_reach
+from master.fabrik.chain import Chain, Coupling, Link, least_root_to_end
 from master.fabrik.fabrik import ChainResult, Fabrik, Reach
 from master.fabrik.finger import FingerSolver, finger_chain
 from master.fabrik.joints import Angles, Hinge, Rotor
@@ -242,7 +242,7 @@ def test_no_joint_twists(finger: int, local: Vector, side: str) -> None:
         parent = np.eye(3)
         for k, link in enumerate(fabrik.chain.links):
             child = np.array(result.orientations[k])
-            own = np.array(link.turn).T @ parent.T @ child
+            own = np.array(link.rotation).T @ parent.T @ child
             if isinstance(link.joint, Hinge):
                 assert own @ np.array(link.joint.axis) == pytest.approx(np.array(link.joint.axis), abs=1e-12)
             else:  # no turn about y and then about x gives the row of y another x than the rest pose has
@@ -292,7 +292,7 @@ def test_too_near_is_flagged() -> None:
         Link(IDENTITY, Rotor((-1.0, 1.0), (-1.0, 1.0)), (0.0, 0.0, -0.03)),
         Link(IDENTITY, Hinge(0.0, math.pi / 2), (0.0, 0.0, -0.02)),
     )
-    assert nearest_reach(Chain(links)) == pytest.approx(math.sqrt(13) / 100, abs=1e-6)
+    assert least_root_to_end(Chain(links)) == pytest.approx(math.sqrt(13) / 100, abs=1e-6)
     result = Fabrik.of(Chain(links)).solve((0.0, -0.01, -0.01))
     assert result.reach is Reach.TOO_NEAR
     assert not result.reached

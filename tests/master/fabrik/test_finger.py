@@ -112,10 +112,10 @@ def _round_trip(model: HandModel, solver: FingerSolver, finger: int, shares: Flo
     at_once = np.abs(solved - angles).max(axis=1) / DEGREE
     assert np.quantile(at_once, 0.8) < 1e-3  # all but hyperextended thumbs, which another legal pose matches
     # the straight finger and the abduction's pole have two legal answers each: tell which is meant
-    near = np.array(
+    warm_start = np.array(
         [solver.solve(_target(p), _four(a + 0.001))[:4] for p, a in zip(points, angles, strict=True)]
     )
-    error_deg = np.abs(near - angles).max(axis=1) / DEGREE
+    error_deg = np.abs(warm_start - angles).max(axis=1) / DEGREE
     assert np.quantile(error_deg, 0.99) < 1e-3
     assert error_deg.max() < 0.3  # a whisker from the pole itself, where the answer is ill-conditioned
 

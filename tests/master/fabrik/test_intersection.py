@@ -61,7 +61,7 @@ def test_exact_pixels_give_the_exact_point(rig: Rig, seed: int, count: int) -> N
     assert out.points_m.shape == (count, 3)
     assert np.abs(out.points_m - points).max(initial=0.0) * 1e3 < 1e-6  # mm
     assert out.residual_px.max(initial=0.0) < 1e-4
-    assert not out.apart.any()
+    assert not out.outliers.any()
 
 
 def test_each_marker_has_its_own_cameras() -> None:
@@ -203,14 +203,14 @@ def test_noise_gives_the_distribution_the_limit_is_made_of(rig: Rig, degrees: in
     found = rig.triangulate(exact + rng.normal(0.0, np.hypot(0.3, RAYS.rig_px), exact.shape), 0.3)
     assert found.chi_square.mean() == pytest.approx(degrees, rel=0.08)
     assert (found.chi_square > chi2.isf(0.01, degrees)).mean() == pytest.approx(0.01, abs=0.006)
-    assert not found.apart.any()
+    assert not found.outliers.any()
 
 
 def test_a_camera_that_sees_something_else_is_told_from_noise() -> None:
     uv = _project(LEVEL, np.tile([0.02, 0.01, 0.5], (3, 1)))
     uv[1, :, 1] += [0.0, 5.0, 7.0]  # limit: 4.9 sqrt(2 (0.1^2 + 0.85^2)) = 5.9 px
-    assert LEVEL.triangulate(uv).apart.tolist() == [False, False, True]
-    assert not LEVEL.triangulate(uv, 2.0).apart.any()
+    assert LEVEL.triangulate(uv).outliers.tolist() == [False, False, True]
+    assert not LEVEL.triangulate(uv, 2.0).outliers.any()
 
 
 def test_a_marker_of_one_camera_has_neither_point_nor_misfit_and_is_not_apart() -> None:
@@ -219,7 +219,7 @@ def test_a_marker_of_one_camera_has_neither_point_nor_misfit_and_is_not_apart() 
     found = LEVEL.triangulate(uv, np.where(np.isnan(uv[..., 0]), np.nan, 0.1))
     assert np.isnan(found.chi_square).all()
     assert np.isnan(found.points_m).all()
-    assert not found.apart.any()
+    assert not found.outliers.any()
 
 
 def test_more_cameras_and_better_ones_make_a_point_surer() -> None:

@@ -20,7 +20,7 @@ from master.fabrik.caps import CAPS, CapTables
 from master.fabrik.depth import CalibrationResidual
 from master.fabrik.estimate import MarkerPositions, SolvedHand
 from master.fabrik.rays import RayTriangulator
-from master.fabrik.rays import locate as kernel_of_rays
+from master.fabrik.rays import correct_centres as kernel_of_rays
 from tests.hand_helpers import (
     MARKERS,
     RIGHT,
@@ -46,11 +46,11 @@ def hand(tilt_rad: float, joints: HandJoints | None = None) -> SolvedHand:
     ends = joints.rotation[TIPS]
     tilt = tilt_rad**2 * (np.eye(3) - ends[:, :, 2:] @ ends[:, :, 2:].swapaxes(1, 2))
     nothing = np.zeros((26, 3, 3))
-    walk = 100.0 * np.trace(tilt, axis1=1, axis2=2)
-    return SolvedHand(palm(), np.zeros((5, 4)), joints, nothing, tilt, walk)
+    process_noise = 100.0 * np.trace(tilt, axis1=1, axis2=2)
+    return SolvedHand(palm(), np.zeros((5, 4)), joints, nothing, tilt, process_noise)
 
 
-def locate(
+def correct_centres(
     known: SolvedHand | None,
     uv: Float,
     age_s: float = 0.0,
@@ -75,11 +75,11 @@ def centroid_errors(rng: np.random.Generator, sigma_px: float = 0.1) -> Float:
 def test_a_known_hand_gives_its_caps_back() -> None:
     known = hand(0.0)
     points, uv = seen(known.joints)
-    found = locate(known, uv)
+    found = correct_centres(known, uv)
     np.testing.assert_allclose(
         found.points_m, points, atol=2e-4
     )  # caps are looked at from where they roughly are
-    assert not found.apart.any()
+    assert not found.outliers.any()
 
 
 def test_the_covariance_is_the_spread_of_the_errors_that_unsure_tilts_make() -> None:
@@ -95,9 +95,9 @@ def test_the_covariance_is_the_spread_of_the_errors_that_unsure_tilts_make() -> 
         ahead = -R[:, :, 2] + np.einsum("kij,kj->ki", R[:, :, :2], tilt)
         rotation[TIPS, :, 2] = -ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
         _, uv = seen(replace(believed.joints, rotation=rotation))
-        errors.append(locate(believed, uv + centroid_errors(rng)).points_m - truth)
+        errors.append(correct_centres(believed, uv + centroid_errors(rng)).points_m - truth)
     spread = np.array(errors)
-    cov = locate(believed, seen(believed.joints)[1]).cov_m2
+    cov = correct_centres(believed, seen(believed.joints)[1]).cov_m2
     for m in range(5):
         nees = np.einsum("ni,ij,nj->n", spread[:, m], np.linalg.inv(cov[m]), spread[:, m])
         assert 0.90 < (nees < 7.815).mean() <= 1.0, MARKERS[m]
@@ -109,14 +109,16 @@ def test_errors_that_cameras_have_alike_move_a_point_and_not_its_depth() -> None
     rng = np.random.default_rng(3)
     known = hand(0.0)
     _, uv = seen(known.joints)
-    found = np.array([locate(known, uv + centroid_errors(rng)).points_m for _ in range(2000)])
-    claimed = locate(known, uv).cov_m2 - locate(known, uv, 0.0, 1e-3 * SIGMA).cov_m2
+    found = np.array([correct_centres(known, uv + centroid_errors(rng)).points_m for _ in range(2000)])
+    claimed = correct_centres(known, uv).cov_m2 - correct_centres(known, uv, 0.0, 1e-3 * SIGMA).cov_m2
     spread = np.array([np.cov(found[:, m].T) for m in range(6)])
     np.testing.assert_allclose(
         np.diagonal(claimed, axis1=1, axis2=2), np.diagonal(spread, axis1=1, axis2=2), rtol=0.12
     )
     # Depth is sure to half of what each camera's own errors would make of it: a quarter of the variance.
-    np.testing.assert_allclose(claimed[:, 2, 2], 0.25 * locate(known, uv).noise_m2[:, 2, 2], rtol=0.2)
+    np.testing.assert_allclose(
+        claimed[:, 2, 2], 0.25 * correct_centres(known, uv).noise_m2[:, 2, 2], rtol=0.2
+    )
 
 
 def test_cameras_share_nothing_of_a_cap_that_is_partly_hidden() -> None:
@@ -125,7 +127,7 @@ def test_cameras_share_nothing_of_a_cap_that_is_partly_hidden() -> None:
     area[:, 5] = np.nan
     covered = area.copy()
     covered[1, 3] *= 0.5
-    before, after = (locate(known, uv, 0.0, SIGMA, seen_px2) for seen_px2 in (area, covered))
+    before, after = (correct_centres(known, uv, 0.0, SIGMA, seen_px2) for seen_px2 in (area, covered))
     assert (before.cov_m2 - before.noise_m2)[3, 2, 2] < 0.0
     assert (after.cov_m2 - after.noise_m2)[3, 2, 2] > 0.0
     np.testing.assert_allclose(np.delete(after.cov_m2, 3, axis=0), np.delete(before.cov_m2, 3, axis=0))
@@ -143,18 +145,18 @@ def test_covariances_stay_positive_whoever_sees_a_marker_and_however_surely(
         uv[rng.random(uv.shape[:2]) < 0.2] = np.nan
         sigma = np.where(np.isnan(uv[..., 0]), np.nan, 10.0 ** rng.uniform(-2.0, 1.0, uv.shape[:2]))
         found = locator(uv, sigma, np.full(sigma.shape, np.nan), hand(0.0), 0.0)
-        placed = np.isfinite(found.points_m[:, 0])
-        assert (np.linalg.eigvalsh(found.cov_m2[placed]) > 0.0).all()
-        np.testing.assert_array_equal(placed, np.isfinite(found.cov_m2).all(axis=(1, 2)))
+        triangulated = np.isfinite(found.points_m[:, 0])
+        assert (np.linalg.eigvalsh(found.cov_m2[triangulated]) > 0.0).all()
+        np.testing.assert_array_equal(triangulated, np.isfinite(found.cov_m2).all(axis=(1, 2)))
 
 
 def test_an_unsure_pose_widens_most_along_the_sight_and_age_adds_to_it() -> None:
     _, uv = seen(hand(0.0).joints)
-    sure, unsure = locate(hand(0.0), uv), locate(hand(0.2), uv)
+    sure, unsure = correct_centres(hand(0.0), uv), correct_centres(hand(0.2), uv)
     more = np.sqrt(np.diagonal(unsure.cov_m2 - sure.cov_m2, axis1=1, axis2=2)[:5])
     assert (more[:, 2] > 2.0 * more[:, :2].max(axis=1)).all()
-    old, turned = locate(hand(0.0), uv, 0.02), locate(hand(0.02 * CAPS.turn_rad_s), uv)
-    size = [np.trace(found.cov_m2[:5] - sure.cov_m2[:5], axis1=1, axis2=2) for found in (old, turned)]
+    old, rotated = correct_centres(hand(0.0), uv, 0.02), correct_centres(hand(0.02 * CAPS.rotation_rad_s), uv)
+    size = [np.trace(found.cov_m2[:5] - sure.cov_m2[:5], axis1=1, axis2=2) for found in (old, rotated)]
     np.testing.assert_allclose(*size, rtol=0.05)
 
 
@@ -164,7 +166,7 @@ def test_without_a_hand_a_cap_may_point_anywhere() -> None:
     for _ in range(80):
         joints = RIGHT.forward(palm(rng.uniform(-30, 30, 3)), natural_angles(rng))
         points, uv = seen(joints)
-        found = locate(None, uv)
+        found = correct_centres(None, uv)
         off = (found.points_m - points)[:5]
         nees = np.vecdot(off, np.linalg.solve(found.cov_m2[:5], off[..., None])[..., 0])
         eye = points[:5] / np.linalg.norm(points[:5], axis=1, keepdims=True)
@@ -188,23 +190,26 @@ def test_what_a_calibration_leaves_is_what_its_file_states() -> None:
 
 
 def test_points_and_covariances_turn_with_the_rig() -> None:
-    turn = rigid(palm(np.array([30.0, -20.0, 70.0]))[:3, :3], np.array([1.0, 2.0, 3.0]))
-    moved = tuple(replace(c, T_rig_camera=turn @ c.T_rig_camera) for c in CAMERAS)
-    known, R = hand(0.1), turn[:3, :3]
+    rotation = rigid(palm(np.array([30.0, -20.0, 70.0]))[:3, :3], np.array([1.0, 2.0, 3.0]))
+    moved = tuple(replace(c, T_rig_camera=rotation @ c.T_rig_camera) for c in CAMERAS)
+    known, R = hand(0.1), rotation[:3, :3]
     joints = replace(known.joints, rotation=R @ known.joints.rotation)
-    turned = replace(known, joints=joints, tilt_cov_rad2=R @ known.tilt_cov_rad2 @ R.T)
+    rotated = replace(known, joints=joints, tilt_cov_rad2=R @ known.tilt_cov_rad2 @ R.T)
     uv = seen(known.joints)[1]
-    here, there = locate(known, uv), RayTriangulator(moved, TABLES)(uv, SIGMA, UNSTATED, turned, 0.0)
-    np.testing.assert_allclose(there.points_m, here.points_m @ R.T + turn[:3, 3], atol=1e-9)
+    here, there = (
+        correct_centres(known, uv),
+        RayTriangulator(moved, TABLES)(uv, SIGMA, UNSTATED, rotated, 0.0),
+    )
+    np.testing.assert_allclose(there.points_m, here.points_m @ R.T + rotation[:3, 3], atol=1e-9)
     np.testing.assert_allclose(there.cov_m2, R @ here.cov_m2 @ R.T, rtol=1e-6, atol=1e-12)
 
 
 def test_what_is_seen_of_a_flat_marker_is_its_centroid_within_the_relief() -> None:
     points, uv = seen(hand(0.0).joints)
-    found = locate(hand(0.3), uv)
+    found = correct_centres(hand(0.3), uv)
     np.testing.assert_allclose(found.points_m[5], points[5], atol=1e-9)
     np.testing.assert_allclose(
-        found.cov_m2[5] - found.noise_m2[5], locate(hand(0.0), uv).cov_m2[5] - found.noise_m2[5]
+        found.cov_m2[5] - found.noise_m2[5], correct_centres(hand(0.0), uv).cov_m2[5] - found.noise_m2[5]
     )
 
 
@@ -232,7 +237,7 @@ def test_nan_stays_with_its_own_marker_and_camera() -> None:
     found = place(uv, sigma, area, known, 0.0)
     assert np.isnan(found.points_m).all(axis=1).tolist() == [False, True, True, False, False, False]
     assert np.isnan(found.cov_m2).any(axis=(1, 2)).tolist() == [False, True, True, False, False, False]
-    assert not found.apart.any()
+    assert not found.outliers.any()
     np.testing.assert_array_equal(found.points_m[[0, 5]], whole.points_m[[0, 5]])
     assert np.abs(found.points_m - whole.points_m)[[3, 4]].max() < 1e-3
 
@@ -243,7 +248,7 @@ def test_the_camera_that_sees_less_of_a_cap_counts_less() -> None:
     uv[1, 3, 1] += 4.0
     covered = area.copy()
     covered[1, 3] *= 0.4
-    even, uneven = (locate(known, uv, 0.0, SIGMA, px2) for px2 in (area, covered))
+    even, uneven = (correct_centres(known, uv, 0.0, SIGMA, px2) for px2 in (area, covered))
     rows = [np.stack([c.project(found.points_m[3]) for c in CAMERAS])[:, 1] for found in (even, uneven)]
     wanted = uv[0, 3, 1] - cap_bias_px(known.joints, even.points_m, CAMERAS)[0, 3, 1]
     assert abs(rows[1][0] - wanted) < 0.1 * abs(rows[0][0] - wanted)
@@ -260,7 +265,7 @@ def example() -> dict[str, object]:
     sigma, area = np.full((4, 6), 0.1), cap_areas_px2(known.joints, FOUR) * rng.uniform(0.4, 1.0, (4, 6))
     for one, as_seen in ((known, False), (None, False), (None, True)):
         out = place(uv, sigma, area, one, 0.02, as_seen=as_seen)
-        for values in (out.points_m, 1e3 * out.cov_m2, 1e3 * out.noise_m2, out.apart, out.left_out):
+        for values in (out.points_m, 1e3 * out.cov_m2, 1e3 * out.noise_m2, out.outliers, out.rejected):
             found.append(values.ravel().astype(np.float64).tolist())
     return {"plain": isfunction(kernel_of_rays), "found": found}
 

@@ -134,10 +134,10 @@ def test_nothing_seen_is_no_hand_and_nothing_raises(run: SyntheticRun) -> None:
 
 
 def test_unrelated_frames_remember_nothing(run: SyntheticRun) -> None:
-    instants = [instant for m in run.messages[:20] for instant in line(run, continuous=False).sync.push(m)]
-    alone = [line(run, continuous=False).solve(instant) for instant in instants]
+    epochs = [epoch for m in run.messages[:20] for epoch in line(run, continuous=False).sync.push(m)]
+    alone = [line(run, continuous=False).solve(epoch) for epoch in epochs]
     solver = line(run, continuous=False)
-    for one, hand in zip(alone, (solver.solve(instant) for instant in instants), strict=True):
+    for one, hand in zip(alone, (solver.solve(epoch) for epoch in epochs), strict=True):
         assert one.solution is not None
         assert hand.solution is not None
         np.testing.assert_array_equal(one.solution.joints.position_m, hand.solution.joints.position_m)

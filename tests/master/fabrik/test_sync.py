@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.messages import MarkerDetections
-from master.fabrik.carry import HISTORY
+from master.fabrik.propagate import HISTORY
 from master.fabrik.sync import SILENT_FRAMES, FrameSet, FrameSync
 from tests.hand_helpers import camera_models, detections, rig_file
 
@@ -48,7 +48,7 @@ def frame(
 
 
 def push_all(machine: FrameSync, messages: list[MarkerDetections]) -> list[FrameSet]:
-    out = [instant for message in messages for instant in machine.push(message)]
+    out = [epoch for message in messages for epoch in machine.push(message)]
     return out + machine.flush()
 
 
@@ -69,10 +69,10 @@ def test_an_instant_waits_for_the_other_camera_and_no_longer() -> None:
         machine.push(frame("left", k, k * PERIOD))
         machine.push(frame("right", k, k * PERIOD + 5 * MS))
     assert machine.push(frame("left", 2, 2 * PERIOD)) == []
-    [instant] = machine.push(frame("right", 2, 2 * PERIOD + 5 * MS))
-    assert instant.t_ns == 2 * PERIOD
-    assert not instant.missing.any()
-    assert instant.ready_t_ns == 2 * PERIOD + 5 * MS + 2 * MS
+    [epoch] = machine.push(frame("right", 2, 2 * PERIOD + 5 * MS))
+    assert epoch.t_ns == 2 * PERIOD
+    assert not epoch.missing.any()
+    assert epoch.ready_t_ns == 2 * PERIOD + 5 * MS + 2 * MS
 
 
 def test_the_deadline_emits_what_there_is() -> None:
@@ -82,11 +82,11 @@ def test_the_deadline_emits_what_there_is() -> None:
         machine.push(message)
     assert machine.push(frame("left", 2, 4 * PERIOD)) == []
     assert machine.push(frame("left", 3, 5 * PERIOD)) == []
-    [instant] = machine.push(frame("left", 4, 6 * PERIOD))  # 1.25 periods are over for the first of the three
-    assert instant.t_ns == 4 * PERIOD
-    assert list(instant.missing) == [False, True]
-    assert np.isfinite(instant.uv[0]).all()
-    assert np.isnan(instant.uv[1]).all()
+    [epoch] = machine.push(frame("left", 4, 6 * PERIOD))  # 1.25 periods are over for the first of the three
+    assert epoch.t_ns == 4 * PERIOD
+    assert list(epoch.missing) == [False, True]
+    assert np.isfinite(epoch.uv[0]).all()
+    assert np.isnan(epoch.uv[1]).all()
 
 
 def test_flush_emits_the_rest_once() -> None:
@@ -107,8 +107,8 @@ def test_predict_waits_only_for_a_frame_that_is_nearer_than_the_last(late_ms: in
 
 def test_predicted_tracks_follow_the_motion() -> None:
     machine = sync(policy="predict")
-    instants = push_all(machine, interleaved(stream("left", 8), stream("right", 8, 12 * MS)))
-    last = instants[-1]
+    epochs = push_all(machine, interleaved(stream("left", 8), stream("right", 8, 12 * MS)))
+    last = epochs[-1]
     np.testing.assert_allclose(last.uv[1], path(np.array(last.t_ns * 1e-9)), atol=0.1)
     waited = push_all(sync(), interleaved(stream("left", 8), stream("right", 8, 12 * MS)))[-1]
     assert (last.sigma_px[1] > waited.sigma_px[1]).all()  # and is less sure than an interpolated one
@@ -153,25 +153,25 @@ def test_a_parabola_is_met_exactly_whatever_the_capture_times(late_ms: float, ro
         stream(c, 10, late, row_time_us=row_time_us)
         for c, late in (("left", 0), ("right", int(late_ms * MS)))
     ]
-    instants = push_all(sync(row_time_us), interleaved(*streams))
-    assert len(instants) == 10
-    for k, instant in enumerate(instants):
-        assert instant.t_ns == k * PERIOD + round(239.5 * row_time_us * 1e3)  # the centre row of the leader
+    epochs = push_all(sync(row_time_us), interleaved(*streams))
+    assert len(epochs) == 10
+    for k, epoch in enumerate(epochs):
+        assert epoch.t_ns == k * PERIOD + round(239.5 * row_time_us * 1e3)  # the centre row of the leader
         if k < 2:
             continue  # the first two have no three sightings
-        truth = path(np.array(instant.t_ns * 1e-9))
-        np.testing.assert_allclose(instant.uv, [truth, truth], atol=0.05)  # half of a centroid's noise
+        truth = path(np.array(epoch.t_ns * 1e-9))
+        np.testing.assert_allclose(epoch.uv, [truth, truth], atol=0.05)  # half of a centroid's noise
 
 
 def test_a_single_sighting_is_held_and_its_sigma_is_a_hand_speed_times_the_time() -> None:
     machine = sync()
     machine.push(frame("left", 0, 0))
     machine.push(frame("right", 0, 4 * MS))
-    [instant] = machine.flush()
-    np.testing.assert_allclose(instant.uv[1], path(np.array(0.004)))
-    np.testing.assert_allclose(instant.sigma_px[0], 0.1)  # the floor: a whole marker at its own time
+    [epoch] = machine.flush()
+    np.testing.assert_allclose(epoch.uv[1], path(np.array(0.004)))
+    np.testing.assert_allclose(epoch.sigma_px[0], 0.1)  # the floor: a whole marker at its own time
     held_px_s = 500.0 / 0.5 * np.sqrt((2 * 1.0**2 + 0.01**2) / 3)  # of a 500 px lens at half a metre
-    np.testing.assert_allclose(instant.sigma_px[1], np.hypot(0.1, held_px_s * 0.004), rtol=1e-3)
+    np.testing.assert_allclose(epoch.sigma_px[1], np.hypot(0.1, held_px_s * 0.004), rtol=1e-3)
 
 
 def test_a_marker_is_as_sure_as_its_slave_says() -> None:
@@ -200,33 +200,33 @@ def test_a_rival_is_carried_at_the_time_of_its_own_row() -> None:
     for camera, late in (("left", 0), ("right", 5 * MS)):
         frames = stream(camera, 10, late, row_time_us=20.6)
         crossed = [camera == "right" and k in (4, 7) for k in range(10)]
-        rivals = [np.where(np.isnan(alone), np.nan, m.uv[[1, 1]]) for m in frames]
+        alternatives = [np.where(np.isnan(alone), np.nan, m.uv[[1, 1]]) for m in frames]
         streams.append(
             [
                 msgspec.structs.replace(
                     m,
-                    uv=np.where(alone[:, ::-1] == 0, rival, alone) if cross else m.uv + alone,
-                    rival_uv=m.uv + alone if cross else rival,
+                    uv=np.where(alone[:, ::-1] == 0, alternative, alone) if cross else m.uv + alone,
+                    alt_uv=m.uv + alone if cross else alternative,
                     sigma_px=np.array([0.1, np.nan]),
                 )
-                for m, rival, cross in zip(frames, rivals, crossed, strict=True)
+                for m, alternative, cross in zip(frames, alternatives, crossed, strict=True)
             ]
         )
-    instants = push_all(sync(20.6), interleaved(*streams))
-    for instant in instants[3:]:
-        assert instant.rival_uv is not None
-        truth = path(np.array(instant.t_ns * 1e-9))
+    epochs = push_all(sync(20.6), interleaved(*streams))
+    for epoch in epochs[3:]:
+        assert epoch.alt_uv is not None
+        truth = path(np.array(epoch.t_ns * 1e-9))
         for c in range(2):
-            places = np.stack([instant.uv[c, 0], instant.rival_uv[c, 0]])
+            places = np.stack([epoch.uv[c, 0], epoch.alt_uv[c, 0]])
             if np.linalg.norm(places[0] - truth[0]) > 1.0:
                 places = places[::-1]
             np.testing.assert_allclose(places, truth, atol=0.1)
-        assert np.isnan(instant.rival_uv[:, 1]).all()
+        assert np.isnan(epoch.alt_uv[:, 1]).all()
 
 
 def test_no_rival_costs_nothing_and_makes_none() -> None:
-    instants = push_all(sync(), interleaved(stream("left", 4), stream("right", 4, 5 * MS)))
-    assert all(instant.rival_uv is None and instant.rival_sigma_px is None for instant in instants)
+    epochs = push_all(sync(), interleaved(stream("left", 4), stream("right", 4, 5 * MS)))
+    assert all(epoch.alt_uv is None and epoch.alt_sigma_px is None for epoch in epochs)
 
 
 # -- cameras that come and go -------------------------------------------------------------------------------------
@@ -235,10 +235,10 @@ def test_no_rival_costs_nothing_and_makes_none() -> None:
 def test_when_the_leader_falls_silent_the_next_camera_leads() -> None:
     machine = sync()
     left, right = stream("left", 10), stream("right", 80, 5 * MS)
-    instants = push_all(machine, interleaved(left, right))
-    times = np.array([i.t_ns for i in instants])
+    epochs = push_all(machine, interleaved(left, right))
+    times = np.array([i.t_ns for i in epochs])
     assert (np.diff(times) > 0).all()
-    after = [i for i in instants if i.t_ns > 10 * PERIOD]
+    after = [i for i in epochs if i.t_ns > 10 * PERIOD]
     assert len(after) >= 80 - 10 - 2 * SILENT_FRAMES - 1
     assert all(i.missing[0] and not i.missing[1] for i in after)
     assert all(i.t_ns % PERIOD == 5 * MS for i in after)
@@ -246,9 +246,9 @@ def test_when_the_leader_falls_silent_the_next_camera_leads() -> None:
 
 def test_when_the_other_camera_falls_silent_poses_go_on() -> None:
     machine = sync()
-    instants = push_all(machine, interleaved(stream("left", 60), stream("right", 10, 5 * MS)))
-    assert [i.t_ns for i in instants] == [k * PERIOD for k in range(60)]
-    assert all(i.missing[1] for i in instants[13:])
+    epochs = push_all(machine, interleaved(stream("left", 60), stream("right", 10, 5 * MS)))
+    assert [i.t_ns for i in epochs] == [k * PERIOD for k in range(60)]
+    assert all(i.missing[1] for i in epochs[13:])
 
 
 def test_after_the_silence_an_instant_no_longer_waits_for_the_deadline() -> None:
@@ -265,11 +265,11 @@ def test_a_leader_that_returns_leads_again_and_time_never_steps_back() -> None:
     # Its first frame comes behind one of the other camera that was exposed later.
     first = next(i for i, m in enumerate(messages) if m.camera == "left" and m.seq == 60)
     messages[first], messages[first + 1] = messages[first + 1], messages[first]
-    instants = push_all(machine, messages)
-    times = np.array([i.t_ns for i in instants])
+    epochs = push_all(machine, messages)
+    times = np.array([i.t_ns for i in epochs])
     assert (np.diff(times) > 0).all()
     assert (times[-15:] % PERIOD == 0).all()
-    assert not np.array([i.missing for i in instants[-15:]]).any()
+    assert not np.array([i.missing for i in epochs[-15:]]).any()
 
 
 def test_a_clock_that_steps_back_is_ignored_until_time_goes_on() -> None:
@@ -297,9 +297,9 @@ def test_what_waited_for_a_partner_while_nothing_came_is_left_out(pause: int, ke
     ]
     if first == "right":
         late[:2] = late[1::-1]
-    found = [instant.t_ns for message in late for instant in machine.push(message)]
+    found = [epoch.t_ns for message in late for epoch in machine.push(message)]
     assert found == [5 * PERIOD] * kept + [back * PERIOD, (back + 1) * PERIOD]
-    assert machine.outdated == (not kept)
+    assert machine.stale == (not kept)
 
 
 def test_a_whole_pair_before_a_pause_is_told_whenever_it_is_complete() -> None:
@@ -308,18 +308,18 @@ def test_a_whole_pair_before_a_pause_is_told_whenever_it_is_complete() -> None:
     found = push_all(
         machine, [frame(c, k, t * PERIOD) for k, t in enumerate(times) for c in ("left", "right")]
     )
-    assert [instant.t_ns for instant in found] == [t * PERIOD for t in times]
-    assert machine.outdated == 0
+    assert [epoch.t_ns for epoch in found] == [t * PERIOD for t in times]
+    assert machine.stale == 0
 
 
 def test_three_cameras_meet_at_the_instant_of_the_first() -> None:
     cameras = ("left", "right", "top")
     streams = [stream(camera, 10, late * MS) for camera, late in zip(cameras, (0, 5, 11), strict=True)]
-    instants = push_all(sync(cameras=cameras), interleaved(*streams))
-    assert len(instants) == 10
-    for instant in instants[2:]:
-        assert instant.uv.shape == (3, 2, 2)
-        np.testing.assert_allclose(instant.uv, [path(np.array(instant.t_ns * 1e-9))] * 3, atol=0.05)
+    epochs = push_all(sync(cameras=cameras), interleaved(*streams))
+    assert len(epochs) == 10
+    for epoch in epochs[2:]:
+        assert epoch.uv.shape == (3, 2, 2)
+        np.testing.assert_allclose(epoch.uv, [path(np.array(epoch.t_ns * 1e-9))] * 3, atol=0.05)
 
 
 def test_unrelated_frames_are_never_mixed() -> None:
@@ -329,10 +329,10 @@ def test_unrelated_frames_are_never_mixed() -> None:
         for k in range(3)
         for camera, late in (("left", 0), ("right", 5 * MS))
     ]
-    instants = push_all(machine, messages)
-    assert len(instants) == 3
-    for k, instant in enumerate(instants):
-        np.testing.assert_array_equal(instant.uv, np.full((2, 2, 2), 100.0 * k))
+    epochs = push_all(machine, messages)
+    assert len(epochs) == 3
+    for k, epoch in enumerate(epochs):
+        np.testing.assert_array_equal(epoch.uv, np.full((2, 2, 2), 100.0 * k))
     lonely = push_all(sync(continuous=False), [messages[0], messages[3]])
     assert list(lonely[0].missing) == [False, True]
 
@@ -375,8 +375,8 @@ def test_a_leader_that_hardly_delivers_or_only_what_is_old_leads_no_more(what: s
     for k in range(300):
         left_ns = k * PERIOD - (59 * PERIOD if what == "old" and k > 60 else 0)
         if what == "old" or k < 60 or k % 15 == 0:
-            found += [instant.t_ns for instant in machine.push(frame("left", k, left_ns))]
-        found += [instant.t_ns for instant in machine.push(frame("right", k, k * PERIOD + 5 * MS))]
+            found += [epoch.t_ns for epoch in machine.push(frame("left", k, left_ns))]
+        found += [epoch.t_ns for epoch in machine.push(frame("right", k, k * PERIOD + 5 * MS))]
     late = [t_ns for t_ns in found if t_ns > 150 * PERIOD]
     assert len(late) >= 0.95 * 150
     assert (np.diff(found) > 0).all()

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from master.fabrik.targets import facing_of, targets_of
+from master.fabrik.targets import back_normal_of, targets_of
 from tests.hand_helpers import palm
 
 
@@ -28,7 +28,7 @@ def test_the_back_faces_the_cameras_that_see_most_of_it() -> None:
         ([[4.0], [np.nan]], -1.0),
         ([[np.nan]] * 2, 0.0),
     ):
-        assert facing_of(points, np.array(area), centres, focal, out)
+        assert back_normal_of(points, np.array(area), centres, focal, out)
         expected = np.array([x, 0.0, -1.0])
         np.testing.assert_allclose(out, expected / np.linalg.norm(expected), atol=1e-12)
-    assert not facing_of(np.full((2, 3), np.nan), np.ones((2, 1)), centres, focal, out)
+    assert not back_normal_of(np.full((2, 3), np.nan), np.ones((2, 1)), centres, focal, out)

@@ -26,10 +26,10 @@ EXACT = (
     camera(0, np.eye(3), (0.0, 0.0, 0.0), np.zeros(5)),
     camera(0, np.eye(3), (0.075, 0.0, 0.0), np.zeros(5)),
 )
-TURNED = axis_rotation(2, 0.005) @ axis_rotation(1, -0.015)
+ROTATED = axis_rotation(2, 0.005) @ axis_rotation(1, -0.015)
 MADE_BY_HAND = (
     camera(0, axis_rotation(0, 0.02), (0.01, 0.0, 0.0), DISTORTED),
-    camera(1, axis_rotation(0, 0.025) @ TURNED, (0.085, 0.001, 0.0), DISTORTED),
+    camera(1, axis_rotation(0, 0.025) @ ROTATED, (0.085, 0.001, 0.0), DISTORTED),
 )
 PINHOLE = AffineDisparity(500.0 * 0.075, 0.0)
 FLAT = CapTables.flat(6)  # on no hand: what is seen of them is their centroid
@@ -69,7 +69,7 @@ def test_a_parallel_pair_gives_its_points_back_by_either_law(law: PowerLaw | Aff
     points = np.random.default_rng(1).uniform([-0.15, -0.12, 0.45], [0.2, 0.12, 0.85], (6, 3))
     found = triangulator(EXACT, law)(seen(EXACT, points), SIGMA, np.full((2, 6), np.nan), None, 0.0)
     np.testing.assert_allclose(found.points_m, points, atol=1e-6)
-    assert not found.apart.any()
+    assert not found.outliers.any()
 
 
 def test_off_the_axis_a_pair_made_by_hand_is_as_right_as_on_it() -> None:
@@ -84,7 +84,7 @@ def test_off_the_axis_a_pair_made_by_hand_is_as_right_as_on_it() -> None:
         worst = max(worst, float(np.abs(found.points_m - points)[inside].max(initial=0.0)))
         z = (points - MADE_BY_HAND[0].centre) @ MADE_BY_HAND[0].T_rig_camera[:3, 2]
         raw = max(raw, float(np.abs(law.depth(uv[0, :, 0] - uv[1, :, 0]) - z)[inside].max(initial=0.0)))
-        assert not found.apart[inside].any()
+        assert not found.outliers[inside].any()
     assert worst < 2e-3
     assert raw > 6e-3
 
@@ -114,9 +114,9 @@ def test_caps_of_a_known_hand_are_where_it_has_them() -> None:
     points = RIGHT.marker_points(known.joints, MARKERS)
     uv = seen(EXACT, points) + cap_bias_px(known.joints, points, EXACT)
     whole = cap_areas_px2(known.joints, EXACT)
-    near = triangulator(EXACT, caps=CAPS)(uv, SIGMA, whole, known, 0.0)
+    warm_start = triangulator(EXACT, caps=CAPS)(uv, SIGMA, whole, known, 0.0)
     blind = triangulator(EXACT, caps=CAPS)(uv, SIGMA, whole, None, 0.0)
-    assert np.linalg.norm(near.points_m - points, axis=1).max() < 2e-4
+    assert np.linalg.norm(warm_start.points_m - points, axis=1).max() < 2e-4
     assert np.linalg.norm(blind.points_m - points, axis=1)[:5].max() > 2e-3
 
 
@@ -140,8 +140,8 @@ def test_rows_that_disagree_are_two_things() -> None:
     uv = seen(EXACT, points)
     uv[1, :, 1] += [0.0, 3.0, -3.0, 10.0, -10.0, 40.0]
     found = triangulator(EXACT)(uv, SIGMA, np.full((2, 6), np.nan), None, 0.0)
-    assert found.apart.tolist() == [False, False, False, True, True, True]
-    assert np.isnan(found.points_m).all(axis=1).tolist() == found.apart.tolist()
+    assert found.outliers.tolist() == [False, False, False, True, True, True]
+    assert np.isnan(found.points_m).all(axis=1).tolist() == found.outliers.tolist()
 
 
 def test_what_is_not_seen_or_has_no_depth_is_nan_and_nothing_raises() -> None:

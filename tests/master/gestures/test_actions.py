@@ -121,9 +121,9 @@ def test_a_dial_is_turned_by_the_palm_over_two_grips(model: HandModel) -> None:
     opened = knob.posture_deg + np.array([[14.0, -14.0, -14.0], *[[0.0, -17.0, -16.0]] * 4])
     palm = np.interp(np.arange(240), [30, 80, 98, 116, 150, 200], [0.0, 50.0, 50.0, -20.0, -20.0, 40.0])
     loose = np.interp(np.arange(240), [85, 96, 118, 130], [0.0, 1.0, 1.0, 0.0])
-    turns = np.radians(palm)
+    rotations = np.radians(palm)
     posture = knob.posture_deg + loose[:, None, None] * (opened - knob.posture_deg)
-    poses = [_pose(model, k, _about(knob.centre_m, knob.axis, turns[k]), posture[k]) for k in range(240)]
+    poses = [_pose(model, k, _about(knob.centre_m, knob.axis, rotations[k]), posture[k]) for k in range(240)]
     told = _actions(GestureRecogniser(default_gestures(), model), poses)
     assert [one.phase for one in told if one.phase != "update"] == ["begin"]
     angle = {one.t_ns // FRAME_NS: np.degrees(one.angle_rad) for one in told}
@@ -137,11 +137,11 @@ def test_a_wrist_device_alone_turns_a_dial_by_its_imu(model: HandModel) -> None:
     knob, recogniser = knob_grip(model, 0.022, STILL), GestureRecogniser(default_gestures(), model)
     told: list[Gesture] = []
     for k in range(60):
-        turn = np.radians(max(k - 20, 0))
-        world = axis_rotation(1, 0.7) @ _about(np.zeros(3), knob.axis, turn)[:3, :3]
+        rotation = np.radians(max(k - 20, 0))
+        dispatcher = axis_rotation(1, 0.7) @ _about(np.zeros(3), knob.axis, rotation)[:3, :3]
         pose = _pose(model, k, np.eye(4), knob.posture_deg, markers=0)
         told += _actions(
-            recogniser, [msgspec.structs.replace(pose, palm_world_wxyz=matrix_to_quaternion(world))]
+            recogniser, [msgspec.structs.replace(pose, palm_world_wxyz=matrix_to_quaternion(dispatcher))]
         )
     assert told[0].phase == "begin"
     assert np.degrees(told[-1].angle_rad) == pytest.approx(39.0, abs=0.1)

@@ -16,7 +16,7 @@ from common.hand_model import TIPS, HandModel
 from common.messages import Gesture, HandPose
 from common.sim.gesture_postures import Knob, knob_grip
 from common.sim.motion import angles_of, smooth_step
-from master.gestures.course import Course
+from master.gestures.grip_history import GripHistory
 from master.gestures.recogniser import GestureRecogniser
 
 STILL, FRAME_NS = np.zeros((5, 4)), 16_666_667
@@ -25,9 +25,9 @@ KNOB = knob_grip(MODEL, 0.023, STILL)
 OPENED = KNOB.posture_deg + np.array([[14.0, -14.0, -14.0], *[[0.0, -17.0, -16.0]] * 4])
 
 
-def _pose(k: int, turn_rad: float, loose: float, knob: Knob = KNOB) -> HandPose:
+def _pose(k: int, rotation_rad: float, loose: float, knob: Knob = KNOB) -> HandPose:
     """A hand about the knob at frame `k`, known to a millimetre: turned so far, open by a share."""
-    rotation = rotation_vector_to_matrix(knob.axis * turn_rad)
+    rotation = rotation_vector_to_matrix(knob.axis * rotation_rad)
     T = rigid(rotation, knob.centre_m - rotation @ knob.centre_m)
     angles = angles_of(MODEL, knob.posture_deg + loose * (OPENED - knob.posture_deg), STILL)
     joints = MODEL.forward(T, angles)
@@ -50,18 +50,25 @@ def _pose(k: int, turn_rad: float, loose: float, knob: Knob = KNOB) -> HandPose:
     )
 
 
-def _grips(turns_deg: list[float], rest: int) -> tuple[Float, Float, Float]:
+def _grips(rotations_deg: list[float], rest: int) -> tuple[Float, Float, Float]:
     """Palm [rad], share open and knob [rad], frame by frame: each grip turns the knob, then opens and turns back."""
     palm, loose, knob = [np.zeros(25)], [np.zeros(25)], [np.zeros(25)]
     there = 0.0
-    for turn in np.radians(turns_deg):
-        gone = turn * _smooth(30)
+    for rotation in np.radians(rotations_deg):
+        gone = rotation * _smooth(30)
         opens, still = _smooth(12), np.zeros(rest)
-        parts = [gone, turn + still, np.full(12, turn), turn * (1.0 - opens), np.zeros(12), np.zeros(10)]
+        parts = [
+            gone,
+            rotation + still,
+            np.full(12, rotation),
+            rotation * (1.0 - opens),
+            np.zeros(12),
+            np.zeros(10),
+        ]
         palm.append(np.concatenate(parts))
         loose.append(np.concatenate([0.0 * gone, still, opens, np.ones(12), 1.0 - opens, np.zeros(10)]))
-        knob.append(there + np.concatenate([gone, np.full(rest + 46, turn)]))
-        there += turn
+        knob.append(there + np.concatenate([gone, np.full(rest + 46, rotation)]))
+        there += rotation
     return np.concatenate(palm), np.concatenate(loose), np.concatenate(knob)
 
 
@@ -77,22 +84,26 @@ def _dial(poses: list[HandPose]) -> list[Gesture]:
 
 @settings(max_examples=3, deadline=None)
 @given(
-    turns_deg=st.lists(st.floats(-50.0, 50.0), min_size=2, max_size=3),
+    rotations_deg=st.lists(st.floats(-50.0, 50.0), min_size=2, max_size=3),
     rest=st.integers(min_value=4, max_value=10),
 )
-def test_a_dial_is_turned_by_the_sum_of_its_grips_without_a_step(turns_deg: list[float], rest: int) -> None:
-    palm, loose, knob = _grips(turns_deg, rest)
+def test_a_dial_is_turned_by_the_sum_of_its_grips_without_a_step(
+    rotations_deg: list[float], rest: int
+) -> None:
+    palm, loose, knob = _grips(rotations_deg, rest)
     told = _dial([_pose(k, palm[k], loose[k]) for k in range(len(palm))])
     assert [one.phase for one in told if one.phase != "update"] == ["begin"]
     off = np.degrees([one.angle_rad - knob[one.t_ns // FRAME_NS] for one in told])
-    assert np.abs(off).max() < 1.5 * len(turns_deg)  # each time it is let go by less than a degree and a half
+    assert np.abs(off).max() < 1.5 * len(
+        rotations_deg
+    )  # each time it is let go by less than a degree and a half
     steps = np.diff([one.angle_rad for one in told])
     assert np.degrees(np.abs(steps).max()) < np.degrees(np.abs(np.diff(knob)).max()) + 1.5
 
 
 def test_one_bad_instant_in_a_quick_turn_is_led_over() -> None:
-    turn = np.radians(np.clip(2.0 * (np.arange(80) - 25), 0.0, 90.0))
-    poses = [_pose(k, float(turn[k]), 0.0) for k in range(80)]
+    rotation = np.radians(np.clip(2.0 * (np.arange(80) - 25), 0.0, 90.0))
+    poses = [_pose(k, float(rotation[k]), 0.0) for k in range(80)]
     bad = poses[45].position_m.copy()
     bad[TIPS[0]] += 0.02 * KNOB.axis + 0.01  # the thumb somewhere else
     poses[45] = msgspec.structs.replace(poses[45], position_m=bad)
@@ -130,16 +141,16 @@ def test_a_hand_that_opens_and_closes_turns_no_dial_further_than_its_fingers() -
 
 
 def test_a_grip_that_slowly_widens_goes_on_and_a_loose_one_does_not() -> None:
-    course = Course(9e-4)
+    history = GripHistory(9e-4)
     wide = np.linspace(0.0, 2e-3, 60)
     for k, w in enumerate(wide):
-        assert course.sound(k * FRAME_NS, float(w), 2.5e-3)
-        course.push(k * FRAME_NS, float(w), 0.1)
-    assert not course.sound(60 * FRAME_NS, 2.6e-3, 2.5e-3)
-    assert course.loosens
-    assert course.ahead_rad(60 * FRAME_NS) == pytest.approx(0.1)
-    assert not course.sound(61 * FRAME_NS, float("nan"), 2.5e-3)
+        assert history.sound(k * FRAME_NS, float(w), 2.5e-3)
+        history.push(k * FRAME_NS, float(w), 0.1)
+    assert not history.sound(60 * FRAME_NS, 2.6e-3, 2.5e-3)
+    assert history.loosens
+    assert history.ahead_rad(60 * FRAME_NS) == pytest.approx(0.1)
+    assert not history.sound(61 * FRAME_NS, float("nan"), 2.5e-3)
 
 
 def test_nothing_is_led_over_before_anything_was_seen() -> None:
-    assert Course(9e-4).ahead_rad(0) is None
+    assert GripHistory(9e-4).ahead_rad(0) is None

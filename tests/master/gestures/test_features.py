@@ -51,7 +51,7 @@ def test_left_hands_tell_what_right_hands_tell() -> None:
     np.testing.assert_allclose(Quantities.of(left).value, Quantities.of(right).value, atol=1e-6)
 
 
-def test_a_pad_is_on_the_palmar_side_as_far_from_the_bone_as_the_skin() -> None:
+def test_a_pad_is_on_the_palmar_side_as_far_from_the_bone_as_the_surface() -> None:
     features = of(shown(np.zeros((5, 4)), T_rig_palm=np.eye(4)))
     assert (features.pads_m[1:, 1] < features.tips_m[1:, 1] - 0.8 * features.radius_m[1:]).all()
 
@@ -80,9 +80,9 @@ def test_a_pose_without_a_hand_has_no_features() -> None:
 def test_a_finger_that_a_pose_lacks_leaves_the_others() -> None:
     # A wrist device at level ik: no fingertip, no finger.
     pose, whole = shown(posture(POINT)), of(shown(posture(POINT)))
-    place, turned = pose.position_m.copy(), pose.orientation_wxyz.copy()
-    place[17:21], turned[17:21] = np.nan, np.nan
-    features = of(msgspec.structs.replace(pose, position_m=place, orientation_wxyz=turned))
+    place, orientation = pose.position_m.copy(), pose.orientation_wxyz.copy()
+    place[17:21], orientation[17:21] = np.nan, np.nan
+    features = of(msgspec.structs.replace(pose, position_m=place, orientation_wxyz=orientation))
     np.testing.assert_array_equal(features.known, [True, True, True, False, True])
     assert np.isinf(features.shape_sigma_m[3])
     assert np.isfinite(features.joints_m).all()

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 import master.gestures
+from common.capsule_gaps import TaperedCapsules, gaps_between
 from common.geometry import axis_rotation, rigid
 from common.gesture_settings import default_gestures
 from common.hand_model import CHAINS
 from common.messages import HandPose
 from common.sim.gesture_postures import knob_grip, pinch_posture
 from common.sim.motion import POSES, angles_of
-from common.skin_gaps import RoundCones, gaps_between
 from master.estimator.matrices import diagonalise, spread
 from master.gestures.features import FeatureExtractor
-from master.gestures.grip import Tips, turned_by
+from master.gestures.grip import Tips, rotation_between
 from master.gestures.recogniser import GestureRecogniser
 from master.gestures.touch import thumb_touch
 from tests.hand_helpers import RIGHT, any_rotation
@@ -32,8 +32,8 @@ def gripping(count: int) -> list[HandPose]:
     """A hand that turns a knob, 3 degrees a frame from the 30th on."""
     knob = knob_grip(RIGHT, 0.023, STILL)
     angles = angles_of(RIGHT, knob.posture_deg, STILL)
-    turned = [axis_rotation(1, np.radians(3.0 * max(k - 30, 0))) for k in range(count)]
-    return [shown(angles, k * FRAME_NS, T_rig_palm=rigid(R, np.zeros(3))) for k, R in enumerate(turned)]
+    rotated = [axis_rotation(1, np.radians(3.0 * max(k - 30, 0))) for k in range(count)]
+    return [shown(angles, k * FRAME_NS, T_rig_palm=rigid(R, np.zeros(3))) for k, R in enumerate(rotated)]
 
 
 @pytest.mark.parametrize("n", [3, 4])
@@ -60,8 +60,8 @@ def test_a_covariance_spreads_by_the_roots_of_its_eigenvalues() -> None:
 def test_gaps_of_the_thumb_are_those_between_round_cones(name: str) -> None:
     seen = FeatureExtractor(RIGHT).of(shown(angles_of(RIGHT, np.array(POSES[name], np.float64), STILL)))
     assert seen is not None
-    cones = RoundCones.of_segments(seen.joints_m, RIGHT.radius_m)
-    want = gaps_between(cones.part(slice(0, 1), slice(2, 3)), cones.part(slice(1, 5), slice(0, 3)))
+    capsules = TaperedCapsules.of_segments(seen.joints_m, RIGHT.radius_m)
+    want = gaps_between(capsules.part(slice(0, 1), slice(2, 3)), capsules.part(slice(1, 5), slice(0, 3)))
     found = thumb_touch(seen, RIGHT.radius_m)
     np.testing.assert_allclose(found.key_gap_m, want.gap_m, atol=1e-12)
     np.testing.assert_allclose(found.middle_m, want.middle_m[:, 2], atol=1e-12)
@@ -74,7 +74,7 @@ def test_tips_turn_as_they_were_turned() -> None:
     then = Tips(place, sigma, known, np.array([0.0, -1.0, 0.0]), np.eye(3))
     for angle in (0.0, 1e-7, 0.3, 3.0):
         now = then._replace(place_m=place @ axis_rotation(2, angle).T + 0.1)
-        np.testing.assert_allclose(turned_by(now, then), [0.0, 0.0, angle], atol=1e-12)
+        np.testing.assert_allclose(rotation_between(now, then), [0.0, 0.0, angle], atol=1e-12)
 
 
 def test_no_kernel_is_compiled_while_a_hand_is_tracked() -> None:
@@ -106,10 +106,10 @@ def test_kernels_are_compiled_once_whether_or_not_a_hand_may_be_written() -> Non
 def test_a_finger_that_is_lost_while_a_dial_turns_leaves_the_dial() -> None:
     recogniser, told = GestureRecogniser(default_gestures(), RIGHT), list[float]()
     for k, pose in enumerate(gripping(60)):
-        place, turned = pose.position_m.copy(), pose.orientation_wxyz.copy()
+        place, rotated = pose.position_m.copy(), pose.orientation_wxyz.copy()
         if k >= 45:
-            place[CHAINS[4]], turned[CHAINS[4]] = np.nan, np.nan
-        lacking = msgspec.structs.replace(pose, position_m=place, orientation_wxyz=turned)
+            place[CHAINS[4]], rotated[CHAINS[4]] = np.nan, np.nan
+        lacking = msgspec.structs.replace(pose, position_m=place, orientation_wxyz=rotated)
         told += [one.angle_rad for one in recogniser.push(lacking) if one.kind == "dial"]
     assert np.isfinite(told).all()
     assert np.degrees(np.abs(np.diff(told)).max()) < 4.5

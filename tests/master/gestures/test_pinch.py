@@ -5,7 +5,7 @@ import pytest
 
 from common.gesture_settings import default_gestures
 from master.gestures.features import FeatureExtractor
-from master.gestures.pinch import PinchWatch
+from master.gestures.pinch import PinchMonitor
 from master.gestures.touch import ThumbTouch, thumb_touch
 from tests.hand_helpers import RIGHT
 from tests.master.gestures.shown_hands import FRAME_NS, PINCH, posture, shown
@@ -23,7 +23,7 @@ def told_of(
     seen = FeatureExtractor(RIGHT).of(shown(posture(PINCH), FRAME_NS))
     assert seen is not None
     touch = changed(thumb_touch(seen, RIGHT.radius_m), gap_mm, sigma_mm, apart_deg, doubt_deg)
-    return [one.name for one in PinchWatch(PINCHES).push(seen, touch, may_begin=True)]
+    return [one.name for one in PinchMonitor(PINCHES).push(seen, touch, may_begin=True)]
 
 
 def changed(

@@ -7,13 +7,13 @@ from common.gesture_settings import default_gestures
 from common.hand_model import CHAINS
 from common.messages import Gesture
 from master.gestures.features import FeatureExtractor
-from master.gestures.point import PointWatch
+from master.gestures.point import PointMonitor
 from tests.hand_helpers import RIGHT
 from tests.master.gestures.shown_hands import FRAME_NS, POINT, posture, shown
 
 
 def told_of(knuckle_sigma_m: list[float]) -> list[Gesture]:
-    watch, out = PointWatch(default_gestures().point), list[Gesture]()
+    watch, out = PointMonitor(default_gestures().point), list[Gesture]()
     for k, sigma in enumerate(knuckle_sigma_m):
         pose = shown(posture(POINT), k * FRAME_NS)
         cov = pose.cov_m2.copy()

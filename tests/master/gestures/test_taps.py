@@ -14,7 +14,7 @@ from common.hand_model import CHAINS
 from common.messages import Gesture, HandPose
 from common.sim.motion import angles_of
 from master.gestures.features import FeatureExtractor
-from master.gestures.taps import TapWatch
+from master.gestures.taps import ThumbTapMonitor
 from master.gestures.touch import thumb_touch
 from tests.hand_helpers import RIGHT, palm
 from tests.master.gestures.shown_hands import FRAME_NS, shown
@@ -38,9 +38,9 @@ def over(
     ends = np.array([[CHAINS[f, s], CHAINS[f, s + 1]] for f, s in places])
     middle = joints.position_m[ends].mean(axis=(0, 1))
     out = -joints.rotation[ends[0, 0], :, 1] * (-1.0 if dorsal else 1.0)
-    skin_m = RIGHT.radius_m[ends].mean() + RIGHT.radius_m[CHAINS[0, 3]]
+    surface_m = RIGHT.radius_m[ends].mean() + RIGHT.radius_m[CHAINS[0, 3]]
     position, wxyz = hand.position_m.copy(), hand.orientation_wxyz.copy()
-    position[CHAINS[0]] = middle + out * (skin_m + gap_m + np.array([0.10, 0.065, 0.03, 0.0])[:, None])
+    position[CHAINS[0]] = middle + out * (surface_m + gap_m + np.array([0.10, 0.065, 0.03, 0.0])[:, None])
     across = joints.rotation[ends[0, 0], :, 0]
     wxyz[CHAINS[0]] = matrix_to_quaternion(np.column_stack([across, np.cross(out, across), out]))
     return msgspec.structs.replace(hand, position_m=position, orientation_wxyz=wxyz)
@@ -53,7 +53,7 @@ def gap_at(k: int, down: int = 5, pace: int = 8) -> float:
 
 
 def told_of(pose: Callable[[int], HandPose], frames: int = 80, settings: TapSettings = TAPS) -> list[Gesture]:
-    watch, out = TapWatch(settings), list[Gesture]()
+    watch, out = ThumbTapMonitor(settings), list[Gesture]()
     for k in range(frames):
         seen = FeatureExtractor(RIGHT).of(pose(k))
         assert seen is not None

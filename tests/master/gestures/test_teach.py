@@ -1,4 +1,4 @@
-"""Taught poses: known again from other holds, told from the study's, refused where they are not, saved whole."""
+"""PoseTemplate poses: known again from other holds, told from the study's, refused where they are not, saved whole."""
 
 from pathlib import Path
 
@@ -15,9 +15,9 @@ from common.hand_model import HandModel
 from common.messages import HandPose
 from master.gestures.command import gestures_app, seconds_of, with_pose
 from master.gestures.features import FeatureExtractor, HandFeatures
-from master.gestures.lesson import lesson, what_lacks
 from master.gestures.poses import PoseRecogniser
-from master.gestures.teach import Example, learn
+from master.gestures.template_session import template_session, what_lacks
+from master.gestures.templates import Example, learn
 from master.outputs.files import PosesFile
 from tests.hand_helpers import RIGHT
 from tests.master.gestures.shown_hands import FRAME_NS, OPEN, PINCH, POINT, SMALL, posture, shown
@@ -67,10 +67,10 @@ def test_a_taught_pose_is_known_again_and_changes_no_other(count: int) -> None:
 
 
 def test_what_tells_it_apart_is_said() -> None:
-    said = learn("horns", examples(4), SETTINGS).said
-    pointing = next(line for line in said if line.startswith("from pointing"))
+    stated = learn("horns", examples(4), SETTINGS).stated
+    pointing = next(line for line in stated if line.startswith("from pointing"))
     assert "little_bend_deg" in pointing
-    assert any(line.startswith("each example fits") for line in said)
+    assert any(line.startswith("each example fits") for line in stated)
 
 
 def test_a_pose_like_another_is_refused_and_named() -> None:
@@ -78,11 +78,11 @@ def test_a_pose_like_another_is_refused_and_named() -> None:
     same = [Example.of(frames(posture(POINT, variation(rng)))) for _ in range(4)]
     with pytest.raises(FitError, match=r"gun: too like 'pointing'.*--within pointing"):
         learn("gun", same, SETTINGS)
-    taught = with_pose(SETTINGS, "horns", learn("horns", examples(4), SETTINGS), "a test")
+    templates = with_pose(SETTINGS, "horns", learn("horns", examples(4), SETTINGS), "a test")
     with pytest.raises(FitError, match="too like 'horns'"):
-        learn("metal", examples(4, seed=9), taught)
-    again = learn("horns", examples(4, seed=9), taught)  # the same name: it is taught anew
-    assert again.shape != taught.poses["horns"]
+        learn("metal", examples(4, seed=9), templates)
+    again = learn("horns", examples(4, seed=9), templates)  # the same name: it is taught anew
+    assert again.shape != templates.poses["horns"]
 
 
 def test_a_special_case_wins_over_its_general_one_and_leaves_it_the_rest() -> None:
@@ -140,10 +140,10 @@ class Stage:
 
 
 def test_the_lesson_counts_down_and_collects_holds() -> None:
-    stage, said = Stage(), list[str]()
-    taken = lesson(stage.receive, RIGHT, "horns", 3, stage, said.append)
+    stage, stated = Stage(), list[str]()
+    taken = template_session(stage.receive, RIGHT, "horns", 3, stage, stated.append)
     assert len(taken) == 3
-    assert [line for line in said if line[0].isdigit() and line.endswith("...")] == [
+    assert [line for line in stated if line[0].isdigit() and line.endswith("...")] == [
         "3 ...",
         "2 ...",
         "1 ...",
@@ -153,10 +153,10 @@ def test_the_lesson_counts_down_and_collects_holds() -> None:
 
 @pytest.mark.parametrize(("stage", "why"), [(Stage(moving=True), "moved"), (Stage(silent=True), "no hand")])
 def test_a_hand_that_moves_or_is_not_there_is_asked_again_and_then_given_up(stage: Stage, why: str) -> None:
-    said = list[str]()
+    stated = list[str]()
     with pytest.raises(FitError, match="example 1: not seen at rest in 3 tries"):
-        lesson(stage.receive, RIGHT, "horns", 3, stage, said.append)
-    assert sum(why in line for line in said) == 3
+        template_session(stage.receive, RIGHT, "horns", 3, stage, stated.append)
+    assert sum(why in line for line in stated) == 3
     assert what_lacks([]) != ""
 
 
@@ -182,9 +182,9 @@ def test_the_commands_teach_from_a_file_read_it_list_and_forget(
     save(mine, msgspec.structs.replace(SETTINGS, name="mine"))
     given = ["--settings", str(mine), "--calibration", str(CALIB_JSON)]
     ranges = ["--range", "0.2-0.9", "--range", "2.2-2.9", "--range", "4.2-4.9", "--range", "6.2-6.9"]
-    taught = runner.invoke(gestures_app(), ["teach", "horns", "--poses", str(run[0]), *ranges, *given])
-    assert taught.exit_code == 0, taught.output
-    assert "from pointing" in taught.output
+    templates = runner.invoke(gestures_app(), ["teach", "horns", "--poses", str(run[0]), *ranges, *given])
+    assert templates.exit_code == 0, templates.output
+    assert "from pointing" in templates.output
     written = load(mine, GestureSettings)
     assert written.provenance["horns"].residual["examples"] == 4.0
     read = runner.invoke(gestures_app(), ["read", str(run[0]), *given])

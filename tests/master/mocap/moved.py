@@ -14,7 +14,7 @@ from master.mocap.track import Track
 
 RIGHT = HandModel.of(generated_profile("moved-right", "right"))
 LEFT = HandModel.of(generated_profile("moved-left", "left"))
-TURN = rotation_vector_to_matrix(np.array([0.9, -1.7, 0.4]))
+ROTATION = rotation_vector_to_matrix(np.array([0.9, -1.7, 0.4]))
 SHIFT = np.array([1.0, -2.0, 0.3])
 
 

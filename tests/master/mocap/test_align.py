@@ -8,7 +8,7 @@ from common.errors import FitError
 from common.geometry import matrix_to_rotation_vector, rigid
 from master.mocap.align import align
 from master.mocap.track import Track
-from tests.master.mocap.moved import SHIFT, TURN, hand_at, ns, track_of
+from tests.master.mocap.moved import ROTATION, SHIFT, hand_at, ns, track_of
 
 OURS_S = np.arange(900) / 60.0
 THEIRS_S = np.arange(2000) / 120.0 - 0.7
@@ -21,19 +21,19 @@ def noisy(joints_m: Float, sigma_m: float, seed: int = 1) -> Float:
 
 def theirs(joints_m: Float | None = None) -> Track:
     exact = hand_at(THEIRS_S).position_m if joints_m is None else joints_m
-    return Track(ns(THEIRS_S + LATER_S), exact @ TURN.T + SHIFT)
+    return Track(ns(THEIRS_S + LATER_S), exact @ ROTATION.T + SHIFT)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_frame_and_clock_are_found_as_well_as_is_said(seed: int) -> None:
     found = align(track_of(noisy(hand_at(OURS_S).position_m, 3e-3, seed), OURS_S), theirs())
-    left = found.T_rig_file @ rigid(TURN, SHIFT)
+    left = found.T_rig_file @ rigid(ROTATION, SHIFT)
     off_s = 1e-9 * found.offset_ns + LATER_S
-    turn_deg = np.degrees(np.linalg.norm(matrix_to_rotation_vector(left[:3, :3])))
+    rotation_deg = np.degrees(np.linalg.norm(matrix_to_rotation_vector(left[:3, :3])))
     middle = np.array([0.0, 0.0, 0.6])
     shift_m = np.linalg.norm(left[:3, :3] @ middle + left[:3, 3] - middle)
     assert abs(off_s) < min(4.0 * found.offset_sigma_s, 1e-3)
-    assert turn_deg < min(4.0 * found.rotation_sigma_deg, 0.1)
+    assert rotation_deg < min(4.0 * found.rotation_sigma_deg, 0.1)
     assert shift_m < 3e-4
     assert found.correlation > 0.8
     assert not found.mirrored
@@ -45,7 +45,7 @@ def test_points_that_are_sometimes_wrong_do_not_turn_it() -> None:
     joints[::3, 10] += [0.2, 0.0, 0.0]  # a marker that was swapped
     joints[200:300, 3:9] = np.nan
     found = align(track_of(joints, OURS_S), theirs())
-    left = found.T_rig_file @ rigid(TURN, SHIFT)
+    left = found.T_rig_file @ rigid(ROTATION, SHIFT)
     assert np.degrees(np.linalg.norm(matrix_to_rotation_vector(left[:3, :3]))) < 0.1
     assert abs(1e-9 * found.offset_ns + LATER_S) < 1e-3
 
@@ -63,8 +63,8 @@ def test_a_movement_that_repeats_is_said() -> None:
         return hand_at(t_s % 2.0).position_m
 
     found = align(track_of(again(OURS_S), OURS_S), Track(ns(THEIRS_S), again(THEIRS_S + 0.7)))
-    assert abs(found.rival_s) % 2.0 == pytest.approx(0.0, abs=0.05)
-    assert np.isnan(align(track_of(hand_at(OURS_S).position_m, OURS_S), theirs()).rival_s)
+    assert abs(found.alternative_s) % 2.0 == pytest.approx(0.0, abs=0.05)
+    assert np.isnan(align(track_of(hand_at(OURS_S).position_m, OURS_S), theirs()).alternative_s)
 
 
 def test_another_movement_is_refused() -> None:

@@ -107,7 +107,7 @@ def test_joints_of_a_program_are_ours(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "output"),
     [
         ("HIERARCHY", "HIERARCHIE", "it has HIERARCHY and MOTION"),
         ("Frames: 2", "Frames: 3", "42 numbers, 3 frames of 21 channels have 63"),
@@ -119,13 +119,13 @@ def test_joints_of_a_program_are_ours(tmp_path: Path) -> None:
         ("{\n  OFFSET 1.0", "OFFSET 1.0", "broken BVH"),
     ],
 )
-def test_a_broken_file_is_refused(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_a_broken_file_is_refused(tmp_path: Path, old: str, new: str, output: str) -> None:
     assert old in SMALL
     path = tmp_path / "broken.bvh"
     path.write_text(SMALL.replace(old, new, 1))
     with pytest.raises(RecordingError, match=r"broken\.bvh") as caught:
         read_bvh(path)
-    assert said in str(caught.value)
+    assert output in str(caught.value)
 
 
 def test_a_file_that_breaks_off_is_refused(tmp_path: Path) -> None:

@@ -68,13 +68,13 @@ def test_a_false_tracked_joint_is_counted(noisy: Poses) -> None:
     assert found["classes"]["tip"]["tracked_percent"] == pytest.approx(100.0 * (1.0 - 0.1 / 5.0))
     # A PIP that is wrong by more than 20 degrees makes the finger's joints false, near as they may be.
     bent = hand_at(T_S)
-    turned = exact.position_m.copy()
+    rotated = exact.position_m.copy()
     middle, last = (
         JOINTS.index("index-finger-phalanx-intermediate"),
         JOINTS.index("index-finger-phalanx-distal"),
     )
-    turned[:, middle] += bent.rotation[:, middle] @ np.array([0.0, 0.011, 0.0])
-    found = of(replace(exact, position_m=turned), truth())
+    rotated[:, middle] += bent.rotation[:, middle] @ np.array([0.0, 0.011, 0.0])
+    found = of(replace(exact, position_m=rotated), truth())
     assert found["fingers"]["index"]["pip_deg"] > 20.0
     assert found["fingers"]["index"]["false_tracked_percent"] > 50.0
     assert found["fingers"]["middle"]["false_tracked_percent"] == 0.0

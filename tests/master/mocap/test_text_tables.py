@@ -112,7 +112,7 @@ HEAD = "time,wrist_x_m,wrist_y_m,wrist_z_m\n"
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "output"),
     [
         ("", "is empty"),
         ("a,b\n1,2\n", "no columns NAME_x"),
@@ -128,10 +128,10 @@ HEAD = "time,wrist_x_m,wrist_y_m,wrist_z_m\n"
         ("time,wrist_x,wrist_y,wrist_z\n0,1,2,3\n", "give --unit"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_with_a_table_is_said(tmp_path: Path, text: str, said: str) -> None:
+def test_what_is_wrong_with_a_table_is_said(tmp_path: Path, text: str, output: str) -> None:
     with pytest.raises(RecordingError, match=r"broken\.csv") as caught:
         read_motion(written(tmp_path / "broken.csv", text))
-    assert said in str(caught.value)
+    assert output in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,10 @@ NOISE_M = 0.002
 def object_at(t_s: float) -> Float:
     """Rests for a second, is lifted by 10 cm, turned by 40 degrees about an axis beside it, and rests."""
     share = float(np.clip((t_s - 1.0) / 1.0, 0.0, 1.0))
-    turn = np.radians(40.0) * float(np.clip((t_s - 2.5) / 1.0, 0.0, 1.0))
-    return rigid(rotation_vector_to_matrix(np.array([0.0, 0.0, turn])), np.array([0.0, -0.1 * share, 0.5]))
+    rotation = np.radians(40.0) * float(np.clip((t_s - 2.5) / 1.0, 0.0, 1.0))
+    return rigid(
+        rotation_vector_to_matrix(np.array([0.0, 0.0, rotation])), np.array([0.0, -0.1 * share, 0.5])
+    )
 
 
 def told(
@@ -39,12 +41,12 @@ def told(
 
 
 def test_what_is_lifted_and_turned_is_carried_and_stays_so_at_rest() -> None:
-    said = told(5.0)
-    assert not any(said[:60])  # at rest beside a hand at rest: nobody knows
-    assert all(said[60 + 30 :])  # half a second after it begins to move
+    output = told(5.0)
+    assert not any(output[:60])  # at rest beside a hand at rest: nobody knows
+    assert all(output[60 + 30 :])  # half a second after it begins to move
 
 
-def test_a_hand_that_rests_beside_what_others_move_carries_nothing() -> None:
+def test_a_hand_that_rests_next_to_what_others_move_carries_nothing() -> None:
     assert not any(told(5.0, lambda t_s: transform(object_at(0.0), PALM_M)))
 
 
@@ -57,9 +59,9 @@ def test_what_moves_alike_but_far_away_is_not_carried() -> None:
 
 
 def test_fingers_that_are_seen_to_be_away_let_go() -> None:
-    said = told(5.0, away_s=4.0)
-    assert said[239]
-    assert not any(said[240:])
+    output = told(5.0, away_s=4.0)
+    assert output[239]
+    assert not any(output[240:])
 
 
 def test_a_palm_that_moves_on_has_left_it() -> None:
@@ -68,9 +70,9 @@ def test_a_palm_that_moves_on_has_left_it() -> None:
     def palm(t_s: float) -> Float:
         return transform(object_at(t_s), PALM_M) + np.array([0.0, 0.0, -0.1 * max(t_s - 4.0, 0.0)])
 
-    said = told(5.0, palm)
-    assert said[240]
-    assert not any(said[240 + 24 :])
+    output = told(5.0, palm)
+    assert output[240]
+    assert not any(output[240 + 24 :])
 
 
 @pytest.mark.parametrize("lost", [np.full(3, np.nan)])

@@ -14,7 +14,7 @@ from common.messages import JOINT_COUNT, HandPose, ObjectPose
 from common.object_profile import CylinderShape, ObjectProfile
 from common.sim.grip import bar_in_palm, closed_round, gaps_m
 from common.sim.motion import REST, angles_of
-from master.objects.contact import ContactWatch
+from master.objects.contact import ContactMonitor
 
 HAND = HandModel.of(load(Path(__file__).parents[3] / "calib_json/hands/default-right.json", HandProfile))
 RADIUS_M = 0.012
@@ -66,8 +66,8 @@ def bar(T: Float, t_ns: int = 0, cov: Float | None = None) -> ObjectPose:
     )
 
 
-def watch(T: Float = PALM @ IN_PALM, t_ns: int = 0) -> ContactWatch:
-    watching = ContactWatch(HAND, [BAR])
+def watch(T: Float = PALM @ IN_PALM, t_ns: int = 0) -> ContactMonitor:
+    watching = ContactMonitor(HAND, [BAR])
     watching.push_object(bar(T, t_ns))
     return watching
 
@@ -104,7 +104,7 @@ def test_the_points_are_on_the_surface_as_far_away_as_is_said() -> None:
 def test_sigma_is_that_of_hand_and_object_along_the_normal() -> None:
     cov = np.zeros((6, 6))
     cov[:3, :3] = 4e-6 * np.eye(3)
-    watching = ContactWatch(HAND, [BAR])
+    watching = ContactMonitor(HAND, [BAR])
     watching.push_object(bar(PALM @ IN_PALM, 0, cov))
     contact = watching.push(hand(OPEN, sigma_m=2e-3))[0]
     np.testing.assert_allclose(contact.sigma_m, 1e-3 * np.sqrt(4.0 + 4.0 + 1.0), rtol=1e-6)
@@ -127,7 +127,7 @@ def test_the_object_is_brought_to_the_instant_of_the_hand() -> None:
     T = PALM @ IN_PALM
     shift = rigid(np.eye(3), np.array([0.0, 0.0, 0.0]))
     shift[:3, 3] = 0.02 * PALM[:3, 1]
-    watching = ContactWatch(HAND, [BAR])
+    watching = ContactMonitor(HAND, [BAR])
     watching.push_object(bar(invert_shift(shift) @ T, 0))
     watching.push_object(bar(shift @ T, 20_000_000))
     there = watching.push(hand(CLOSED, 10_000_000))[0]

@@ -23,9 +23,9 @@ from common.geometry import (
 )
 from common.messages import MarkerDetections, ObjectPose, ObjectSource, TagDetections
 from common.object_profile import ObjectProfile
-from master.objects.course import HELD_S
 from master.objects.line import ObjectLine
 from master.objects.start import two_poses
+from master.objects.trajectory import HELD_S
 
 CALIBRATION = Path(__file__).parents[3] / "calib_json"
 Message = MarkerDetections | TagDetections
@@ -73,9 +73,9 @@ WAND, CUBE = Setup.of("wand"), Setup.of("cube")
 FLAT, TOP = axis_rotation(0, np.pi / 2), axis_rotation(1, np.radians(145.0))
 
 
-def about(first: Float, seed: int = 1, speed_m_s: float = 0.5, turn_rad_s: float = np.pi / 3) -> Where:
+def about(first: Float, seed: int = 1, speed_m_s: float = 0.5, rotation_rad_s: float = np.pi / 3) -> Where:
     """A way on which what faces the cameras at first goes on facing them."""
-    way = wander(seed, np.zeros(3), speed_m_s, turn_rad_s)
+    way = wander(seed, np.zeros(3), speed_m_s, rotation_rad_s)
     back = invert(way(0.0))
     at = rigid(first, np.array([0.0, 0.0, 0.5]))
 
@@ -98,9 +98,9 @@ def errors(poses: list[ObjectPose], where: Where) -> tuple[Float, Float]:
     for pose in poses:
         if np.isfinite(pose.position_m).all():
             T = where(pose.t_ns * 1e-9)
-            turn = quaternion_to_matrix(pose.orientation_wxyz) @ T[:3, :3].T
+            rotation = quaternion_to_matrix(pose.orientation_wxyz) @ T[:3, :3].T
             mm.append(1e3 * float(np.linalg.norm(pose.position_m - T[:3, 3])))
-            deg.append(float(np.degrees(np.linalg.norm(matrix_to_rotation_vector(turn)))))
+            deg.append(float(np.degrees(np.linalg.norm(matrix_to_rotation_vector(rotation)))))
     return np.array(mm), np.array(deg)
 
 
@@ -126,8 +126,8 @@ def test_its_covariance_covers_its_errors() -> None:
         where = about(FLAT, seed)
         for pose in run(WAND.line(), WAND.messages(where, 0.7, seed))[2:]:
             T = where(pose.t_ns * 1e-9)
-            turn = matrix_to_rotation_vector(T[:3, :3] @ quaternion_to_matrix(pose.orientation_wxyz).T)
-            off = np.concatenate([T[:3, 3] - pose.position_m, turn])
+            rotation = matrix_to_rotation_vector(T[:3, :3] @ quaternion_to_matrix(pose.orientation_wxyz).T)
+            off = np.concatenate([T[:3, 3] - pose.position_m, rotation])
             squares.append(float(off @ np.linalg.solve(pose.cov, off)) / 6.0)
     assert 0.05 < np.mean(squares) < 2.0
 
@@ -206,12 +206,14 @@ def test_beads_do_not_begin_with_one_camera_alone() -> None:
     assert all(np.isnan(pose.position_m).all() for pose in run(WAND.line(), iter(messages)))
 
 
-def with_uv(message: MarkerDetections, row: int, uv: Float, rival: Float | None = None) -> MarkerDetections:
-    places, rivals = message.uv.copy(), message.rival_uv.copy()
+def with_uv(
+    message: MarkerDetections, row: int, uv: Float, alternative: Float | None = None
+) -> MarkerDetections:
+    places, alternatives = message.uv.copy(), message.alt_uv.copy()
     places[row] = uv
-    if rival is not None:
-        rivals[row] = rival
-    return msgspec.structs.replace(message, uv=places, rival_uv=rivals)
+    if alternative is not None:
+        alternatives[row] = alternative
+    return msgspec.structs.replace(message, uv=places, alt_uv=alternatives)
 
 
 def test_another_thing_in_the_colour_of_a_bead_does_no_harm() -> None:
@@ -275,14 +277,14 @@ def test_far_away_the_doubt_of_a_single_tag_reaches_its_other_pose() -> None:
     one = msgspec.structs.replace(CUBE.profile, tags=msgspec.structs.replace(tags, tags=tags.tags[4:]))
     setup = Setup(one, CUBE.rig, CUBE.models)
     at = rigid(axis_rotation(1, np.radians(160.0)), np.array([0.0, 0.0, 0.7]))
-    noise = Noise(stays_px=0.5, fresh_px=0.2)
+    noise = Noise(correlated_px=0.5, independent_px=0.2)
     messages = [m for m in setup.messages(lambda t_s: at, 0.4, 3, noise=noise) if m.camera == "left"]
     poses = [p for p in run(setup.line(), iter(messages)) if np.isfinite(p.position_m).all()]
     assert poses
     for pose in poses:
-        turn = matrix_to_rotation_vector(quaternion_to_matrix(pose.orientation_wxyz) @ at[:3, :3].T)
+        rotation = matrix_to_rotation_vector(quaternion_to_matrix(pose.orientation_wxyz) @ at[:3, :3].T)
         sigma = np.sqrt(np.linalg.eigvalsh(pose.cov[3:, 3:])[-1])
-        assert np.linalg.norm(turn) < 4.0 * sigma
+        assert np.linalg.norm(rotation) < 4.0 * sigma
 
 
 def test_a_bead_that_the_rig_does_not_know_is_refused() -> None:

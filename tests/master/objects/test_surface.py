@@ -5,7 +5,7 @@ import pytest
 
 from common.geometry import rigid, rotation_vector_to_matrix
 from common.object_profile import BoxShape, CylinderShape, Shape, SphereShape
-from common.round_cones import Cones
+from common.tapered_capsules import Capsules
 from master.objects.surface import Surface
 
 BOX = BoxShape(size_m=(0.2, 0.1, 0.04))
@@ -62,13 +62,15 @@ def test_round_cones_are_as_near_as_their_nearest_ball() -> None:
     rng = np.random.default_rng(3)
     start, stop = rng.normal(0.0, 0.05, (2, 20, 3))
     stop = start + 0.3 * (stop - start)  # as long as a bone of a finger
-    cones = Cones(start, stop, rng.uniform(0.005, 0.01, 20), rng.uniform(0.005, 0.01, 20))
+    capsules = Capsules(start, stop, rng.uniform(0.005, 0.01, 20), rng.uniform(0.005, 0.01, 20))
     surface = Surface([BOX])
-    found = surface.nearest_to_cones(cones)
+    found = surface.nearest_to_capsules(capsules)
     share = np.linspace(0.0, 1.0, 4001)[:, None]
     for k in range(20):
         middle = start[k] + share * (stop[k] - start[k])
-        radius = cones.start_radius_m[k] + share[:, 0] * (cones.stop_radius_m[k] - cones.start_radius_m[k])
+        radius = capsules.start_radius_m[k] + share[:, 0] * (
+            capsules.stop_radius_m[k] - capsules.start_radius_m[k]
+        )
         assert found.distance_m[k] == pytest.approx((surface.nearest(middle)[0] - radius).min(), abs=1e-4)
 
 

@@ -35,8 +35,10 @@ QUARTER = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
 HERE = np.array([0.2, 0.3, 0.5])
 
 
-def told(t_ms: float, place: np.ndarray = HERE, turn: np.ndarray = QUARTER, session: int = 1) -> TrackerPose:
-    return TrackerPose("tracker", session, int(t_ms), ZERO_NS + round(t_ms * MS), place, turn)
+def told(
+    t_ms: float, place: np.ndarray = HERE, quaternion: np.ndarray = QUARTER, session: int = 1
+) -> TrackerPose:
+    return TrackerPose("tracker", session, int(t_ms), ZERO_NS + round(t_ms * MS), place, quaternion)
 
 
 def lost(t_ms: float) -> TrackerPose:
@@ -111,8 +113,8 @@ def test_poses_come_once_and_rise_and_a_new_process_may_have_another_clock() -> 
 
 def test_a_turn_that_is_none_is_counted_and_a_foreign_device_is_an_error() -> None:
     line = TrackerLine(CUBE, RIG)
-    assert not one(line, told(0.0, turn=np.array([0.955, 0.0, 0.0, 0.0]))).tracked
-    assert not one(line, told(10.0, turn=np.array([1.0, np.nan, 0.0, 0.0]))).tracked
+    assert not one(line, told(0.0, quaternion=np.array([0.955, 0.0, 0.0, 0.0]))).tracked
+    assert not one(line, told(10.0, quaternion=np.array([1.0, np.nan, 0.0, 0.0]))).tracked
     assert line.counts == {"broken": 1, "lost": 1}
     with pytest.raises(ValueError, match="'other'"):
         line.push(replace(told(20.0), source="other"))
@@ -140,8 +142,8 @@ def test_the_covariance_is_that_of_what_was_left_and_of_the_registration(
     residual = {
         "position_mm": mm,
         "position_sigma_mm": sigma_mm,
-        "turn_deg": deg,
-        "turn_sigma_deg": sigma_deg,
+        "rotation_deg": deg,
+        "rotation_sigma_deg": sigma_deg,
     }
     how = Provenance(date="2026-01-01T00:00:00Z", tool="t", data=(), residual=residual)
     cov = covariance_of(replace(CUBE, provenance={"T_object_tracker": how}))
@@ -163,8 +165,10 @@ def test_from_a_registration_to_poses_that_are_as_right_as_they_say() -> None:
             if not solved.pose.tracked:
                 continue
             R, p = motion.truth(np.array([1e-9 * (solved.pose.t_ns - ZERO_NS)]))
-            turn = matrix_to_rotation_vector(quaternion_to_matrix(solved.pose.orientation_wxyz) @ R[0].T)
-            off = np.concatenate([solved.pose.position_m - p[0], turn])
+            quaternion = matrix_to_rotation_vector(
+                quaternion_to_matrix(solved.pose.orientation_wxyz) @ R[0].T
+            )
+            off = np.concatenate([solved.pose.position_m - p[0], quaternion])
             millimetres.append(1e3 * float(np.linalg.norm(off[:3])))
             degrees.append(float(np.degrees(np.linalg.norm(off[3:]))))
             within.append(float(off @ np.linalg.solve(solved.pose.cov, off)))

@@ -1,4 +1,4 @@
-"""A short recording as a live master would have left it: messages pushed through a `World`, and what it told."""
+"""A short recording as a live master would have left it: messages pushed through a `Dispatcher`, and what it told."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -9,13 +9,13 @@ from typing import NamedTuple
 from common.bus import LoopbackBus
 from common.messages import Contact, Gesture, HandPose, Health, MarkerDetections
 from common.recording import MessageWriter
-from master.hurry import Hurry
-from master.link_senders import Taken
+from master.link_senders import SensorMessage
+from master.load_shedding import LoadShedding
 from master.message_queue import MessageQueue
 from master.recording.digest import ToldDigest
 from master.recording.files import carried_files, rigs_text
 from master.recording.player import world_of
-from master.recording.tap import Tap, Tapped, came_ns
+from master.recording.probe import Probe, Tapped, came_ns
 from master.rig import RigFiles
 from tests.network_helpers import ManualClock
 from tests.synthetic_run import synthetic_run
@@ -48,16 +48,16 @@ def recorded_run(
     files = RigFiles(calibration, ("desk",))
     setups = files.load()
     writer = MessageWriter(path, carried_files(files, setups), {"rigs": rigs_text(files.rigs)})
-    world, live = world_of(setups, Hurry()), ToldDigest()
+    dispatcher, live = world_of(setups, LoadShedding()), ToldDigest()
     messages = scene()[: 2 * frames]
     writer.write("health", report(messages[0].t_ns), messages[0].t_ns)
     for number, message in enumerate(messages):
         t_ns = message.t_ns + LATE_NS
         if number == restart_at:
-            world = world_of(setups, Hurry())
+            dispatcher = world_of(setups, LoadShedding())
             writer.write("health", report(t_ns, 6), t_ns)
         writer.write("taken", message, t_ns)
-        for solved in world.push(message):
+        for solved in dispatcher.push(message):
             told = solved if isinstance(solved, Contact | Gesture) else solved.pose
             live.take(told)
             writer.write("hand" if isinstance(told, HandPose) else "gesture", told, t_ns)
@@ -71,7 +71,7 @@ class Bursts:
     def __init__(self, sizes: Sequence[int]) -> None:
         self.queue, self._sizes, self._come = MessageQueue(2), list(sizes), iter(scene())
 
-    def get(self, timeout_s: float) -> Taken | None:
+    def get(self, timeout_s: float) -> SensorMessage | None:
         if not self.queue.frames and self._sizes:
             self.queue.put(list(islice(self._come, self._sizes.pop(0))))
         return self.queue.get(timeout_s)
@@ -82,17 +82,17 @@ def overloaded_run(path: Path, calibration: Path, bursts: Sequence[int]) -> tupl
     files = RigFiles(calibration, ("desk",))
     setups = files.load()
     writer = MessageWriter(path, carried_files(files, setups), {"rigs": rigs_text(files.rigs)})
-    bus, hurry, come, live = LoopbackBus(), Hurry(setups), Bursts(bursts), ToldDigest()
-    hurry.waiting, world = come.queue.frame_spans, world_of(setups, hurry)
+    bus, load_shedding, come, live = LoopbackBus(), LoadShedding(setups), Bursts(bursts), ToldDigest()
+    load_shedding.waiting, dispatcher = come.queue.frame_spans, world_of(setups, load_shedding)
     shown = bus.subscribe("taken", depth=1000)
-    tap = Tap(bus, ManualClock(), always=True)
-    source = Tapped(come, tap, hurry)
+    probe = Probe(bus, ManualClock(), always=True)
+    source = Tapped(come, probe, load_shedding)
     while (message := source.get(0.0)) is not None:
-        for solved in world.push(message):
+        for solved in dispatcher.push(message):
             live.take(solved if isinstance(solved, Contact | Gesture) else solved.pose)
-    tap.drain()
+    probe.drain()
     while (one := shown.get(0.01)) is not None:
         writer.write("taken", one, came_ns(one, 0))
-    tap.close()
+    probe.close()
     writer.close()
-    return RecordedRun(path, live), world.counts["instants_shed"]
+    return RecordedRun(path, live), dispatcher.counts["instants_shed"]

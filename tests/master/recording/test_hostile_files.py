@@ -64,11 +64,11 @@ class Made:
 
     def taken(self, *messages: tuple[Message, int], stream: str = "taken") -> bytes:
         """A file of these messages, with their log times."""
-        names = dict.fromkeys(sender_of(said) for said, _ in messages)
+        names = dict.fromkeys(sender_of(output) for output, _ in messages)
         numbers = {name: number for number, name in enumerate(names, start=1)}
         channels = [channel(number, stream, name) for name, number in numbers.items()]
         content = b"".join(map(record, channels)) + b"".join(
-            record(message(encode(said), t_ns, numbers[sender_of(said)])) for said, t_ns in messages
+            record(message(encode(output), t_ns, numbers[sender_of(output)])) for output, t_ns in messages
         )
         times = [t_ns for _, t_ns in messages]
         counts = dict.fromkeys(numbers.values(), len(messages) // len(numbers))
@@ -260,7 +260,7 @@ def wider(one: MarkerDetections) -> MarkerDetections:
     """The same frame with two markers more."""
     arrays = {
         name: np.concatenate([getattr(one, name), getattr(one, name)[:2]])
-        for name in ("uv", "area", "sigma_px", "quality", "rival_uv")
+        for name in ("uv", "area", "sigma_px", "quality", "alt_uv")
     }
     return msgspec.structs.replace(one, **arrays)
 
@@ -294,13 +294,13 @@ def test_an_honest_recording_is_read_without_a_loss(tmp_path: Path, files: dict[
 
 @pytest.mark.parametrize(
     ("name", "wanted"),
-    [(name, wanted) for name, (_, said) in ATTACKS.items() for wanted in said],
+    [(name, wanted) for name, (_, output) in ATTACKS.items() for wanted in output],
     ids=lambda one: one if isinstance(one, str) else one[0],
 )
 def test_a_hostile_recording_ends_in_a_line(
     name: str, wanted: tuple[str, ...], tmp_path: Path, files: dict[str, bytes]
 ) -> None:
-    make, said = ATTACKS[name]
+    make, output = ATTACKS[name]
     path = tmp_path / "made" / "hostile.mcap"
     path.parent.mkdir()
     path.write_bytes(make(Made(path.parent, files)))
@@ -311,7 +311,7 @@ def test_a_hostile_recording_ends_in_a_line(
     assert done.code in (0, 1)
     lines = [line for line in done.err.splitlines() if line.startswith("phalanx-master:")]
     assert len(lines) == done.code, done.err
-    assert re.search(said[wanted], done.text), done.text
+    assert re.search(output[wanted], done.text), done.text
     if wanted == INFO:
         assert done.spent_s < MOST_S
     inside = {one.relative_to(tmp_path).parts[0] for one in tmp_path.rglob("*")}

@@ -12,7 +12,7 @@ from common.errors import BusError, PhalanxError, RecordingError
 from common.messages import Backlog, Command, HandPose, Told
 from common.recording import open_messages
 from common.streams import MASTER
-from master.hurry import MOST
+from master.load_shedding import MOST
 from master.outputs.files import load_poses
 from master.recording.clock import ReplayClock
 from master.recording.files import recorded_setups
@@ -73,11 +73,11 @@ def test_every_speed_tells_what_was_told_live(run: RecordedRun, whole: tuple[Pas
 
 def test_what_a_master_that_fell_behind_left_out_is_left_out_again(tmp_path: Path, root: Path) -> None:
     bursts = [*[2] * 6, 16, 4, 4, 4, *[2] * 4]
-    (path, live), shed = overloaded_run(tmp_path / "run.mcap", root / "calib_json", bursts)
+    (path, live), dropped_epochs = overloaded_run(tmp_path / "run.mcap", root / "calib_json", bursts)
     recording = open_messages(path)
-    said = [one.message for one in recording.read(["taken"]) if isinstance(one.message, Backlog)]
-    assert [one.leave_out for one in said] == 4 * [MOST, 0]
-    assert (shed, live.counts["poses"]) == (10, FRAMES - 10)
+    output = [one.message for one in recording.read(["taken"]) if isinstance(one.message, Backlog)]
+    assert [one.reject for one in output] == 4 * [MOST, 0]
+    assert (dropped_epochs, live.counts["poses"]) == (10, FRAMES - 10)
     setups = recorded_setups(recording)
     for passed in (Player(recording, setups, []).run(), Player(recording, setups, [], speed=2.0).run()):
         assert passed.digest.counts == live.counts
@@ -105,12 +105,12 @@ def test_a_stretch_begins_settled(run: RecordedRun, whole: tuple[Passed, list[Ha
 
 def test_a_master_that_was_started_again_is_so_in_the_replay(twice: RecordedRun) -> None:
     recording = open_messages(twice.path)
-    said: list[str] = []
-    passed = Player(recording, recorded_setups(recording), [], say=said.append).run()
+    output: list[str] = []
+    passed = Player(recording, recorded_setups(recording), [], notify=output.append).run()
     assert passed.digest.lines() == twice.live.lines()
-    assert said == events_of(recording)
-    assert len(said) == 1
-    assert "started again" in said[0]
+    assert output == events_of(recording)
+    assert len(output) == 1
+    assert "started again" in output[0]
 
 
 def played(
@@ -129,7 +129,7 @@ def test_the_playing_master_obeys(run: RecordedRun) -> None:
     try:
         assert until(lambda: MASTER in asker.alive(), 30.0)
         asker.ask(Command(MASTER, "pause"), 1.0)
-        paused = asker.ask(Command(MASTER, "report"), 1.0).gauges
+        paused = asker.ask(Command(MASTER, "report"), 1.0).metrics
         assert paused["play.paused"] == 1.0
         assert paused["play.length_s"] == pytest.approx(0.392, abs=0.01)
         with pytest.raises(BusError, match=r"t_s 99: must be 0\.000 to 0\.3"):
@@ -148,7 +148,7 @@ def test_the_playing_master_obeys(run: RecordedRun) -> None:
             asker.ask(Command(MASTER, "dance"), 1.0)
         asker.ask(Command(MASTER, "seek", '{"t_s": 0.3}'), 1.0)
         asker.ask(Command(MASTER, "speed", '{"factor": 0}'), 1.0)
-        assert asker.ask(Command(MASTER, "resume"), 1.0).gauges["play.paused"] == 0.0
+        assert asker.ask(Command(MASTER, "resume"), 1.0).metrics["play.paused"] == 0.0
         thread.join(60.0)
     finally:
         stop.set()

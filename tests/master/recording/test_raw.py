@@ -45,8 +45,8 @@ class FakeSlave:
         return Health(self.name, 1, 1, counts, {"raw.on": float(self.on), "raw.megabytes": 12.3})
 
 
-def asker(cameras: Sequence[str], said: list[str]) -> RawAsker:
-    return RawAsker("wave", cameras, said.append, lambda _told: None, period_s=0.01)
+def asker(cameras: Sequence[str], output: list[str]) -> RawAsker:
+    return RawAsker("wave", cameras, output.append, lambda _told: None, period_s=0.01)
 
 
 def test_slaves_keep_raw_frames_for_as_long_as_messages_are_recorded(
@@ -56,23 +56,23 @@ def test_slaves_keep_raw_frames_for_as_long_as_messages_are_recorded(
     hub = LoopbackBus()
     master, left = FakeMaster(hub.join()), FakeSlave(hub, "left")
     FakeSlave(hub, "right", "raw: this slave keeps no raw frames: start it with --raw-folder DIR")
-    path, said = tmp_path / "wave.mcap", list[str]()
+    path, output = tmp_path / "wave.mcap", list[str]()
     settings = RecordSettings(path, RigFiles(root / "calib_json", ("desk",)), reserve_bytes=0, raw=True)
-    stop, thread, out = recording(settings, lambda _stop: hub.join(), said)
+    stop, thread, out = recording(settings, lambda _stop: hub.join(), output)
     try:
-        assert until(lambda: left.on and any("right" in line for line in said))
-        assert until(lambda: len(said) == 3)
+        assert until(lambda: left.on and any("right" in line for line in output))
+        assert until(lambda: len(output) == 3)
     finally:
         stop.set()
         thread.join(60.0)
-        master.tap.close()
+        master.probe.close()
     assert isinstance(out[0], Progress), "a camera that refuses does not end it"
     assert not left.on
     assert left.kept == ["wave-left"]
-    text = "\n".join(said)
+    text = "\n".join(output)
     assert "camera left: raw frames into wave-left" in text
     assert "camera right: raw frames not recorded: 'right' refused 'raw': raw: this slave keeps no" in text
-    assert said[-1] == "camera left: 42 raw frames, 3 dropped, in wave-left (12.3 MB)"
+    assert output[-1] == "camera left: 42 raw frames, 3 dropped, in wave-left (12.3 MB)"
     kept = open_messages(path)
     assert kept.about["raw"] == '{"left": "wave-left", "right": "wave-right"}'
     assert raw_lines(kept) == ["raw frames of left: 42 in wave-left, 3 dropped", "raw frames of right: none"]
@@ -94,10 +94,10 @@ def test_a_name_that_is_no_folder_is_refused_before_anything_is_made(tmp_path: P
 
 
 def test_a_slave_that_was_away_begins_a_further_part_and_one_with_a_fault_does_not() -> None:
-    bus, said = LoopbackBus(), list[str]()
-    one = asker(("left",), said)
+    bus, output = LoopbackBus(), list[str]()
+    one = asker(("left",), output)
     one.attach(bus)
-    assert until(lambda: said == ["camera left does not answer; its raw frames begin when it does"])
+    assert until(lambda: output == ["camera left does not answer; its raw frames begin when it does"])
     left = FakeSlave(bus, "left")
     assert until(lambda: left.kept == ["wave-left"])
     one.detach()
@@ -105,9 +105,9 @@ def test_a_slave_that_was_away_begins_a_further_part_and_one_with_a_fault_does_n
     one.attach(bus)
     assert until(lambda: left.kept == ["wave-left", "wave-left-2"])
     left.ended, left.why_not = 1, "the disk is full"
-    assert until(lambda: len(said) == 4)
+    assert until(lambda: len(output) == 4)
     one.end(bus)
-    assert said[1:] == [
+    assert output[1:] == [
         "camera left: raw frames into wave-left",
         "camera left: raw frames into wave-left-2",
         "camera left: raw frames ended: 'left' refused 'raw': the disk is full",
@@ -116,15 +116,15 @@ def test_a_slave_that_was_away_begins_a_further_part_and_one_with_a_fault_does_n
 
 
 def test_a_slave_that_is_gone_at_the_end_ends_by_itself() -> None:
-    bus, said = LoopbackBus(), list[str]()
+    bus, output = LoopbackBus(), list[str]()
     end = bus.join()
     FakeSlave(end, "left")
-    one = asker(("left",), said)
+    one = asker(("left",), output)
     one.attach(bus)
-    assert until(lambda: len(said) == 1)
+    assert until(lambda: len(output) == 1)
     one.detach()
     end.close()
     one.end(bus)
-    assert said[1].startswith(
+    assert output[1].startswith(
         f"camera left: raw frames end within {raw.LEASE_S:g} s by themselves: no answer"
     )

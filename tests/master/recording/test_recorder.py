@@ -17,13 +17,13 @@ from common.messages import Backlog, Command, Health, MarkerDetections, Message,
 from common.recording import MessageWriter, open_messages
 from common.streams import MASTER
 from common.zenoh_bus import ZenohBus
-from master.hurry import Hurry
-from master.recording import feed, process
-from master.recording.feed import MasterClock
+from master.load_shedding import LoadShedding
+from master.recording import process, subscriber
 from master.recording.lines import ProgressLine, events_of, progress_text
+from master.recording.probe import LEASE_NS, Probe, Tapped, came_ns
 from master.recording.process import NAME, RecordSettings, run_recorder
 from master.recording.recorder import MessageRecorder, Progress
-from master.recording.tap import LEASE_NS, Tap, Tapped, came_ns
+from master.recording.subscriber import MasterClock
 from master.rig import RigFiles
 from tests.network_helpers import ManualClock, detections, free_endpoint, until
 from tests.picture_helpers import TINY
@@ -47,73 +47,73 @@ def frames(count: int, first: int = 0) -> list[Message]:
 def test_the_tap_shows_only_while_somebody_asks_and_all_of_it_in_order() -> None:
     bus, clock = LoopbackBus(), ManualClock(10)
     shown = bus.subscribe("taken", depth=100)
-    tap = Tap(bus, clock)
-    source = Tapped(Listed(frames(9)), tap, Hurry())
-    assert tap.counts == {}
+    probe = Probe(bus, clock)
+    source = Tapped(Listed(frames(9)), probe, LoadShedding())
+    assert probe.counts == {}
     assert source.get(0.0) is not None
     assert source.get(0.0) is not None
-    assert tap.counts == {}, "nobody asked"
-    tap.lease()
+    assert probe.counts == {}, "nobody asked"
+    probe.lease()
     for _ in range(3):
         source.get(0.0)
     clock.t_ns += LEASE_NS
     for _ in range(3):
         source.get(0.0)
-    tap.lease()
+    probe.lease()
     source.get(0.0)
     source.flush()
     source.flush()
-    tap.drain()
+    probe.drain()
     seqs = [message.seq for message in iter(lambda: cast(MarkerDetections | None, shown.get(0.01)), None)]
     assert seqs == [1, 2, 3, 7, 8]
-    assert tap.counts == {"tap.shown": 5, "tap.dropped": 0}
-    tap.close()
+    assert probe.counts == {"tap.shown": 5, "tap.dropped": 0}
+    probe.close()
 
 
 def test_a_tap_from_the_beginning_shows_everything_until_its_recorder_is_gone() -> None:
     bus = LoopbackBus()
     shown = bus.subscribe("taken", depth=100)
-    tap = Tap(bus, ManualClock(), always=True)
+    probe = Probe(bus, ManualClock(), always=True)
     for message in frames(4):
-        tap.show(message)
-    tap.end_always()
-    tap.show(detections("left", 1, 9))
-    tap.drain()
+        probe.show(message)
+    probe.end_always()
+    probe.show(detections("left", 1, 9))
+    probe.drain()
     assert len(list(iter(lambda: shown.get(0.01), None))) == 4
     bus.close()
-    tap.close()
+    probe.close()
 
 
-class Behind(Hurry):
+class Behind(LoadShedding):
     """So far behind, message by message."""
 
-    def __init__(self, leave_out: list[int]) -> None:
+    def __init__(self, reject: list[int]) -> None:
         super().__init__()
-        self._next = leave_out
+        self._next = reject
 
     def look(self, message: Message) -> None:
-        self.leave_out = self._next.pop(0)
+        self.reject = self._next.pop(0)
 
 
 def test_how_far_behind_the_master_is_comes_before_the_message_it_holds_for() -> None:
-    bus, hurry = LoopbackBus(), Behind([0, 3, 3, 3, 0, 0])
+    bus, load_shedding = LoopbackBus(), Behind([0, 3, 3, 3, 0, 0])
     shown = bus.subscribe("taken", depth=100)
-    tap = Tap(bus, ManualClock(10))
-    source = Tapped(Listed(frames(6)), tap, hurry)
-    tap.lease()
+    probe = Probe(bus, ManualClock(10))
+    source = Tapped(Listed(frames(6)), probe, load_shedding)
+    probe.lease()
     for number in range(7):
         if number == 3:
-            tap.lease()  # of a second reader, who knows nothing yet
+            probe.lease()  # of a second reader, who knows nothing yet
         source.get(0.0)
-    tap.drain()
+    probe.drain()
     told = [
-        (one.leave_out, one.t_ns) if isinstance(one, Backlog) else cast(MarkerDetections, one).seq
+        (one.reject, one.t_ns) if isinstance(one, Backlog) else cast(MarkerDetections, one).seq
         for one in iter(lambda: shown.get(0.01), None)
     ]
     at = [came_ns(one, 0) for one in frames(6)]
     assert told == [0, (3, at[1]), 1, (3, at[2]), 2, 3, (0, at[4]), 4, 5]
-    assert tap.counts == {"tap.shown": 9, "tap.dropped": 0}
-    tap.close()
+    assert probe.counts == {"tap.shown": 9, "tap.dropped": 0}
+    probe.close()
 
 
 class Stuck:
@@ -179,24 +179,26 @@ class FakeMaster:
 
     def __init__(self, bus: Bus, session: int = 5) -> None:
         self.bus, self.session, self.reloads, self.clock = bus, session, 0, ManualClock(1)
-        self.tap = Tap(bus, self.clock)
+        self.probe = Probe(bus, self.clock)
         bus.announce(MASTER)
         bus.serve(MASTER, self.answer)
 
     def answer(self, command: Command) -> Health:
         assert command.verb == "tap"
-        self.tap.lease()
-        return Health(MASTER, self.session, now_ns(), {"reload.applied": self.reloads} | self.tap.counts, {})
+        self.probe.lease()
+        return Health(
+            MASTER, self.session, now_ns(), {"reload.applied": self.reloads} | self.probe.counts, {}
+        )
 
 
 def recording(
-    settings: RecordSettings, connect: Callable[[threading.Event], Bus | None], said: list[str]
+    settings: RecordSettings, connect: Callable[[threading.Event], Bus | None], output: list[str]
 ) -> tuple[threading.Event, threading.Thread, list[Progress | RecordingError]]:
     stop, out = threading.Event(), list[Progress | RecordingError]()
 
     def work() -> None:
         try:
-            out.append(run_recorder(settings, connect, stop, said.append, lambda _now, _lost: None))
+            out.append(run_recorder(settings, connect, stop, output.append, lambda _now, _lost: None))
         except RecordingError as error:
             out.append(error)
 
@@ -223,20 +225,20 @@ def test_a_recorder_keeps_what_a_master_takes_and_tells(
 
     for name in ("left", "right"):
         asker.serve(name, camera)
-    path, said = tmp_path / "a.mcap", list[str]()
+    path, output = tmp_path / "a.mcap", list[str]()
     files = RigFiles(root / "calib_json", ("desk",))
     settings = RecordSettings(path, files, frames_hz=20.0, previews=True, reserve_bytes=0)
-    stop, thread, out = recording(settings, lambda _stop: hub.join(), said)
+    stop, thread, out = recording(settings, lambda _stop: hub.join(), output)
     try:
-        assert until(lambda: NAME in asker.alive() and len(asked) == 4 and bool(said))
+        assert until(lambda: NAME in asker.alive() and len(asked) == 4 and bool(output))
         for message in frames(30):
-            master.tap.show(message)
+            master.probe.show(message)
         asker.publish("preview", "left", Preview("left", 5, TINY))
         asker.publish("still", "left", Still("left", 1, 5, TINY))
         assert until(lambda: asker.ask(Command(NAME, "report"), 1.0).counts.get("taken") == 30)
         told = asker.ask(Command(NAME, "report"), 1.0)
         assert told.counts["dropped"] == told.counts["lost"] == 0
-        assert told.gauges.keys() >= {"recorder.seconds", "recorder.megabytes", "recorder.free_gb"}
+        assert told.metrics.keys() >= {"recorder.seconds", "recorder.megabytes", "recorder.free_gb"}
         with pytest.raises(BusError, match="there are report, stop"):
             asker.ask(Command(NAME, "dance"), 1.0)
         asker.ask(Command(NAME, "stop"), 1.0)
@@ -244,7 +246,7 @@ def test_a_recorder_keeps_what_a_master_takes_and_tells(
     finally:
         stop.set()
         thread.join(60.0)
-        master.tap.close()
+        master.probe.close()
     assert isinstance(out[0], Progress)
     assert asked == {"left preview", "left still", "right preview", "right still"}
     kept = open_messages(path)
@@ -261,27 +263,27 @@ def test_a_recorder_outlives_its_master_and_tells_what_a_replay_cannot_repeat(
     monkeypatch.setattr(process, "_PERIOD_NS", 20_000_000)
     hub = LoopbackBus()
     first = FakeMaster(hub.join())
-    path, said = tmp_path / "a.mcap", list[str]()
+    path, output = tmp_path / "a.mcap", list[str]()
     settings = RecordSettings(path, RigFiles(root / "calib_json", ("desk",)), reserve_bytes=0)
-    stop, thread, _ = recording(settings, lambda _stop: hub.join(), said)
+    stop, thread, _ = recording(settings, lambda _stop: hub.join(), output)
     try:
-        assert until(lambda: len(said) == 1)
-        first.tap.show(frames(1)[0])
+        assert until(lambda: len(output) == 1)
+        first.probe.show(frames(1)[0])
         first.reloads = 1
         hub.publish("health", MASTER, first.answer(Command(MASTER, "tap")))
-        assert until(lambda: len(said) == 2)
-        first.tap.drain()
+        assert until(lambda: len(output) == 2)
+        first.probe.drain()
         first.bus.close()
-        assert until(lambda: len(said) == 3)
+        assert until(lambda: len(output) == 3)
         second = FakeMaster(hub.join(), session=6)
-        assert until(lambda: len(said) == 4)
-        second.tap.show(frames(1, 7)[0])
-        second.tap.drain()
+        assert until(lambda: len(output) == 4)
+        second.probe.show(frames(1, 7)[0])
+        second.probe.drain()
     finally:
         stop.set()
         thread.join(60.0)
     assert [
-        word for line, word in zip(said, ("into", "changed", "gone", "again"), strict=True) if word in line
+        word for line, word in zip(output, ("into", "changed", "gone", "again"), strict=True) if word in line
     ] == [
         "into",
         "changed",
@@ -298,7 +300,7 @@ def test_a_connection_that_is_dead_is_opened_anew(
     tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(process, "_PERIOD_NS", 20_000_000)
-    monkeypatch.setattr(feed, "_ASK_S", 0.3)
+    monkeypatch.setattr(subscriber, "_ASK_S", 0.3)
     end, opened = free_endpoint(), list[Bus]()
     first = FakeMaster(ZenohBus(end, None))
 
@@ -312,20 +314,20 @@ def test_a_connection_that_is_dead_is_opened_anew(
                 return opened[-1]
         return None
 
-    path, said = tmp_path / "a.mcap", list[str]()
+    path, output = tmp_path / "a.mcap", list[str]()
     settings = RecordSettings(path, RigFiles(root / "calib_json", ("desk",)), reserve_bytes=0)
-    stop, thread, out = recording(settings, connect, said)
+    stop, thread, out = recording(settings, connect, output)
     try:
-        assert until(lambda: len(said) == 1)
-        first.tap.show(frames(1)[0])
-        first.tap.drain()
+        assert until(lambda: len(output) == 1)
+        first.probe.show(frames(1)[0])
+        first.probe.drain()
         assert until(lambda: first.bus.ask(Command(NAME, "report"), 5.0).counts.get("taken") == 1)
         first.bus.close()
-        assert until(lambda: any("is gone" in line for line in said))
+        assert until(lambda: any("is gone" in line for line in output))
         second = FakeMaster(ZenohBus(end, None), session=6)
-        assert until(lambda: any("started again" in line for line in said))
-        second.tap.show(frames(1, 7)[0])
-        second.tap.drain()
+        assert until(lambda: any("started again" in line for line in output))
+        second.probe.show(frames(1, 7)[0])
+        second.probe.drain()
         assert until(lambda: second.bus.ask(Command(NAME, "report"), 5.0).counts.get("taken") == 2)
         second.bus.close()
     finally:
@@ -343,7 +345,7 @@ def test_a_length_ends_it_and_a_broken_tree_is_refused(tmp_path: Path, root: Pat
     path, files = tmp_path / "a.mcap", RigFiles(root / "calib_json", ("desk",))
     stop, thread, out = recording(RecordSettings(path, files, 0.3, reserve_bytes=0), lambda _: hub.join(), [])
     for seq in range(400):
-        master.tap.show(frames(1, seq)[0])
+        master.probe.show(frames(1, seq)[0])
         if not thread.is_alive():
             break
         stop.wait(0.05)

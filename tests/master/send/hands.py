@@ -15,13 +15,13 @@ MODELS = {side: HandModel.of(generated_profile(f"my-{side}", side)) for side in 
 def hand_pose(
     side: str,
     angles_rad: Float = FLAT,
-    turn: Float | None = None,
+    rotation_vector: Float | None = None,
     place_m: tuple[float, float, float] = (0.05, -0.02, 0.4),
     t_ns: int = 5_000_000_000,
 ) -> HandPose:
     """A hand with these angles (5, 4), its palm turned by a rotation vector (3,) and at a place, rig frame."""
     model = MODELS[side]
-    rotation = rotation_vector_to_matrix(np.zeros(3) if turn is None else turn)
+    rotation = rotation_vector_to_matrix(np.zeros(3) if rotation_vector is None else rotation_vector)
     joints = model.forward(rigid(rotation, np.array(place_m)), angles_rad)
     return pose_of(model.profile.name, joints.position_m, joints.rotation, angles_rad, t_ns)
 

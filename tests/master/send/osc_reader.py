@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Heard:
+class Received:
     """One message: where it goes, its arguments, and the time of its bundle, in seconds since 1900."""
 
     address: str
@@ -22,13 +22,13 @@ class Heard:
         return [float(one) for one in self.arguments if not isinstance(one, str)]
 
 
-def packet_of(data: bytes, at_s: float = 0.0) -> list[Heard]:
+def packet_of(data: bytes, at_s: float = 0.0) -> list[Received]:
     """All messages of a packet; a packet that is not one raises."""
     assert len(data) % 4 == 0, "not a multiple of four bytes"
     if not data.startswith(b"#bundle\0"):
         return [_message(data, at_s)]
     seconds, fraction = struct.unpack(">II", data[8:16])
-    rest, out = data[16:], list[Heard]()
+    rest, out = data[16:], list[Received]()
     while rest:
         (size,) = struct.unpack(">i", rest[:4])
         assert 0 < size <= len(rest) - 4, "an element is longer than its bundle"
@@ -37,7 +37,7 @@ def packet_of(data: bytes, at_s: float = 0.0) -> list[Heard]:
     return out
 
 
-def _message(data: bytes, at_s: float) -> Heard:
+def _message(data: bytes, at_s: float) -> Received:
     address, rest = _string(data)
     types, rest = _string(rest)
     assert address.startswith("/")
@@ -51,7 +51,7 @@ def _message(data: bytes, at_s: float) -> Heard:
             arguments += struct.unpack({"i": ">i", "f": ">f"}[kind], rest[:4])
             rest = rest[4:]
     assert not rest, "bytes behind the last argument"
-    return Heard(address, tuple(arguments), at_s)
+    return Received(address, tuple(arguments), at_s)
 
 
 def _string(data: bytes) -> tuple[str, bytes]:

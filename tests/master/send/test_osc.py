@@ -15,7 +15,7 @@ from master.send.osc import OscSink
 from master.send.osc_packets import Blank, BlankBundle, floats, ints
 from master.send.times import MasterTimes
 from tests.master.send.hands import hand_pose
-from tests.master.send.osc_reader import Heard, packet_of
+from tests.master.send.osc_reader import Received, packet_of
 
 T_NS, NTP_1970_S = 5_000_000_000, 2_208_988_800
 WALL_NS = 1_700_000_000_250_000_000  # at the master's 0
@@ -23,13 +23,13 @@ WALL_NS = 1_700_000_000_250_000_000  # at the master's 0
 
 @pytest.fixture
 def ear() -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard:
-        heard.bind(("127.0.0.1", 0))
-        heard.settimeout(10.0)
-        yield heard
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as received:
+        received.bind(("127.0.0.1", 0))
+        received.settimeout(10.0)
+        yield received
 
 
-def sent(ear: socket.socket, *messages: Told) -> list[Heard]:
+def sent(ear: socket.socket, *messages: Told) -> list[Received]:
     """What arrives when these are sent, of all datagrams."""
     now_ns = T_NS + 10_000_000
     times = MasterTimes(lambda: now_ns, lambda: WALL_NS + now_ns)
@@ -38,25 +38,25 @@ def sent(ear: socket.socket, *messages: Told) -> list[Heard]:
         sink.write(message)
     sink.close()
     sink.close()
-    return [heard for _ in messages for heard in packet_of(ear.recv(65536))]
+    return [received for _ in messages for received in packet_of(ear.recv(65536))]
 
 
 def test_a_hand_is_one_bundle_of_its_joints_and_angles_at_its_time(ear: socket.socket) -> None:
     angles = np.arange(20.0).reshape(5, 4) / 40.0
     pose = hand_pose("right", angles, np.array([0.4, -0.2, 0.9]))
-    heard = {one.address: one for one in sent(ear, pose)}
+    received = {one.address: one for one in sent(ear, pose)}
     joints = [f"/phalanx/hand/right/{joint}" for joint in JOINTS]
     fingers = [f"/phalanx/hand/right/{finger}/angles" for finger in FINGERS]
-    assert list(heard) == ["/phalanx/hand/right/frame", *joints, *fingers]
-    assert heard["/phalanx/hand/right/frame"].arguments == ("my-right", 1, pytest.approx(0.012))
+    assert list(received) == ["/phalanx/hand/right/frame", *joints, *fingers]
+    assert received["/phalanx/hand/right/frame"].arguments == ("my-right", 1, pytest.approx(0.012))
     for row, joint in enumerate(joints):
         w, x, y, z = pose.orientation_wxyz[row]
         np.testing.assert_allclose(
-            heard[joint].numbers, [*pose.position_m[row], x, y, z, w, 1], rtol=1e-6, atol=1e-7
+            received[joint].numbers, [*pose.position_m[row], x, y, z, w, 1], rtol=1e-6, atol=1e-7
         )
     for row, finger in enumerate(fingers):
-        np.testing.assert_allclose(heard[finger].numbers, angles[row], rtol=1e-6)
-    assert {one.at_s for one in heard.values()} == {1_700_000_005.25 + NTP_1970_S}
+        np.testing.assert_allclose(received[finger].numbers, angles[row], rtol=1e-6)
+    assert {one.at_s for one in received.values()} == {1_700_000_005.25 + NTP_1970_S}
 
 
 def test_what_is_not_known_has_no_message_and_a_left_hand_is_left(ear: socket.socket) -> None:
@@ -66,31 +66,33 @@ def test_what_is_not_known_has_no_message_and_a_left_hand_is_left(ear: socket.so
     angles = pose.angles_rad.copy()
     angles[1] = np.nan
     known = replace(pose, valid=valid, tracked=tracked, position_m=position, angles_rad=angles)
-    heard = {one.address: one.arguments for one in sent(ear, known)}
+    received = {one.address: one.arguments for one in sent(ear, known)}
     missing = {f"/phalanx/hand/left/{JOINTS[row]}" for row in (7, 8)} | {"/phalanx/hand/left/index/angles"}
-    assert len(heard) == 32 - len(missing)
-    assert not missing & set(heard)
-    assert heard[f"/phalanx/hand/left/{JOINTS[9]}"][7] == 0
+    assert len(received) == 32 - len(missing)
+    assert not missing & set(received)
+    assert received[f"/phalanx/hand/left/{JOINTS[9]}"][7] == 0
 
 
 def test_objects_contact_and_gestures_have_addresses_of_their_own(ear: socket.socket) -> None:
-    turn = np.array([0.5, 0.5, -0.5, 0.5])
-    wand = ObjectPose("wand", T_NS, np.array([0.1, 0.2, 0.3]), turn, np.eye(6), 0.001, 1, True, 3, 3, False)
+    quaternion = np.array([0.5, 0.5, -0.5, 0.5])
+    wand = ObjectPose(
+        "wand", T_NS, np.array([0.1, 0.2, 0.3]), quaternion, np.eye(6), 0.001, 1, True, 3, 3, False
+    )
     touch = np.array([True, False, False, False, True])
     contact = Contact(
         "me", "wand", T_NS, np.arange(5) / 8, np.ones(5), np.zeros((5, 3)), touch, 0.25, held=True
     )
     pinch = Gesture("me", T_NS, "pinch", "index", "begin", T_NS, 0.75, 0.5, 0.25, origin_m=np.ones(3))
-    heard = sent(ear, wand, contact, pinch)
-    assert [one.address for one in heard] == [
+    received = sent(ear, wand, contact, pinch)
+    assert [one.address for one in received] == [
         "/phalanx/object/wand",
         "/phalanx/contact/wand",
         "/phalanx/gesture/pinch",
     ]
-    np.testing.assert_allclose(heard[0].numbers, [0.1, 0.2, 0.3, 0.5, -0.5, 0.5, 0.5, 1], rtol=1e-6)
-    assert heard[1].arguments == ("me", 1, 1, 0, 0, 0, 1, 0.25, 0.0, 0.125, 0.25, 0.375, 0.5)
-    assert heard[2].arguments[:6] == ("me", "index", "begin", 0.75, 0.5, 0.25)
-    np.testing.assert_array_equal(heard[2].numbers[3:], [np.nan, 1, 1, 1, np.nan, np.nan, np.nan])
+    np.testing.assert_allclose(received[0].numbers, [0.1, 0.2, 0.3, 0.5, -0.5, 0.5, 0.5, 1], rtol=1e-6)
+    assert received[1].arguments == ("me", 1, 1, 0, 0, 0, 1, 0.25, 0.0, 0.125, 0.25, 0.375, 0.5)
+    assert received[2].arguments[:6] == ("me", "index", "begin", 0.75, 0.5, 0.25)
+    np.testing.assert_array_equal(received[2].numbers[3:], [np.nan, 1, 1, 1, np.nan, np.nan, np.nan])
 
 
 def test_a_hand_or_object_of_which_nothing_is_known_is_not_sent(ear: socket.socket) -> None:
@@ -112,9 +114,9 @@ def test_a_host_that_is_none_is_named_with_its_key() -> None:
 def test_numbers_are_filled_in_behind_texts_of_any_length() -> None:
     blanks = [Blank("/" + "a" * n, ("t" * n, "u"), "fi") for n in range(1, 10)]
     rows = np.stack([floats(np.arange(9) / 4), ints(np.arange(9) - 4)], axis=1)
-    heard = packet_of(BlankBundle(blanks).filled(0, rows.ravel()))
-    assert [one.arguments for one in heard] == [("t" * n, "u", (n - 1) / 4, n - 5) for n in range(1, 10)]
-    assert {one.at_s for one in heard} == {float(NTP_1970_S)}
+    received = packet_of(BlankBundle(blanks).filled(0, rows.ravel()))
+    assert [one.arguments for one in received] == [("t" * n, "u", (n - 1) / 4, n - 5) for n in range(1, 10)]
+    assert {one.at_s for one in received} == {float(NTP_1970_S)}
     some = np.arange(9) % 2 == 0
     few = packet_of(BlankBundle(blanks).filled(0, rows.ravel(), some))
-    assert few == heard[::2]
+    assert few == received[::2]

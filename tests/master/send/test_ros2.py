@@ -156,7 +156,7 @@ def test_a_program_that_has_joined_the_router_finds_and_reads_a_hand(
     router: tuple[str, zenoh.Session],
 ) -> None:
     end, session = router
-    heard = session.declare_subscriber(
+    received = session.declare_subscriber(
         "7/phalanx/default_right/joint_poses/**", zenoh.handlers.FifoChannel(16)
     )
     pose = whole_pose()
@@ -164,7 +164,7 @@ def test_a_program_that_has_joined_the_router_finds_and_reads_a_hand(
     sample = None
     for _ in range(400):  # who declares on one session is known to another a moment later
         sink.write(pose)
-        if (sample := heard.try_recv()) is not None:
+        if (sample := received.try_recv()) is not None:
             break
         time.sleep(0.05)
     assert sample is not None

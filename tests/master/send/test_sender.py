@@ -16,9 +16,9 @@ from common.output_settings import OscOutput, OutputSettings, VmcOutput, default
 from common.streams import MASTER
 from master.outputs.bus import BusSink
 from master.send import outputs as registry
-from master.send.line import DEPTH, OutputLine, Tally
+from master.send.line import DEPTH, Counters, OutputLine
 from master.send.outputs import OUTPUTS, Output
-from master.send.sender import NAME, Beside, Sender, run_sender, settings_of
+from master.send.sender import NAME, Housekeeping, Sender, run_sender, settings_of
 from master.send.times import MasterTimes
 from tests.master.send.hands import hand_pose
 
@@ -73,8 +73,8 @@ def sinks(monkeypatch: pytest.MonkeyPatch) -> dict[str, Kept]:
 
 
 def sender(settings: OutputSettings, *only: str) -> tuple[Sender, list[str]]:
-    said: list[str] = []
-    return Sender(settings, only, said.append), said
+    output: list[str] = []
+    return Sender(settings, only, output.append), output
 
 
 def counts(one: Sender, name: str) -> tuple[int, int, int, bool]:
@@ -84,7 +84,7 @@ def counts(one: Sender, name: str) -> tuple[int, int, int, bool]:
         health.counts[f"sent.{name}"],
         health.counts[f"failed.{name}"],
         health.counts[f"dropped.{name}"],
-        health.gauges[f"on.{name}"] == 1.0,
+        health.metrics[f"on.{name}"] == 1.0,
     )
 
 
@@ -125,10 +125,10 @@ def test_without_a_default_file_all_is_off_and_another_name_is_an_error(tmp_path
 def test_what_is_on_gets_what_it_is_for_and_what_is_off_nothing(sinks: dict[str, Kept]) -> None:
     one, _ = sender(OSC_ON)
     pose = hand_pose("left")
-    eventually(lambda: one.health().gauges["open.osc"] == 1.0)
+    eventually(lambda: one.health().metrics["open.osc"] == 1.0)
     one.push(pose)
     one.switch("vmc", on=True)
-    eventually(lambda: one.health().gauges["open.vmc"] == 1.0)
+    eventually(lambda: one.health().metrics["open.vmc"] == 1.0)
     one.push(pose)
     one.close()
     assert [len(sink.messages) for sink in sinks.values()] == [2, 1]
@@ -137,11 +137,11 @@ def test_what_is_on_gets_what_it_is_for_and_what_is_off_nothing(sinks: dict[str,
 
 
 def test_what_is_named_is_on_whatever_the_file_says(sinks: dict[str, Kept]) -> None:
-    one, said = sender(OSC_ON, "vmc")
+    one, output = sender(OSC_ON, "vmc")
     assert one.on == ("vmc",)
     one.use(replace(default_outputs(), osc=OscOutput(on=True, port=9009), vmc=VmcOutput(port=9010)))
     assert one.on == ("vmc",)
-    assert said == ["osc: off", "vmc: udp 127.0.0.1:9010"]
+    assert output == ["osc: off", "vmc: udp 127.0.0.1:9010"]
     one.close()
     with pytest.raises(PhalanxError, match=r"output 'osk': unknown; there are osc, vmc"):
         sender(OSC_ON, "osk")
@@ -152,55 +152,55 @@ def test_an_output_that_breaks_says_so_once_is_opened_again_and_the_others_go_on
     sinks: dict[str, Kept], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("master.send.line.FIRST_RETRY_S", 0.01)
-    one, said = sender(OSC_ON, "osc", "vmc")
+    one, output = sender(OSC_ON, "osc", "vmc")
     eventually(lambda: sinks.keys() == {"osc", "vmc"})
-    eventually(lambda: all(one.health().gauges[f"open.{name}"] for name in sinks))
+    eventually(lambda: all(one.health().metrics[f"open.{name}"] for name in sinks))
     sinks["osc"].broken = True
     first = sinks["osc"]
     one.push(hand_pose("left"))
-    eventually(lambda: sinks["osc"] is not first and one.health().gauges["open.osc"] == 1.0)
+    eventually(lambda: sinks["osc"] is not first and one.health().metrics["open.osc"] == 1.0)
     one.push(hand_pose("left"))
     one.close()
-    assert said == ["osc: the cable is out; put it in; tried again", "osc: open again"]
+    assert output == ["osc: the cable is out; put it in; tried again", "osc: open again"]
     assert first.closed == 1
     assert (counts(one, "osc")[:3], counts(one, "vmc")[:3]) == ((1, 1, 1), (2, 0, 0))
 
 
 def test_an_output_that_cannot_open_costs_its_messages_and_says_why_once() -> None:
-    said: list[str] = []
-    tally = Tally()
+    output: list[str] = []
+    counters = Counters()
 
     def refuse() -> Kept:
         raise OSError("no such device")
 
-    line = OutputLine("lsl", refuse, tally, said.append)
-    eventually(lambda: tally.failed == 1)
+    line = OutputLine("lsl", refuse, counters, output.append)
+    eventually(lambda: counters.failed == 1)
     line.offer(hand_pose("left"))
     line.close()
-    assert said == ["lsl: no such device; tried again"]
-    assert (tally.sent, tally.dropped) == (0, 1)
+    assert output == ["lsl: no such device; tried again"]
+    assert (counters.sent, counters.dropped) == (0, 1)
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_an_output_that_ends_by_an_error_nobody_foresaw_is_closed_and_not_called_open() -> None:
-    class Odd(Kept):
+    class Faulty(Kept):
         def write(self, message: Told) -> None:
             raise KeyError(message.t_ns)
 
-    sink, tally = Odd(), Tally()
-    line = OutputLine("lsl", lambda: sink, tally, print)
+    sink, counters = Faulty(), Counters()
+    line = OutputLine("lsl", lambda: sink, counters, print)
     eventually(lambda: line.open)
     line.offer(hand_pose("left"))
     eventually(lambda: not line.open)
     line.offer(hand_pose("left"))
-    assert (sink.closed, tally.sent, tally.dropped) == (1, 0, 1)
+    assert (sink.closed, counters.sent, counters.dropped) == (1, 0, 1)
     line.close()
 
 
 def test_a_slow_output_loses_its_oldest_and_counts_them() -> None:
-    gate, tally = threading.Event(), Tally()
+    gate, counters = threading.Event(), Counters()
     sink = Kept(gate=gate)
-    line = OutputLine("web", lambda: sink, tally, print)
+    line = OutputLine("web", lambda: sink, counters, print)
     eventually(lambda: line.open)
     poses = [hand_pose("left", t_ns=number) for number in range(3 * DEPTH)]
     line.offer(poses[0])
@@ -212,7 +212,7 @@ def test_a_slow_output_loses_its_oldest_and_counts_them() -> None:
     line.close()
     kept = [message.t_ns for message in sink.messages]
     assert kept == [0, *range(2 * DEPTH, 3 * DEPTH)]
-    assert (tally.sent, tally.dropped) == (DEPTH + 1, 2 * DEPTH - 1)
+    assert (counters.sent, counters.dropped) == (DEPTH + 1, 2 * DEPTH - 1)
 
 
 def test_the_process_obeys_follows_its_file_and_reports(sinks: dict[str, Kept], tmp_path: Path) -> None:
@@ -222,24 +222,24 @@ def test_the_process_obeys_follows_its_file_and_reports(sinks: dict[str, Kept], 
     master, asker, stop = bus.join(), bus.join(), threading.Event()
     master.serve(MASTER, lambda command: Health(MASTER, 1, time.monotonic_ns() + 10**12, {}, {}))
     reports = asker.subscribe("health", NAME, depth=64)
-    said: list[str] = []
-    thread = threading.Thread(target=run_sender, args=(bus, default_outputs(), path, (), stop, said.append))
+    output: list[str] = []
+    thread = threading.Thread(target=run_sender, args=(bus, default_outputs(), path, (), stop, output.append))
     thread.start()
     try:
         eventually(lambda: NAME in asker.alive())
-        assert said == [f"all outputs are off; switch them on in {path}, or name them: --only osc,vmc"]
+        assert output == [f"all outputs are off; switch them on in {path}, or name them: --only osc,vmc"]
         answer = asker.ask(Command(NAME, "on", '{"output": "osc"}'), 1.0)
-        assert answer.gauges["on.osc"] == 1.0
-        eventually(lambda: asker.ask(Command(NAME, "report"), 1.0).gauges["open.osc"] == 1.0)
+        assert answer.metrics["on.osc"] == 1.0
+        eventually(lambda: asker.ask(Command(NAME, "report"), 1.0).metrics["open.osc"] == 1.0)
         told = BusSink(master)
         for number in range(20):
             told.write(hand_pose("right", t_ns=number))
         eventually(lambda: len(sinks["osc"].messages) == 20)
         save(path, replace(default_outputs(), vmc=VmcOutput(on=True)))
         eventually(lambda: "vmc" in sinks)
-        assert asker.ask(Command(NAME, "off", '{"output": "osc"}'), 1.0).gauges["on.osc"] == 0.0
+        assert asker.ask(Command(NAME, "off", '{"output": "osc"}'), 1.0).metrics["on.osc"] == 0.0
         path.write_text("{")
-        eventually(lambda: any("the settings stay as they were" in line for line in said))
+        eventually(lambda: any("the settings stay as they were" in line for line in output))
         report = reports.get(60.0)
         assert isinstance(report, Health)
         assert report.source == NAME
@@ -258,7 +258,7 @@ def test_the_process_obeys_follows_its_file_and_reports(sinks: dict[str, Kept], 
     finally:
         stop.set()
         thread.join(30.0)
-    assert "vmc: udp 127.0.0.1:39539" in said
+    assert "vmc: udp 127.0.0.1:39539" in output
     assert sinks["vmc"].closed == 1
 
 
@@ -267,10 +267,10 @@ def test_the_clock_of_a_master_on_another_machine_is_learned(tmp_path: Path) -> 
     ahead_ns = 3_600 * 10**9
     bus.serve(MASTER, lambda command: Health(MASTER, 1, time.monotonic_ns() + ahead_ns, {}, {}))
     one, _ = sender(default_outputs())
-    beside = Beside(one, bus, tmp_path / "default.json", [])
+    housekeeping = Housekeeping(one, bus, tmp_path / "default.json", [])
     assert one.times.offset_ns == 0
     for _ in range(8):
-        beside.step(print)
+        housekeeping.step(print)
     assert one.times.offset_ns == pytest.approx(ahead_ns, abs=1_000_000)
     now = time.monotonic_ns()
     assert one.times.local_ns(now + ahead_ns) == pytest.approx(now, abs=1_000_000)

@@ -21,7 +21,7 @@ from master.send.sides import Side, side_of
 from master.send.times import MasterTimes
 from master.send.vmc import VmcSink
 from tests.master.send.hands import MODELS, hand_pose, pose_of
-from tests.master.send.osc_reader import Heard, packet_of
+from tests.master.send.osc_reader import Received, packet_of
 
 SIDES: tuple[Side, ...] = ("left", "right")
 # The bones of one hand in Unity's HumanBodyBones, and the joints of OpenXR at which they begin and end.
@@ -46,15 +46,15 @@ class Bone:
 
 @pytest.fixture(scope="module")
 def ear() -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard:
-        heard.bind(("127.0.0.1", 0))
-        heard.settimeout(10.0)
-        yield heard
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as received:
+        received.bind(("127.0.0.1", 0))
+        received.settimeout(10.0)
+        yield received
 
 
 def sent(
     ear: socket.socket, pose: HandPose, output: VmcOutput = FACING
-) -> tuple[list[Heard], dict[str, Bone]]:
+) -> tuple[list[Received], dict[str, Bone]]:
     """What arrives of one pose: the messages about the whole avatar, and the bones."""
     sink = VmcSink(replace(output, port=ear.getsockname()[1]), MasterTimes())
     sink.write(pose)
@@ -86,12 +86,12 @@ def t_hand(side: Side, bend: dict[int, Float] | None = None) -> HandPose:
         joint: thumb if row == 0 else finger for row, joints in enumerate(FINGER_JOINTS) for joint in joints
     }
     for row, joints in enumerate(FINGER_JOINTS):
-        at, turn = (0.02 + 0.015 * row) * -front + 0.02 * out, np.eye(3)
+        at, rotation_vector = (0.02 + 0.015 * row) * -front + 0.02 * out, np.eye(3)
         if row == 0:
             at = 0.03 * out + 0.02 * front
         frame = rest[joints[0]]
         for joint in joints:
-            frame = turn @ rest[joint] if joint == joints[0] else frame
+            frame = rotation_vector @ rest[joint] if joint == joints[0] else frame
             frame = frame @ (np.eye(3) if bend is None else bend.get(joint, np.eye(3)))
             position[joint], rotation[joint] = at, frame
             at = at - 0.03 * frame[:, 2]
@@ -151,12 +151,12 @@ def test_a_thumb_bends_level_across_the_palm_by_a_turn_about_unitys_y(ear: socke
 
 def test_the_mirror_between_the_axes_is_no_rotation(ear: socket.socket) -> None:
     # Three directions of a hand that make a right-handed triple in the rig make a left-handed one in Unity.
-    pose = hand_pose("right", turn=np.array([0.3, 1.0, -0.4]))
+    pose = hand_pose("right", rotation_vector=np.array([0.3, 1.0, -0.4]))
     _, bones = sent(ear, pose)
     rig = pose.position_m[[8, 13, 18]] - pose.position_m[WRIST]
-    world = np.stack([built(bones, "right")[row] for row in (8, 13, 18)])
-    assert np.linalg.det(rig) * np.linalg.det(world) < 0.0
-    np.testing.assert_allclose(np.linalg.norm(rig, axis=1), np.linalg.norm(world, axis=1), atol=1e-6)
+    dispatcher = np.stack([built(bones, "right")[row] for row in (8, 13, 18)])
+    assert np.linalg.det(rig) * np.linalg.det(dispatcher) < 0.0
+    np.testing.assert_allclose(np.linalg.norm(rig, axis=1), np.linalg.norm(dispatcher, axis=1), atol=1e-6)
 
 
 def built(bones: dict[str, Bone], side: Side) -> dict[int, Float]:
@@ -165,11 +165,11 @@ def built(bones: dict[str, Bone], side: Side) -> dict[int, Float]:
     hand = bones[f"{top}Hand"].rotation
     places: dict[int, Float] = {}
     for finger, (_, joints) in CHAINS.items():
-        at, turn = np.zeros(3), hand
+        at, rotation_vector = np.zeros(3), hand
         for joint, segment in zip(joints, SEGMENTS, strict=False):
             bone = bones[f"{top}{finger}{segment}"]
-            at = at + turn @ bone.position_m
-            turn = turn @ bone.rotation
+            at = at + rotation_vector @ bone.position_m
+            rotation_vector = rotation_vector @ bone.rotation
             places[joint] = at
     return places
 
@@ -181,12 +181,12 @@ angle = st.floats(-0.4, 1.6)
 @given(
     side=st.sampled_from(SIDES),
     angles=st.lists(angle, min_size=20, max_size=20),
-    turn=st.tuples(*[st.floats(-2.0, 2.0)] * 3),
+    rotation_vector=st.tuples(*[st.floats(-2.0, 2.0)] * 3),
 )
 def test_the_bones_build_the_pose_again(
-    ear: socket.socket, side: Side, angles: list[float], turn: tuple[float, float, float]
+    ear: socket.socket, side: Side, angles: list[float], rotation_vector: tuple[float, float, float]
 ) -> None:
-    pose = hand_pose(side, np.array(angles).reshape(5, 4), np.array(turn))
+    pose = hand_pose(side, np.array(angles).reshape(5, 4), np.array(rotation_vector))
     _, bones = sent(ear, pose, VmcOutput())
     # The usual rig: an upright camera that looks where the avatar looks; x is its right, y its down, z its front.
     to_unity = np.diag([1.0, -1.0, 1.0])
@@ -206,28 +206,28 @@ def test_an_avatar_with_straight_bones_points_its_fingers_where_ours_point(
     top, sign, half = side.capitalize(), 1.0 if side == "right" else -1.0, np.sqrt(0.5)
     for finger, (_, joints) in CHAINS.items():
         rest = np.array([sign * half, 0.0, half]) if finger == "Thumb" else np.array([sign, 0.0, 0.0])
-        turn = bones[f"{top}Hand"].rotation
+        rotation_vector = bones[f"{top}Hand"].rotation
         for joint, segment in zip(joints, SEGMENTS, strict=False):
-            turn = turn @ bones[f"{top}{finger}{segment}"].rotation
+            rotation_vector = rotation_vector @ bones[f"{top}{finger}{segment}"].rotation
             along = -quaternion_to_matrix(pose.orientation_wxyz[joint])[:, 2]
-            np.testing.assert_allclose(turn @ rest, np.diag([1.0, -1.0, 1.0]) @ along, atol=1e-5)
+            np.testing.assert_allclose(rotation_vector @ rest, np.diag([1.0, -1.0, 1.0]) @ along, atol=1e-5)
 
 
 @pytest.mark.parametrize("side", SIDES)
 def test_the_bone_of_the_hand_as_the_settings_want_it(ear: socket.socket, side: Side) -> None:
-    pose = hand_pose(side, turn=np.array([0.2, -0.7, 0.4]))
+    pose = hand_pose(side, rotation_vector=np.array([0.2, -0.7, 0.4]))
     top, sign = side.capitalize(), 1.0 if side == "right" else -1.0
     _, still = sent(ear, pose, replace(FACING, hand="rest", forearm_m=0.3))
     np.testing.assert_allclose(still[f"{top}Hand"].rotation, np.eye(3), atol=1e-6)
     np.testing.assert_allclose(still[f"{top}Hand"].position_m, [0.3 * sign, 0, 0], atol=1e-6)
-    _, unknown = sent(ear, pose, replace(FACING, hand="bend"))
+    _, unknown = sent(ear, pose, replace(FACING, hand="wrist"))
     assert f"{top}Hand" not in unknown  # no device on the forearm: the avatar keeps it as it is
     assert len(unknown) == 15
-    bent = replace(pose, wrist_bend_rad=np.array([np.pi / 2, 0.0]))  # fingers to the palm's side: down
-    _, down = sent(ear, bent, replace(FACING, hand="bend"))
+    flexed = replace(pose, wrist_angles_rad=np.array([np.pi / 2, 0.0]))  # fingers to the palm's side: down
+    _, down = sent(ear, flexed, replace(FACING, hand="wrist"))
     np.testing.assert_allclose(down[f"{top}Hand"].rotation @ [sign, 0, 0], [0, -1, 0], atol=1e-6)
-    aside = replace(pose, wrist_bend_rad=np.array([0.0, np.pi / 2]))  # to the thumb of a right hand
-    _, to_side = sent(ear, aside, replace(FACING, hand="bend"))
+    aside = replace(pose, wrist_angles_rad=np.array([0.0, np.pi / 2]))  # to the thumb of a right hand
+    _, to_side = sent(ear, aside, replace(FACING, hand="wrist"))
     np.testing.assert_allclose(to_side[f"{top}Hand"].rotation @ [sign, 0, 0], [0, 0, sign], atol=1e-6)
 
 
@@ -243,8 +243,8 @@ def test_what_is_not_known_is_left_out(ear: socket.socket) -> None:
 @pytest.mark.parametrize("side", SIDES)
 def test_the_side_is_told_by_the_shape_however_the_hand_lies(side: Side) -> None:
     rng = np.random.default_rng(5)
-    for turn in rng.normal(size=(20, 3)) * 2.0:
-        assert side_of(hand_pose(side, rng.uniform(-0.2, 1.2, (5, 4)), turn)) == side
+    for rotation_vector in rng.normal(size=(20, 3)) * 2.0:
+        assert side_of(hand_pose(side, rng.uniform(-0.2, 1.2, (5, 4)), rotation_vector)) == side
     assert MODELS[side].profile.side == side
     lost = np.full((26, 3), np.nan)
     assert side_of(replace(hand_pose(side), position_m=lost)) is None

@@ -9,7 +9,7 @@ from common.arrays import Float
 from common.calibration import HandProfile, RigCalibration, load
 from common.hand_model import FINGER_JOINTS, JOINTS, HandModel
 from common.sim.motion import POSES
-from master.study.participant import Participant, participant, turned, with_bones
+from master.study.participant import Participant, participant, rotated, with_bones
 from master.study.session import orders
 
 CALIB = Path(__file__).resolve().parents[3] / "calib_json"
@@ -26,7 +26,7 @@ def lengths(hand: HandProfile) -> Float:
     return np.linalg.norm(np.diff(place, axis=1), axis=2)
 
 
-def test_bones_mounting_and_skin_stay_within_their_ranges_and_fill_them() -> None:
+def test_bones_mounting_and_reflectance_stay_in_their_ranges_and_fill_them() -> None:
     share = np.array([lengths(one.hand) for one in PEOPLE]) / lengths(HAND) - 1.0
     assert np.abs(share).max() <= 0.08 + 1e-6
     assert np.ptp(share, axis=0).min() > 0.14  # every bone of its own
@@ -38,11 +38,11 @@ def test_bones_mounting_and_skin_stay_within_their_ranges_and_fill_them() -> Non
     poses = np.array([one.rig.T_camera_palm for one in PEOPLE])
     shift = 1e3 * (poses[:, :3, 3] - nominal[:3, 3])
     assert 1.9 < np.abs(shift).max() <= 2.0
-    turns = poses[:, :3, :3] @ nominal[:3, :3].T
-    angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(turns, axis1=1, axis2=2) - 1.0), -1.0, 1.0)))
+    rotations = poses[:, :3, :3] @ nominal[:3, :3].T
+    angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(rotations, axis1=1, axis2=2) - 1.0), -1.0, 1.0)))
     assert angle.max() <= 3.0 * np.sqrt(3.0) + 1e-6
     assert angle.max() > 3.5
-    np.testing.assert_allclose(np.linalg.det(turns), 1.0, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.det(rotations), 1.0, atol=1e-9)
 
 
 def test_measured_bones_are_off_as_a_hand_calibration_is() -> None:
@@ -67,7 +67,7 @@ def test_a_hand_with_its_own_bones_is_the_same_hand_and_every_hand_is_legal() ->
     same = with_bones(HAND, 1.0, np.ones((5, 3)))
     for name, joint in HAND.rest_joints.items():
         np.testing.assert_allclose(same.rest_joints[name].position_m, joint.position_m, atol=1e-12)
-    still = np.array(turned(RIG, np.zeros(3), np.zeros(3)).T_camera_palm)
+    still = np.array(rotated(RIG, np.zeros(3), np.zeros(3)).T_camera_palm)
     np.testing.assert_allclose(still, np.array(RIG.T_camera_palm), atol=1e-12)
     for one in PEOPLE[:5]:
         assert HandModel.of(one.hand).dip_per_pip == pytest.approx(0.84)  # as the paper's hands bend

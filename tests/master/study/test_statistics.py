@@ -33,11 +33,11 @@ def trial(
         pip_deg=(true + off,) * 5,
         truth_deg=(true,) * 5,
         tracked=(tracked,) * 5,
-        level=(1,) * 5,
+        solver_mode=(1,) * 5,
         ambiguous=(False,) * 5,
         laser_seen=(seen,) * 5,
         tip_seen=(False,) * 5,
-        triples=6,
+        cycles=6,
     )
 
 
@@ -73,7 +73,7 @@ def test_a_cell_is_mean_and_sd_of_absolute_errors() -> None:
     )
     assert [cell.pose for cell in found] == ["pinch"] * 5
     for cell in found:
-        assert (cell.trials, cell.reached, cell.told, cell.tip, cell.blind) == (4, 3, 4, 0, 0)
+        assert (cell.trials, cell.reached, cell.told, cell.tip, cell.unseen) == (4, 3, 4, 0, 0)
         assert cell.is_reached
         assert cell.mean_deg == pytest.approx(3.0)
         assert cell.sd_deg == pytest.approx(2.0)  # of 3, 5, 1 about 3, n - 1
@@ -91,7 +91,7 @@ def test_a_finger_tracked_in_fewer_than_half_of_the_trials_is_not_filled_in(
 
 def test_a_finger_that_was_told_by_something_else_is_counted_and_its_error_kept() -> None:
     cell = cells_of([trial(1, off=2.0), trial(2, off=30.0, seen=False)])[0]
-    assert (cell.reached, cell.blind) == (2, 1)
+    assert (cell.reached, cell.unseen) == (2, 1)
     assert cell.mean_deg == pytest.approx(16.0)
 
 

@@ -35,7 +35,7 @@ def task(out: Path) -> Task:
         seed=3,
         blocks=1,
         conditions=(JUDGED,),
-        level="fk",
+        solver_mode="fk",
         step=6,
         guided=8,
         out=out,
@@ -72,7 +72,7 @@ def test_every_trial_went_through_the_line(told: dict[str, Any]) -> None:
     for who in ("participant-01", "participant-02"):
         assert {one["pose"] for one in trials if one["participant"] == who} == set(POSES)
     for one in trials:
-        assert one["triples"] in (1, 2)
+        assert one["cycles"] in (1, 2)
         if one["pose"] == "open_palm":
             off = np.abs(np.array(one["pip_deg"]) - one["truth_deg"])[1:]
             assert off.max() < 35.0  # eight triples calibrate nothing: a device 5 degrees askew costs 20
@@ -103,15 +103,15 @@ def test_tables_and_picture_show_it(out: Path, told: dict[str, Any]) -> None:
 def test_calibration_is_ours_and_what_it_refuses_is_said(told: dict[str, Any]) -> None:
     for one in told["calibrated"].values():
         assert one["said"]
-        assert 0.0 < one["nominal_turn_deg"] < 5.3
+        assert 0.0 < one["nominal_rotation_deg"] < 5.3
         if one["refused"]:  # then the rig file's pose is used
-            assert one["turn_deg"] == one["nominal_turn_deg"]
+            assert one["rotation_deg"] == one["nominal_rotation_deg"]
 
 
 def test_a_study_goes_on_from_what_was_detected_and_solves_anew(out: Path, told: dict[str, Any]) -> None:
     detections = out / "participant-01/calibrated-detected/detections_wrist.npz"
     before = detections.stat().st_mtime_ns
-    found = run_participant(replace(task(out), level="auto", keep=False, conditions=(EXACT,)), 1)
+    found = run_participant(replace(task(out), solver_mode="auto", keep=False, conditions=(EXACT,)), 1)
     assert detections.stat().st_mtime_ns == before
     assert [len(trials) for trials in found.trials.values()] == [6]
     (palm,) = (one for one in found.trials["all, exact"] if one.pose == "open_palm")

@@ -14,7 +14,7 @@ from master.outputs.poses import Poses
 from master.rig_setup import RigSetup
 from master.study.session import COLUMNS, Held, write_trials
 from master.study.trials import read_trials, trials_of
-from tests.wrist_run import START_NS, TRIPLE_NS, true_poses, wrist_scene, wrist_setup
+from tests.wrist_run import CYCLE_NS, START_NS, true_poses, wrist_scene, wrist_setup
 
 N = 12
 HEADER = ",".join(COLUMNS)
@@ -32,7 +32,7 @@ def truths(setup: RigSetup) -> list[WristTruth]:
 
 
 def at(k: int) -> int:
-    return START_NS + k * TRIPLE_NS
+    return START_NS + k * CYCLE_NS
 
 
 def recorded(folder: Path, setup: RigSetup, truths: list[WristTruth], **more: object) -> FrameRecording:
@@ -66,7 +66,7 @@ def test_a_trial_is_what_was_held_against_its_truth(
     held(tmp_path)
     poses = with_error(true_poses(setup, truths), 2.5)
     found = trials_of(recorded(tmp_path, setup, truths), "wrist", "anna", poses)
-    assert [(one.participant, one.block, one.pose, one.triples) for one in found] == [
+    assert [(one.participant, one.block, one.pose, one.cycles) for one in found] == [
         ("anna", 1, "pinch", 4),
         ("anna", 1, "open_palm", N - 4),
     ]
@@ -78,7 +78,7 @@ def test_a_trial_is_what_was_held_against_its_truth(
     assert found[0].laser_seen == tuple((2 * line.sum(axis=0) >= 4).tolist())
 
 
-def test_triples_in_which_a_finger_was_not_tracked_do_not_count_and_half_of_them_must_be(
+def test_cycles_in_which_a_finger_was_not_tracked_do_not_count_and_half_of_them_must_be(
     tmp_path: Path, setup: RigSetup, truths: list[WristTruth]
 ) -> None:
     held(tmp_path)
@@ -96,7 +96,7 @@ def test_triples_in_which_a_finger_was_not_tracked_do_not_count_and_half_of_them
     assert one.ambiguous == (False,) * 5
 
 
-def test_triples_without_a_pose_are_not_tracked(
+def test_cycles_without_a_pose_are_not_tracked(
     tmp_path: Path, setup: RigSetup, truths: list[WristTruth]
 ) -> None:
     held(tmp_path)
@@ -111,7 +111,7 @@ def test_labels_of_the_truth_serve_as_well_by_name_and_by_letter(
     labels = ["rest", *["A_open"] * 3, "F_pinch", *["A_open"] * 2, "large_grasp", "pip30", *["D_grasp"] * 3]
     opened = recorded(tmp_path, setup, truths, label=np.array(labels))
     found = trials_of(opened, "wrist", "a", true_poses(setup, truths))
-    assert [(one.block, one.pose, one.triples) for one in found] == [
+    assert [(one.block, one.pose, one.cycles) for one in found] == [
         (1, "open_palm", 3),
         (1, "pinch", 1),
         (2, "open_palm", 2),

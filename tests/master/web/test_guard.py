@@ -20,7 +20,7 @@ from common.errors import PhalanxError
 from common.output_settings import LslOutput, OscOutput, OutputSettings, WebOutput
 from master.listening import is_loopback, page_certificate
 from master.send.outputs import who_reads
-from master.send.web import KEY_FILE, WebSink, address_of, guard_of
+from master.send.web import KEY_FILE, WebSink, address_of, request_filter_of
 from tests.master.send.hands import hand_pose
 
 WAIT_S = 60.0
@@ -44,7 +44,7 @@ def test_who_shows_the_key_is_served_by_tls_and_nobody_else(tmp_path: Path) -> N
     key = (folder / KEY_FILE).read_text()
     assert address.split()[-1] == f"https://127.0.0.1:0/?key={key}"
     assert "0.0.0.0" not in address  # which no browser opens
-    assert guard_of(EVERYWHERE, environment).key == key, "the same after a restart"
+    assert request_filter_of(EVERYWHERE, environment).key == key, "the same after a restart"
     assert stat.S_IMODE((folder / KEY_FILE).stat().st_mode) == 0o600
     tls = trusting(folder)
 
@@ -68,9 +68,9 @@ def test_who_shows_the_key_is_served_by_tls_and_nobody_else(tmp_path: Path) -> N
             assert got(path).status == 401, path
         opened = got(f"/?key={key}")
         assert opened.status == 200
-        said = opened.headers["Set-Cookie"]
-        assert {"HttpOnly", "Secure", "SameSite=Strict"} <= set(said.split("; "))
-        ((name, morsel),) = SimpleCookie(said).items()
+        output = opened.headers["Set-Cookie"]
+        assert {"HttpOnly", "Secure", "SameSite=Strict"} <= set(output.split("; "))
+        ((name, morsel),) = SimpleCookie(output).items()
         assert got("/page.js", f"a=b; {name}={morsel.value}").status == 200
         assert got("/page.js", f"{name}=x").status == 401
         # The server hangs up behind its 401, which a client that is slow to read may lose.
@@ -92,7 +92,7 @@ def test_here_nobody_is_asked_and_open_asks_for_the_key_alone(tmp_path: Path) ->
     environment = {"XDG_CONFIG_HOME": str(tmp_path)}
     assert address_of(WebOutput(), environment) == "http://127.0.0.1:8765/"
     assert not (tmp_path / "phalanx").exists()
-    plain = guard_of(EVERYWHERE, environment | {"PHALANX_OPEN": "1"})
+    plain = request_filter_of(EVERYWHERE, environment | {"PHALANX_OPEN": "1"})
     assert plain.tls is None
     assert plain.key is not None
 
@@ -104,7 +104,7 @@ def test_a_broken_key_opens_nothing(tmp_path: Path, text: str) -> None:
     (folder / KEY_FILE).touch(mode=0o600)
     (folder / KEY_FILE).write_text(text)
     with pytest.raises(PhalanxError, match="not a key"):
-        guard_of(EVERYWHERE, {"XDG_CONFIG_HOME": str(tmp_path)})
+        request_filter_of(EVERYWHERE, {"XDG_CONFIG_HOME": str(tmp_path)})
 
 
 def test_a_certificate_is_kept_until_it_ends_or_another_address_is_served(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ CLOSE = b"\x88"  # as no pose and no head of HTTP has it
 ENDED = (0, 1, 3, 4, 5)  # of these: the server says so, and closes
 
 
-class Feed:
+class StreamSubscriber:
     """Offers poses to a server, as the sender does. Holds how many it offered, and a thread."""
 
     def __init__(self, server: WebServer) -> None:
@@ -54,35 +54,35 @@ class Feed:
 
 def spoken(port: int, frame: bytes, wait_s: float) -> bytes:
     """Open a WebSocket, say this, and return all that is said until the server says the end, or in so many seconds."""
-    said, deadline = b"", time.monotonic() + wait_s
+    output, deadline = b"", time.monotonic() + wait_s
     with socket.create_connection(("127.0.0.1", port), timeout=WAIT_S) as one, suppress(OSError):
         one.sendall(UPGRADE)
-        while b"\r\n\r\n" not in said:
-            said += one.recv(4096)
+        while b"\r\n\r\n" not in output:
+            output += one.recv(4096)
         one.sendall(frame)
         one.settimeout(wait_s)
         while (piece := one.recv(65_536)) and time.monotonic() < deadline:
-            said += piece
+            output += piece
             if CLOSE in piece:
                 break
-    return said
+    return output
 
 
 def test_three_hundred_strangers_and_broken_frames_leave_the_reader_its_poses() -> None:
     server = WebServer("127.0.0.1", 0)
-    feed = Feed(server)
+    feed = StreamSubscriber(server)
     try:
         with connect(f"ws://127.0.0.1:{server.port}/hands", open_timeout=WAIT_S) as reader:
-            stranger = threading.Thread(target=assault, args=(("127.0.0.1", server.port), 300, 100, 3.0))
-            stranger.start()
+            unknown_peer = threading.Thread(target=assault, args=(("127.0.0.1", server.port), 300, 100, 3.0))
+            unknown_peer.start()
             read: list[int] = []
             answers: list[bytes] = []
-            while stranger.is_alive() or len(answers) < len(FRAMES):
+            while unknown_peer.is_alive() or len(answers) < len(FRAMES):
                 if len(answers) < len(FRAMES):
                     frame = len(answers)
                     answers.append(spoken(server.port, FRAMES[frame], WAIT_S if frame in ENDED else 0.5))
                 read.append(int(reader.recv(WAIT_S)))
-            stranger.join()
+            unknown_peer.join()
             last = feed.offered
             while read[-1] < last:  # what it reads is new again at once: nothing waited for the strangers
                 read.append(int(reader.recv(WAIT_S)))

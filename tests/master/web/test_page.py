@@ -77,7 +77,7 @@ def test_the_page_moves_a_rigged_hand_and_asks_nobody_else(tmp_path: Path) -> No
         page.set_default_timeout(WAIT_MS)
         page.on("request", lambda request: asked.append(request.url))
         page.on("websocket", lambda opened: asked.append(opened.url))
-        page.on("console", lambda said: trouble.append(said.text) if said.type == "error" else None)
+        page.on("console", lambda output: trouble.append(output.text) if output.type == "error" else None)
         page.on("pageerror", lambda error: trouble.append(str(error)))
         page.goto(address)
         until(page, "globalThis.handView?.hands.size === 1", sink, moving(0))
@@ -114,7 +114,7 @@ def test_a_closing_socket_is_not_asked_for_the_round_trip() -> None:
         with chromium() as browser:
             page = browser.new_page()
             page.set_default_timeout(WAIT_MS)
-            page.on("console", lambda said: trouble.append(said.text) if said.type == "error" else None)
+            page.on("console", lambda output: trouble.append(output.text) if output.type == "error" else None)
             page.add_init_script(REACH)
             page.goto(f"http://127.0.0.1:{sink.server.port}/")
             until(page, "sockets[0]?.readyState === WebSocket.OPEN && ticks.length >= 2")
@@ -127,15 +127,17 @@ def test_a_closing_socket_is_not_asked_for_the_round_trip() -> None:
 
 def an_object(page: Page, sink: WebSink) -> None:
     """An object is where its pose says, turned by pi about x as the hand is."""
-    where, turn = np.array([0.1, 0.05, 0.4]), np.array([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])
+    where, quaternion = np.array([0.1, 0.05, 0.4]), np.array([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])
     sink.write(
-        ObjectPose("mug", 9, where, turn, np.full((6, 6), np.nan), math.nan, 2, True, 3, 3, occluded=False)
+        ObjectPose(
+            "mug", 9, where, quaternion, np.full((6, 6), np.nan), math.nan, 2, True, 3, 3, occluded=False
+        )
     )
     until(page, "handView.objects.size === 1")
     group = "handView.objects.get('mug').group"
     assert np.abs(np.array(page.evaluate(f"{group}.position.toArray()")) - where * TO_WEBXR).max() < 1e-4
-    said = np.array(page.evaluate(f"{group}.quaternion.toArray()"))
-    assert abs(abs(said @ [math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0]) - 1.0) < 1e-5
+    output = np.array(page.evaluate(f"{group}.quaternion.toArray()"))
+    assert abs(abs(output @ [math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0]) - 1.0) < 1e-5
 
 
 def keyboard(page: Page) -> None:

@@ -79,21 +79,21 @@ def test_golden_axes(wxyz: list[float], xyzw: list[float]) -> None:
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_turned_axes_say_the_same_rotation_as_the_pose(side: str) -> None:
-    pose = hand_pose(side, turn=np.array([0.4, -1.1, 2.0]))
+    pose = hand_pose(side, rotation_vector=np.array([0.4, -1.1, 2.0]))
     message = told(pose)
-    half_turn = Rotation.from_euler("x", 180, degrees=True)
-    expected = half_turn * Rotation.from_quat(pose.orientation_wxyz[1:], scalar_first=True)
-    said = Rotation.from_quat([joint["orientation"] for joint in message["joints"]])
-    assert np.degrees((expected.inv() * said).magnitude()).max() < 1e-3
+    half_rotation = Rotation.from_euler("x", 180, degrees=True)
+    expected = half_rotation * Rotation.from_quat(pose.orientation_wxyz[1:], scalar_first=True)
+    output = Rotation.from_quat([joint["orientation"] for joint in message["joints"]])
+    assert np.degrees((expected.inv() * output).magnitude()).max() < 1e-3
     points = np.array([joint["position"] for joint in message["joints"]])
-    assert np.abs(half_turn.apply(pose.position_m[1:].copy()) - points).max() < 1e-6
+    assert np.abs(half_rotation.apply(pose.position_m[1:].copy()) - points).max() < 1e-6
     assert message["side"] == side
 
 
 def test_a_bone_lies_along_minus_z_of_its_joint_and_the_back_of_the_hand_along_y() -> None:
     # What WebXR demands of joint axes, of a flat hand that points up before the camera, its back to the camera.
-    turn = Rotation.from_matrix([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]]).as_rotvec()
-    joints = told(hand_pose("right", turn=turn))["joints"]
+    rotation_vector = Rotation.from_matrix([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]]).as_rotvec()
+    joints = told(hand_pose("right", rotation_vector=rotation_vector))["joints"]
     for first, second in pairwise(joints[11:15]):
         axes = Rotation.from_quat(first["orientation"]).as_matrix()
         bone = np.subtract(second["position"], first["position"])

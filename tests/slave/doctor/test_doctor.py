@@ -37,8 +37,8 @@ GROUP_LINES = "root:x:0:\nvideo:x:44:\ndialout:x:20:\ni2c:x:994:\ngpio:x:993:\n"
 class Answers:
     """Programs that answer as told; of others there are none."""
 
-    def __init__(self, said: Mapping[str, Ran]) -> None:
-        self._said = said
+    def __init__(self, output: Mapping[str, Ran]) -> None:
+        self._said = output
         self.asked: list[Sequence[str]] = []
 
     def __call__(self, command: Sequence[str], timeout_s: float) -> Ran:
@@ -47,16 +47,16 @@ class Answers:
 
 
 def machine(
-    root: Path, said: Mapping[str, Ran] | None = None, files: Mapping[str, str] | None = None
+    root: Path, output: Mapping[str, Ran] | None = None, files: Mapping[str, str] | None = None
 ) -> System:
     for place, text in (files or {}).items():
         path = root / place
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-    return System(root, {ROOT: str(root)}, Answers(said or {}))
+    return System(root, {ROOT: str(root)}, Answers(output or {}))
 
 
-def pi(root: Path, said: Mapping[str, Ran] | None = None) -> System:
+def pi(root: Path, output: Mapping[str, Ran] | None = None) -> System:
     files = {
         "etc/os-release": 'PRETTY_NAME="Debian GNU/Linux 13 (trixie)"\nVERSION_CODENAME=trixie\n',
         "etc/group": GROUP_LINES,
@@ -66,7 +66,7 @@ def pi(root: Path, said: Mapping[str, Ran] | None = None) -> System:
         "disk_free_mb": "20000\n",
         "sys/fs/cgroup/cgroup.controllers": "cpuset cpu io memory pids\n",
     }
-    return machine(root, said, files)
+    return machine(root, output, files)
 
 
 def by_check(findings: Sequence[Finding]) -> dict[str, Finding]:
@@ -74,10 +74,10 @@ def by_check(findings: Sequence[Finding]) -> dict[str, Finding]:
 
 
 def test_a_pi_that_is_well(tmp_path: Path) -> None:
-    said = by_check(list(check_host(pi(tmp_path, {"vcgencmd": Ran(0, "throttled=0x0\n", "")}))))
-    assert {one.verdict for one in said.values()} == {Verdict.OK}
-    assert said["board"].text == "Raspberry Pi 5 Model B Rev 1.0"
-    assert said["temperature"].text == "51 °C, limit 80 °C"
+    output = by_check(list(check_host(pi(tmp_path, {"vcgencmd": Ran(0, "throttled=0x0\n", "")}))))
+    assert {one.verdict for one in output.values()} == {Verdict.OK}
+    assert output["board"].text == "Raspberry Pi 5 Model B Rev 1.0"
+    assert output["temperature"].text == "51 °C, limit 80 °C"
 
 
 @pytest.mark.parametrize(
@@ -101,13 +101,13 @@ def test_a_pi_in_trouble(tmp_path: Path) -> None:
     (tmp_path / "sys/class/thermal/thermal_zone0/temp").write_text("83000\n")
     (tmp_path / "etc/os-release").write_text("PRETTY_NAME=Elsewhere\n")
     (tmp_path / "sys/fs/cgroup/cgroup.controllers").write_text("cpuset cpu io pids\n")
-    said = by_check(list(check_host(system)))
-    assert said["memory limit"].verdict is Verdict.WARN
-    assert "cgroup_enable=memory" in said["memory limit"].fix
-    assert said["disk"].verdict is Verdict.FAIL
-    assert said["temperature"].verdict is Verdict.WARN
-    assert said["system"].verdict is Verdict.WARN
-    assert said["throttling"].verdict is Verdict.UNSEEN  # neither the firmware's file nor vcgencmd
+    output = by_check(list(check_host(system)))
+    assert output["memory limit"].verdict is Verdict.WARN
+    assert "cgroup_enable=memory" in output["memory limit"].fix
+    assert output["disk"].verdict is Verdict.FAIL
+    assert output["temperature"].verdict is Verdict.WARN
+    assert output["system"].verdict is Verdict.WARN
+    assert output["throttling"].verdict is Verdict.UNSEEN  # neither the firmware's file nor vcgencmd
 
 
 def test_a_missing_group_would_keep_systemd_from_starting_it(tmp_path: Path) -> None:
@@ -138,7 +138,7 @@ TRACKING = "C0A80005,pc.local,9,1763800000.1,{},0.000002,0.000031,-3.1,0.0,0.05,
 
 
 @pytest.mark.parametrize(
-    ("said", "verdict", "text"),
+    ("output", "verdict", "text"),
     [
         (Ran(0, TRACKING.format("0.000012", "Normal"), ""), Verdict.OK, "+12 µs off pc.local (stratum 9)"),
         (Ran(0, TRACKING.format("-0.004", "Normal"), ""), Verdict.WARN, "-4000 µs off"),
@@ -148,15 +148,15 @@ TRACKING = "C0A80005,pc.local,9,1763800000.1,{},0.000002,0.000031,-3.1,0.0,0.05,
         (Ran(0, "", ""), Verdict.WARN, "no answer"),
     ],
 )
-def test_the_clock_as_chrony_tells_it(tmp_path: Path, said: Ran, verdict: Verdict, text: str) -> None:
-    (found,) = check_clock(machine(tmp_path, {"chronyc": said}), None)
+def test_the_clock_as_chrony_tells_it(tmp_path: Path, output: Ran, verdict: Verdict, text: str) -> None:
+    (found,) = check_clock(machine(tmp_path, {"chronyc": output}), None)
     assert found.verdict is verdict
     assert text in found.text
 
 
 def test_another_source_than_the_master_and_no_chrony_at_all(tmp_path: Path) -> None:
-    said = Ran(0, TRACKING.format("0.00001", "Normal"), "")
-    (found,) = check_clock(machine(tmp_path, {"chronyc": said}), "other.local")
+    output = Ran(0, TRACKING.format("0.00001", "Normal"), "")
+    (found,) = check_clock(machine(tmp_path, {"chronyc": output}), "other.local")
     assert found.verdict is Verdict.WARN
     assert "not by other.local" in found.text
     told = {"timedatectl": Ran(0, "NTP=yes\nNTPSynchronized=yes\n", "")}
@@ -171,9 +171,9 @@ def test_libraries_are_asked_of_the_services_python(tmp_path: Path) -> None:
     python.parent.mkdir(parents=True)
     python.touch()
     lines = "libstdc++ yes\nnumpy yes 2.4.6\ncv2 yes 5.0\nzenoh no ImportError: GLIBC_2.38 not found\n"
-    said = Answers({"python": Ran(-11, lines, "")})
-    findings = list(check_programs(System(tmp_path, {}, said), ["picamera2"]))
-    assert str(said.asked[0][0]) == str(python)
+    output = Answers({"python": Ran(-11, lines, "")})
+    findings = list(check_programs(System(tmp_path, {}, output), ["picamera2"]))
+    assert str(output.asked[0][0]) == str(python)
     found = by_check(findings)
     assert found["numpy"] == ok("numpy", "2.4.6")
     assert found["zenoh"].verdict is Verdict.FAIL
@@ -273,12 +273,12 @@ def test_a_beacon_is_heard(
 ) -> None:
     keys, port = keys_of(tmp_path / "keys", "left"), free_port()
     key = bytes.fromhex((keys / "rig.key").read_text()) if own else bytes(32)
-    said, over = beacon(key, port), threading.Event()
+    output, over = beacon(key, port), threading.Event()
 
     def speak() -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as to:
             while not over.wait(0.05):
-                to.sendto(said, ("127.0.0.1", port))
+                to.sendto(output, ("127.0.0.1", port))
 
     speaker = threading.Thread(target=speak)
     speaker.start()
@@ -298,7 +298,7 @@ UNIT = (
 
 
 @pytest.mark.parametrize(
-    ("said", "verdict", "runs", "text"),
+    ("output", "verdict", "runs", "text"),
     [
         (UNIT.format("active", "running", 0, 0, "90 frames/s"), Verdict.OK, True, "90 frames/s"),
         (UNIT.format("active", "running", 3, 0, "90 frames/s"), Verdict.WARN, True, "restarted 3 times"),
@@ -319,9 +319,9 @@ UNIT = (
     ],
 )
 def test_the_service_as_systemd_tells_it(
-    tmp_path: Path, said: str, verdict: Verdict, runs: bool, text: str
+    tmp_path: Path, output: str, verdict: Verdict, runs: bool, text: str
 ) -> None:
-    unit = check_unit(machine(tmp_path, {"systemctl": Ran(0, said, "")}), "left")
+    unit = check_unit(machine(tmp_path, {"systemctl": Ran(0, output, "")}), "left")
     assert (unit.finding.verdict, unit.runs) == (verdict, runs)
     assert text in unit.finding.text
 
@@ -361,7 +361,7 @@ def test_it_runs_without_any_hardware(capsys: pytest.CaptureFixture[str]) -> Non
     code = main(
         ["doctor", "--name", "left", "--camera", "v4l2:/dev/none", *files, "--beacon-port", str(free_port())]
     )
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     assert code == 1  # there is no such camera
-    assert "/dev/none" in said
-    assert "not looked at:" in said
+    assert "/dev/none" in output
+    assert "not looked at:" in output

@@ -49,9 +49,9 @@ def test_colours_of_a_video_by_clicks_find_its_markers(
     assert main(["import", video, "--calibration", tree, "-o", str(painted / "recording")]) == 0
     fix = ["detect", str(painted / "recording"), "--camera", "left", "--calibration", tree]
     assert main([*fix, "-o", str(painted / "d.npz")]) == 1
-    said = capsys.readouterr().err
-    assert "cameras/left.json: markers: missing; make them: phalanx-slave colours" in said
-    assert all(f"--click {name}=U,V" in said for name in NAMES)
+    output = capsys.readouterr().err
+    assert "cameras/left.json: markers: missing; make them: phalanx-slave colours" in output
+    assert all(f"--click {name}=U,V" in output for name in NAMES)
     clicks = [
         text
         for name, (u, v) in zip(NAMES, CENTRES + SHIFT, strict=True)
@@ -66,19 +66,19 @@ def test_colours_of_a_video_by_clicks_find_its_markers(
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
+    ("options", "expected"),
     [
         ([], "of a video or pictures give --calibration DIR, whose cameras/left.json they are of"),
         (["--calibration", "TREE", "--click", "nose=1,2"], "rig 'desk' has no marker 'nose'; it has thumb"),
     ],
 )
 def test_colours_of_a_video_say_what_is_missing(
-    painted: Path, options: list[str], says: str, capsys: pytest.CaptureFixture[str]
+    painted: Path, options: list[str], expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = [text.replace("TREE", str(painted / "calib")) for text in options]
     target = str(painted / "made.json")
     assert main(["colours", str(painted / "left.avi"), "--camera", "left", *options, "-o", target]) == 1
-    assert says in capsys.readouterr().err
+    assert expected in capsys.readouterr().err
 
 
 def test_a_click_that_is_none_is_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
@@ -93,8 +93,8 @@ def test_import_says_what_it_made_of_what(tmp_path: Path, capsys: pytest.Capture
     first, second = (write_video(tmp_path / name) for name in ("GOPR0012.mp4", "GOPR0944.mp4"))
     named = ["--camera", f"right={first}", "--camera", f"left={second}"]
     assert main(["import", *named, "--calibration", str(tree), "-o", str(out)]) == 0
-    said = capsys.readouterr().out
-    assert f"right: {first}: {COUNT} frames in 0.44 s" in said
-    assert f"recording in {out}" in said
+    output = capsys.readouterr().out
+    assert f"right: {first}: {COUNT} frames in 0.44 s" in output
+    assert f"recording in {out}" in output
     assert main(["import", "--calibration", str(tree), "-o", str(out)]) == 1
     assert "name a video or a folder of pictures for each camera" in capsys.readouterr().err

@@ -25,12 +25,12 @@ MS = 1_000_000
 
 def imported(tmp_path: Path, *paths: Path, **wish: object) -> tuple[FrameRecording, str]:
     """The recording, and all that was said."""
-    said: list[str] = []
+    output: list[str] = []
     tree = tmp_path / "calib"
     if not tree.exists():
         write_tree(tree)
-    import_pictures(Wish(tree, paths, **wish), tmp_path / "out", said.append)  # type: ignore[arg-type]
-    return open_recording(tmp_path / "out"), "\n".join(said)
+    import_pictures(Wish(tree, paths, **wish), tmp_path / "out", output.append)  # type: ignore[arg-type]
+    return open_recording(tmp_path / "out"), "\n".join(output)
 
 
 def shown(recording: FrameRecording, camera: str) -> list[int]:
@@ -42,14 +42,14 @@ def shown(recording: FrameRecording, camera: str) -> list[int]:
 @pytest.mark.parametrize("ending", [".avi", ".mp4", ".mkv"])
 def test_videos_named_as_cameras_are_a_recording_with_their_own_times(tmp_path: Path, ending: str) -> None:
     left, right = (write_video(tmp_path / f"{name}{ending}") for name in ("left", "right"))
-    recording, said = imported(tmp_path, right, left)
+    recording, output = imported(tmp_path, right, left)
     for camera in ("left", "right"):
         rows = recording.frames_of(camera)
         assert shown(recording, camera) == list(range(COUNT))
         assert [row.seq for row in rows] == list(range(COUNT))
         assert all(abs(row.t_ns - 40 * MS * row.seq) <= MS for row in rows)  # Matroska counts in milliseconds
-    assert "first frames of all cameras are taken as simultaneous" in said
-    assert f"left: {left}: 12 frames in 0.44 s (time stamps of the video)" in said
+    assert "first frames of all cameras are taken as simultaneous" in output
+    assert f"left: {left}: 12 frames in 0.44 s (time stamps of the video)" in output
     assert recording.manifest.marker_rig().cameras == ("left", "right")
 
 
@@ -57,11 +57,11 @@ def test_pictures_come_in_the_order_of_their_numbers_at_the_rate_of_the_camera_f
     take = tmp_path / "take"
     write_pictures(take / "left")
     write_pictures(take / "right", ".jpg")
-    recording, said = imported(tmp_path, take)
+    recording, output = imported(tmp_path, take)
     for camera in ("left", "right"):
         assert shown(recording, camera) == list(range(COUNT))
         assert [row.t_ns for row in recording.frames_of(camera)] == [20 * MS * k for k in range(COUNT)]
-    assert "50 frames per second, as the camera file states" in said
+    assert "50 frames per second, as the camera file states" in output
 
 
 def test_frames_are_read_again_in_any_order(tmp_path: Path) -> None:
@@ -76,23 +76,23 @@ def test_names_of_no_camera_go_in_the_order_of_the_rig_and_the_mapping_is_said(t
     take = tmp_path / "take"
     for k, count in ((2, 5), (10, 7)):
         write_video(take / f"camera_{k}.mp4", count=count)
-    recording, said = imported(tmp_path, take)
+    recording, output = imported(tmp_path, take)
     assert [len(recording.frames_of(camera)) for camera in ("left", "right")] == [5, 7]
-    assert f"left = {take / 'camera_2.mp4'}, right = {take / 'camera_10.mp4'}" in said
+    assert f"left = {take / 'camera_2.mp4'}, right = {take / 'camera_10.mp4'}" in output
 
 
 def test_cameras_can_be_named_and_the_rig_keeps_those_that_there_are(tmp_path: Path) -> None:
     write_tree(tmp_path / "calib", ("left", "right", "top"))
     named = {"top": write_video(tmp_path / "a.avi", count=3), "left": write_video(tmp_path / "b.avi")}
-    recording, said = imported(tmp_path, named=named)
+    recording, output = imported(tmp_path, named=named)
     assert recording.manifest.marker_rig().cameras == ("left", "top")
     assert len(recording.frames_of("top")) == 3
-    assert "rig 'desk' has right, too, of which there is nothing" in said
+    assert "rig 'desk' has right, too, of which there is nothing" in output
 
 
-@pytest.mark.parametrize("beside", [False, True])
+@pytest.mark.parametrize("sidecar", [False, True])
 def test_a_table_of_times_is_kept_to_the_nanosecond_and_frames_without_one_are_left_out(
-    tmp_path: Path, beside: bool
+    tmp_path: Path, sidecar: bool
 ) -> None:
     left, right = (write_video(tmp_path / f"{name}.avi") for name in ("left", "right"))
     base = 1_760_000_000_000_000_000  # since 1970, beyond what a float keeps
@@ -102,18 +102,18 @@ def test_a_table_of_times_is_kept_to_the_nanosecond_and_frames_without_one_are_l
         name: [f"{k},{t // 10**9}.{t % 10**9:09d}" for k, t in enumerate(own)] for name, own in taken.items()
     }
     table = None
-    if beside:
+    if sidecar:
         for name, own in lines.items():
             (tmp_path / f"{name}.csv").write_text("\n".join(["frame,time", *own]))
     else:
         table = tmp_path / "times.csv"
         rows = [f"{name},{line}" for name, own in lines.items() for line in own]
         table.write_text("\n".join(["camera,frame,time", *rows]))
-    recording, said = imported(tmp_path, left, right, times=table)
+    recording, output = imported(tmp_path, left, right, times=table)
     for name, own in taken.items():
         assert [row.t_ns for row in recording.frames_of(name)] == [t - base for t in own]
-    assert "simultaneous" not in said
-    assert "3 frames without one left out" in said
+    assert "simultaneous" not in output
+    assert "3 frames without one left out" in output
 
 
 def test_frames_that_cannot_be_decoded_are_counted_and_the_others_keep_number_and_time(
@@ -123,23 +123,23 @@ def test_frames_that_cannot_be_decoded_are_counted_and_the_others_keep_number_an
     break_frame(left, 4)
     right = write_pictures(tmp_path / "right")
     (right / "frame7.png").write_bytes((right / "frame7.png").read_bytes()[:60])
-    recording, said = imported(tmp_path, left, right)
+    recording, output = imported(tmp_path, left, right)
     assert shown(recording, "left") == [k for k in range(COUNT) if k != 4]
     assert [row.t_ns for row in recording.frames_of("left")] == [40 * MS * k for k in range(COUNT) if k != 4]
     assert shown(recording, "right") == [k for k in range(COUNT) if k != 7]
-    assert "1 frames between them cannot be decoded" in said
-    assert "1 pictures cannot be decoded" in said
+    assert "1 frames between them cannot be decoded" in output
+    assert "1 pictures cannot be decoded" in output
 
 
 def test_a_video_that_was_cut_says_how_much_is_missing(tmp_path: Path) -> None:
     left, right = (write_video(tmp_path / f"{name}.avi") for name in ("left", "right"))
     data = left.read_bytes()
     left.write_bytes(data[: data.find(b"movi") + (len(data) - data.find(b"movi")) // 2])
-    recording, said = imported(tmp_path, left, right)
+    recording, output = imported(tmp_path, left, right)
     count = len(recording.frames_of("left"))
     assert 2 <= count < COUNT
     assert shown(recording, "left") == list(range(count))
-    assert f"it ends {COUNT - count} frames before the {COUNT}" in said
+    assert f"it ends {COUNT - count} frames before the {COUNT}" in output
 
 
 def test_importing_again_replaces_the_import_and_nothing_else(tmp_path: Path) -> None:
@@ -208,7 +208,7 @@ def _text(tmp_path: Path) -> list[Path]:
 
 
 @pytest.mark.parametrize(
-    ("make", "says"),
+    ("make", "expected"),
     [
         (
             _small,
@@ -230,15 +230,15 @@ def _text(tmp_path: Path) -> list[Path]:
     ],
 )
 def test_what_cannot_be_used_is_refused_by_name_with_the_fix(
-    tmp_path: Path, make: Callable[[Path], list[Path]], says: str
+    tmp_path: Path, make: Callable[[Path], list[Path]], expected: str
 ) -> None:
-    with pytest.raises(RecordingError, match=says):
+    with pytest.raises(RecordingError, match=expected):
         imported(tmp_path, *make(tmp_path))
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "expected"),
     [
         ("frame;time\n0;1\n", "the header must have frame and time"),
         ("frame,time\n0,1.0\n0,2.0\n", "line 3: frame 0 of 'left' is there twice"),
@@ -251,10 +251,10 @@ def test_what_cannot_be_used_is_refused_by_name_with_the_fix(
         ("frame,time\n0,nan\n", "line 2: time: 'nan' is no time"),
     ],
 )
-def test_a_table_that_is_of_no_use_is_refused_by_line(tmp_path: Path, text: str, says: str) -> None:
+def test_a_table_that_is_of_no_use_is_refused_by_line(tmp_path: Path, text: str, expected: str) -> None:
     (tmp_path / "left.csv").write_text(text)
     left, right = (write_video(tmp_path / f"{name}.avi") for name in ("left", "right"))
-    with pytest.raises(RecordingError, match=says):
+    with pytest.raises(RecordingError, match=expected):
         imported(tmp_path, left, right)
 
 

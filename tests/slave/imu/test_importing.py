@@ -36,17 +36,18 @@ def test_it_says_what_is_in_it_and_writes_our_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = rested(tmp_path / "foreign.csv", off_deg=1.0)
-    assert main(["imu", "--csv", str(path), "--out", str(tmp_path / "taken"), "--name", "worn"]) == 0
-    said = capsys.readouterr().out
-    assert "Timestamp (ms) in ms (header)" in said
-    assert "gx_dps, gy_dps, gz_dps in deg/s (header)" in said
+    assert main(["imu", "--csv", str(path), "--out", str(tmp_path / "taken"), "--name", "device"]) == 0
+    output = capsys.readouterr().out
+    assert "Timestamp (ms) in ms (header)" in output
+    assert "gx_dps, gy_dps, gz_dps in deg/s (header)" in output
     assert (
-        "495 in 4.99 s, 100.0 Hz; 1 gaps, the longest 0.060 s; 1 rows with NaN, 0 not after the last" in said
+        "495 in 4.99 s, 100.0 Hz; 1 gaps, the longest 0.060 s; 1 rows with NaN, 0 not after the last"
+        in output
     )
-    against = next(line for line in said.splitlines() if line.startswith("inclination"))
+    against = next(line for line in output.splitlines() if line.startswith("inclination"))
     assert "deg rms against opt_qw, opt_qx, opt_qy, opt_qz, taken for true" in against
     assert float(against.split()[1]) == pytest.approx(1.0, abs=0.1)
-    samples = read_imu(tmp_path / "taken", "worn")
+    samples = read_imu(tmp_path / "taken", "device")
     assert len(samples) == 495
     np.testing.assert_allclose(samples[0].gyro_rad_s, [np.radians(1.0), 0.0, 0.0])
     found = samples[-1].orientation_wxyz
@@ -81,8 +82,8 @@ def test_a_real_recording_in_a_foreign_layout(datasets: Path, tmp_path: Path) ->
     )
     path = tmp_path / "swung.csv"
     np.savetxt(path, columns, fmt="%.6f", delimiter="\t", header=header, comments="")
-    said: list[str] = []
-    import_table(read_csv(path), "imu", None, said.append)
-    line = next(one for one in said if one.startswith("inclination"))
+    output: list[str] = []
+    import_table(read_csv(path), "imu", None, output.append)
+    line = next(one for one in output if one.startswith("inclination"))
     assert float(line.split()[1]) < 1.5
     assert float(line.split("stated ")[1].split("%")[0].split(",")[1]) > 95.0

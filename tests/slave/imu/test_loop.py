@@ -13,8 +13,8 @@ from common.clock import SystemClock
 from common.errors import ImuError
 from common.messages import Command, ImuSample, Message
 from slave.__main__ import main
+from slave.imu.counters import SampleCounters
 from slave.imu.live import run, wait_for_start
-from slave.imu.tally import SampleTally
 from slave.report import Reporter
 from tests.network_helpers import until
 
@@ -60,23 +60,23 @@ class Wire:
 
 
 def test_every_sample_is_sent_in_the_name_of_this_process_and_gaps_are_counted() -> None:
-    wire, tally = Wire(), SampleTally()
-    run(Source([sample(k) for k in (40, 41, 45, 46)]), wire, tally, threading.Event())
+    wire, counters = Wire(), SampleCounters()
+    run(Source([sample(k) for k in (40, 41, 45, 46)]), wire, counters, threading.Event())
     assert [(one.source, one.session, one.seq, one.t_ns) for one in wire.sent] == [
         ("imu", 77, seq, 8_333_333 * seq) for seq in (40, 41, 45, 46)
     ]
-    assert tally.counts() == {"samples": 4, "skipped": 3, "failed": 0}
-    assert tally.gauges()["rate_hz"] > 0.0
-    assert set(tally.gauges()) == {"rate_hz"}
+    assert counters.counts() == {"samples": 4, "skipped": 3, "failed": 0}
+    assert counters.metrics()["rate_hz"] > 0.0
+    assert set(counters.metrics()) == {"rate_hz"}
 
 
 def test_the_loop_ends_when_told_and_when_the_device_is_gone() -> None:
     wire, stop = Wire(), threading.Event()
     with pytest.raises(ImuError, match="unplugged"):
-        run(Source([sample(0), ImuError("unplugged"), sample(1)]), wire, SampleTally(), stop)
+        run(Source([sample(0), ImuError("unplugged"), sample(1)]), wire, SampleCounters(), stop)
     assert len(wire.sent) == 1
     stop.set()
-    run(Source([sample(2)]), wire, SampleTally(), stop)
+    run(Source([sample(2)]), wire, SampleCounters(), stop)
     assert len(wire.sent) == 1
 
 
@@ -94,22 +94,22 @@ class Filter:
         return msgspec.structs.replace(sample, orientation_wxyz=np.array([1.0, 0.0, 0.0, 0.0]))
 
 
-class Telling(Source):
+class Reporting(Source):
     """An IMU that has more to tell."""
 
     def counts(self) -> dict[str, int]:
         return {"lost": 1, "back": 1, "broken": 0}
 
-    def gauges(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {"temperature_c": 30.5, "away_s": 0.0, "battery_percent": np.inf}
 
 
 def test_the_filters_orientation_is_sent_and_what_it_and_the_imu_tell_is_told() -> None:
-    wire, source, orientation = Wire(), Telling([sample(0), sample(1)]), Filter()
-    tally = SampleTally(source, orientation)
-    run(source, wire, tally, threading.Event(), orientation)
+    wire, source, orientation = Wire(), Reporting([sample(0), sample(1)]), Filter()
+    counters = SampleCounters(source, orientation)
+    run(source, wire, counters, threading.Event(), orientation)
     assert [one.orientation_wxyz.tolist() for one in wire.sent] == [[1.0, 0.0, 0.0, 0.0]] * 2
-    assert tally.counts() == {
+    assert counters.counts() == {
         "samples": 2,
         "skipped": 0,
         "failed": 0,
@@ -118,9 +118,9 @@ def test_the_filters_orientation_is_sent_and_what_it_and_the_imu_tell_is_told() 
         "broken": 0,
         "fusion.gap": 2,
     }
-    gauges = tally.gauges()
-    assert gauges.pop("rate_hz") > 0.0
-    assert gauges == {
+    metrics = counters.metrics()
+    assert metrics.pop("rate_hz") > 0.0
+    assert metrics == {
         "temperature_c": 30.5,
         "away_s": 0.0,
         "bias_x_rad_s": 0.01,
@@ -154,10 +154,10 @@ def test_samples_before_the_start_are_read_and_forgotten() -> None:
 
 
 def test_it_reports_and_stops_on_the_bus() -> None:
-    bus, stop, tally = LoopbackBus(), threading.Event(), SampleTally()
+    bus, stop, counters = LoopbackBus(), threading.Event(), SampleCounters()
     for seq in (1, 2, 4):
-        tally.sample(seq)
-    reporter = Reporter("imu", Wire(), tally, SystemClock(), lambda _endpoint: bus, stop.set, 0.01)
+        counters.sample(seq)
+    reporter = Reporter("imu", Wire(), counters, SystemClock(), lambda _endpoint: bus, stop.set, 0.01)
     assert until(lambda: "imu" in bus.alive())
     health = bus.ask(Command("imu", "report", ""), 5.0)
     assert (health.source, health.session) == ("imu", 77)
@@ -170,7 +170,7 @@ def test_it_reports_and_stops_on_the_bus() -> None:
 
 
 @pytest.mark.parametrize(
-    ("option", "says"),
+    ("option", "expected"),
     [
         (["--name", "imu", "--rig", "desk"], "rig 'desk' has no IMU 'imu'; it has none"),
         (["--name", "wrist"], "rig 'wrist' has no IMU 'wrist'; its IMU is 'imu'"),
@@ -196,7 +196,7 @@ def test_it_reports_and_stops_on_the_bus() -> None:
 )
 def test_what_it_cannot_be_is_said_at_the_start(
     option: list[str],
-    says: str,
+    expected: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -213,4 +213,4 @@ def test_what_it_cannot_be_is_said_at_the_start(
             (files / kept).symlink_to(ROOT / "calib_json" / kept)
     command = ["imu", "--rig", "wrist", "--imu", "synthetic", "--calibration", str(files)]
     assert main([*command, *option, "--bind", "127.0.0.1"]) == 1
-    assert says in capsys.readouterr().err
+    assert expected in capsys.readouterr().err

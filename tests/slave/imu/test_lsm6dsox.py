@@ -14,13 +14,13 @@ from common.errors import ImuError
 from common.messages import ImuSample
 from slave.imu.lsm6dsox import SILENT_POLLS, I2cPlace, Lsm6dsoxImu, buses, rate_of
 from slave.imu.lsm6dsox_fifo import Register, Slots, temperature_c
-from slave.imu.reopening import ReopeningImu
+from slave.imu.reconnecting import ReconnectingImu
 from tests.slave.imu.fake_i2c import FakeLsm6dsox
 
 PLACE = I2cPlace(1)
 
 
-class World(threading.Event):
+class Dispatcher(threading.Event):
     """A clock that waiting moves on, and with it a part that measures."""
 
     def __init__(self, part: FakeLsm6dsox) -> None:
@@ -50,12 +50,12 @@ class World(threading.Event):
         return int((self.t_ns - self.epoch_ns) * 1e-9 * rate)
 
 
-def opened(part: FakeLsm6dsox, world: World | None = None, place: I2cPlace = PLACE) -> Lsm6dsoxImu:
-    world = World(part) if world is None else world
+def opened(part: FakeLsm6dsox, world: Dispatcher | None = None, place: I2cPlace = PLACE) -> Lsm6dsoxImu:
+    world = Dispatcher(part) if world is None else world
     return Lsm6dsoxImu("imu", place, 120.0, world, world, part)
 
 
-def samples(imu: Lsm6dsoxImu | ReopeningImu, count: int) -> Iterator[ImuSample]:
+def samples(imu: Lsm6dsoxImu | ReconnectingImu, count: int) -> Iterator[ImuSample]:
     for _ in range(count):
         sample = imu.read()
         assert sample is not None
@@ -87,7 +87,7 @@ def test_samples_have_the_units_of_the_data_sheet_and_the_times_of_its_stamps() 
     np.testing.assert_allclose(first.accel_m_s2, np.array([0.0, -0.488, 0.999912]) * 9.80665, rtol=1e-12)
     assert np.isnan([*first.mag_ut, *first.orientation_wxyz]).all()
     assert imu.counts()["clipped"] == 1
-    assert imu.gauges() == {"temperature_c": 31.5}
+    assert imu.metrics() == {"temperature_c": 31.5}
     rest = [*samples(imu, 400)]
     periods_ms = np.diff([one.t_ns for one in rest]) * 1e-6
     true_ms = 1e3 / (208.34375 * (1.0 - 7 * 0.0015))  # as its fine frequency says, 1 % off
@@ -101,7 +101,7 @@ def test_samples_have_the_units_of_the_data_sheet_and_the_times_of_its_stamps() 
 
 def test_what_overran_is_a_gap_and_what_is_broken_is_counted() -> None:
     part = FakeLsm6dsox()
-    world = World(part)
+    world = Dispatcher(part)
     imu = opened(part, world)
     [first] = samples(imu, 1)
     world.t_ns += 2_000_000_000  # the machine stood still: 412 samples, and the FIFO has room for 170
@@ -142,19 +142,21 @@ def test_what_cannot_be_is_told() -> None:
         opened(part)
     assert part.closed == 1
     with pytest.raises(ImuError, match=r"I2C bus 99, address 0x6a: there is no /dev/i2c-99: is I2C on\?"):
-        Lsm6dsoxImu("imu", I2cPlace(99), 120.0, World(part), threading.Event())
+        Lsm6dsoxImu("imu", I2cPlace(99), 120.0, Dispatcher(part), threading.Event())
 
     def forbidden(_bus: int) -> FakeLsm6dsox:
         raise PermissionError(13, "Permission denied")
 
     with pytest.raises(ImuError, match="usermod -aG i2c"):
-        Lsm6dsoxImu("imu", PLACE, 120.0, World(part), threading.Event(), forbidden)
+        Lsm6dsoxImu("imu", PLACE, 120.0, Dispatcher(part), threading.Event(), forbidden)
 
 
 def test_wires_that_come_off_are_a_loss_and_it_comes_back() -> None:
     part = FakeLsm6dsox()
-    world = World(part)
-    imu = ReopeningImu(lambda: Lsm6dsoxImu("imu", PLACE, 120.0, world, world, part), 208.34375, world, world)
+    world = Dispatcher(part)
+    imu = ReconnectingImu(
+        lambda: Lsm6dsoxImu("imu", PLACE, 120.0, world, world, part), 208.34375, world, world
+    )
     before = [*samples(imu, 50)]
     part.plugged = False
     lost_ns = world.t_ns

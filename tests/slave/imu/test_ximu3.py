@@ -11,8 +11,8 @@ import pytest
 from common.clock import SystemClock
 from common.errors import ImuError
 from common.messages import ImuSample
-from slave.imu.reopening import ReopeningImu
-from slave.imu.source import ImuSource, Telling
+from slave.imu.reconnecting import ReconnectingImu
+from slave.imu.source import ImuSource, Reporting
 from slave.imu.ximu3 import SerialPlace, Ximu3Imu, divisor, open_port
 from slave.imu.ximu3_protocol import Kind
 from tests.slave.imu.fake_ximu3 import FakeXimu3
@@ -86,7 +86,7 @@ def test_units_values_that_come_rarely_and_when_it_was_measured(device: FakeXimu
     assert second.t_ns - first.t_ns == 7_500_000
     assert second.t_ns <= CLOCK.now_ns()
     assert abs(second.t_ns - before_ns) < 60e9
-    assert imu.gauges() == {"temperature_c": 31.25, "battery_percent": 87.0}
+    assert imu.metrics() == {"temperature_c": 31.25, "battery_percent": 87.0}
     assert imu.counts()["imu.inertial"] == 2
     assert imu.counts()["broken"] == 0
     imu.close()
@@ -144,7 +144,7 @@ def test_behind_a_uart_the_wire_takes_its_time(link: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("behaviour", "says"),
+    ("behaviour", "expected"),
     [
         ({"mute": True}, "no x-IMU3 answers: is it switched on"),
         (
@@ -154,12 +154,12 @@ def test_behind_a_uart_the_wire_takes_its_time(link: Path) -> None:
     ],
 )
 def test_who_does_not_answer_or_refuses_is_told(
-    behaviour: dict[str, object], says: str, link: Path, monkeypatch: pytest.MonkeyPatch
+    behaviour: dict[str, object], expected: str, link: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if "mute" in behaviour:
         monkeypatch.setattr("slave.imu.ximu3.ANSWER_S", 0.05)
     device = FakeXimu3(link, **behaviour)
-    with pytest.raises(ImuError, match=says):
+    with pytest.raises(ImuError, match=expected):
         opened(link)
     device.unplug()
 
@@ -203,15 +203,15 @@ def test_a_rate_it_does_not_have_is_refused() -> None:
         divisor(500.0)
 
 
-def reopening(link: Path, stop: threading.Event) -> ReopeningImu:
-    return ReopeningImu(
+def reconnecting(link: Path, stop: threading.Event) -> ReconnectingImu:
+    return ReconnectingImu(
         lambda: Ximu3Imu("imu", SerialPlace(str(link)), 120.0, CLOCK, stop), 400.0 / 3.0, CLOCK, stop
     )
 
 
 def test_unplugged_it_is_lost_and_plugged_in_again_it_is_back(link: Path) -> None:
     device = FakeXimu3(link)
-    imu = reopening(link, threading.Event())
+    imu = reconnecting(link, threading.Event())
     device.inertial(3)
     before = samples(imu, 3)
     device.unplug()
@@ -222,10 +222,10 @@ def test_unplugged_it_is_lost_and_plugged_in_again_it_is_back(link: Path) -> Non
     gap = after[0].seq - before[-1].seq
     assert gap == max(1, round((after[0].t_ns - before[-1].t_ns) * 1e-9 * 400.0 / 3.0)) > 1
     assert after[1].seq == after[0].seq + 1
-    assert isinstance(imu, Telling)
+    assert isinstance(imu, Reporting)
     counts = imu.counts()
     assert (counts["lost"], counts["back"], counts["imu.inertial"]) == (1, 1, 5)
-    assert imu.gauges()["away_s"] == 0.0
+    assert imu.metrics()["away_s"] == 0.0
     imu.close()
 
 
@@ -238,7 +238,7 @@ def _return(link: Path) -> FakeXimu3:
 
 
 def test_a_reboot_is_a_loss_and_its_settings_are_written_again(device: FakeXimu3, link: Path) -> None:
-    imu = reopening(link, threading.Event())
+    imu = reconnecting(link, threading.Event())
     device.inertial(3)
     assert len(samples(imu, 3)) == 3
     device.now_us = 0
@@ -265,12 +265,12 @@ def test_a_reboot_is_a_loss_and_its_settings_are_written_again(device: FakeXimu3
 def test_while_it_is_away_the_slave_can_be_stopped(link: Path) -> None:
     stop = threading.Event()
     device = FakeXimu3(link)
-    imu = reopening(link, stop)
+    imu = reconnecting(link, stop)
     device.unplug()
     threading.Timer(0.1, stop.set).start()
     assert imu.read() is None
     assert imu.counts()["lost"] == 1
-    assert imu.gauges()["away_s"] > 0.0
+    assert imu.metrics()["away_s"] > 0.0
     imu.close()
 
 

@@ -118,9 +118,9 @@ class Board:
         (root / "etc/group").write_text("root:x:0:\nvideo:x:44:\n")
         (root / "boot/firmware/config.txt").write_text("# of the system\ndtparam=audio=on\n")
         self.systemd = FakeSystemd(root)
-        self.said: list[str] = []
+        self.output: list[str] = []
         services = Systemd(self.systemd.run, lambda: self.systemd.now_s, self.systemd.sleep)
-        self.machine = steps.Machine(root, services, self.said.append, 30.0, 2.0)
+        self.machine = steps.Machine(root, services, self.output.append, 30.0, 2.0)
 
     def install(
         self,

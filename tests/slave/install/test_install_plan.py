@@ -63,7 +63,7 @@ def test_drivers_and_options_are_of_one_camera_or_of_all() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "output"),
     [
         (("--rig", "attic"), "calib_json/rigs/attic.json: no such rig; there are desk"),
         ((), "rig 'desk' has left, right: say which of them this is, --name NAME"),
@@ -78,15 +78,15 @@ def test_drivers_and_options_are_of_one_camera_or_of_all() -> None:
         (("--name", "left", "--master", "a b"), "--master a b: give the host name or the address"),
     ],
 )
-def test_what_does_not_fit_is_refused_with_its_fix(words: tuple[str, ...], said: str) -> None:
+def test_what_does_not_fit_is_refused_with_its_fix(words: tuple[str, ...], output: str) -> None:
     with pytest.raises(InstallError) as refused:
         plan(*words)
-    assert said in str(refused.value)
+    assert output in str(refused.value)
     assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
-    ("file", "content", "said"),
+    ("file", "content", "output"),
     [
         ("rig.key", b"0123", "rig.key is not 64 hexadecimal digits"),
         ("devices/left.secret", b"0123", "device-left.secret is not 64 hexadecimal digits"),
@@ -99,12 +99,12 @@ def test_what_does_not_fit_is_refused_with_its_fix(words: tuple[str, ...], said:
     ],
 )
 def test_keys_that_are_none_are_refused_and_nothing_is_written(
-    board: Board, site: Path, file: str, content: bytes | None, said: str
+    board: Board, site: Path, file: str, content: bytes | None, output: str
 ) -> None:
     other = (board.keys / "devices/right.pem").read_bytes()
     (board.keys / file).write_bytes(other if content is None else content)
     before = board.files()
-    with pytest.raises(InstallError, match=said):
+    with pytest.raises(InstallError, match=output):
         board.install(site)
     assert {p: v for p, v in board.files().items() if p != "run"} == before
 
@@ -190,7 +190,7 @@ def test_what_config_txt_says_already_is_not_said_again() -> None:
 
 
 @pytest.mark.parametrize(
-    ("facts", "camera", "said"),
+    ("facts", "camera", "output"),
     [
         ({"bits": 32}, "", "needs a 64-bit system"),
         ({"machine": "armv7l"}, "", "needs a 64-bit system"),
@@ -204,9 +204,9 @@ def test_what_config_txt_says_already_is_not_said_again() -> None:
         ({"video": []}, "v4l2:/dev/video2", "no V4L2 camera is there (/dev/video2)"),
     ],
 )
-def test_a_machine_that_cannot_is_told_why(facts: dict[str, object], camera: str, said: str) -> None:
+def test_a_machine_that_cannot_is_told_why(facts: dict[str, object], camera: str, output: str) -> None:
     assert judge(FACTS, camera) is None
-    assert said in (judge(FACTS | facts, camera) or "")
+    assert output in (judge(FACTS | facts, camera) or "")
 
 
 def test_picamera2_has_to_be_there_only_where_apt_may_not_bring_it() -> None:
@@ -256,14 +256,14 @@ def test_a_service_that_restarts_or_says_nothing_is_not_ready() -> None:
 def test_a_service_that_asks_for_time_to_start_has_it_once() -> None:
     clock = [0.0]
 
-    def services(says: str, ready_s: float) -> Systemd:
+    def services(expected: str, ready_s: float) -> Systemd:
         def run(words: object) -> str:
             assert isinstance(words, list)
             if words[0] == "journalctl":
                 return ""
             active = clock[0] >= ready_s
             state = ("active", "running") if active else ("activating", "start")
-            return f"ActiveState={state[0]}\nSubState={state[1]}\nMainPID=7\nStatusText={says}\n"
+            return f"ActiveState={state[0]}\nSubState={state[1]}\nMainPID=7\nStatusText={expected}\n"
 
         return Systemd(run, lambda: clock[0], lambda seconds: clock.__setitem__(0, clock[0] + seconds))
 

@@ -64,7 +64,7 @@ def test_a_dry_run_writes_nothing_and_says_what_it_would(board: Board, site: Pat
     outcome = board.install(site, dry_run=True)
     assert board.files() == before
     assert outcome.restarted == [UNIT]
-    assert "would write /etc/phalanx/left.env" in board.said
+    assert "would write /etc/phalanx/left.env" in board.output
     assert all(line.startswith("systemctl show") for line in board.systemd.asked)
 
 
@@ -213,7 +213,7 @@ def test_an_installation_that_was_cut_off_is_taken_back_first(
             board.install(site_of(tmp_path / "new", "2.0"), "--options", "--seed 8")
     assert Transaction(board.root).is_open
     outcome = board.install(site)
-    assert board.said.count("an installation before was cut off: taking it back") == 1
+    assert board.output.count("an installation before was cut off: taking it back") == 1
     assert outcome.changed == []
     assert outcome.release == good.release
 
@@ -253,7 +253,7 @@ def test_a_full_disk_is_told_and_leaves_what_runs(
         (big / "ballast").write_bytes(bytes(30_000_000))
         with pytest.raises(InstallError, match=r"MB free, a release needs 92 MB; make room there"):
             board.install(big)
-        monkeypatch.setattr(release, "_check_room", _enough)  # as if somebody else filled it meanwhile
+        monkeypatch.setattr(release, "_check_space", _enough)  # as if somebody else filled it meanwhile
         (disk / "filler").write_bytes(bytes(40_000_000))
         with pytest.raises(InstallError, match="No space left on device"):
             board.install(big)
@@ -273,10 +273,10 @@ def test_an_installation_waits_for_another_and_not_for_ever(board: Board, site: 
     fcntl.flock(other, fcntl.LOCK_EX)
     try:
         for act in (lambda: board.install(site), lambda: uninstall(board.machine)):
-            board.said.clear()
+            board.output.clear()
             with pytest.raises(InstallError, match="still runs on this machine after 600 s"):
                 act()
-            assert board.said == [
+            assert board.output == [
                 "another installation runs on this machine: waiting for its end, at most 600 s"
             ]
     finally:
@@ -326,7 +326,7 @@ def test_a_release_that_was_half_removed_is_made_again(
         patch.setattr(release.shutil, "rmtree", _nothing)  # the power goes
         release.remove(board.root, name)
     assert not (board.root / release.RELEASES / name).exists()
-    assert release.make(board.root, name, Source(None, site), board.said.append)
+    assert release.make(board.root, name, Source(None, site), board.output.append)
 
 
 def _nothing(_path: Path, ignore_errors: bool = False) -> None:

@@ -53,7 +53,7 @@ def test_systemd_has_nothing_to_say_about_the_unit(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "output"),
     [
         ("WatchdogSec", "WatchdogSek", "Unknown key 'WatchdogSek'"),
         ("char-i2c", "chor-i2c", "chor-i2c"),
@@ -62,10 +62,10 @@ def test_systemd_has_nothing_to_say_about_the_unit(tmp_path: Path) -> None:
         ("current/bin/phalanx-slave $PHALANX_COMMAND", "current/bin/phalanx", "not executable"),
     ],
 )
-def test_a_slip_in_the_unit_would_be_said(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_a_slip_in_the_unit_would_be_said(tmp_path: Path, old: str, new: str, output: str) -> None:
     text = UNIT.read_text()
     assert old in text
-    assert said in verified(tmp_path, text.replace(old, new, 1))
+    assert output in verified(tmp_path, text.replace(old, new, 1))
 
 
 @pytest.mark.parametrize(("drop", "passes"), [(None, True), ("SystemCallFilter", False)])
@@ -99,13 +99,13 @@ def test_every_group_of_the_unit_is_made_and_known_to_the_doctor() -> None:
 
 
 def test_the_unit_waits_for_the_slave_and_watches_its_loop() -> None:
-    said = dict(settings(UNIT.read_text()))
-    assert (said["Type"], said["Restart"], said["StartLimitIntervalSec"]) == ("notify", "always", "0")
+    output = dict(settings(UNIT.read_text()))
+    assert (output["Type"], output["Restart"], output["StartLimitIntervalSec"]) == ("notify", "always", "0")
     # A hang is found after at most a watchdog's period, ended within the abort's, and then the slave starts again.
-    assert int(said["WatchdogSec"]) + int(said["TimeoutAbortSec"]) <= 7
-    assert said["RestartSec"] == "500ms"
-    assert (said["MemoryMax"], said["MemorySwapMax"], said["TasksMax"]) == ("70%", "0", "256")
-    assert "MemoryDenyWriteExecute" not in said  # numba
+    assert int(output["WatchdogSec"]) + int(output["TimeoutAbortSec"]) <= 7
+    assert output["RestartSec"] == "500ms"
+    assert (output["MemoryMax"], output["MemorySwapMax"], output["TasksMax"]) == ("70%", "0", "256")
+    assert "MemoryDenyWriteExecute" not in output  # numba
     credentials = [value.split(":") for key, value in settings(UNIT.read_text()) if key == "LoadCredential"]
     assert [name for name, _ in credentials] == [
         "rig.key",

@@ -9,7 +9,7 @@ import pytest
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.errors import CalibrationError, LightsError
 from slave.__main__ import main
-from slave.lights.opening import choose, limits_for, open_guarded
+from slave.lights.factory import choose, limits_for, open_guarded
 from slave.lights.strobed import check_pulses, schedule_of
 from tests.slave.lights.stage import CAMERA, RIG, ROOT
 
@@ -34,7 +34,7 @@ def test_what_lights_a_camera(lights: str | None, camera: str, choice: str | Non
 
 
 @pytest.mark.parametrize(
-    ("lights", "camera", "says"),
+    ("lights", "camera", "expected"),
     [
         (None, "v4l2:0", "say who switches its laser and LEDs, --lights gpio:"),
         (None, "picamera2", "say who switches"),
@@ -45,8 +45,8 @@ def test_what_lights_a_camera(lights: str | None, camera: str, choice: str | Non
         ("i2c:1", "replay:rec", "a recording is lit already"),
     ],
 )
-def test_what_is_refused(lights: str | None, camera: str, says: str) -> None:
-    with pytest.raises(LightsError, match=says):
+def test_what_is_refused(lights: str | None, camera: str, expected: str) -> None:
+    with pytest.raises(LightsError, match=expected):
         choose(lights, RIG, camera)
 
 
@@ -68,7 +68,7 @@ def test_no_lights_without_limits() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "expected"),
     [
         (
             {"exposure_us": 5000.0},
@@ -78,14 +78,16 @@ def test_no_lights_without_limits() -> None:
         ({"frame_rate_hz": 130.0}, "for 0.139 of the time, strobe.max_duty of rig 'wrist' is 0.12"),
     ],
 )
-def test_an_exposure_that_cannot_be_lit_is_refused_at_the_start(changes: dict[str, float], says: str) -> None:
-    with pytest.raises(CalibrationError, match=says):
+def test_an_exposure_that_cannot_be_lit_is_refused_at_the_start(
+    changes: dict[str, float], expected: str
+) -> None:
+    with pytest.raises(CalibrationError, match=expected):
         check_pulses(RIG, msgspec.structs.replace(CAMERA, **changes))
 
 
 def test_the_budget_is_printed_with_every_limit(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["lights", "--rig", "wrist", "--calibration", str(ROOT / "calib_json")]) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     for line in (
         "30.0 triples/s, exposure 2000 us",
         "pulse 3200 us (at most 5000)",
@@ -96,11 +98,11 @@ def test_the_budget_is_printed_with_every_limit(capsys: pytest.CaptureFixture[st
         "LEDs, cornea",
         "no certificate",
     ):
-        assert line in said
+        assert line in output
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "expected"),
     [
         (["--blink", "1"], "--blink and --off need the lights: --lights gpio:"),
         (["--off", "--lights", "camera"], "does not switch these"),
@@ -110,10 +112,10 @@ def test_the_budget_is_printed_with_every_limit(capsys: pytest.CaptureFixture[st
     ],
 )
 def test_the_command_says_what_is_wrong(
-    arguments: list[str], says: str, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["lights", "--calibration", str(ROOT / "calib_json"), *arguments]) == 1
-    assert says in capsys.readouterr().err
+    assert expected in capsys.readouterr().err
 
 
 def test_a_rig_that_may_do_too_much_is_refused_by_every_command(
@@ -124,7 +126,7 @@ def test_a_rig_that_may_do_too_much_is_refused_by_every_command(
     path = tree / "rigs/wrist.json"
     path.write_text(path.read_text().replace('"power_w": 0.01', '"power_w": 0.2'))
     assert main(["lights", "--calibration", str(tree)]) == 1
-    said = capsys.readouterr().err
-    assert str(path) in said
-    assert "laser.power_w" in said
+    output = capsys.readouterr().err
+    assert str(path) in output
+    assert "laser.power_w" in output
     assert load(tree / "cameras/wrist.json", CameraCalibration) == CAMERA

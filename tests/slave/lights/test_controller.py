@@ -9,7 +9,7 @@ import pytest
 from common.clock import SystemClock
 from common.frame_recording import Illumination
 from slave.lights.controller import FAILED_NS, StrobeController, Strober
-from slave.lights.guard import WINDOW_NS, Guard
+from slave.lights.interlock import WINDOW_NS, Interlock
 from slave.lights.schedule import CYCLE, LEAST, StrobeSchedule
 from tests.slave.lights.stage import (
     AMBIENT,
@@ -36,9 +36,9 @@ class Stage:
     def __init__(self, takes_ns: int = 0, late: Lateness = lambda: 0) -> None:
         self.clock = SetClock(stamp(0))
         self.lights = NotedLights(self.clock, takes_ns)
-        self.guard = Guard(self.lights, STROBE, self.clock, watch=False)
+        self.interlock = Interlock(self.lights, STROBE, self.clock, watch=False)
         self.schedule = StrobeSchedule(90.0, 2000.0, 1000.0)
-        self.strober = Strober(self.schedule, self.guard, self.clock)
+        self.strober = Strober(self.schedule, self.interlock, self.clock)
         self.late = late
 
     def run(self, frames: range, jitter_ns: float = 0.0, seed: int = 0, lost: float = 0.0) -> None:
@@ -73,7 +73,7 @@ def test_every_frame_is_lit_as_the_cycle_says() -> None:
     stage.run(range(60))
     assert [stage.kind(k) for k in range(20, 58)] == [CYCLE[k % 3] for k in range(20, 58)]
     assert stage.strober.counts == {"skipped": 0, "late": 0}
-    assert stage.guard.counts["refused"] == 0
+    assert stage.interlock.counts["refused"] == 0
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -88,10 +88,10 @@ def test_who_wakes_up_late_leaves_frames_dark_and_lights_no_other(seed: int) -> 
     rng = np.random.default_rng(seed)
     stage = Stage(late=lambda: int(rng.exponential(0.8) * MS))
     stage.run(range(300))
-    kinds = [stage.kind(k) for k in range(20, 298)]
+    illuminations = [stage.kind(k) for k in range(20, 298)]
     wanted = [CYCLE[k % 3] for k in range(20, 298)]
-    assert all(kind in (AMBIENT, right) for kind, right in zip(kinds, wanted, strict=True))
-    dark = sum(kind is not right for kind, right in zip(kinds, wanted, strict=True))
+    assert all(kind in (AMBIENT, right) for kind, right in zip(illuminations, wanted, strict=True))
+    dark = sum(kind is not right for kind, right in zip(illuminations, wanted, strict=True))
     assert 10 < dark < 150
     assert (
         abs(stage.strober.counts["skipped"] - dark) <= 6
@@ -137,9 +137,9 @@ def test_a_driver_that_is_unplugged_is_tried_again_and_comes_back() -> None:
     stage.run(range(30))
     stage.lights.fails = True
     stage.run(range(30, 60))
-    assert 1 <= stage.guard.counts["failed"] <= 4  # not at every frame
+    assert 1 <= stage.interlock.counts["failed"] <= 4  # not at every frame
     stage.lights.fails = False
-    stage.guard.look()
+    stage.interlock.look()
     # A light that could not be darkened counts as on, so its duty is used up for a second.
     rest = round((FAILED_NS + WINDOW_NS) / PERIOD_NS) + 3
     stage.run(range(60, 60 + rest + 30))
@@ -157,8 +157,8 @@ def test_the_thread_lights_what_it_is_told_of_and_ends_dark() -> None:
                 begun.set()
 
     lights = Real(SetClock())
-    guard = Guard(lights, STROBE)
-    controller = StrobeController(StrobeSchedule(90.0, 2000.0, 1000.0), guard, clock)
+    interlock = Interlock(lights, STROBE)
+    controller = StrobeController(StrobeSchedule(90.0, 2000.0, 1000.0), interlock, clock)
     first_ns = clock.now_ns()
     for k in range(-20, 0):  # a camera that has run for a while
         controller.push(k + 21, first_ns + round(k * PERIOD_NS))

@@ -20,8 +20,8 @@ import pytest
 from common.errors import LightsError
 from slave.__main__ import main
 from slave.lights import gpio
-from slave.lights.gpio import CONSUMER, HEIR, GpioLights
-from slave.lights.gpio_heir import DARK, LIT, SET_VALUES
+from slave.lights.gpio import CONSUMER, WATCHDOG, GpioLights
+from slave.lights.gpio_watchdog import DARK, LIT, SET_VALUES
 from tests.slave.lights.stage import AMBIENT, LASER, LED, ROOT
 
 VALUE = gpiod.line.Value
@@ -162,12 +162,12 @@ def test_one_light_at_a_time_and_dark_at_both_ends(
     ):
         lights.switch(kind)
         assert lit() == seen
-    heir = lights._heir
-    assert heir is not None
-    assert heir.poll() is None
+    watchdog = lights._watchdog
+    assert watchdog is not None
+    assert watchdog.poll() is None
     lights.close()
     lights.close()
-    assert heir.returncode == 1  # the stand-in's lines are no lines of a kernel
+    assert watchdog.returncode == 1  # the stand-in's lines are no lines of a kernel
     assert lit() == (False, False)
     assert kernel.users == {}
     lights.switch(LASER)
@@ -191,22 +191,22 @@ def test_a_chip_that_is_unplugged_comes_back(kernel: FakeGpio) -> None:
 def test_without_its_heir_nothing_is_lit_until_there_is_another(
     kernel: FakeGpio, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(gpio, "HEIR_S", 0.1)
+    monkeypatch.setattr(gpio, "WATCHDOG_S", 0.1)
     lights = GpioLights("0:17,27", LONGEST_S)
 
-    def killed(heir: subprocess.Popen[bytes]) -> None:
-        heir.kill()
-        heir.wait()
+    def killed(watchdog: subprocess.Popen[bytes]) -> None:
+        watchdog.kill()
+        watchdog.wait()
 
-    def stopped(heir: subprocess.Popen[bytes]) -> None:
-        heir.send_signal(signal.SIGSTOP)
-        assert heir.stdin is not None
-        os.write(heir.stdin.fileno(), DARK * (1 << 20))  # as many as fit
+    def stopped(watchdog: subprocess.Popen[bytes]) -> None:
+        watchdog.send_signal(signal.SIGSTOP)
+        assert watchdog.stdin is not None
+        os.write(watchdog.stdin.fileno(), DARK * (1 << 20))  # as many as fit
         with pytest.raises(BlockingIOError):
-            os.write(heir.stdin.fileno(), DARK)
+            os.write(watchdog.stdin.fileno(), DARK)
 
     for deaf in (killed, stopped):
-        first = lights._heir
+        first = lights._watchdog
         assert first is not None
         deaf(first)
         with pytest.raises(LightsError, match="does not listen"):
@@ -215,7 +215,7 @@ def test_without_its_heir_nothing_is_lit_until_there_is_another(
         assert first.returncode == -signal.SIGKILL
         lights.switch(LASER)
         assert kernel.level[17] == 1
-        assert lights._heir is not first
+        assert lights._watchdog is not first
         lights.off()
     lights.close()
     assert not any(17 in request.lit for request in kernel.requests[:1])
@@ -236,7 +236,7 @@ def test_a_line_that_does_not_follow_is_said(kernel: FakeGpio) -> None:
 
 
 @pytest.mark.parametrize(
-    ("place", "fails", "says"),
+    ("place", "fails", "expected"),
     [
         ("7:17,27", None, "/dev/gpiochip7: no such GPIO chip; `gpiodetect`"),
         ("0:17,27", errno.EACCES, "not allowed; add the user to the group"),
@@ -250,9 +250,11 @@ def test_a_line_that_does_not_follow_is_said(kernel: FakeGpio) -> None:
         ("0:,27", None, "line ''"),
     ],
 )
-def test_what_cannot_be_opened_says_why(kernel: FakeGpio, place: str, fails: int | None, says: str) -> None:
+def test_what_cannot_be_opened_says_why(
+    kernel: FakeGpio, place: str, fails: int | None, expected: str
+) -> None:
     kernel.fails = fails
-    with pytest.raises(LightsError, match=says):
+    with pytest.raises(LightsError, match=expected):
         GpioLights(place, LONGEST_S)
 
 
@@ -265,8 +267,8 @@ def test_the_command_blinks_within_the_limits_and_ends_dark(
     assert (kernel.level[17], kernel.level[27]) == (0, 0)
     assert capsys.readouterr().out == "dark\n"
     assert main([*command, "--blink", "0.2"]) == 0
-    said = capsys.readouterr().out
-    pulses = re.search(r"^pulses (\d+), refused", said, re.MULTILINE)
+    output = capsys.readouterr().out
+    pulses = re.search(r"^pulses (\d+), refused", output, re.MULTILINE)
     assert pulses is not None
     assert 1 <= int(pulses[1]) <= 14  # 18 frames, 12 of them lit; fewer on a busy machine
     assert (kernel.level[17], kernel.level[27]) == (0, 0)
@@ -300,17 +302,17 @@ time.sleep(600)
 
 
 def test_the_heir_of_a_killed_slave_darkens_both_lines() -> None:
-    slave = subprocess.Popen([sys.executable, "-c", SLAVE, str(HEIR)], stdout=subprocess.PIPE, text=True)
+    slave = subprocess.Popen([sys.executable, "-c", SLAVE, str(WATCHDOG)], stdout=subprocess.PIPE, text=True)
     assert slave.stdout is not None
-    heir = int(slave.stdout.readline())
-    assert ignores_stops(heir)
-    os.kill(heir, signal.SIGTERM)  # a service's stop reaches both: the slave is to end first
-    os.kill(heir, signal.SIGABRT)  # as does that of its watchdog
+    watchdog = int(slave.stdout.readline())
+    assert ignores_stops(watchdog)
+    os.kill(watchdog, signal.SIGTERM)  # a service's stop reaches both: the slave is to end first
+    os.kill(watchdog, signal.SIGABRT)  # as does that of its watchdog
     slave.kill()
-    said = slave.stdout.read()  # ends when the heir has ended, too
+    output = slave.stdout.read()  # ends when the heir has ended, too
     slave.wait()
     slave.stdout.close()
-    assert said == f"9 {0xC010B40F} {struct.pack('=QQ', 0, 3)!r}\n"
+    assert output == f"9 {0xC010B40F} {struct.pack('=QQ', 0, 3)!r}\n"
 
 
 # The heir by itself, its call of the kernel printed.
@@ -319,21 +321,22 @@ WATCHED = "import fcntl, runpy, sys; fcntl.ioctl = lambda *call: print(*call, fl
 
 def test_the_heir_of_a_stopped_slave_darkens_what_is_on_for_too_long() -> None:
     run = (
-        WATCHED + f"sys.argv = [{str(HEIR)!r}, '9', '0.02']; runpy.run_path(sys.argv[0], run_name='__main__')"
+        WATCHED
+        + f"sys.argv = [{str(WATCHDOG)!r}, '9', '0.02']; runpy.run_path(sys.argv[0], run_name='__main__')"
     )
     dark = f"9 {SET_VALUES} {struct.pack('=QQ', 0, 3)!r}\n".encode()
     with subprocess.Popen(
         [sys.executable, "-I", "-c", run], stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0
-    ) as heir:
-        assert heir.stdin is not None
-        assert heir.stdout is not None
-        heir.stdin.write(LIT + DARK)  # over before it was looked at
-        heir.stdin.write(LIT)
+    ) as watchdog:
+        assert watchdog.stdin is not None
+        assert watchdog.stdout is not None
+        watchdog.stdin.write(LIT + DARK)  # over before it was looked at
+        watchdog.stdin.write(LIT)
         for _ in range(2):  # and whoever goes on only now, and lights, is darkened again
-            assert heir.stdout.read(len(dark)) == dark
-        heir.stdin.write(DARK)
-        heir.stdin.close()
-        assert set(heir.stdout.read().splitlines(keepends=True)) == {dark}
+            assert watchdog.stdout.read(len(dark)) == dark
+        watchdog.stdin.write(DARK)
+        watchdog.stdin.close()
+        assert set(watchdog.stdout.read().splitlines(keepends=True)) == {dark}
 
 
 def ignores_stops(pid: int) -> bool:

@@ -9,71 +9,71 @@ import pytest
 
 from common.errors import LightsError
 from common.frame_recording import Illumination
-from slave.lights.guard import WINDOW_NS, Guard
+from slave.lights.interlock import WINDOW_NS, Interlock
 from tests.slave.lights.stage import AMBIENT, LASER, LED, MS, ROOT, STROBE, NotedLights, SetClock
 
 LIMITS = msgspec.structs.replace(STROBE, max_pulse_us=5000.0, max_duty=0.1)
 
 
-def staged(kind: type[Guard] = Guard, watch: bool = False) -> tuple[Guard, NotedLights, SetClock]:
+def staged(kind: type[Interlock] = Interlock, watch: bool = False) -> tuple[Interlock, NotedLights, SetClock]:
     clock = SetClock()
     lights = NotedLights(clock)
     return kind(lights, LIMITS, clock, watch), lights, clock
 
 
-def flash(guard: Guard, clock: SetClock, times: int, pulse_ns: int) -> None:
+def flash(interlock: Interlock, clock: SetClock, times: int, pulse_ns: int) -> None:
     """The LEDs, allowed and ended every time, a millisecond apart."""
     for _ in range(times):
-        assert guard.begin(LED, pulse_ns)
+        assert interlock.begin(LED, pulse_ns)
         clock.t_ns += pulse_ns
-        guard.end()
+        interlock.end()
         clock.t_ns += MS
 
 
-def misuse(kind: type[Guard]) -> list[str]:
+def misuse(kind: type[Interlock]) -> list[str]:
     """What a guard lets happen that it must not; empty: it bites."""
     wrong: list[str] = []
-    guard, lights, clock = staged(kind)
-    if guard.begin(LASER, 5 * MS + 1) or lights.lit is not AMBIENT:
+    interlock, lights, clock = staged(kind)
+    if interlock.begin(LASER, 5 * MS + 1) or lights.lit is not AMBIENT:
         wrong.append("too long a pulse")
-    guard, lights, clock = staged(kind)
-    guard.begin(LASER, 5 * MS)
-    if guard.begin(LED, MS) or lights.lit is LED:
+    interlock, lights, clock = staged(kind)
+    interlock.begin(LASER, 5 * MS)
+    if interlock.begin(LED, MS) or lights.lit is LED:
         wrong.append("both at once")
-    guard, lights, clock = staged(kind)
+    interlock, lights, clock = staged(kind)
     on_ns, start_ns = 0, clock.t_ns
     while clock.t_ns < start_ns + WINDOW_NS:
-        if guard.begin(LASER, 4 * MS):
+        if interlock.begin(LASER, 4 * MS):
             clock.t_ns += 4 * MS
             on_ns += 4 * MS
-            guard.end()
+            interlock.end()
         clock.t_ns += MS
     if on_ns > 0.1 * WINDOW_NS:
         wrong.append("too much duty")
-    guard, lights, clock = staged(kind)
-    guard.begin(LED, 4 * MS)
+    interlock, lights, clock = staged(kind)
+    interlock.begin(LED, 4 * MS)
     clock.t_ns += 5 * MS
-    guard.look()
+    interlock.look()
     if lights.lit is LED:
         wrong.append("nobody ended it")
     return wrong
 
 
-class NoLimits(Guard):
+class NoLimits(Interlock):
     """A planted violation: everything is allowed."""
 
     def _allowance_ns(self, lit: Illumination, now_ns: int) -> int:
         return 10 * WINDOW_NS
 
 
-class NoDuty(Guard):
+class NoDuty(Interlock):
     """A planted violation: only the length of a pulse is limited."""
 
     def _allowance_ns(self, lit: Illumination, now_ns: int) -> int:
         return self._longest_ns
 
 
-class NoWatchdog(Guard):
+class NoWatchdog(Interlock):
     """A planted violation: nobody looks."""
 
     def look(self) -> float | None:
@@ -81,7 +81,7 @@ class NoWatchdog(Guard):
 
 
 def test_the_guard_lets_nothing_happen_that_it_must_not() -> None:
-    assert misuse(Guard) == []
+    assert misuse(Interlock) == []
 
 
 @pytest.mark.parametrize(
@@ -92,63 +92,63 @@ def test_the_guard_lets_nothing_happen_that_it_must_not() -> None:
         (NoWatchdog, ["nobody ended it"]),
     ],
 )
-def test_a_guard_without_a_rule_is_found_out(kind: type[Guard], lets: list[str]) -> None:
+def test_a_guard_without_a_rule_is_found_out(kind: type[Interlock], lets: list[str]) -> None:
     assert misuse(kind) == lets
 
 
 def test_what_is_refused_and_what_the_watchdog_ends_is_counted() -> None:
-    guard, lights, clock = staged()
-    assert not guard.begin(LASER, 6 * MS)
-    assert not guard.begin(LASER, 0)
-    assert not guard.begin(AMBIENT, MS)
-    assert guard.begin(LASER, 4 * MS)
-    assert guard.look() == pytest.approx(0.005)
+    interlock, lights, clock = staged()
+    assert not interlock.begin(LASER, 6 * MS)
+    assert not interlock.begin(LASER, 0)
+    assert not interlock.begin(AMBIENT, MS)
+    assert interlock.begin(LASER, 4 * MS)
+    assert interlock.look() == pytest.approx(0.005)
     clock.t_ns += 5 * MS
-    assert guard.look() is None
+    assert interlock.look() is None
     assert lights.pulses() == [(LASER, clock.t_ns - 5 * MS, clock.t_ns)]
-    assert guard.events() == {"pulses": 1, "refused": 3, "off_by_watchdog": 1, "failed": 0}
+    assert interlock.events() == {"pulses": 1, "refused": 3, "off_by_watchdog": 1, "failed": 0}
 
 
 def test_duty_is_free_again_when_its_second_is_over() -> None:
-    guard, _, clock = staged()
-    flash(guard, clock, 20, 5 * MS)
-    assert not guard.begin(LED, MS)
-    assert guard.begin(LASER, MS)  # each light has its own
-    guard.end()
+    interlock, _, clock = staged()
+    flash(interlock, clock, 20, 5 * MS)
+    assert not interlock.begin(LED, MS)
+    assert interlock.begin(LASER, MS)  # each light has its own
+    interlock.end()
     clock.t_ns += WINDOW_NS - 110 * MS
-    assert guard.begin(LED, 5 * MS)
+    assert interlock.begin(LED, 5 * MS)
 
 
 def test_a_pulse_that_is_not_ended_uses_up_no_more_than_its_duty() -> None:
-    guard, lights, clock = staged()
-    flash(guard, clock, 24, 4 * MS)
-    assert guard.begin(LED, 3 * MS)  # 4 ms are left
-    assert guard.look() == pytest.approx(0.004)
+    interlock, lights, clock = staged()
+    flash(interlock, clock, 24, 4 * MS)
+    assert interlock.begin(LED, 3 * MS)  # 4 ms are left
+    assert interlock.look() == pytest.approx(0.004)
     clock.t_ns += 4 * MS
-    guard.look()
+    interlock.look()
     assert lights.lit is AMBIENT
 
 
 def test_a_driver_that_fails_is_darkened_as_soon_as_it_answers() -> None:
-    guard, lights, clock = staged()
+    interlock, lights, clock = staged()
     lights.fails = True
     with pytest.raises(LightsError, match="unplugged"):
-        guard.begin(LASER, MS)
-    again_s = guard.look()
+        interlock.begin(LASER, MS)
+    again_s = interlock.look()
     assert again_s is not None
     assert again_s < 0.1
     lights.fails = False
-    assert guard.look() is None
+    assert interlock.look() is None
     assert lights.switched == [(clock.t_ns, AMBIENT)]
-    assert guard.begin(LASER, MS)
+    assert interlock.begin(LASER, MS)
     lights.fails = True
     with pytest.raises(LightsError):
-        guard.end()
-    assert guard.look() is not None
+        interlock.end()
+    assert interlock.look() is not None
     lights.fails = False
-    assert guard.look() is None
+    assert interlock.look() is None
     assert lights.lit is AMBIENT
-    assert guard.counts["off_by_watchdog"] == 0  # the driver failed, nobody overslept
+    assert interlock.counts["off_by_watchdog"] == 0  # the driver failed, nobody overslept
 
 
 @pytest.mark.parametrize("raised", [LightsError("unplugged"), RuntimeError("released"), ValueError("closed")])
@@ -166,15 +166,15 @@ def test_nothing_that_a_driver_raises_ends_the_watchdog(raised: Exception) -> No
             dark.set()
 
     lights = Raising(SetClock())
-    guard = Guard(lights, LIMITS)
-    assert guard.begin(LASER, MS)
+    interlock = Interlock(lights, LIMITS)
+    assert interlock.begin(LASER, MS)
     with pytest.raises(LightsError, match=str(raised)):
-        guard.end()
-    assert not guard.begin(LED, MS)  # it may be lit still
+        interlock.end()
+    assert not interlock.begin(LED, MS)  # it may be lit still
     assert dark.wait(30.0)
-    guard.close()
+    interlock.close()
     assert lights.lit is AMBIENT
-    assert guard.counts["failed"] == 2
+    assert interlock.counts["failed"] == 2
 
 
 def test_the_watchdog_ends_a_pulse_by_itself() -> None:
@@ -186,25 +186,25 @@ def test_the_watchdog_ends_a_pulse_by_itself() -> None:
             dark.set()
 
     lights = Told(SetClock())
-    guard = Guard(lights, LIMITS)  # on the clock of this machine
-    assert guard.begin(LASER, MS)
+    interlock = Interlock(lights, LIMITS)  # on the clock of this machine
+    assert interlock.begin(LASER, MS)
     assert dark.wait(30.0)
-    guard.close()
-    assert guard.counts["off_by_watchdog"] == 1
+    interlock.close()
+    assert interlock.counts["off_by_watchdog"] == 1
     assert lights.closed
-    assert not guard.begin(LASER, MS)
+    assert not interlock.begin(LASER, MS)
 
 
 DYING = """
 from tests.slave.lights.stage import LASER, STROBE, NotedLights, SetClock
-from slave.lights.guard import Guard
+from slave.lights.interlock import Interlock
 
 class Spoken(NotedLights):
     def switch(self, lit):
         super().switch(lit)
         print(lit, flush=True)
 
-guard = Guard(Spoken(SetClock()), STROBE, SetClock())
+guard = Interlock(Spoken(SetClock()), STROBE, SetClock())
 guard.begin(LASER, 1_000_000)
 raise RuntimeError("nobody closes the guard")
 """

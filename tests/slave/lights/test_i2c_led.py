@@ -227,11 +227,11 @@ def test_a_chip_that_does_not_go_dark_is_said(chip: Chip) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "says"), [(0x04, "LM3644TT, whose shortest time-out is 40 ms"), (0x1A, "id 0x1a")]
+    ("kind", "expected"), [(0x04, "LM3644TT, whose shortest time-out is 40 ms"), (0x1A, "id 0x1a")]
 )
-def test_another_chip_is_refused(chip: Chip, kind: int, says: str) -> None:
+def test_another_chip_is_refused(chip: Chip, kind: int, expected: str) -> None:
     chip.kind = kind
-    with pytest.raises(LightsError, match=says):
+    with pytest.raises(LightsError, match=expected):
         FlashDriverLights("1", STROBE)
 
 
@@ -242,16 +242,16 @@ def test_a_register_that_does_not_take_its_value_is_refused(chip: Chip) -> None:
 
 
 @pytest.mark.parametrize(
-    ("error", "says"),
+    ("error", "expected"),
     [
         (FileNotFoundError(errno.ENOENT, "x"), "no /dev/i2c-1; on a Pi: sudo raspi-config"),
         (PermissionError(errno.EACCES, "x"), "not allowed; add the user to the group i2c"),
         (OSError(errno.EIO, "broken"), "cannot be opened: broken"),
     ],
 )
-def test_a_bus_that_cannot_be_opened_says_why(chip: Chip, error: OSError, says: str) -> None:
+def test_a_bus_that_cannot_be_opened_says_why(chip: Chip, error: OSError, expected: str) -> None:
     FakeBus.fails = error
-    with pytest.raises(LightsError, match=says):
+    with pytest.raises(LightsError, match=expected):
         FlashDriverLights("1", STROBE)
 
 

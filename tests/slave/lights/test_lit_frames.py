@@ -62,9 +62,9 @@ def test_frames_are_dark_until_the_camera_is_understood_and_then_lit_in_turn(sce
     camera = device(scene, StageClock())
     frames = taken(camera, 24)
     cycle = (AMBIENT, LASER, LED)
-    kinds = [frame.illumination for frame in frames]
-    assert kinds[:9] == [AMBIENT] * 9
-    assert kinds[12:] == [cycle[frame.seq % 3] for frame in frames[12:]]
+    illuminations = [frame.illumination for frame in frames]
+    assert illuminations[:9] == [AMBIENT] * 9
+    assert illuminations[12:] == [cycle[frame.seq % 3] for frame in frames[12:]]
     counts = camera.counts()
     assert counts["lights.pulses"] in (8, 9, 10)
     assert counts["lights.skipped"] == counts["lights.refused"] == 0
@@ -73,17 +73,17 @@ def test_frames_are_dark_until_the_camera_is_understood_and_then_lit_in_turn(sce
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_late_and_skipped_pulses_cost_triples_and_make_no_wrong_one(scene: WristScene, seed: int) -> None:
+def test_late_and_skipped_pulses_cost_cycles_and_make_no_wrong_one(scene: WristScene, seed: int) -> None:
     rng = np.random.default_rng(seed)
 
     def late() -> int:
         return int(rng.choice([0, 2, 7, 13], p=[0.9, 0.05, 0.03, 0.02])) * MS
 
     camera, strobe = device(scene, StageClock(), late), Strobe(CAMERA.frame_rate_hz)
-    triples = [triple for frame in taken(camera, 150) if (triple := strobe.push(frame)) is not None]
-    kinds = {(t.ambient.illumination, t.laser.illumination, t.led.illumination) for t in triples}
-    assert kinds == {(AMBIENT, LASER, LED)}
-    assert 10 <= len(triples) < 45
+    cycles = [cycle for frame in taken(camera, 150) if (cycle := strobe.push(frame)) is not None]
+    illuminations = {(t.ambient.illumination, t.laser.illumination, t.led.illumination) for t in cycles}
+    assert illuminations == {(AMBIENT, LASER, LED)}
+    assert 10 <= len(cycles) < 45
     assert camera.counts()["lights.skipped"] > 3
 
 
@@ -133,8 +133,8 @@ def test_the_lights_follow_the_exposure_and_refuse_one_that_is_too_long(scene: W
     taken(camera, 15)
     camera.tune(msgspec.structs.replace(CAMERA, exposure_us=2500.0))
     assert camera.figures()["exposure_us"] == 2500.0
-    kinds = [frame.illumination for frame in taken(camera, 6)]
-    assert kinds == [(AMBIENT, LASER, LED)[seq % 3] for seq in range(15, 21)]
+    illuminations = [frame.illumination for frame in taken(camera, 6)]
+    assert illuminations == [(AMBIENT, LASER, LED)[seq % 3] for seq in range(15, 21)]
     with pytest.raises(CameraError, match=r"exposure_us 4000: needs light for 5200 us, strobe.max_pulse_us"):
         camera.tune(msgspec.structs.replace(CAMERA, exposure_us=4000.0))
     assert camera.figures()["exposure_us"] == 2500.0

@@ -14,8 +14,8 @@ from tests.slave.lights.stage import CAMERA, RIG
 class Source:
     """A camera with two frames, which is lost then, and gone at last."""
 
-    def __init__(self, said: list[object], tunes: bool = True) -> None:
-        self.said, self.tunes, self.count = said, tunes, 0
+    def __init__(self, output: list[object], tunes: bool = True) -> None:
+        self.output, self.tunes, self.count = output, tunes, 0
 
     def read(self) -> Frame | None:
         self.count += 1
@@ -24,12 +24,12 @@ class Source:
         return None if self.count > 3 else Frame(self.count, 1000 * self.count, 0, np.zeros((2, 2), np.uint8))
 
     def close(self) -> None:
-        self.said.append("camera closed")
+        self.output.append("camera closed")
 
     def tune(self, camera: CameraCalibration) -> None:
         if not self.tunes:
             raise CameraError("not taken")
-        self.said.append(("camera", camera.exposure_us))
+        self.output.append(("camera", camera.exposure_us))
 
     def figures(self) -> dict[str, float]:
         return {"exposure_us": 1.0}
@@ -41,62 +41,62 @@ class Source:
 class Controller:
     """Notes what it is told."""
 
-    def __init__(self, said: list[object], fails: bool = False) -> None:
-        self.said, self.fails = said, fails
+    def __init__(self, output: list[object], fails: bool = False) -> None:
+        self.output, self.fails = output, fails
 
     def push(self, seq: int, t_ns: int) -> None:
-        self.said.append((seq, t_ns))
+        self.output.append((seq, t_ns))
 
     def expose(self, exposure_us: float) -> None:
-        self.said.append(("lights", exposure_us))
+        self.output.append(("lights", exposure_us))
 
     def stalled(self) -> None:
-        self.said.append("dark")
+        self.output.append("dark")
 
     def counts(self) -> dict[str, int]:
         return {"lights.pulses": 5}
 
     def close(self) -> None:
-        self.said.append("lights closed")
+        self.output.append("lights closed")
         if self.fails:
             raise LightsError("unplugged")
 
 
 def test_frames_are_told_and_a_lost_camera_is_dark() -> None:
-    said: list[object] = []
-    camera = StrobedCamera(Source(said), CAMERA, RIG, Controller(said))
+    output: list[object] = []
+    camera = StrobedCamera(Source(output), CAMERA, RIG, Controller(output))
     assert camera.read() is not None
     assert camera.read() is not None
     with pytest.raises(CameraError, match="lost"):
         camera.read()
     assert camera.read() is None
-    assert said == [(1, 1000), (2, 2000), "dark", "dark"]
+    assert output == [(1, 1000), (2, 2000), "dark", "dark"]
     assert camera.counts() == {"camera.lost": 1, "lights.pulses": 5}
 
 
 @pytest.mark.parametrize("fails", [False, True])
 def test_lights_go_first_and_the_camera_is_closed_in_any_case(fails: bool) -> None:
-    said: list[object] = []
-    camera = StrobedCamera(Source(said), CAMERA, RIG, Controller(said, fails))
+    output: list[object] = []
+    camera = StrobedCamera(Source(output), CAMERA, RIG, Controller(output, fails))
     if fails:
         with pytest.raises(LightsError):
             camera.close()
     else:
         camera.close()
-    assert said == ["lights closed", "camera closed"]
+    assert output == ["lights closed", "camera closed"]
 
 
 @pytest.mark.parametrize(("wanted_us", "between_us"), [(1500.0, 2000.0), (2500.0, 2500.0)])
 def test_while_the_exposure_changes_the_longer_one_is_lit(wanted_us: float, between_us: float) -> None:
-    said: list[object] = []
-    camera = StrobedCamera(Source(said), CAMERA, RIG, Controller(said))
+    output: list[object] = []
+    camera = StrobedCamera(Source(output), CAMERA, RIG, Controller(output))
     camera.tune(msgspec.structs.replace(CAMERA, exposure_us=wanted_us))
-    assert said == [("lights", between_us), ("camera", wanted_us), ("lights", wanted_us)]
+    assert output == [("lights", between_us), ("camera", wanted_us), ("lights", wanted_us)]
 
 
 def test_an_exposure_that_is_not_taken_changes_no_light() -> None:
-    said: list[object] = []
-    camera = StrobedCamera(Source(said, tunes=False), CAMERA, RIG, Controller(said))
+    output: list[object] = []
+    camera = StrobedCamera(Source(output, tunes=False), CAMERA, RIG, Controller(output))
     with pytest.raises(CameraError, match="not taken"):
         camera.tune(msgspec.structs.replace(CAMERA, exposure_us=2500.0))
-    assert said == [("lights", 2500.0), ("lights", 2000.0)]
+    assert output == [("lights", 2500.0), ("lights", 2000.0)]

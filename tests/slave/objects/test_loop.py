@@ -15,9 +15,9 @@ from common.messages import Message, TrackerPose
 from common.object_profile import ObjectProfile
 from common.sim.tracker import SET_UP_TRACKER, SET_UP_TRACKING, SimulatedTracker
 from slave.__main__ import main
+from slave.objects.counters import PoseCounters
 from slave.objects.live import run, wait_for_start
 from slave.objects.synthetic import SyntheticTracker
-from slave.objects.tally import PoseTally
 from slave.simulated import tracker_of
 
 CALIB = Path(__file__).resolve().parents[3] / "calib_json"
@@ -25,10 +25,10 @@ KEY = "11" * 32
 
 
 def pose(seq: int, known: bool = True) -> TrackerPose:
-    place, turn = (
+    place, quaternion = (
         (np.zeros(3), np.array([1.0, 0, 0, 0])) if known else (np.full(3, np.nan), np.full(4, np.nan))
     )
-    return TrackerPose("tracker", 0, seq, 10_000_000 * seq, place, turn)
+    return TrackerPose("tracker", 0, seq, 10_000_000 * seq, place, quaternion)
 
 
 class Source:
@@ -51,7 +51,7 @@ class Source:
     def counts(self) -> dict[str, int]:
         return {"lost": 2}
 
-    def gauges(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {"away_s": 0.5}
 
 
@@ -75,15 +75,15 @@ class Wire:
 
 def test_every_pose_is_sent_in_the_name_of_this_process_and_counted() -> None:
     source = Source([pose(0), pose(1, known=False), pose(4)])
-    wire, tally = Wire(), PoseTally(source)
-    run(source, wire, tally, threading.Event())
+    wire, counters = Wire(), PoseCounters(source)
+    run(source, wire, counters, threading.Event())
     assert [(one.session, one.seq) for one in wire.sent] == [(77, 0), (77, 1), (77, 4)]
-    assert tally.counts() == {"poses": 3, "skipped": 2, "nowhere": 1, "lost": 2}
-    gauges = tally.gauges()
-    assert gauges.pop("rate_hz") > 0.0
-    assert gauges == {"tracked": 1.0, "away_s": 0.5}
+    assert counters.counts() == {"poses": 3, "skipped": 2, "nowhere": 1, "lost": 2}
+    metrics = counters.metrics()
+    assert metrics.pop("rate_hz") > 0.0
+    assert metrics == {"tracked": 1.0, "away_s": 0.5}
     with pytest.raises(TrackerError, match="gone"):
-        run(Source([TrackerError("gone")]), wire, PoseTally(), threading.Event())
+        run(Source([TrackerError("gone")]), wire, PoseCounters(), threading.Event())
 
 
 def test_poses_before_the_start_are_forgotten() -> None:
@@ -123,8 +123,8 @@ def test_a_synthetic_tracker_is_where_the_object_is_in_a_frame_of_its_own(tmp_pa
             continue
         found = SET_UP_TRACKING @ told @ np.linalg.inv(SET_UP_TRACKER)
         truth = tracker.scene.truth(float(t_s)).objects["cube"]
-        turn = matrix_to_rotation_vector(found[:3, :3] @ truth[:3, :3].T)
-        off.append(np.array([np.linalg.norm(found[:3, 3] - truth[:3, 3]), np.linalg.norm(turn)]))
+        quaternion = matrix_to_rotation_vector(found[:3, :3] @ truth[:3, :3].T)
+        off.append(np.array([np.linalg.norm(found[:3, 3] - truth[:3, 3]), np.linalg.norm(quaternion)]))
     worst = np.max(off, axis=0)
     assert 0 < lost < 20  # some half seconds behind something
     assert 2e-4 < worst[0] < 4e-3
@@ -185,7 +185,7 @@ def test_the_command_says_in_one_line_what_is_missing(
 
 
 def test_an_object_without_a_tracker_is_said_to_have_none() -> None:
-    from slave.objects.opening import object_with
+    from slave.objects.factory import object_with
 
     rig = load(CALIB / "rigs" / "desk-wand.json", RigCalibration)
     with pytest.raises(CalibrationError, match="no object has the tracker 'tracker'; there is none"):

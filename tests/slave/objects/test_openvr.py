@@ -14,7 +14,7 @@ from common.messages import TrackerPose
 from slave.objects import openvr_library
 from slave.objects.openvr_library import connect, load_library
 from slave.objects.openvr_tracker import OpenVrTracker
-from slave.objects.reopening import ReopeningTracker
+from slave.objects.reconnecting import ReconnectingTracker
 from tests.slave.objects.fake_openvr import (
     CONTROLLER,
     HMD,
@@ -126,7 +126,7 @@ def test_of_two_trackers_one_must_be_named() -> None:
 def test_when_steamvr_ends_it_is_acknowledged_and_looked_for_again() -> None:
     vr = FakeVr([place()])
     stop = threading.Event()
-    source = ReopeningTracker("tracker", lambda: opened(vr), SystemClock(), stop)
+    source = ReconnectingTracker("tracker", lambda: opened(vr), SystemClock(), stop)
     assert source.read() is not None
     vr.events = [100, 700]
     vr.error = InitError_Init_NoServerForBackgroundApp(121)
@@ -143,7 +143,7 @@ def test_when_steamvr_ends_it_is_acknowledged_and_looked_for_again() -> None:
         pytest.fail("never came back")
     counts = source.counts()
     assert (counts["lost"], counts["back"]) == (1, 1)
-    assert source.gauges()["away_s"] == 0.0
+    assert source.metrics()["away_s"] == 0.0
     source.close()
 
 

@@ -12,7 +12,7 @@ import pytest
 from common.clock import SystemClock
 from common.errors import TrackerChoiceError, TrackerError
 from common.messages import TrackerPose
-from slave.objects.reopening import ReopeningTracker
+from slave.objects.reconnecting import ReconnectingTracker
 from slave.objects.survive import OPTIONS, SurviveFile, SurviveTracker
 from tests.network_helpers import until
 from tests.slave.objects.recorded import HEAD, pose, program
@@ -22,19 +22,19 @@ def opened(command: str, wanted: str | None = None) -> SurviveTracker:
     return SurviveTracker("tracker", wanted, SystemClock(), threading.Event(), command)
 
 
-def read(source: SurviveTracker | SurviveFile | ReopeningTracker, count: int) -> list[TrackerPose]:
+def read(source: SurviveTracker | SurviveFile | ReconnectingTracker, count: int) -> list[TrackerPose]:
     poses = [source.read() for _ in range(count)]
     return [one for one in poses if one is not None]
 
 
-def said(folder: Path, *parts: bytes) -> str:
+def output(folder: Path, *parts: bytes) -> str:
     (folder / "lines").write_bytes(b"".join(parts))
     return f"cat {folder / 'lines'}"
 
 
 def test_it_is_told_to_write_poses_alone_and_they_come_at_once(tmp_path: Path) -> None:
     command = program(
-        tmp_path, f'echo "$@" > {tmp_path}/told; {said(tmp_path, HEAD, pose(8.0), pose(8.01))}; sleep 60'
+        tmp_path, f'echo "$@" > {tmp_path}/told; {output(tmp_path, HEAD, pose(8.0), pose(8.01))}; sleep 60'
     )
     source = opened(command)
     begin_ns = SystemClock().now_ns()
@@ -51,7 +51,7 @@ def test_it_is_told_to_write_poses_alone_and_they_come_at_once(tmp_path: Path) -
 
 
 def test_a_device_that_vanishes_is_nowhere_and_comes_back(tmp_path: Path) -> None:
-    first, then = said(tmp_path, HEAD, pose(8.0), b"8.1 WM0 DISCONNECT\r\n"), tmp_path / "then"
+    first, then = output(tmp_path, HEAD, pose(8.0), b"8.1 WM0 DISCONNECT\r\n"), tmp_path / "then"
     then.write_bytes(pose(9.0))
     source = opened(program(tmp_path, f"{first}; sleep 0.7; cat {then}; sleep 60"))
     poses = read(source, 4)
@@ -64,14 +64,14 @@ def test_a_device_that_vanishes_is_nowhere_and_comes_back(tmp_path: Path) -> Non
 
 
 def test_a_program_that_ends_is_an_error_and_is_started_again(tmp_path: Path) -> None:
-    command = program(tmp_path, f"{said(tmp_path, HEAD, pose(8.0))}; exit 3")
+    command = program(tmp_path, f"{output(tmp_path, HEAD, pose(8.0))}; exit 3")
     source = opened(command)
     assert len(read(source, 1)) == 1
     with pytest.raises(TrackerError, match="survive-cli ended with code 3"):
         source.read()
     source.close()
     clock, stop = SystemClock(), threading.Event()
-    again = ReopeningTracker("tracker", lambda: opened(command), clock, stop)
+    again = ReconnectingTracker("tracker", lambda: opened(command), clock, stop)
     poses = read(again, 6)
     stop.set()
     again.close()
@@ -114,8 +114,8 @@ def alive(number: int) -> bool:
 
 
 def test_two_devices_and_no_choice_end_it_though_it_would_be_reopened(tmp_path: Path) -> None:
-    command = program(tmp_path, f"{said(tmp_path, HEAD, pose(8.0), pose(8.0, 'T20'))}; sleep 60")
-    again = ReopeningTracker("tracker", lambda: opened(command), SystemClock(), threading.Event())
+    command = program(tmp_path, f"{output(tmp_path, HEAD, pose(8.0), pose(8.0, 'T20'))}; sleep 60")
+    again = ReconnectingTracker("tracker", lambda: opened(command), SystemClock(), threading.Event())
     with pytest.raises(TrackerChoiceError, match="--serial"):
         read(again, 9)
     again.close()

@@ -21,31 +21,31 @@ def found(data: bytes) -> list[object]:
 
 
 def test_a_recorded_session_says_who_is_there_and_where() -> None:
-    said = found(HEAD + pose(8.042091) + b"9.112874 WM0 DISCONNECT\r\n")
-    assert said[0] == Serial("WM0", "LHR-1A2B3C4D")
-    assert isinstance(said[1], Pose)
-    assert said[1].t_s == 8.042091
-    assert said[1].position_m == (-0.284080, 0.936063, 0.374069)
-    assert said[2:] == [Gone("WM0")]
+    output = found(HEAD + pose(8.042091) + b"9.112874 WM0 DISCONNECT\r\n")
+    assert output[0] == Serial("WM0", "LHR-1A2B3C4D")
+    assert isinstance(output[1], Pose)
+    assert output[1].t_s == 8.042091
+    assert output[1].position_m == (-0.284080, 0.936063, 0.374069)
+    assert output[2:] == [Gone("WM0")]
 
 
 def test_the_quaternion_has_w_first_and_turns_device_axes_into_those_of_the_system() -> None:
     [one] = found(b"1.5 T20 POSE 1 2 3 0.707107 0 0 0.707107 \r\n")
     assert isinstance(one, Pose)
-    turned = quaternion_to_matrix(np.array(one.orientation_wxyz))
-    np.testing.assert_allclose(turned @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-6)  # a quarter about z
+    rotated = quaternion_to_matrix(np.array(one.orientation_wxyz))
+    np.testing.assert_allclose(rotated @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-6)  # a quarter about z
     assert math.isclose(math.hypot(*one.orientation_wxyz), 1.0, rel_tol=1e-12)
 
 
 @given(st.lists(st.integers(1, 300), max_size=12))
 def test_lines_are_the_same_however_the_bytes_come(steps: list[int]) -> None:
     data = HEAD + pose(8.0) + pose(8.01, "T20") + b"8.02 WM0 POSE 1 2\r\n" + pose(8.03)
-    decoder, said, begin = LineDecoder(), [], 0
+    decoder, output, begin = LineDecoder(), [], 0
     for step in [*steps, len(data)]:
-        said += decoder.push(data[begin : begin + step])
+        output += decoder.push(data[begin : begin + step])
         begin += step
-    assert said == found(data)
-    assert len(said) == 5
+    assert output == found(data)
+    assert len(output) == 5
 
 
 @pytest.mark.parametrize("cut", range(1, len(pose(8.0).split(b"\r\n")[0])))
@@ -69,8 +69,8 @@ def test_a_pose_that_was_cut_and_run_into_by_the_next_line_is_never_believed(cut
         (b"8.0 WM0 POSE 0.1 0.2 0.3 0.707107 0.0 \xff 0.707107", Fault.NUMBER),
         (b"nan WM0 POSE 0.1 0.2 0.3 0.707107 0.0 0.0 0.707107", Fault.NUMBER),
         (b"-1.0 WM0 POSE 0.1 0.2 0.3 0.707107 0.0 0.0 0.707107", Fault.NUMBER),
-        (b"8.0 WM0 POSE 0.1 0.2 0.3 0.707107 0.0 0.0 0.7", Fault.TURN),
-        (b"8.0 WM0 POSE 0.1 0.2 0.3 0.0 0.0 0.0 0.0", Fault.TURN),
+        (b"8.0 WM0 POSE 0.1 0.2 0.3 0.707107 0.0 0.0 0.7", Fault.QUATERNION),
+        (b"8.0 WM0 POSE 0.1 0.2 0.3 0.0 0.0 0.0 0.0", Fault.QUATERNION),
         (b"8.0 WM0 POSE 0.1 0.2 inf 1.0 0.0 0.0 0.0", Fault.PLACE),
         (b"8.0 WM0 POSE 1e9 0.2 0.3 1.0 0.0 0.0 0.0", Fault.PLACE),
     ],

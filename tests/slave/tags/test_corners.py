@@ -24,8 +24,8 @@ def square(corners: Float, width: float, size: int = 120) -> Image:
 @pytest.mark.parametrize("degrees", [0.0, 7.0, 45.0])
 @pytest.mark.parametrize("side", [24.0, 70.0])
 def test_a_turned_square_is_found_from_a_pixel_away(degrees: float, side: float) -> None:
-    turn = np.radians(degrees)
-    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    angle = np.radians(degrees)
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     true = 0.5 * side * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ rotation.T + 60.3
     begun = true + np.random.default_rng(1).uniform(-0.8, 0.8, (4, 2))
     found = refine(square(true, 0.7), begun[None], 7, None)

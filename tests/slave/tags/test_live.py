@@ -18,11 +18,11 @@ from common.messages import MarkerDetections, Message, TagDetections
 from common.object_profile import ObjectProfile, Tag, Tags
 from slave.app import run
 from slave.cameras.source import Frame
-from slave.markers.blind import BlindDetector
+from slave.counters import Counters
+from slave.markers.null_detector import NullDetector
 from slave.tags.live import LiveTags, finder_of
 from slave.tags.offline import TagCollector, tagged_objects
 from slave.tags.pace import SHARE, Pace
-from slave.tally import Tally
 
 ROOT = Path(__file__).resolve().parents[3]
 FILE = load(ROOT / "calib_json/cameras/left.json", CameraCalibration)
@@ -59,9 +59,9 @@ class Wire:
 
 
 def test_the_tags_of_a_frame_follow_its_markers() -> None:
-    image, tags, tally = picture(), LiveTags(FILE, [BARE, BOX]), Tally(RIG.markers)
+    image, tags, counters = picture(), LiveTags(FILE, [BARE, BOX]), Counters(RIG.markers)
     wire = Wire([Frame(4, 16 * MS, 16 * MS + 5, image, t_sigma_ns=9.0)])
-    run(wire, BlindDetector(len(RIG.markers)), wire, "left", tally, threading.Event(), tags=tags)
+    run(wire, NullDetector(len(RIG.markers)), wire, "left", counters, threading.Event(), tags=tags)
     markers, seen = wire.sent
     assert isinstance(markers, MarkerDetections)
     assert isinstance(seen, TagDetections)

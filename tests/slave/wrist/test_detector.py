@@ -22,13 +22,13 @@ def found_in(frames: list[Frame] | tuple[Frame, ...]) -> list[WristFound]:
     return [found for frame in frames if (found := machine.push(frame)) is not None]
 
 
-def kinds(found: WristFound) -> tuple[Illumination, ...]:
+def illuminations(found: WristFound) -> tuple[Illumination, ...]:
     """What really lit the three frames: the label of the simulation, which nothing that senses has read."""
-    triple = found.triple
-    return triple.ambient.illumination, triple.laser.illumination, triple.led.illumination
+    cycle = found.cycle
+    return cycle.ambient.illumination, cycle.laser.illumination, cycle.led.illumination
 
 
-RIGHT_KINDS = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
+RIGHT_ILLUMINATIONS = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
 
 
 def test_laser_points_lie_where_the_laser_meets_the_fingers() -> None:
@@ -37,7 +37,7 @@ def test_laser_points_lie_where_the_laser_meets_the_fingers() -> None:
     assert len(found) >= 28  # to get into step may take a triple or two
     errors: list[np.ndarray] = []
     for one in found:
-        truth = scene("curl").truth((one.triple.laser.t_ns - FIRST_NS) * 1e-9)
+        truth = scene("curl").truth((one.cycle.laser.t_ns - FIRST_NS) * 1e-9)
         seen = truth.laser_len_vis[1:6] > 0.002
         errors.append(np.linalg.norm(one.laser.uv - truth.laser_uv[1:6], axis=1)[seen])
     error = np.concatenate(errors)
@@ -48,7 +48,7 @@ def test_laser_points_lie_where_the_laser_meets_the_fingers() -> None:
 def test_the_message_says_when_the_laser_was_on_and_how_well_that_is_known() -> None:
     one = found_in(strobed("curl", 6))[-1]
     message = one.message("wrist", 77)
-    laser = one.triple.laser
+    laser = one.cycle.laser
     assert (message.camera, message.session, message.seq, message.t_ns) == (
         "wrist",
         77,
@@ -56,7 +56,7 @@ def test_the_message_says_when_the_laser_was_on_and_how_well_that_is_known() -> 
         laser.t_ns,
     )
     assert laser.seq % 3 == 1
-    assert message.ready_t_ns == one.triple.led.ready_t_ns
+    assert message.ready_t_ns == one.cycle.led.ready_t_ns
     assert message.t_sigma_ns == 1000.0
     np.testing.assert_array_equal(message.laser_uv, one.laser.uv)
     np.testing.assert_array_equal(message.tip_uv, one.tips.uv)
@@ -71,10 +71,10 @@ def test_no_row_comes_of_a_wrong_kind_of_frame(name: str) -> None:
     for _ in range(6):
         given = spoiled(frames, rng, SHARE)
         found = found_in(given)
-        assert [kinds(one) for one in found if kinds(one) != RIGHT_KINDS] == []
+        assert [illuminations(one) for one in found if illuminations(one) != RIGHT_ILLUMINATIONS] == []
         right += len(found)
         whole += sum(
-            tuple(frame.illumination for frame in given[k : k + 3]) == RIGHT_KINDS
+            tuple(frame.illumination for frame in given[k : k + 3]) == RIGHT_ILLUMINATIONS
             for k in range(len(given) - 2)
         )
     assert right > 0.8 * whole  # and it is not refused altogether
@@ -84,7 +84,7 @@ def test_labels_decide_nothing() -> None:
     frames = strobed("curl", 8)
     lying = [replace(frame, illumination=Illumination.LASER) for frame in frames]
     honest, lied = found_in(frames), found_in(lying)
-    assert [one.triple.laser.seq for one in honest] == [one.triple.laser.seq for one in lied]
+    assert [one.cycle.laser.seq for one in honest] == [one.cycle.laser.seq for one in lied]
     for one, other in zip(honest, lied, strict=True):
         np.testing.assert_array_equal(one.laser.uv, other.laser.uv)
         np.testing.assert_array_equal(one.tips.uv, other.tips.uv)
@@ -110,7 +110,7 @@ def test_frames_that_show_no_hand_raise_nothing_and_find_little(what: str) -> No
         assert seen < 0.05
 
 
-def test_another_view_is_used_from_the_next_triple_on() -> None:
+def test_another_view_is_used_from_the_next_cycle_on() -> None:
     frames = strobed("curl", 8)
     plain = found_in(frames)
     machine = detector()

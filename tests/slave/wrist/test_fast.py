@@ -13,7 +13,7 @@ from slave.wrist.engine import NUMPY, Engine, engine_named
 from slave.wrist.fingers import separate
 from slave.wrist.fingertips import fingertips
 from slave.wrist.laser import laser_lines
-from slave.wrist.paths import FENCE
+from slave.wrist.seams import FENCE
 from tests.slave.wrist.wrist_frames import VIEW, strobed
 
 pytest.importorskip("numba", reason="numba is not installed: the extra `fast`")
@@ -42,21 +42,25 @@ def test_paths_cost_as_little(fast: Engine, stations: int) -> None:
     widths = (9, 30, 17)
     energy = random_energy(rng, stations, widths)
     begin = np.concatenate([[0], np.cumsum(widths)])
-    pairs = zip(fast.least_paths(energy, widths), NUMPY.least_paths(energy, widths), strict=True)
-    for corridor, (found, expected) in enumerate(pairs):
-        part = energy[:, begin[corridor] : begin[corridor + 1]]
+    pairs = zip(
+        fast.minimum_cost_paths(energy, widths), NUMPY.minimum_cost_paths(energy, widths), strict=True
+    )
+    for band, (found, expected) in enumerate(pairs):
+        part = energy[:, begin[band] : begin[band + 1]]
         assert cost(part, found) == pytest.approx(cost(part, expected), rel=1e-5)
         assert np.abs(np.diff(found)).max(initial=0) <= 2
 
 
 def test_energy_is_the_same(fast: Engine) -> None:
     rng = np.random.default_rng(4)
-    strips = rng.integers(0, 256, (40, len(fast.energy(np.zeros((1, 232), np.uint8), 0)[0]))).astype(np.uint8)
-    strips[rng.random(strips.shape) < 0.5] = 0
-    strips[:, 100:180] = 0
+    straightened = rng.integers(0, 256, (40, len(fast.energy(np.zeros((1, 232), np.uint8), 0)[0]))).astype(
+        np.uint8
+    )
+    straightened[rng.random(straightened.shape) < 0.5] = 0
+    straightened[:, 100:180] = 0
     for crossed in (0, 7, 40):
         np.testing.assert_allclose(
-            fast.energy(strips, crossed), NUMPY.energy(strips, crossed), rtol=1e-5, atol=1e-5
+            fast.energy(straightened, crossed), NUMPY.energy(straightened, crossed), rtol=1e-5, atol=1e-5
         )
 
 
@@ -150,7 +154,13 @@ def test_a_first_hand_finds_everything_compiled(fast: Engine) -> None:
     from slave.wrist import fast as seams
     from slave.wrist import fast_lines, fast_tips
 
-    functions = (seams._least_paths, seams._energy, fast_lines._scan, fast_lines._link, fast_lines._measure)
+    functions = (
+        seams._minimum_cost_paths,
+        seams._energy,
+        fast_lines._scan,
+        fast_lines._link,
+        fast_lines._measure,
+    )
     functions += (fast_tips._search,)
     before = [len(one.signatures) for one in functions]  # pyright: ignore[reportFunctionMemberAccess]
     assert all(before)

@@ -14,8 +14,8 @@ from common.geometry import axis_rotation
 from common.hand_profiles import mirrored_profile
 from common.sim.wrist.render import WristRenderer
 from slave.wrist.background import lit
-from slave.wrist.corridors import corridors_of
 from slave.wrist.fingers import NONE, separate
+from slave.wrist.search_bands import search_bands_of
 from slave.wrist.view import WristView
 from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW, scene
 
@@ -49,14 +49,14 @@ def test_laser_points_and_tips_lie_on_their_own_fingers(name: str, seed: int) ->
 def test_the_seams_of_fingers_never_cross() -> None:
     for _, image in led_images("standard@indoor", 12, 3):
         seams = separate(image, VIEW).seams[:3]
-        assert (np.diff(corridors_of(VIEW).thumb_side * seams, axis=0) <= 0.0).all()
+        assert (np.diff(search_bands_of(VIEW).thumb_side * seams, axis=0) <= 0.0).all()
 
 
 @pytest.mark.parametrize("image", [BLACK, np.full_like(BLACK, 255), np.full_like(BLACK, 12)])
 def test_an_image_without_a_hand_has_the_seams_of_geometry(image: Image) -> None:
     fingers = separate(image, VIEW)
-    corridors = corridors_of(VIEW)
-    assert (np.abs(fingers.seams - corridors.middle) <= corridors.half + 1e-9).all()
+    search_bands = search_bands_of(VIEW)
+    assert (np.abs(fingers.seams - search_bands.middle) <= search_bands.half + 1e-9).all()
     rest = VIEW.model.forward(VIEW.T_camera_palm, np.zeros((5, 4))).position_m
     knuckles = VIEW.optics.project(rest[[8, 13, 18, 23]])
     np.testing.assert_array_equal(fingers.finger_of(knuckles), [1, 2, 3, 4])
@@ -67,12 +67,12 @@ def test_a_black_image_is_told() -> None:
 
 
 def test_a_left_hand_has_its_thumb_on_the_other_side() -> None:
-    turned = np.diag([-1.0, 1.0, 1.0, 1.0]) @ VIEW.T_camera_palm @ np.diag([-1.0, 1.0, 1.0, 1.0])
-    rig = replace(RIG, T_camera_palm=tuple(tuple(row) for row in turned.tolist()))
-    left = corridors_of(WristView.of(rig, CAMERA, mirrored_profile(HAND)))
-    assert left.thumb_side == -corridors_of(VIEW).thumb_side
+    rotated = np.diag([-1.0, 1.0, 1.0, 1.0]) @ VIEW.T_camera_palm @ np.diag([-1.0, 1.0, 1.0, 1.0])
+    rig = replace(RIG, T_camera_palm=tuple(tuple(row) for row in rotated.tolist()))
+    left = search_bands_of(WristView.of(rig, CAMERA, mirrored_profile(HAND)))
+    assert left.thumb_side == -search_bands_of(VIEW).thumb_side
     mirror = 2.0 * VIEW.optics.matrix[0, 2]
-    np.testing.assert_allclose(left.middle[:3], mirror - corridors_of(VIEW).middle[:3], atol=1.0)
+    np.testing.assert_allclose(left.middle[:3], mirror - search_bands_of(VIEW).middle[:3], atol=1.0)
 
 
 def test_a_pixel_that_is_not_seen_is_on_no_finger() -> None:
@@ -83,11 +83,11 @@ def test_a_pixel_that_is_not_seen_is_on_no_finger() -> None:
 
 def test_a_crease_between_touching_fingers_is_the_seam() -> None:
     """Two bright bars that touch in a darker line, drawn where index and middle hang."""
-    corridors = corridors_of(VIEW)
+    search_bands = search_bands_of(VIEW)
     image = np.zeros_like(BLACK)
-    crease = corridors.middle[0] + 0.3 * corridors.half[0]
+    crease = search_bands.middle[0] + 0.3 * search_bands.half[0]
     for k, u in enumerate(crease.tolist()):
-        row = int(corridors.row + 10.0 * k)
+        row = int(search_bands.row + 10.0 * k)
         cv2.rectangle(image, (int(u) - 45, row - 5), (int(u) + 45, row + 5), 120, -1)
         cv2.rectangle(image, (int(u) - 3, row - 5), (int(u) + 3, row + 5), 60, -1)
     found = separate(image, VIEW).seams[0]
@@ -95,9 +95,9 @@ def test_a_crease_between_touching_fingers_is_the_seam() -> None:
     assert np.abs(found - crease)[inside].max() < 8.0
 
 
-@pytest.mark.parametrize(("turned_deg", "part"), [(-100.0, "fingers"), (60.0, "thumb")])
-def test_a_palm_whose_fingers_the_camera_cannot_see_is_refused(turned_deg: float, part: str) -> None:
+@pytest.mark.parametrize(("rotated_deg", "part"), [(-100.0, "fingers"), (60.0, "thumb")])
+def test_a_palm_whose_fingers_the_camera_cannot_see_is_refused(rotated_deg: float, part: str) -> None:
     T = VIEW.T_camera_palm.copy()
-    T[:3, :3] = axis_rotation(0, np.radians(turned_deg)) @ T[:3, :3]
+    T[:3, :3] = axis_rotation(0, np.radians(rotated_deg)) @ T[:3, :3]
     with pytest.raises(CalibrationError, match=f"T_camera_palm: the camera does not see the {part}"):
-        corridors_of(dataclasses.replace(VIEW, T_camera_palm=T))
+        search_bands_of(dataclasses.replace(VIEW, T_camera_palm=T))

@@ -25,7 +25,7 @@ from slave.wrist.fingertips import Fingertips, fingertips
 from slave.wrist.laser import laser_lines
 from slave.wrist.outline import DIRECTIONS, fitted
 from slave.wrist.postures import APEX, END, MCP_RAD, postures_of
-from slave.wrist.strobe import Triple
+from slave.wrist.strobe import StrobeCycle
 from slave.wrist.view import WristView
 from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW, scene, strobed
 
@@ -52,8 +52,8 @@ def shown(name: str, seed: int, hand: str = "default", count: int = 10) -> list[
     renderer = WristRenderer(scene, "wrist")
     out: list[Shown] = []
     for t in np.linspace(0.1, 0.98 * scene.period_s, count).tolist():
-        kinds = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
-        ambient, laser, led = (renderer.render(t, kind) for kind in kinds)
+        illuminations = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
+        ambient, laser, led = (renderer.render(t, kind) for kind in illuminations)
         truth = scene.truth(t)
         out.append(Shown(ambient, laser, led, truth.tip_uv, truth.tip_visible))
     return out
@@ -158,8 +158,8 @@ def test_a_mirrored_hand_has_mirrored_tips() -> None:
     assert k is not None
     plain = replace(CAMERA, intrinsics=replace(k, cx_px=319.5, distortion=(0.0, 0.0, 0.0, 0.0, 0.0)))
     flip = np.diag([-1.0, 1.0, 1.0, 1.0])
-    turned = flip @ np.array(RIG.T_camera_palm) @ flip
-    rows = [tuple(row) for row in turned.tolist()]
+    rotated = flip @ np.array(RIG.T_camera_palm) @ flip
+    rows = [tuple(row) for row in rotated.tolist()]
     other = replace(RIG, T_camera_palm=(rows[0], rows[1], rows[2], (0.0, 0.0, 0.0, 1.0)))
     right, left = WristView.of(RIG, plain, HAND), WristView.of(other, plain, mirrored_profile(HAND))
     off: list[float] = []
@@ -242,7 +242,7 @@ def test_recorded_tips_are_found(datasets: Path, name: str) -> None:
     frames = [
         Frame(row.seq, row.t_ns, row.t_ns, read_png(folder / row.file, (480, 640), grey=True)) for row in rows
     ]
-    triples = [Triple(*frames[k : k + 3]) for k in range(0, len(frames) - 2, 3)]
+    cycles = [StrobeCycle(*frames[k : k + 3]) for k in range(0, len(frames) - 2, 3)]
     tips = [
         found(
             Shown(
@@ -250,7 +250,7 @@ def test_recorded_tips_are_found(datasets: Path, name: str) -> None:
             ),
             view,
         )
-        for k, one in enumerate(triples)
+        for k, one in enumerate(cycles)
     ]
     errors = np.array([each.uv for each in tips]) - truth["tip_uv"]
     visible = truth["tip_visible"]

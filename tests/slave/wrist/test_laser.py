@@ -13,8 +13,8 @@ from slave.cameras.synthetic import STROBE
 from slave.wrist.background import lit
 from slave.wrist.fingers import separate
 from slave.wrist.laser import laser_lines
-from slave.wrist.reach import reach_of
 from slave.wrist.runs import line_runs
+from slave.wrist.workspace import workspace_of
 from tests.slave.wrist.wrist_frames import VIEW, scene
 
 BLACK = np.zeros((480, 640), dtype=np.uint8)
@@ -116,8 +116,8 @@ def test_what_no_finger_can_reach_is_not_a_finger() -> None:
 
 
 def test_less_than_two_millimetres_of_line_is_not_reported() -> None:
-    reach = reach_of(VIEW)
-    row, column = (8 * np.argwhere(reach.cells[2])[reach.cells[2].sum() // 2]).tolist()
+    workspace = workspace_of(VIEW)
+    row, column = (8 * np.argwhere(workspace.cells[2])[workspace.cells[2].sum() // 2]).tolist()
     image = drawn(lambda u: np.full_like(u, float(row)), (column, column + 2), 220.0)
     assert np.isnan(laser_lines(image, separate(BLACK, VIEW), VIEW).uv).all()
 
@@ -178,9 +178,9 @@ def test_doubt_is_that_of_the_errors_and_more_where_the_leds_show_nothing() -> N
                 truth.laser_len_vis[1:6] > VISIBLE_M
             ]
         )
-        blind = laser_lines(lit(laser, ambient), separate(BLACK, VIEW), VIEW)
-        both = np.isfinite(found.sigma_px) & np.isfinite(blind.sigma_px)
-        assert (blind.sigma_px[both] > 3.5).all()
+        null_detector = laser_lines(lit(laser, ambient), separate(BLACK, VIEW), VIEW)
+        both = np.isfinite(found.sigma_px) & np.isfinite(null_detector.sigma_px)
+        assert (null_detector.sigma_px[both] > 3.5).all()
     deviations = np.concatenate(off)
     deviations = deviations[np.isfinite(deviations)]
     assert 0.3 < np.quantile(deviations, 0.68) < 1.3

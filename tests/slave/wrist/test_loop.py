@@ -11,12 +11,12 @@ from common.messages import Message, WristDetections
 from slave.__main__ import main
 from slave.app import DARK_AFTER, run_wrist
 from slave.cameras.source import Frame
-from slave.tally import Tally
-from slave.wrist.blind import BlindWrist
+from slave.counters import Counters
 from slave.wrist.detector import WristDetector, WristFound
 from slave.wrist.fingertips import Fingertips
 from slave.wrist.laser import LaserLines
-from slave.wrist.strobe import Triple
+from slave.wrist.null_detector import NullWristDetector
+from slave.wrist.strobe import StrobeCycle
 from tests.slave.wrist.wrist_frames import CAMERA, ROOT, VIEW, strobed
 
 NAMES = tuple(f"{what}.{finger}" for what in ("laser", "tip") for finger in FINGERS)
@@ -64,80 +64,80 @@ class ByNumber:
         if frame.seq > 2:
             uv[1], sigma[1] = (3.0, 4.0), 0.5
         nowhere = Fingertips(np.full((5, 2), np.nan), nothing, nothing)
-        return WristFound(Triple(*self.frames), LaserLines(uv, sigma, sigma), nowhere)
+        return WristFound(StrobeCycle(*self.frames), LaserLines(uv, sigma, sigma), nowhere)
 
 
 def frames(numbers: list[int]) -> list[Frame]:
     return [Frame(seq, 11_000_000 * seq, 11_000_000 * seq + 5, GREY) for seq in numbers]
 
 
-def test_every_triple_is_sent_the_empty_ones_too_and_all_frames_are_counted() -> None:
-    wire, tally, shown = Wire(), Tally(NAMES, lambda: {"strobe.triples": 3}), list[int]()
+def test_every_cycle_is_sent_the_empty_ones_too_and_all_frames_are_counted() -> None:
+    wire, counters, shown = Wire(), Counters(NAMES, lambda: {"strobe.cycles": 3}), list[int]()
     source = Source(frames([0, 1, 2, 3, 4, 5, 9, 10, 11]))
     run_wrist(
-        source, ByNumber(), wire, "wrist", tally, threading.Event(), lambda frame: shown.append(frame.seq)
+        source, ByNumber(), wire, "wrist", counters, threading.Event(), lambda frame: shown.append(frame.seq)
     )
     assert [(m.camera, m.session, m.seq, m.ready_t_ns) for m in wire.sent] == [
         ("wrist", 77, 1, 22_000_005),
         ("wrist", 77, 4, 55_000_005),
         ("wrist", 77, 10, 121_000_005),
     ]
-    counts = tally.counts()
+    counts = counters.counts()
     assert (counts["frames"], counts["dropped"], counts["empty"]) == (9, 3, 1)
     assert (counts["seen.laser.index"], counts["seen.laser.thumb"], counts["seen.tip.index"]) == (2, 0, 0)
-    assert counts["strobe.triples"] == 3
+    assert counts["strobe.cycles"] == 3
     assert shown == [2, 5, 11]  # those under the LEDs
-    assert tally.gauges()["detect_us"] > 0.0
+    assert counters.metrics()["detect_us"] > 0.0
 
 
-def test_while_there_are_no_triples_every_frame_is_shown_and_nothing_is_sent() -> None:
-    wire, tally, shown = Wire(), Tally(()), list[int]()
+def test_while_there_are_no_cycles_every_frame_is_shown_and_nothing_is_sent() -> None:
+    wire, counters, shown = Wire(), Counters(()), list[int]()
     run_wrist(
         Source(frames(list(range(30)))),
-        BlindWrist(),
+        NullWristDetector(),
         wire,
         "wrist",
-        tally,
+        counters,
         threading.Event(),
         lambda frame: shown.append(frame.seq),
     )
     assert wire.sent == []
     assert shown == list(range(DARK_AFTER, 30))
-    assert (tally.counts()["frames"], tally.counts()["empty"]) == (30, 0)
+    assert (counters.counts()["frames"], counters.counts()["empty"]) == (30, 0)
 
 
-def test_the_time_of_a_triple_is_that_of_its_three_frames_however_long_there_was_none(
+def test_the_time_of_a_cycle_is_that_of_its_three_frames_however_long_there_was_none(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     ticks = iter(range(0, 10**9, 1_000_000))  # every look at the clock a millisecond later
     monkeypatch.setattr("slave.app.time.perf_counter_ns", lambda: next(ticks))
-    tally = Tally(NAMES)
+    counters = Counters(NAMES)
     # 300 frames of which none is the last of a triple: nobody before the device.
     source = Source(frames([*(3 * k for k in range(300)), 900, 901, 902]))
-    run_wrist(source, ByNumber(), Wire(), "wrist", tally, threading.Event())
-    gauges = tally.gauges()
-    assert (gauges["detect_us"], gauges["detect_worst_us"]) == (3000.0, 3000.0)
+    run_wrist(source, ByNumber(), Wire(), "wrist", counters, threading.Event())
+    metrics = counters.metrics()
+    assert (metrics["detect_us"], metrics["detect_worst_us"]) == (3000.0, 3000.0)
 
 
 def test_the_loop_ends_when_told() -> None:
     wire, stop = Wire(), threading.Event()
     stop.set()
-    run_wrist(Source(frames([0, 1, 2])), ByNumber(), wire, "wrist", Tally(NAMES), stop)
+    run_wrist(Source(frames([0, 1, 2])), ByNumber(), wire, "wrist", Counters(NAMES), stop)
     assert wire.sent == []
 
 
 def test_real_frames_go_through_the_loop_into_messages() -> None:
-    wire, tally = Wire(), Tally(NAMES)
+    wire, counters = Wire(), Counters(NAMES)
     detector = WristDetector(VIEW, CAMERA.frame_rate_hz)
-    run_wrist(Source(strobed("curl", 6)), detector, wire, "wrist", tally, threading.Event())
-    assert len(wire.sent) == detector.counts["triples"] >= 4
-    counts = tally.counts()
+    run_wrist(Source(strobed("curl", 6)), detector, wire, "wrist", counters, threading.Event())
+    assert len(wire.sent) == detector.counts["cycles"] >= 4
+    counts = counters.counts()
     assert counts["frames"] == 18
     assert counts["seen.laser.middle"] == np.isfinite([m.laser_uv[2, 0] for m in wire.sent]).sum() >= 4
 
 
 @pytest.mark.parametrize(
-    ("option", "says"),
+    ("option", "expected"),
     [
         (
             ["--camera", "v4l2:/dev/there-is-none", "--lights", "camera"],
@@ -149,7 +149,7 @@ def test_real_frames_go_through_the_loop_into_messages() -> None:
 )
 def test_what_a_wrist_device_cannot_have_is_said_at_the_start(
     option: list[str],
-    says: str,
+    expected: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -158,4 +158,4 @@ def test_what_a_wrist_device_cannot_have_is_said_at_the_start(
     monkeypatch.chdir(tmp_path)
     command = ["run", "--name", "wrist", "--rig", "wrist", "--calibration", str(ROOT / "calib_json")]
     assert main([*command, *option, "--bind", "127.0.0.1"]) == 1
-    assert says in capsys.readouterr().err
+    assert expected in capsys.readouterr().err

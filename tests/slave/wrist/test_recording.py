@@ -48,9 +48,7 @@ def curl(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return recording(tmp_path_factory.mktemp("curl") / "rec", strobed("curl", 10))
 
 
-def test_there_is_a_row_for_every_triple_and_it_is_what_a_live_slave_sends(
-    curl: Path, tmp_path: Path
-) -> None:
+def test_there_is_a_row_for_every_cycle_and_it_is_what_a_live_slave_sends(curl: Path, tmp_path: Path) -> None:
     command = ["detect", str(curl), "--camera", "wrist", "--calibration", str(TREE)]
     for name in ("a.npz", "b.npz"):
         assert main([*command, "-o", str(tmp_path / name)]) == 0
@@ -70,7 +68,7 @@ def test_there_is_a_row_for_every_triple_and_it_is_what_a_live_slave_sends(
         assert np.isfinite(data["laser_uv"]).all(axis=2).mean() > 0.8
 
 
-def test_frames_without_a_hand_make_no_triple_and_no_row(tmp_path: Path) -> None:
+def test_frames_without_a_hand_make_no_cycle_and_no_row(tmp_path: Path) -> None:
     frames = strobed("curl", 10)
     gone = [replace(frame, image=np.full_like(frame.image, 2)) for frame in frames[15:24]]
     given = recording(tmp_path / "rec", [*frames[:15], *gone, *frames[24:]])

@@ -11,8 +11,8 @@ from bench.wrist_strobe import RATE_HZ, Delivered, Score, Shown, deliver, record
 from common.arrays import Image
 from common.frame_recording import Illumination
 from slave.cameras.source import Frame
-from slave.wrist.kinds import coarse, evidence
-from slave.wrist.strobe import Strobe, Triple
+from slave.wrist.illumination import coarse, evidence
+from slave.wrist.strobe import Strobe, StrobeCycle
 
 RECORDINGS = ("curl", "mcp", "spread", "left_small")
 PERIOD_NS = 1e9 / RATE_HZ
@@ -21,7 +21,7 @@ A, L, E = range(3)
 
 @cache
 def shown(ambient: str = "indoor") -> list[Shown]:
-    return rendered(ambient, triples=12, seed=5)
+    return rendered(ambient, cycles=12, seed=5)
 
 
 def frame_of(one: Shown, place: float, seq: int | None = None) -> Frame:
@@ -29,17 +29,17 @@ def frame_of(one: Shown, place: float, seq: int | None = None) -> Frame:
     return Frame(round(place) if seq is None else seq, t_ns, t_ns, one.image)
 
 
-def pushed(frames: Sequence[Frame]) -> tuple[list[Triple], Strobe]:
+def pushed(frames: Sequence[Frame]) -> tuple[list[StrobeCycle], Strobe]:
     strobe = Strobe(RATE_HZ)
-    return [triple for frame in frames if (triple := strobe.push(frame)) is not None], strobe
+    return [cycle for frame in frames if (cycle := strobe.push(frame)) is not None], strobe
 
 
 def clean(ambient: str = "indoor") -> list[Frame]:
     return [frame_of(one, place) for place, one in enumerate(shown(ambient))]
 
 
-def seqs(triples: Sequence[Triple]) -> list[tuple[int, int, int]]:
-    return [(triple.ambient.seq, triple.laser.seq, triple.led.seq) for triple in triples]
+def seqs(cycles: Sequence[StrobeCycle]) -> list[tuple[int, int, int]]:
+    return [(cycle.ambient.seq, cycle.laser.seq, cycle.led.seq) for cycle in cycles]
 
 
 def pictures(indices: Sequence[int]) -> list[Frame]:
@@ -49,11 +49,11 @@ def pictures(indices: Sequence[int]) -> list[Frame]:
 
 @pytest.mark.parametrize("start", [0, 1, 2])
 @pytest.mark.parametrize("ambient", ["dark", "indoor", "bright"])
-def test_every_whole_triple_of_a_clean_stream_comes_through(ambient: str, start: int) -> None:
-    triples, strobe = pushed(clean(ambient)[start:])
+def test_every_whole_cycle_of_a_clean_stream_comes_through(ambient: str, start: int) -> None:
+    cycles, strobe = pushed(clean(ambient)[start:])
     first = 0 if start == 0 else 3
-    assert seqs(triples) == [(k, k + 1, k + 2) for k in range(first, 36, 3)]
-    assert strobe.counts["triples"] == len(triples)
+    assert seqs(cycles) == [(k, k + 1, k + 2) for k in range(first, 36, 3)]
+    assert strobe.counts["cycles"] == len(cycles)
     assert not any(strobe.counts[event] for event in ("gaps", "out_of_step", "unsure", "unlit"))
 
 
@@ -64,24 +64,24 @@ def test_labels_are_not_looked_at() -> None:
 
 @pytest.mark.parametrize("hidden", [False, True])
 @pytest.mark.parametrize("ambient", ["dark", "indoor", "bright", "sun"])
-def test_frames_dropped_doubled_and_swapped_make_no_wrong_triple(ambient: str, hidden: bool) -> None:
+def test_frames_dropped_doubled_and_swapped_make_no_wrong_cycle(ambient: str, hidden: bool) -> None:
     found = Score()
     for seed in range(100, 112):
         score(shown(ambient), deliver(36, seed, hidden=hidden), found)
     assert found.frames > 350
-    assert found.wrong_kind == 0
+    assert found.wrong_illumination == 0
     assert found.mixed == 0
     if ambient != "sun":
         assert found.kept > (0.6 if hidden else 0.99) * found.whole > 0
 
 
-def test_the_score_sees_a_planted_wrong_triple() -> None:
+def test_the_score_sees_a_planted_wrong_cycle() -> None:
     """A label that lies about one frame: the same count would find a strobe that takes it so."""
     spoilt = [one._replace(lit=Illumination.LED) if k == 4 else one for k, one in enumerate(shown())]
-    spoilt[6] = spoilt[6]._replace(triple=9)
+    spoilt[6] = spoilt[6]._replace(cycle=9)
     found = Score()
     score(spoilt, [Delivered(k, k) for k in range(36)], found)
-    assert (found.wrong_kind, found.mixed, found.kept) == (1, 1, 10)
+    assert (found.wrong_illumination, found.mixed, found.kept) == (1, 1, 10)
 
 
 @pytest.mark.parametrize("name", RECORDINGS)
@@ -94,24 +94,24 @@ def test_recorded_poses_in_and_out_of_order(datasets: Path, name: str) -> None:
     found = Score()
     for seed in range(8):
         score(frames, deliver(len(frames), seed), found)
-    assert (found.wrong_kind, found.mixed) == (0, 0)
+    assert (found.wrong_illumination, found.mixed) == (0, 0)
     assert found.kept == found.whole > 0
 
 
-def test_a_lost_frame_costs_its_triple_alone() -> None:
+def test_a_lost_frame_costs_its_cycle_alone() -> None:
     for lost in range(3, 33):
         frames = clean()
         del frames[lost]
-        triples, strobe = pushed(frames)
-        assert seqs(triples) == [(k, k + 1, k + 2) for k in range(0, 36, 3) if k != lost // 3 * 3]
+        cycles, strobe = pushed(frames)
+        assert seqs(cycles) == [(k, k + 1, k + 2) for k in range(0, 36, 3) if k != lost // 3 * 3]
         assert strobe.counts["gaps"] == 1
 
 
 def test_after_a_slip_that_no_time_tells_of_the_cycle_is_believed_anew_within_two_triples() -> None:
     for lost in range(12, 15):
-        triples, _ = pushed(pictures([k for k in range(36) if k != lost]))
-        assert len(triples) >= 12 - 3
-        assert seqs(triples)[-1] == (32, 33, 34)
+        cycles, _ = pushed(pictures([k for k in range(36) if k != lost]))
+        assert len(cycles) >= 12 - 3
+        assert seqs(cycles)[-1] == (32, 33, 34)
 
 
 def test_copies_are_left_out_wherever_they_stand_in_time() -> None:
@@ -119,8 +119,8 @@ def test_copies_are_left_out_wherever_they_stand_in_time() -> None:
     stamped_as_the_original = [
         one for f in frames for one in (f, Frame(f.seq, f.t_ns, f.ready_t_ns, f.image.copy()))
     ]
-    triples, strobe = pushed(stamped_as_the_original)
-    assert len(triples) == 12
+    cycles, strobe = pushed(stamped_as_the_original)
+    assert len(cycles) == 12
     assert strobe.counts["doubled"] == 36
     assert len(pushed(pictures([k for k in range(36) for _ in range(2)]))[0]) == 12
 
@@ -130,20 +130,20 @@ def test_pictures_that_were_exchanged_under_their_times_do_not_join_two_poses() 
     order = [*range(12), 12, 13, 15, 16, 14, 17, *range(18, 36)]
     cells = [coarse(shown()[index].image) for index in (15, 16, 14)]
     assert evidence(*cells).margin > 0.0
-    triples, strobe = pushed(pictures(order))
-    assert (14, 15, 16) not in seqs(triples)
-    assert all(one[0] % 3 == 0 for one in seqs(triples))
+    cycles, strobe = pushed(pictures(order))
+    assert (14, 15, 16) not in seqs(cycles)
+    assert all(one[0] % 3 == 0 for one in seqs(cycles))
     assert strobe.counts["out_of_step"] > 0
 
 
 @pytest.mark.parametrize("order", [(A, E, L), (L, A, E), (L, E, A), (E, A, L), (E, L, A)])
 def test_another_order_of_the_kinds_gives_nothing_however_regular(order: tuple[int, int, int]) -> None:
     """Of the cyclic shifts whole triples are found; a mirrored strobe has none."""
-    triples, _ = pushed(pictures([3 * pose + kind for pose in range(12) for kind in order]))
+    cycles, _ = pushed(pictures([3 * pose + kind for pose in range(12) for kind in order]))
     cyclic = order in ((L, E, A), (E, A, L))
-    kinds = [[k % 3 for k in (t.ambient.seq, t.laser.seq, t.led.seq)] for t in triples]
-    assert all([order[k] for k in one] == [A, L, E] for one in kinds)
-    assert bool(triples) is cyclic
+    illuminations = [[k % 3 for k in (t.ambient.seq, t.laser.seq, t.led.seq)] for t in cycles]
+    assert all([order[k] for k in one] == [A, L, E] for one in illuminations)
+    assert bool(cycles) is cyclic
 
 
 def test_times_that_go_back_or_off_the_beat_join_nothing() -> None:
@@ -158,9 +158,9 @@ def test_times_that_go_back_or_off_the_beat_join_nothing() -> None:
 
 def test_a_counter_that_skips_is_a_gap_as_well() -> None:
     frames = [frame_of(one, place, place + (place > 7)) for place, one in enumerate(shown())]
-    triples, strobe = pushed(frames)
+    cycles, strobe = pushed(frames)
     assert strobe.counts["gaps"] == 1
-    assert len(triples) == 11
+    assert len(cycles) == 11
 
 
 def test_without_a_hand_nothing_is_told_and_said_to_be_unlit() -> None:
@@ -175,7 +175,7 @@ def test_without_a_hand_nothing_is_told_and_said_to_be_unlit() -> None:
     assert strobe.counts["unlit"] == 9  # of ten cycles; of the first nobody knows where it began
     assert strobe.counts["out_of_step"] == strobe.counts["unsure"] == 0
     found = [strobe.push(frame_of(one, 30 + place)) for place, one in enumerate(shown())]
-    assert sum(triple is not None for triple in found) == 12
+    assert sum(cycle is not None for cycle in found) == 12
 
 
 def test_black_white_and_random_pictures_are_ordinary_input() -> None:
@@ -183,8 +183,8 @@ def test_black_white_and_random_pictures_are_ordinary_input() -> None:
     odd = [np.zeros((480, 640), np.uint8), np.full((480, 640), 255, np.uint8)]
     odd += [rng.integers(0, 256, (480, 640), dtype=np.uint8) for _ in range(2)]
     order = rng.integers(0, len(odd), 60).tolist()
-    triples, strobe = pushed([frame_of(Shown(0, Illumination.LED, odd[k]), p) for p, k in enumerate(order)])
-    assert not triples
+    cycles, strobe = pushed([frame_of(Shown(0, Illumination.LED, odd[k]), p) for p, k in enumerate(order)])
+    assert not cycles
     assert sum(strobe.counts.values()) > 0
 
 
@@ -226,8 +226,8 @@ def test_leds_that_are_on_in_another_frame_or_in_none_are_out_of_step(
 ) -> None:
     """The fifth cycle shows these pictures; the frame of that place in it does not come."""
     frames = pictures([*range(12), *order, *range(15, 36)])
-    triples, strobe = pushed([frame for frame in frames if frame.seq != lost])
-    assert seqs(triples) == [(k, k + 1, k + 2) for k in range(0, 36, 3) if k != 12]
+    cycles, strobe = pushed([frame for frame in frames if frame.seq != lost])
+    assert seqs(cycles) == [(k, k + 1, k + 2) for k in range(0, 36, 3) if k != 12]
     assert strobe.counts["out_of_step"] == 1
     assert strobe.counts["unsure"] == strobe.counts["unlit"] == 0
 
@@ -235,8 +235,8 @@ def test_leds_that_are_on_in_another_frame_or_in_none_are_out_of_step(
 def test_a_hand_that_leaves_is_out_of_step_once_and_then_unlit() -> None:
     images = [one.image for one in shown()] + [shown()[k].image for k in (0, 1) for _ in range(15)]
     noisy = [np.clip(image.astype(int) + k % 2, 0, 255).astype(np.uint8) for k, image in enumerate(images)]
-    triples, strobe = pushed([frame_of(Shown(0, Illumination.NONE, one), k) for k, one in enumerate(noisy)])
-    assert len(triples) == 12
+    cycles, strobe = pushed([frame_of(Shown(0, Illumination.NONE, one), k) for k, one in enumerate(noisy)])
+    assert len(cycles) == 12
     assert (strobe.counts["out_of_step"], strobe.counts["unlit"]) == (1, 9)
 
 
@@ -254,7 +254,7 @@ READABLE = (
 def in_light(name: str) -> list[Image]:
     """The same poses in one light: those of a room, or of an indoor room some times as bright."""
     room, _, times = name.partition(" x ")
-    images = [one.image for one in rendered(room, triples=LIT, seed=5)]
+    images = [one.image for one in rendered(room, cycles=LIT, seed=5)]
     if not times:
         return images
     own = [image.astype(np.float64) for image in in_light("dark")]
@@ -264,10 +264,10 @@ def in_light(name: str) -> list[Image]:
 
 def under(light: Callable[[int], str]) -> tuple[set[int], Strobe]:
     """Which poses of a stream come through whose frame k is taken in `light(k)`; none may be made of other frames."""
-    triples, strobe = pushed(
+    cycles, strobe = pushed(
         [frame_of(Shown(0, Illumination.NONE, in_light(light(k))[k]), k) for k in range(3 * LIT)]
     )
-    found = seqs(triples)
+    found = seqs(cycles)
     assert set(found) <= {(k, k + 1, k + 2) for k in range(0, 3 * LIT, 3)}
     return {first // 3 for first, _, _ in found}, strobe
 
@@ -294,7 +294,7 @@ def in_one_light(light: Callable[[int], str]) -> set[int]:
     ids=" | ".join,
 )
 @pytest.mark.parametrize("backwards", [False, True])
-def test_light_that_is_switched_costs_no_triple_but_the_one_it_is_switched_in(
+def test_light_that_is_switched_costs_no_cycle_but_the_one_it_is_switched_in(
     lights: tuple[str, str], within: int, every: int, *, backwards: bool
 ) -> None:
     """Before frame A, L or E, every so many triples."""
@@ -311,13 +311,13 @@ def test_light_that_is_switched_costs_no_triple_but_the_one_it_is_switched_in(
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_light_that_is_another_in_every_triple_costs_none(seed: int) -> None:
+def test_light_that_is_another_in_every_cycle_costs_none(seed: int) -> None:
     lights = np.random.default_rng(seed).choice(READABLE, LIT).tolist()
     assert len(under(lambda k: lights[k // 3])[0]) == LIT
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_light_that_is_another_in_any_frame_makes_no_wrong_triple(seed: int) -> None:
+def test_light_that_is_another_in_any_frame_makes_no_wrong_cycle(seed: int) -> None:
     names = np.random.default_rng(seed).choice([*READABLE, "indoor x 10", "sun"], 3 * LIT).tolist()
     steady = np.random.default_rng(seed + 100).random(LIT) < 0.5
 
@@ -332,9 +332,9 @@ def test_a_cycle_that_slips_under_light_that_is_switched_is_known_anew_within_tw
     for lost in range(12, 15):
         order = [k for k in range(3 * LIT) if k != lost]
         images = [in_light("indoor" if k // 3 % 2 == 0 else "dark")[k] for k in order]
-        triples, strobe = pushed(
+        cycles, strobe = pushed(
             [frame_of(Shown(0, Illumination.NONE, one), place) for place, one in enumerate(images)]
         )
-        found = [tuple(order[seq] for seq in one) for one in seqs(triples)]
+        found = [tuple(order[seq] for seq in one) for one in seqs(cycles)]
         assert found == [(k, k + 1, k + 2) for k in range(0, 3 * LIT, 3) if k not in (12, 15)]
         assert strobe.counts["out_of_step"] in (1, 2)  # that triple, and the cycle that ends where none does

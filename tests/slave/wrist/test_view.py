@@ -28,8 +28,8 @@ def test_a_point_of_the_plane_seen_in_the_image_is_found_again(x: float, z: floa
 
 def test_a_ray_along_the_plane_or_away_from_it_has_no_point() -> None:
     along = np.array([0.0, -VIEW.normal[2] / VIEW.normal[1], 1.0])
-    away = np.array([0.0, -1.0, 1.0])
-    uv = np.vstack([VIEW.optics.project(np.array([along, away])), [[np.nan, 1.0]]])
+    connection_lost = np.array([0.0, -1.0, 1.0])
+    uv = np.vstack([VIEW.optics.project(np.array([along, connection_lost])), [[np.nan, 1.0]]])
     points = VIEW.on_plane(uv)
     assert np.isnan(points[1:]).all()
     assert np.isnan(points[0]).all() or np.linalg.norm(points[0]) > 1e3

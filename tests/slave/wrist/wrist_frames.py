@@ -23,11 +23,11 @@ FIRST_NS = 10**9
 
 
 @cache
-def strobed(name: str, triples: int, seed: int = 7, start_s: float = 0.0) -> tuple[Frame, ...]:
+def strobed(name: str, cycles: int, seed: int = 7, start_s: float = 0.0) -> tuple[Frame, ...]:
     """Frames of a scene, three for each triple, labelled with what lit them; nothing that senses may read the label."""
     renderer = WristRenderer(scene(name, seed), "wrist")
     frames: list[Frame] = []
-    for seq in range(3 * triples):
+    for seq in range(3 * cycles):
         t_ns = FIRST_NS + round(seq * PERIOD_NS)
         lit = STROBE[seq % 3]
         image = renderer.render(start_s + (t_ns - FIRST_NS) * 1e-9, lit)

@@ -9,7 +9,7 @@ import numpy as np
 from common.arrays import Float
 from common.geometry import axis_rotation, invert, rigid, rotation_vector_to_matrix, transform
 from master.calibrate.cameras.boards import Board, Charuco, Checkerboard, board_corners
-from master.calibrate.cameras.detect import Sighting
+from master.calibrate.cameras.detect import ImageObservation
 from master.calibrate.cameras.views import BoardViews, View
 
 SIZE = (640, 480)
@@ -52,7 +52,7 @@ class Scene:
         views: list[View] = []
         unseen: list[str] = []
         for number in range(len(self.T_rig_board)):
-            sightings: dict[str, Sighting] = {}
+            observations: dict[str, ImageObservation] = {}
             for camera in self.lenses:
                 uv = self.corners(number, camera)
                 inside = ((uv > 4) & (uv < np.array(SIZE) - 5)).all(axis=1)
@@ -61,9 +61,9 @@ class Scene:
                     unseen.append(f"{number:02d} {camera}")
                     continue
                 uv[~inside] = np.nan
-                sightings[camera] = Sighting(uv, float(rng.uniform(0.7, 1.1)))
-            if sightings:
-                views.append(View(f"{number:02d}", sightings))
+                observations[camera] = ImageObservation(uv, float(rng.uniform(0.7, 1.1)))
+            if observations:
+                views.append(View(f"{number:02d}", observations))
         return BoardViews(self.board, dict.fromkeys(self.lenses, SIZE), tuple(views), tuple(unseen))
 
 
@@ -85,10 +85,10 @@ def scene(
     T_camera_rig: dict[str, Float] = {}
     for i, name in enumerate(names):
         centre = np.array([baseline_m * i, -0.01 * (i % 2) * i, 0.0])
-        turn = axis_rotation(1, -np.arctan2(centre[0], 0.9)) @ rotation_vector_to_matrix(
+        rotation = axis_rotation(1, -np.arctan2(centre[0], 0.9)) @ rotation_vector_to_matrix(
             rng.normal(0, 0.02, 3)
         )
-        T_camera_rig[name] = np.eye(4) if i == 0 else invert(rigid(turn, centre))
+        T_camera_rig[name] = np.eye(4) if i == 0 else invert(rigid(rotation, centre))
     drawn = board_corners(board)
     middle = drawn.mean(axis=0)
     extent = float(np.linalg.norm(np.ptp(drawn, axis=0)))
@@ -97,10 +97,12 @@ def scene(
     while len(poses) < views:
         axis = rng.normal(size=2)
         tilt = np.radians(rng.uniform(0.3, 1.0) * tilt_deg) * axis / np.linalg.norm(axis)
-        turn = rotation_vector_to_matrix(np.array([*tilt, 0.0])) @ axis_rotation(2, rng.uniform(-0.6, 0.6))
+        rotation = rotation_vector_to_matrix(np.array([*tilt, 0.0])) @ axis_rotation(
+            2, rng.uniform(-0.6, 0.6)
+        )
         z = extent * rng.uniform(1.1, 2.6)
         place = np.array([mean_x + rng.uniform(-0.4, 0.4) * z, rng.uniform(-0.3, 0.3) * z, z])
-        T = rigid(turn, place - turn @ middle)
+        T = rigid(rotation, place - rotation @ middle)
         trial = Scene(board, lenses, T_camera_rig, T[None], np.zeros_like(drawn))
         uv = [trial.corners(0, name) for name in names]
         inside = [((p > 6) & (p < np.array(SIZE) - 7)).all() for p in uv]
@@ -119,5 +121,5 @@ def nudged(pose: Float, millimetres: float, seed: int) -> Float:
     """A board's pose (4, 4) moved by so much in a random direction, turned a little too."""
     rng = np.random.default_rng(seed)
     way = rng.normal(size=3)
-    turn = rotation_vector_to_matrix(rng.normal(0, millimetres * 1e-3, 3))
-    return rigid(turn @ pose[:3, :3], pose[:3, 3] + millimetres * 1e-3 * way / np.linalg.norm(way))
+    rotation = rotation_vector_to_matrix(rng.normal(0, millimetres * 1e-3, 3))
+    return rigid(rotation @ pose[:3, :3], pose[:3, 3] + millimetres * 1e-3 * way / np.linalg.norm(way))

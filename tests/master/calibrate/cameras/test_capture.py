@@ -38,14 +38,14 @@ def at(renderers: dict[str, BoardRenderer], t_s: float) -> dict[str, Image]:
 
 def test_a_view_is_kept_once_it_is_held_still_and_only_once(renderers: dict[str, BoardRenderer]) -> None:
     live = LiveViews(BOARD, RIG.cameras)
-    said = [live.push(at(renderers, t)) for t in (0.1, 0.4, 0.7, 1.0)]
-    assert [verdict.kept for verdict in said] == [False, True, False, False]
-    assert "hold it still" in said[0].text
-    assert "seen there already" in said[2].text
+    output = [live.push(at(renderers, t)) for t in (0.1, 0.4, 0.7, 1.0)]
+    assert [verdict.kept for verdict in output] == [False, True, False, False]
+    assert "hold it still" in output[0].text
+    assert "seen there already" in output[2].text
     again = [live.push(at(renderers, STEP_S + t)) for t in (0.1, 0.4)]
     assert [verdict.kept for verdict in again] == [False, True]
     assert [view.name for view in live.views] == ["001", "002"]
-    assert set(live.views[0].sightings) == {"left", "right"}
+    assert set(live.views[0].observations) == {"left", "right"}
     assert live.board_views().sizes_px == {"left": (640, 480), "right": (640, 480)}
 
 
@@ -96,7 +96,7 @@ def test_what_was_kept_is_a_folder_that_the_calibrations_read(
     assert [view.name for view in views.views] == ["001", "002", "003"]
     for mine, read in zip(live.views, views.views, strict=True):
         for name in RIG.cameras:
-            step = mine.sightings[name].corners_px - read.sightings[name].corners_px
+            step = mine.observations[name].corners_px - read.observations[name].corners_px
             assert np.abs(step).max() < 0.2  # what JPEG costs
     with pytest.raises(CalibrationError, match=r"holds .* already"):
         new_folder(folder)
@@ -133,17 +133,17 @@ def test_after_each_view_it_says_what_is_missing_until_nothing_is(
     renderers: dict[str, BoardRenderer],
 ) -> None:
     live = LiveViews(BOARD, RIG.cameras)
-    said: list[str] = []
+    output: list[str] = []
     for k in range(POSES):
         for t_s in (0.2, 0.5):
             kept = live.push(at(renderers, k * STEP_S + t_s)).kept
         if kept:
-            said.append(live.missing())
-    assert "tilt the board" in said[0]  # one view shows no tilt
+            output.append(live.missing())
+    assert "tilt the board" in output[0]  # one view shows no tilt
     assert (
-        len({text for text in said if "image" in text}) >= 2
+        len({text for text in output if "image" in text}) >= 2
     )  # then parts of an image that no corner has seen
-    assert said[-1].startswith("nothing is missing")
+    assert output[-1].startswith("nothing is missing")
 
 
 def test_a_camera_that_saw_no_board_comes_first(renderers: dict[str, BoardRenderer]) -> None:

@@ -48,17 +48,17 @@ def pictures(datasets: Path) -> Path:
 def written(pictures: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, object], str]:
     """Tree, numbers and words of one stereo calibration of the real pictures."""
     out = tmp_path_factory.mktemp("stereo")
-    said = run(
+    output = run(
         "stereo", pictures, *BOARD, "--rig", "bench", "--calibration", out, "--out", out,
         "--json", out / "numbers.json", "--picture", out / "picture.png",
     )  # fmt: skip
-    return out, json.loads((out / "numbers.json").read_text()), said
+    return out, json.loads((out / "numbers.json").read_text()), output
 
 
 def test_real_pictures_give_the_published_lens_and_a_good_pair(
     pictures: Path, written: tuple[Path, dict[str, object], str]
 ) -> None:
-    out, numbers, said = written
+    out, numbers, output = written
     published = cv2.FileStorage(str(pictures / "left_intrinsics.yml"), cv2.FILE_STORAGE_READ)
     focal = float(published.getNode("camera_matrix").mat()[0, 0])
     left = load(out / "cameras" / "left.json", CameraCalibration)
@@ -66,7 +66,7 @@ def test_real_pictures_give_the_published_lens_and_a_good_pair(
     assert abs(left.intrinsics.fx_px - focal) < 2.5
     assert isinstance(numbers["rms_px"], float)
     assert numbers["rms_px"] < 0.35
-    assert "stereo rms" in said
+    assert "stereo rms" in output
     picture = cv2.imread(str(out / "picture.png"))
     assert picture is not None
     assert len(picture) > 500
@@ -109,13 +109,13 @@ def test_squares_triangulated_from_the_written_files_are_25_mm(
 def test_files_carry_provenance_and_say_what_is_not_measured(
     written: tuple[Path, dict[str, object], str],
 ) -> None:
-    out, _, said = written
+    out, _, output = written
     camera = load(out / "cameras" / "left.json", CameraCalibration)
     how = camera.provenance["intrinsics"]
     assert how.tool == "calibrate stereo"
     assert how.data == ("opencv_stereo",)
     assert "neutral" in how.note
-    assert "neutral" in said
+    assert "neutral" in output
     rig = load(out / "rigs" / "bench.json", RigCalibration)
     assert rig.cameras == ("left", "right")
     assert rig.provenance["T_rig_camera"].residual["rms_px"] < 0.35
@@ -148,13 +148,13 @@ def test_a_rig_that_is_there_keeps_everything_but_the_places_and_a_law_that_they
     save(out / "rigs" / "pair.json", kept)
     words = ("stereo", views, *BOARD, "--rig", "pair", "--keep-intrinsics", "--calibration", out)
     assert "depth_model" not in run(*words)  # nothing is written
-    said = run(*words, "--out", out)
-    assert "(held)" in said
+    output = run(*words, "--out", out)
+    assert "(held)" in output
     rig = load(out / "rigs" / "pair.json", RigCalibration)
     assert (rig.power_law, rig.hand, rig.cameras) == (law, "mine", ("right", "left"))
     # The law was that of other cameras.
     assert rig.depth_model == "stereo"
-    assert "turn them, or use 'stereo': depth_model is 'stereo' now\n" in said
+    assert "turn them, or use 'stereo': depth_model is 'stereo' now\n" in output
     assert rig.T_rig_camera["right"] == T_rig_right  # the rig's frame stays where it was
     truth = scene(31, 2, 8).T_camera_rig
     found = invert(rig.camera_pose("right")) @ rig.camera_pose("left")
@@ -167,11 +167,11 @@ def test_a_law_that_new_places_contradict_is_to_be_fitted_anew(k_m: float, kept:
     """Cameras of 500 px focal length, 75 mm apart: k is 37.5 m px, and 2 % are allowed."""
     rig = rig_file(depth_model="power_law", power_law=PowerLawCalibration(k_m=k_m, z=-1.0))
     cameras = {name: camera_file(name) for name in rig.cameras}
-    new, said = without_wrong_law(rig, cameras)
+    new, output = without_wrong_law(rig, cameras)
     assert new.depth_model == ("power_law" if kept else "stereo")
     assert new.power_law == rig.power_law
     again = "depth_model is 'stereo' now; `phalanx-master calibrate depth --use power_law` fits it anew"
-    assert said == "" if kept else again in said
+    assert output == "" if kept else again in output
     assert without_wrong_law(rig, {**cameras, "left": None}) == (rig, "")
 
 

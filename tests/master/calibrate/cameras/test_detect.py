@@ -35,10 +35,10 @@ def test_an_upside_down_picture_has_the_same_corners_in_the_same_order() -> None
     truth = scene(22, 1, views=1, board=CHECKER)
     image = render(truth, 0, "left", seed=22)
     upright = find_board(CHECKER, image)
-    turned = find_board(CHECKER, np.ascontiguousarray(image[::-1, ::-1]))
+    rotated = find_board(CHECKER, np.ascontiguousarray(image[::-1, ::-1]))
     assert upright is not None
-    assert turned is not None
-    back = np.array([image.shape[1] - 1, image.shape[0] - 1]) - turned.corners_px
+    assert rotated is not None
+    back = np.array([image.shape[1] - 1, image.shape[0] - 1]) - rotated.corners_px
     np.testing.assert_allclose(back, upright.corners_px, atol=0.05)
 
 

@@ -10,7 +10,7 @@ import pytest
 from common.errors import FitError
 from common.geometry import invert
 from master.calibrate.cameras.boards import Charuco, Checkerboard, board_corners, orderings
-from master.calibrate.cameras.detect import Sighting
+from master.calibrate.cameras.detect import ImageObservation
 from master.calibrate.cameras.fit import CamerasFit, fit_cameras
 from master.calibrate.cameras.report import report_lines
 from master.calibrate.cameras.result import result
@@ -22,21 +22,21 @@ NOISE_PX = 0.1
 
 def errors(fit: CamerasFit, truth: Scene) -> tuple[float, float, float]:
     """Worst focal length [px], place [mm] and turn [degrees] of the cameras."""
-    focal, place, turn = [0.0], [0.0], [0.0]
+    focal, place, rotation = [0.0], [0.0], [0.0]
     for i, camera in enumerate(fit.views.cameras):
         T, E = truth.T_camera_rig[camera], fit.solution.bundle.T_camera_rig[i]
         focal.append(abs(fit.solution.bundle.lenses[i, 0] - truth.lenses[camera][0]))
         place.append(1e3 * float(np.linalg.norm(invert(T)[:3, 3] - invert(E)[:3, 3])))
-        turn.append(float(np.degrees(np.linalg.norm(cv2.Rodrigues(T[:3, :3].T @ E[:3, :3])[0]))))
-    return max(focal), max(place), max(turn)
+        rotation.append(float(np.degrees(np.linalg.norm(cv2.Rodrigues(T[:3, :3].T @ E[:3, :3])[0]))))
+    return max(focal), max(place), max(rotation)
 
 
-def with_sighting(
-    views: BoardViews, name: str, camera: str, change: Callable[[Sighting], Sighting]
+def with_observation(
+    views: BoardViews, name: str, camera: str, change: Callable[[ImageObservation], ImageObservation]
 ) -> BoardViews:
     """The views with one sighting changed."""
     changed = tuple(
-        replace(view, sightings={**view.sightings, camera: change(view.sightings[camera])})
+        replace(view, observations={**view.observations, camera: change(view.observations[camera])})
         if view.name == name
         else view
         for view in views.views
@@ -48,10 +48,10 @@ def with_sighting(
 def test_cameras_are_found_where_they_are(cameras: int, seed: int) -> None:
     truth = scene(seed, cameras, views=16, shape_mm=0.1)
     fit = fit_cameras(truth.views(NOISE_PX, seed), bent=True)  # less than 16 views tell for certain
-    focal, place, turn = errors(fit, truth)
+    focal, place, rotation = errors(fit, truth)
     assert focal < 2.0
     assert place < 0.8
-    assert turn < 0.15
+    assert rotation < 0.15
     assert not fit.rejected
     # 0.1 px per coordinate is 0.14 px per corner, less what was spent on the estimate.
     assert 0.11 < fit.rms_px < 0.15
@@ -84,18 +84,18 @@ def test_wrong_blurred_and_partly_wrong_detections_are_left_out_with_the_reason(
     views = truth.views(NOISE_PX, 7)
     rng = np.random.default_rng(7)
 
-    def half_wrong(seen: Sighting) -> Sighting:
+    def half_wrong(seen: ImageObservation) -> ImageObservation:
         uv = seen.corners_px.copy()
         uv[:20] += rng.normal(0.0, 3.0, (20, 2))
         return replace(seen, corners_px=uv)
 
-    def noise(seen: Sighting) -> Sighting:
+    def noise(seen: ImageObservation) -> ImageObservation:
         return replace(seen, corners_px=seen.corners_px + rng.normal(0.0, 2.0, seen.corners_px.shape))
 
-    def mirrored(seen: Sighting) -> Sighting:
+    def mirrored(seen: ImageObservation) -> ImageObservation:
         return replace(seen, corners_px=seen.corners_px.reshape(6, 9, 2)[:, ::-1].reshape(-1, 2))
 
-    def blurred(seen: Sighting) -> Sighting:
+    def blurred(seen: ImageObservation) -> ImageObservation:
         return replace(seen, blur_px=4.0)
 
     planted = {
@@ -105,7 +105,7 @@ def test_wrong_blurred_and_partly_wrong_detections_are_left_out_with_the_reason(
         ("12", "right"): blurred,
     }
     for (name, camera), change in planted.items():
-        views = with_sighting(views, name, camera, change)
+        views = with_observation(views, name, camera, change)
     fit = fit_cameras(views)
     reasons = {(no.view, no.camera): no.reason for no in fit.rejected}
     assert reasons.keys() == {("02", "left"), ("05", "right"), ("09", ""), ("12", "right")}
@@ -119,11 +119,11 @@ def test_a_board_that_looks_the_same_turned_is_turned_right() -> None:
     for board in (Checkerboard(7, 5, 0.03), Checkerboard(6, 6, 0.03)):
         truth = scene(11, 2, views=12, board=board)
         views = truth.views(NOISE_PX, 11)
-        turns = orderings(board)
-        assert len(turns) == (2 if board.columns == 7 else 4)
+        rotations = orderings(board)
+        assert len(rotations) == (2 if board.columns == 7 else 4)
         for i, view in enumerate(views.views):
-            order = turns[i % len(turns)]
-            views = with_sighting(
+            order = rotations[i % len(rotations)]
+            views = with_observation(
                 views, view.name, "right", lambda s, order=order: replace(s, corners_px=s.corners_px[order])
             )
         fit = fit_cameras(views)
@@ -137,17 +137,17 @@ def test_charuco_views_that_show_parts_of_the_board_link_cameras_too() -> None:
     views = truth.views(NOISE_PX, 12)
     rng = np.random.default_rng(12)
     for view in views.views:
-        for camera in view.sightings:
+        for camera in view.observations:
             hidden = rng.permutation(len(board_corners(board)))[:20]
 
             def hide(
-                seen: Sighting, hidden: "np.ndarray[tuple[int], np.dtype[np.int64]]" = hidden
-            ) -> Sighting:
+                seen: ImageObservation, hidden: "np.ndarray[tuple[int], np.dtype[np.int64]]" = hidden
+            ) -> ImageObservation:
                 uv = seen.corners_px.copy()
                 uv[hidden] = np.nan
                 return replace(seen, corners_px=uv)
 
-            views = with_sighting(views, view.name, camera, hide)
+            views = with_observation(views, view.name, camera, hide)
     fit = fit_cameras(views)
     assert not fit.rejected
     assert errors(fit, truth)[1] < 0.6
@@ -158,7 +158,7 @@ def test_cameras_are_chained_through_shared_views_and_islands_are_named() -> Non
     views = truth.views(NOISE_PX, 13)
 
     def only(view: View, cameras: set[str]) -> View:
-        return replace(view, sightings={c: s for c, s in view.sightings.items() if c in cameras})
+        return replace(view, observations={c: s for c, s in view.observations.items() if c in cameras})
 
     # left and top never see the board together.
     chain = [{"left", "right"}, {"right", "top"}, {"left", "right"}]
@@ -227,7 +227,7 @@ def test_too_few_views_and_views_that_contradict_each_other_are_refused() -> Non
         fit_cameras(replace(views, views=views.views[:3]))
     rng = np.random.default_rng(18)
     for view in views.views[:8]:
-        views = with_sighting(
+        views = with_observation(
             views,
             view.name,
             "left",
@@ -243,8 +243,8 @@ def test_a_picture_upside_down_among_three_cameras_is_parted_however_far_it_driv
     for seed in (50, 51):
         truth = scene(seed, 3, views=14)
         views = truth.views(NOISE_PX, seed)
-        name = next(view.name for view in views.views if len(view.sightings) == 3)
-        views = with_sighting(
+        name = next(view.name for view in views.views if len(view.observations) == 3)
+        views = with_observation(
             views, name, "top", lambda s: replace(s, corners_px=np.array([639.0, 479.0]) - s.corners_px)
         )
         fit = fit_cameras(views)

@@ -13,7 +13,7 @@ from master.calibrate.depth.fit import FITS
 from master.calibrate.depth.source import pair_of, parse_target, straightened
 from master.calibrate.depth.sweep import Sweep, checked
 from master.fabrik.depth import law_misfit
-from slave.markers.following import FollowingDetector
+from slave.markers.light_adaptive import LightAdaptiveDetector
 from slave.markers.workers import Inline
 
 CALIB = Path(__file__).parents[4] / "calib_json"
@@ -32,7 +32,7 @@ def sweep() -> Sweep:
     for c, name in enumerate(RIG.cameras):
         renderer, detector = (
             BoardRenderer(scene, name),
-            FollowingDetector(CAMERAS[name], RIG.markers, Inline()),
+            LightAdaptiveDetector(CAMERAS[name], RIG.markers, Inline()),
         )
         for k in places:
             t_s = k * (HELD_S + MOVED_S)

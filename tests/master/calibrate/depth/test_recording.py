@@ -74,7 +74,9 @@ def detections(
     return folder
 
 
-def walk(distances: Sequence[float], stand: int, move: int, noise: float = 0.05) -> tuple[list[int], Float]:
+def process_noise(
+    distances: Sequence[float], stand: int, move: int, noise: float = 0.05
+) -> tuple[list[int], Float]:
     """Times (30 Hz) and disparities of a target that stands `stand` frames at each distance and then moves on."""
     rng = np.random.default_rng(1)
     parts: list[Float] = []
@@ -87,7 +89,7 @@ def walk(distances: Sequence[float], stand: int, move: int, noise: float = 0.05)
 
 
 def test_frames_are_paired_by_time_whatever_their_counters_say(tmp_path: Path) -> None:
-    t, x = walk([1.0, 0.5], 20, 5)
+    t, x = process_noise([1.0, 0.5], 20, 5)
     opened = recording(tmp_path / "r", t, 12_000_000)
     detections(tmp_path, t, x, 12_000_000)
     pairs, target = read_pairs(opened, tmp_path, CAMERAS, None)
@@ -97,7 +99,7 @@ def test_frames_are_paired_by_time_whatever_their_counters_say(tmp_path: Path) -
 
 
 def test_frames_that_belong_to_no_other_are_left_out_or_refused(tmp_path: Path) -> None:
-    t, x = walk([1.0], 20, 0)
+    t, x = process_noise([1.0], 20, 0)
     opened = recording(tmp_path / "r", t)
     detections(tmp_path, t, x, 10_000_000_000)
     with pytest.raises(RecordingError, match=r"no frame of 'right' lies within 16\.7 ms"):
@@ -108,7 +110,7 @@ def test_frames_that_belong_to_no_other_are_left_out_or_refused(tmp_path: Path) 
 
 
 def test_the_target_must_be_named_where_there_are_several(tmp_path: Path) -> None:
-    t, x = walk([1.0], 20, 0)
+    t, x = process_noise([1.0], 20, 0)
     opened = recording(tmp_path / "r", t)
     detections(tmp_path, t, x)
     with pytest.raises(CalibrationError, match=r"'nose'.*thumb, index"):
@@ -125,7 +127,7 @@ def test_the_target_must_be_named_where_there_are_several(tmp_path: Path) -> Non
 
 
 def pairs_of(tmp_path: Path, distances: Sequence[float], stand: int, move: int) -> Pairs:
-    t, x = walk(distances, stand, move)
+    t, x = process_noise(distances, stand, move)
     opened = recording(tmp_path / "r", t)
     return read_pairs(opened, detections(tmp_path, t, x), CAMERAS, None)[0]
 
@@ -194,7 +196,7 @@ def test_a_wrong_file_of_distances_is_refused(tmp_path: Path, text: str, words: 
 
 
 def test_a_rendered_recording_brings_its_distances(tmp_path: Path) -> None:
-    t, x = walk([1.0], 3, 0)
+    t, x = process_noise([1.0], 3, 0)
     opened = recording(tmp_path / "r", t)
     pairs, _ = read_pairs(opened, detections(tmp_path, t, x), CAMERAS, None)
     assert by_truth(opened, pairs) is None

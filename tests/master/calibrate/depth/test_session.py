@@ -200,7 +200,7 @@ def test_a_whole_session_over_the_wire(desk: Desk, tmp_path: Path) -> None:
 
     sweep = run_session(
         desk.ingest, CAMERAS, INDEX, STEPS.tolist(), frames=10, seconds=0.2, clock=desk.clock,
-        ask=ask, say=lines.append, progress=lambda share: None, keep=keep,
+        ask=ask, notify=lines.append, progress=lambda share: None, keep=keep,
     )  # fmt: skip
     assert sweep.distance_m.tolist() == [1.0, 0.8, 0.55, 0.5, 0.4, 0.3, 0.25, 0.2]
     assert sweep.disparity_px == pytest.approx(RIG.disparity(sweep.distance_m), abs=0.1)
@@ -216,12 +216,12 @@ def test_skipping_and_ending(desk: Desk) -> None:
     answers = deque(["s", "", "q"])
     sweep = run_session(
         desk.ingest, CAMERAS, INDEX, [0.7, 1.0, 0.5, 0.4], frames=10, seconds=0.2, clock=desk.clock,
-        ask=lambda prompt: answers.popleft(), say=lambda line: None, progress=lambda share: None,
+        ask=lambda prompt: answers.popleft(), notify=lambda line: None, progress=lambda share: None,
         keep=lambda sweep: None,
     )  # fmt: skip
     assert sweep.distance_m.tolist() == [1.0]
     empty = run_session(
         desk.ingest, CAMERAS, INDEX, [1.0], frames=10, seconds=0.2, clock=desk.clock,
-        ask=lambda prompt: None, say=lambda line: None, progress=lambda share: None, keep=lambda sweep: None,
+        ask=lambda prompt: None, notify=lambda line: None, progress=lambda share: None, keep=lambda sweep: None,
     )  # fmt: skip
     assert empty.size == 0

@@ -46,8 +46,12 @@ def test_a_quick_start_from_another_hand_is_mirrored_and_scaled(tmp_path: Path) 
 
 
 def test_a_routine_from_a_file_of_poses(tmp_path: Path, root: Path) -> None:
-    sight = routine(31, "left")
-    poses = {"t_ns": sight.t_ns, "markers_raw_m": sight.points_m, "markers_cov_m2": sight.cov_m2}
+    line_of_sight = routine(31, "left")
+    poses = {
+        "t_ns": line_of_sight.t_ns,
+        "markers_raw_m": line_of_sight.points_m,
+        "markers_cov_m2": line_of_sight.cov_m2,
+    }
     write_npz(tmp_path / "poses.npz", poses)
     calibration = ("--rig", "desk", "--calibration", str(root / "calib_json"))
     given = ("--poses", str(tmp_path / "poses.npz"), "--side", "left", "--name", "ben", *calibration)

@@ -17,7 +17,7 @@ from master.calibrate.hand.motion import hand_from_motion, motion_lines
 from master.calibrate.hand.motion_couplings import Ratio, motion_couplings
 from master.calibrate.hand.palm import find_palm
 from master.mocap.joint_motion import Side
-from tests.master.mocap.moved import LEFT, RIGHT, SHIFT, TURN, hand_at, motion_of, ns, write_table
+from tests.master.mocap.moved import LEFT, RIGHT, ROTATION, SHIFT, hand_at, motion_of, ns, write_table
 
 T_S = np.arange(900) / 30.0
 BASES = tuple(name for name in JOINTS if name.endswith("finger-metacarpal"))
@@ -33,7 +33,7 @@ def run(*options: str) -> str:
 @pytest.mark.parametrize("without", [(), BASES, ("palm", *BASES)])
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_a_hand_comes_back_and_shows_its_side(side: Side, without: tuple[str, ...]) -> None:
-    joints = hand_at(T_S, MODELS[side]).position_m @ TURN.T + SHIFT
+    joints = hand_at(T_S, MODELS[side]).position_m @ ROTATION.T + SHIFT
     hand = hand_from_motion(motion_of(joints, T_S, without), "again")
     assert hand.profile.side == side
     assert not hand.palm.mirrored
@@ -109,7 +109,7 @@ def test_a_short_motion_tells_no_posture() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "kind", "said"),
+    ("change", "kind", "output"),
     [
         ("no tips", RecordingError, "a hand needs thumb-tip, index-finger-tip"),
         ("stiff ring", CalibrationError, "the ring never bends by 5 degrees"),
@@ -119,7 +119,7 @@ def test_a_short_motion_tells_no_posture() -> None:
         ("giant", FitError, "expected 0.1 to 0.25 m"),
     ],
 )
-def test_what_makes_no_hand_is_refused(change: str, kind: type[Exception], said: str) -> None:
+def test_what_makes_no_hand_is_refused(change: str, kind: type[Exception], output: str) -> None:
     joints, without = hand_at(T_S).position_m, tuple[str, ...]()
     if change == "no tips":
         without = tuple(name for name in JOINTS if name.endswith("tip"))
@@ -136,7 +136,7 @@ def test_what_makes_no_hand_is_refused(change: str, kind: type[Exception], said:
         joints = RIGHT.forward(np.tile(np.eye(4), (len(T_S), 1, 1)), angles).position_m
     with pytest.raises(kind) as caught:
         hand_from_motion(motion_of(joints, T_S, without), "again")
-    assert said in str(caught.value)
+    assert output in str(caught.value)
 
 
 def test_a_user_makes_a_hand_file(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import pytest
 from common.errors import FitError
 from common.hand_routine import STEPS
 from common.messages import HandPose, Source
-from master.calibrate.hand.session import Track, lead, unseen
+from master.calibrate.hand.session import Track, guide, unseen
 
 NAMES = ("thumb", "index", "middle", "ring", "little", "back")
 TIPS = (0, 1, 2, 3, 4)
@@ -29,7 +29,7 @@ class Person:
 
     def __init__(self, hidden: tuple[int, ...] = (), first_s: float = 0.0, last_s: float = 0.0) -> None:
         self.t_ns = 0
-        self.said: list[str] = []
+        self.output: list[str] = []
         self._hidden, self._first_s, self._last_s = hidden, first_s, last_s
 
     def now_ns(self) -> int:
@@ -40,14 +40,14 @@ class Person:
         dark = self._first_s <= 1e-9 * self.t_ns < self._last_s
         return pose_at(self.t_ns, self._hidden if dark else ())
 
-    def lead(self) -> Track:
-        return lead(self.receive, TIPS, NAMES, self, self.said.append)
+    def guide(self) -> Track:
+        return guide(self.receive, TIPS, NAMES, self, self.output.append)
 
 
 def test_all_steps_are_told_in_order_and_kept() -> None:
     person = Person()
-    t_ns, points, cov = person.lead().arrays()
-    told = [line for line in person.said if f" of {len(STEPS)}: " in line]
+    t_ns, points, cov = person.guide().arrays()
+    told = [line for line in person.output if f" of {len(STEPS)}: " in line]
     assert [line.split(": ")[0] for line in told] == [
         f"{n} of {len(STEPS)}" for n in range(1, len(STEPS) + 1)
     ]
@@ -58,8 +58,8 @@ def test_all_steps_are_told_in_order_and_kept() -> None:
 
 def test_a_step_that_is_not_seen_is_done_again_and_its_first_try_is_dropped() -> None:
     person, other = Person(hidden=(2,), first_s=6.0, last_s=11.0), Person()
-    track, whole = person.lead(), other.lead()
-    assert any("middle in" in line and "this step again" in line for line in person.said)
+    track, whole = person.guide(), other.guide()
+    assert any("middle in" in line and "this step again" in line for line in person.output)
     assert person.t_ns > other.t_ns + 5e9
     assert np.isfinite(track.arrays()[1]).mean() > 0.97
     assert abs((track.t_ns[-1] - track.t_ns[0]) - (whole.t_ns[-1] - whole.t_ns[0])) < 1e9
@@ -75,5 +75,5 @@ def test_a_finger_that_has_nothing_to_do_may_be_hidden() -> None:
 def test_a_master_that_is_silent_or_blind_ends_it() -> None:
     person = Person(hidden=(1,), first_s=0.0, last_s=99.0)
     with pytest.raises(FitError, match="not seen in 3 tries"):
-        person.lead()
+        person.guide()
     assert "no pose came" in unseen(STEPS[0], 0, [], TIPS, NAMES)

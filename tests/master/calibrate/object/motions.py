@@ -31,13 +31,13 @@ def body(places_m: np.ndarray = PLACES_M, names: tuple[str, ...] = BEADS) -> Obj
     return ObjectProfile(version=1, name="body", markers=beads)
 
 
-def messages(seed: int, seconds: float = 5.0, turn_rad_s: float = 2.0) -> list[MarkerDetections]:
+def messages(seed: int, seconds: float = 5.0, rotation_rad_s: float = 2.0) -> list[MarkerDetections]:
     """What the cameras say of the body on its way, by stamps."""
-    where = wander(seed, MIDDLE_M, 0.25, turn_rad_s)
+    where = wander(seed, MIDDLE_M, 0.25, rotation_rad_s)
     told = detections(body(), RIG.markers, MODELS, where, seconds, seed, noise=NOISE)
     return [message for message in told if isinstance(message, MarkerDetections)]
 
 
-def seen(seed: int, seconds: float = 5.0, turn_rad_s: float = 2.0) -> Seen:
+def seen(seed: int, seconds: float = 5.0, rotation_rad_s: float = 2.0) -> Seen:
     """The same, placed."""
-    return seen_by(RIG, MODELS, RATES, messages(seed, seconds, turn_rad_s), BEADS)
+    return seen_by(RIG, MODELS, RATES, messages(seed, seconds, rotation_rad_s), BEADS)

@@ -50,8 +50,8 @@ def test_four_beads_of_which_one_is_missing_most_of_the_time() -> None:
     """Truth by hand: a body whose pose is known, each bead missing in its turn, then none."""
     rng = np.random.default_rng(6)
     places = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.05, 0.05, 0.08]])
-    turns = rotation_vector_to_matrix(rng.normal(0.0, 0.6, (200, 3)))
-    points = np.einsum("tij,bj->tbi", turns, places) + rng.normal(0.0, 0.1, (200, 1, 3))
+    rotations = rotation_vector_to_matrix(rng.normal(0.0, 0.6, (200, 3)))
+    points = np.einsum("tij,bj->tbi", rotations, places) + rng.normal(0.0, 0.1, (200, 1, 3))
     points += rng.normal(0.0, 3e-4, points.shape)
     lost = np.arange(200) % 5
     points[np.flatnonzero(lost < 4), lost[lost < 4]] = np.nan
@@ -112,8 +112,8 @@ def test_no_pose_is_nothing_seen() -> None:
 
 
 def test_own_frame_is_as_documented() -> None:
-    turned = rigid(rotation_vector_to_matrix(np.array([0.4, -1.0, 0.3])), np.array([0.2, 0.1, 0.5]))
-    own = transform(own_frame(transform(turned, PLACES_M), BEADS), transform(turned, PLACES_M))
+    rotated = rigid(rotation_vector_to_matrix(np.array([0.4, -1.0, 0.3])), np.array([0.2, 0.1, 0.5]))
+    own = transform(own_frame(transform(rotated, PLACES_M), BEADS), transform(rotated, PLACES_M))
     np.testing.assert_allclose(own.mean(axis=0), 0.0, atol=1e-12)
     np.testing.assert_allclose((own[1] - own[0])[1:], 0.0, atol=1e-12)
     assert own[1, 0] > own[0, 0]
@@ -122,9 +122,9 @@ def test_own_frame_is_as_documented() -> None:
 
 
 def test_the_frame_of_a_file_is_kept_or_refused() -> None:
-    turned = rigid(rotation_vector_to_matrix(np.array([0.4, -1.0, 0.3])), np.array([0.2, 0.1, 0.5]))
-    T, misses = frame_of(transform(turned, PLACES_M), BEADS, body(), "body.json")
-    np.testing.assert_allclose(T @ turned, np.eye(4), atol=1e-9)
+    rotated = rigid(rotation_vector_to_matrix(np.array([0.4, -1.0, 0.3])), np.array([0.2, 0.1, 0.5]))
+    T, misses = frame_of(transform(rotated, PLACES_M), BEADS, body(), "body.json")
+    np.testing.assert_allclose(T @ rotated, np.eye(4), atol=1e-9)
     assert max(misses.values()) < 1e-9
     with pytest.raises(FitError, match=r"body.json: wand. lies .* mm from where the file has it"):
         frame_of(PLACES_M[[1, 0, 2]], BEADS, body(), "body.json")

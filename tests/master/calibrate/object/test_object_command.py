@@ -17,7 +17,7 @@ from common.object_profile import ObjectProfile
 from common.sim.record import record_scene
 from common.sim.scenes import scene_by_name
 from master.__main__ import main
-from master.calibrate.object.session import lead, progress
+from master.calibrate.object.session import guide, progress
 from master.objects.line import ObjectLine
 from master.recorded import recorded_detections
 from master.rig import load_setup
@@ -77,8 +77,8 @@ def shown(recorded: Path, tree: Path) -> tuple[object, ...]:
 
 def test_rendered_beads_are_measured_and_the_file_tracks(run: Run, recorded: Path, tree: Path) -> None:
     beads = ("--markers", ",".join(BEADS), "--radius-mm", 9, "--add-to-rig")
-    beside = ("--json", tree / "told.json", "--picture", tree / "wand.png")
-    assert run(*shown(recorded, tree), *beads, *beside) == 0
+    outputs = ("--json", tree / "told.json", "--picture", tree / "wand.png")
+    assert run(*shown(recorded, tree), *beads, *outputs) == 0
     profile = load(tree / "objects" / "wand.json", ObjectProfile)
     places = np.array([profile.markers[name].position_m for name in BEADS])
     T_true_own = fit_rigid(TRUE_M, places)
@@ -160,10 +160,10 @@ class Clock:
 
 
 def test_a_person_is_told_that_nothing_comes() -> None:
-    said: list[str] = []
+    output: list[str] = []
     with pytest.raises(Exception, match="no pose came"):
-        lead(lambda wait_s: None, RIG, BEADS, Clock(), said.append, 3.0)
-    assert any("phalanx-master run" in line for line in said[1:])
+        guide(lambda wait_s: None, RIG, BEADS, Clock(), output.append, 3.0)
+    assert any("phalanx-master run" in line for line in output[1:])
 
 
 def test_progress_counts_ways_of_turning_and_names_what_is_not_seen() -> None:
@@ -181,7 +181,7 @@ def test_markers_of_poses_are_what_is_measured() -> None:
     """A session of poses as a master publishes them is what was placed from the detections."""
     motion = seen(5, 1.5)
     poses = iter([*map(_pose, range(len(motion.t_s)), motion.t_s, motion.points_m, motion.cov_m2)])
-    found = lead(lambda wait_s: next(poses, None), RIG, BEADS, Clock(), lambda line: None, 4.0)
+    found = guide(lambda wait_s: next(poses, None), RIG, BEADS, Clock(), lambda line: None, 4.0)
     np.testing.assert_array_equal(found.points_m, motion.points_m)
 
 

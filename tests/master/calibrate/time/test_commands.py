@@ -99,7 +99,7 @@ def test_the_rig_file_gets_the_offset_with_its_source_and_keeps_the_rest(tmp_pat
     found = write_recording(tmp_path / "swing", messages_of(scenes.natural(2), 8.0))
     out = tmp_path / "calib"
     (out / "rigs").mkdir(parents=True)
-    before = rig_file(pairing="predict", stamp_offset_us={"right": 3.0})
+    before = rig_file(frame_sync="predict", stamp_offset_us={"right": 3.0})
     save(out / "rigs" / "bench.json", before)
     numbers = tmp_path / "time.json"
     code, text = run(tmp_path / "swing", "--detections", found, "--out", out, "--json", numbers)

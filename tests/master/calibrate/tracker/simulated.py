@@ -29,7 +29,7 @@ class Motion:
     Attributes:
         seed: Of all that is drawn.
         seconds: How long.
-        turns: How far it is turned about each of its axes, 1: some 60 degrees to both sides.
+        rotations: How far it is turned about each of its axes, 1: some 60 degrees to both sides.
         way_m: How far it is carried to each side.
         pace: How fast, 1: to and fro in some two seconds.
         late_s: How much later the tracker's poses hold than they say.
@@ -40,7 +40,7 @@ class Motion:
 
     seed: int
     seconds: float = 20.0
-    turns: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    rotations: tuple[float, float, float] = (1.0, 1.0, 1.0)
     way_m: float = 0.12
     pace: float = 1.0
     late_s: float = 0.023
@@ -52,8 +52,8 @@ class Motion:
 
     def __post_init__(self) -> None:
         rng = np.random.default_rng([self.seed, 1])
-        turn, other = rotation_vector_to_matrix(2.0 * rng.normal(size=(2, 3)))
-        object.__setattr__(self, "X", rigid(turn, rng.normal(size=3)))
+        rotation, other = rotation_vector_to_matrix(2.0 * rng.normal(size=(2, 3)))
+        object.__setattr__(self, "X", rigid(rotation, rng.normal(size=3)))
         object.__setattr__(self, "Y", rigid(other, 0.06 * rng.normal(size=3)))
 
     def truth(self, t_s: Float) -> tuple[Float, Float]:
@@ -64,8 +64,8 @@ class Motion:
         size /= size.sum(axis=1, keepdims=True)
         waves = (size * np.sin(2.0 * np.pi * rate * t_s[:, None, None] + phase)).sum(axis=-1)
         mean = rotation_vector_to_matrix(np.array([0.4, -2.1, 0.3]))
-        turned = mean @ rotation_vector_to_matrix(1.6 * np.array(self.turns) * waves[:, 3:])
-        return turned, MIDDLE + 1.6 * self.way_m * waves[:, :3]
+        rotated = mean @ rotation_vector_to_matrix(1.6 * np.array(self.rotations) * waves[:, 3:])
+        return rotated, MIDDLE + 1.6 * self.way_m * waves[:, :3]
 
     def objects(self) -> list[ObjectPose]:
         """What cameras made of it, at 60 Hz, with honest covariances."""
@@ -105,8 +105,8 @@ class Motion:
     def device(self, R: Float, p: Float) -> tuple[Float, Float]:
         """Where the device is in its system's frame when the object is at (R, p) in the rig: inv(X) A Y."""
         back = np.linalg.inv(self.X)
-        turn = back[:3, :3] @ R @ self.Y[:3, :3]
-        return turn, (R @ self.Y[:3, 3] + p) @ back[:3, :3].T + back[:3, 3]
+        rotation = back[:3, :3] @ R @ self.Y[:3, :3]
+        return rotation, (R @ self.Y[:3, 3] + p) @ back[:3, :3].T + back[:3, 3]
 
 
 def errors_of(motion: Motion, placed: Placed, seed: int = 5) -> tuple[float, float]:
@@ -122,8 +122,8 @@ def errors_of(motion: Motion, placed: Placed, seed: int = 5) -> tuple[float, flo
     p = MIDDLE + rng.uniform(-0.12, 0.12, (200, 3))
     RB, pB = motion.device(R, p)
     X, Y = placed.T_rig_tracking, placed.T_object_tracker
-    turn = X[:3, :3] @ RB @ Y[:3, :3].T
-    place = pB @ X[:3, :3].T + X[:3, 3] - turn @ Y[:3, 3]
-    off = np.linalg.norm(matrix_to_rotation_vector(turn @ R.swapaxes(1, 2)), axis=1)
+    rotation = X[:3, :3] @ RB @ Y[:3, :3].T
+    place = pB @ X[:3, :3].T + X[:3, 3] - rotation @ Y[:3, 3]
+    off = np.linalg.norm(matrix_to_rotation_vector(rotation @ R.swapaxes(1, 2)), axis=1)
     far = np.linalg.norm(place - p, axis=1)
     return 1e3 * float(np.sqrt(np.mean(far**2))), float(np.degrees(np.sqrt(np.mean(off**2))))

@@ -19,7 +19,7 @@ from common.object_profile import ObjectProfile
 from master.__main__ import main
 from master.calibrate.tracker.coverage import coverage_of
 from master.calibrate.tracker.save import read_motion, write_motion
-from master.calibrate.tracker.session import lead
+from master.calibrate.tracker.session import guide
 from master.calibrate.tracker.tracks import object_track, tracker_track
 from master.objects.tracker import TrackerLine
 from master.outputs.devices import DevicePoses
@@ -83,8 +83,8 @@ def test_from_a_kept_motion_to_files_that_the_line_takes(
         )
         == 0
     )
-    said = capsys.readouterr().out
-    assert "an object's pose by the tracker is then known to" in said
+    output = capsys.readouterr().out
+    assert "an object's pose by the tracker is then known to" in output
     assert picture.read_bytes().startswith(b"\x89PNG")
     rig = load(tree / "rigs" / "desk-cube.json", RigCalibration)
     cube = load(tree / "objects" / "cube.json", ObjectProfile)
@@ -94,7 +94,9 @@ def test_from_a_kept_motion_to_files_that_the_line_takes(
     assert cube.tags is not None
     for file in (rig.provenance["T_rig_tracking"], cube.provenance["T_object_tracker"]):
         assert (file.tool, file.data) == ("calibrate tracker", ("motion.npz",))
-        assert {"position_mm", "turn_deg", "position_sigma_mm", "turn_sigma_deg"} <= set(file.residual)
+        assert {"position_mm", "rotation_deg", "position_sigma_mm", "rotation_sigma_deg"} <= set(
+            file.residual
+        )
     numbers = json.loads(told.read_text())
     assert numbers["late_ms"] == pytest.approx(1e3 * motion.late_s, abs=2.0)
     [solved] = TrackerLine(cube, rig).push(motion.tracked()[300])
@@ -106,7 +108,7 @@ def test_what_it_needs_is_said(
     run: Run, tree: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     motion = tmp_path / "motion.npz"
-    poor = Motion(1, turns=(1.0, 0.0, 0.0))
+    poor = Motion(1, rotations=(1.0, 0.0, 0.0))
     write_motion(motion, poor.objects(), poor.tracked())
     before = (tree / "rigs" / "desk-cube.json").read_bytes()
     cube = load(tree / "objects" / "cube.json", ObjectProfile)
@@ -173,8 +175,8 @@ def test_coverage_tells_which_axis_and_what_else_is_missing() -> None:
         return found.missing
 
     assert of(Motion(7, strays=0.0)) == ()
-    [turn] = of(Motion(7, strays=0.0, turns=(1.0, 1.0, 0.1)))
-    assert "about its z axis as well" in turn
+    [rotation] = of(Motion(7, strays=0.0, rotations=(1.0, 1.0, 0.1)))
+    assert "about its z axis as well" in rotation
     assert any("hand's width" in line for line in of(Motion(7, strays=0.0, way_m=0.02)))
     assert any("together for 8 s" in line for line in of(Motion(7, seconds=4.0)))
     assert any("faster" in line for line in of(Motion(7, strays=0.0, pace=0.02)))
@@ -207,19 +209,19 @@ def played(
 
 
 def test_the_guided_motion_ends_by_itself_and_says_what_is_missing_until_then() -> None:
-    motion, clock, said = Motion(9, seconds=40.0), Clock(), list[str]()
+    motion, clock, output = Motion(9, seconds=40.0), Clock(), list[str]()
     held = replace(motion.objects()[0], tracked=False, source=ObjectSource.HELD)
-    session = lead(played([held, *motion.objects(), *motion.tracked()], clock), clock, said.append, 60.0)
+    session = guide(played([held, *motion.objects(), *motion.tracked()], clock), clock, output.append, 60.0)
     assert 15.0 < 1e-9 * (clock.t_ns - ZERO_NS) < 30.0
-    assert "as well" in " ".join(said[1:4])
-    assert said[-1].startswith("100 %")
-    assert said[-1].endswith("done")
+    assert "as well" in " ".join(output[1:4])
+    assert output[-1].startswith("100 %")
+    assert output[-1].endswith("done")
     assert all(one.tracked for one in session.objects)
-    assert said[0].startswith("hold the object")
+    assert output[0].startswith("hold the object")
 
 
 @pytest.mark.parametrize(
-    ("left_out", "text"),
+    ("rejected", "text"),
     [
         ("tracker", "no tracker is heard"),
         ("object", "the cameras do not see the object"),
@@ -227,16 +229,16 @@ def test_the_guided_motion_ends_by_itself_and_says_what_is_missing_until_then() 
         ("both", "no tracker is heard"),
     ],
 )
-def test_who_is_silent_is_said(left_out: str, text: str) -> None:
-    motion, clock, said = Motion(9, seconds=8.0), Clock(), list[str]()
+def test_who_is_silent_is_said(rejected: str, text: str) -> None:
+    motion, clock, output = Motion(9, seconds=8.0), Clock(), list[str]()
     nowhere = [replace(one, position_m=np.full(3, np.nan)) for one in motion.tracked()]
-    messages: list[ObjectPose | TrackerPose] = [] if left_out in ("object", "both") else [*motion.objects()]
-    messages += {"tracker": [], "both": [], "place": nowhere}.get(left_out, motion.tracked())
+    messages: list[ObjectPose | TrackerPose] = [] if rejected in ("object", "both") else [*motion.objects()]
+    messages += {"tracker": [], "both": [], "place": nowhere}.get(rejected, motion.tracked())
     try:
-        lead(played(messages, clock), clock, said.append, 7.0)
+        guide(played(messages, clock), clock, output.append, 7.0)
     except FitError as error:
-        said.append(str(error))
-    assert any(text in line for line in said)
+        output.append(str(error))
+    assert any(text in line for line in output)
 
 
 def test_what_a_tracker_says_goes_on_the_bus_as_it_came() -> None:
@@ -248,13 +250,13 @@ def test_what_a_tracker_says_goes_on_the_bus_as_it_came() -> None:
             return self.messages.pop(0) if self.messages else None
 
     bus = LoopbackBus()
-    heard = bus.subscribe("device", "tracker")
+    received = bus.subscribe("device", "tracker")
     passing = DevicePoses(Source(), bus)
     taken = [passing.get(0.0) for _ in range(5)]
     assert taken[3:] == ["a frame", None]
     for was in taken[:3]:
-        came = heard.get(0.1)
+        came = received.get(0.1)
         assert isinstance(was, TrackerPose)
         assert isinstance(came, TrackerPose)
         assert came.t_ns == was.t_ns
-    assert heard.get(0.0) is None
+    assert received.get(0.0) is None

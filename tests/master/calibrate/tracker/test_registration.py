@@ -27,8 +27,8 @@ def test_closed_form_of_three_poses_by_hand() -> None:
     # The device sits 10 cm along the object's x; the system's frame is the rig's, a quarter turned about z, 1 m aside.
     X = rigid(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 0, 0]))
     Y = rigid(np.eye(3), np.array([0.1, 0, 0]))
-    turns = rotation_vector_to_matrix(np.array([[0.0, 0, 0], [0.9, 0, 0], [0, 0.8, 0], [0, 0, 0.7]]))
-    A = [rigid(R, np.array([0.0, 0.1 * k, 0.5])) for k, R in enumerate(turns)]
+    rotations = rotation_vector_to_matrix(np.array([[0.0, 0, 0], [0.9, 0, 0], [0, 0.8, 0], [0, 0, 0.7]]))
+    A = [rigid(R, np.array([0.0, 0.1 * k, 0.5])) for k, R in enumerate(rotations)]
     B = [np.linalg.inv(X) @ one @ Y for one in A]
     np.testing.assert_allclose(B[0][:3, 3], [0.0, 0.9, 0.5], atol=1e-12)  # inv(X): x - 1, then a quarter back
     RA, pA = np.array([one[:3, :3] for one in A]), np.array([one[:3, 3] for one in A])
@@ -39,7 +39,7 @@ def test_closed_form_of_three_poses_by_hand() -> None:
 
 
 def test_over_seeds_it_is_right_and_as_sure_as_it_is_right() -> None:
-    millimetres, degrees, late_ms, place_sigmas, turn_sigmas = ([] for _ in range(5))
+    millimetres, degrees, late_ms, place_sigmas, rotation_sigmas = ([] for _ in range(5))
     for seed in range(8):
         motion = Motion(seed, late_s=0.06 * np.sin(5.0 * seed))
         found = register(motion.objects(), motion.tracked())
@@ -48,12 +48,12 @@ def test_over_seeds_it_is_right_and_as_sure_as_it_is_right() -> None:
         degrees.append(deg)
         late_ms.append(1e3 * (found.fit.placed.late_s - motion.late_s) / found.figures["late_sigma_ms"])
         place_sigmas.append(mm / found.figures["position_sigma_mm"])
-        turn_sigmas.append(deg / found.figures["turn_sigma_deg"])
+        rotation_sigmas.append(deg / found.figures["rotation_sigma_deg"])
         assert 0.03 < found.figures["strays"] < 0.1
         assert 1.5 < found.figures["position_mm"] < 3.5  # the cameras' noise, nothing else
     assert max(millimetres) < 1.5
     assert max(degrees) < 0.25
-    for ratios in (place_sigmas, turn_sigmas):
+    for ratios in (place_sigmas, rotation_sigmas):
         assert 0.3 < float(np.median(ratios)) < 1.5
         assert max(ratios) < 3.0
     assert np.abs(late_ms).max() < 4.0
@@ -83,8 +83,11 @@ def test_what_was_held_or_told_by_a_tracker_does_not_count() -> None:
 @pytest.mark.parametrize(
     ("motion", "text"),
     [
-        (Motion(1, turns=(1.0, 0.0, 0.0)), r"poses would be known to .*about its y and its z axis as well"),
-        (Motion(1, turns=(0.02, 0.02, 0.02)), "axis as well"),
+        (
+            Motion(1, rotations=(1.0, 0.0, 0.0)),
+            r"poses would be known to .*about its y and its z axis as well",
+        ),
+        (Motion(1, rotations=(0.02, 0.02, 0.02)), "axis as well"),
         (Motion(1, seconds=0.8), "at least 60 of each are needed"),
         (Motion(1, lost_s=6.0), "the tracker 0; at least 60"),
         (Motion(1, late_s=1.7), "hardly saw|no registration explains"),
@@ -112,8 +115,8 @@ def test_the_other_systems_frame_is_found_as_well() -> None:
     other = rigid(rotation_vector_to_matrix(np.array([np.pi / 2, 0.0, 0.0])), np.array([0.3, -1.0, 2.0]))
     placed = register(motion.objects(), motion.tracked()).fit.placed
     object.__setattr__(motion, "X", motion.X @ np.linalg.inv(other))
-    turned = register(motion.objects(), motion.tracked()).fit.placed
-    same = Placed(turned.T_rig_tracking @ other, turned.T_object_tracker, turned.late_s)
+    rotated = register(motion.objects(), motion.tracked()).fit.placed
+    same = Placed(rotated.T_rig_tracking @ other, rotated.T_object_tracker, rotated.late_s)
     np.testing.assert_allclose(same.T_rig_tracking, placed.T_rig_tracking, atol=2e-3)
     np.testing.assert_allclose(same.T_object_tracker, placed.T_object_tracker, atol=2e-3)
 

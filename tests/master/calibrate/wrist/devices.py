@@ -10,7 +10,7 @@ from common.calibration import CameraCalibration, RigCalibration, load
 from common.camera_model import CameraModel
 from common.frame_recording import Illumination
 from common.geometry import rotation_vector_to_matrix
-from common.sim.wrist_board import KINDS, WristBoardRenderer, WristBoardScene, board_poses
+from common.sim.wrist_board import ILLUMINATIONS, WristBoardRenderer, WristBoardScene, board_poses
 from common.wrist_calibration import LaserPlane
 from master.calibrate.cameras.boards import Checkerboard
 from master.calibrate.wrist.lit_views import LitView
@@ -43,10 +43,10 @@ def scene_of(seed: int, views: int, *, anywhere: bool = False) -> WristBoardScen
 
 
 @cache
-def triples_of(seed: int, views: int) -> tuple[dict[Illumination, Image], ...]:
+def cycles_of(seed: int, views: int) -> tuple[dict[Illumination, Image], ...]:
     """The rendered triples of such a scene."""
     renderer = WristBoardRenderer(scene_of(seed, views))
-    return tuple({lit: renderer.render(pose, lit) for lit in KINDS} for pose in range(views))
+    return tuple({lit: renderer.render(pose, lit) for lit in ILLUMINATIONS} for pose in range(views))
 
 
 def view_of(name: str, frames: dict[Illumination, Image]) -> LitView:

@@ -20,7 +20,7 @@ from common.sim.wrist.scene import WristScene
 from common.sim.wrist_board import WristBoardScene, record_wrist_board
 from master.calibrate.cameras.boards import Checkerboard
 from master.calibrate.cli import calibrate_app
-from master.calibrate.wrist.palm_board import Mounting
+from master.calibrate.wrist.palm_board import BoardOffset
 from master.wrist_setup import WristSetup
 from tests.conftest import ROOT
 from tests.master.calibrate.wrist.devices import CAMERA, RIG, angle_deg, plane_of, scene_of
@@ -81,7 +81,7 @@ def rig_of(tree: Path) -> RigCalibration:
 def test_a_recording_gives_the_plane_that_the_master_then_uses(
     tree: Path, boards: Path, tmp_path: Path
 ) -> None:
-    said = run(
+    output = run(
         "laser-plane", boards, *BOARD, "--rig", "wrist", "--calibration", tree, "--out", tree,
         "--json", tmp_path / "plane.json", "--picture", tmp_path / "plane.png",
     )  # fmt: skip
@@ -93,8 +93,8 @@ def test_a_recording_gives_the_plane_that_the_master_then_uses(
     assert (how.tool, how.data) == ("calibrate laser-plane", ("boards",))
     assert {"rms_mm", "normal_sigma_deg", "offset_sigma_mm"} == how.residual.keys()
     assert rig.T_camera_palm == RIG.T_camera_palm
-    assert "± " in said
-    assert "wrote" in said
+    assert "± " in output
+    assert "wrote" in output
     numbers = json.loads((tmp_path / "plane.json").read_text())
     assert np.array(numbers["covariance_normal_offset_m"]).shape == (4, 4)
     assert cv2.imread(str(tmp_path / "plane.png")) is not None
@@ -117,15 +117,15 @@ def test_images_by_name_give_the_same_plane(tree: Path, boards: Path, tmp_path: 
 def test_intrinsics_of_the_wrist_camera_from_the_same_recording(
     tree: Path, boards: Path, tmp_path: Path
 ) -> None:
-    said = run("intrinsics", boards, *BOARD, "--calibration", tree, "--out", tmp_path)
+    output = run("intrinsics", boards, *BOARD, "--calibration", tree, "--out", tmp_path)
     lens = load(tmp_path / "cameras" / "wrist.json", CameraCalibration)
     assert lens.intrinsics is not None
     assert CAMERA.intrinsics is not None
     assert lens.intrinsics.fx_px == pytest.approx(CAMERA.intrinsics.fx_px, rel=0.01)
     assert lens.provenance["intrinsics"].residual["rms_px"] < 0.2
-    assert "rms" in said
+    assert "rms" in output
     # One frame of each triple, not all three: nothing with the laser's line across the corners.
-    assert "of 7 images" in said or "wrist: 7 images" in said
+    assert "of 7 images" in output or "wrist: 7 images" in output
 
 
 def test_the_flat_field_names_the_corner_that_was_not_shown(tree: Path, boards: Path) -> None:
@@ -135,8 +135,8 @@ def test_the_flat_field_names_the_corner_that_was_not_shown(tree: Path, boards: 
 
 def test_the_flat_field_of_a_board_shown_everywhere(tree: Path, tmp_path: Path) -> None:
     scene = scene_of(31, 24, anywhere=True)
-    record_wrist_board(tmp_path / "white", scene, kinds=(Illumination.AMBIENT, Illumination.LED))
-    said = run(
+    record_wrist_board(tmp_path / "white", scene, illuminations=(Illumination.AMBIENT, Illumination.LED))
+    output = run(
         "flat-field", tmp_path / "white", *BOARD, "--rig", "wrist", "--calibration", tree, "--out", tree,
         "--picture", tmp_path / "flat.png",
     )  # fmt: skip
@@ -144,18 +144,20 @@ def test_the_flat_field_of_a_board_shown_everywhere(tree: Path, tmp_path: Path) 
     assert rig.flat_field is not None
     assert rig.flat_field.coefficients[0] == 1.0
     assert rig.provenance["flat_field"].residual["foretold_rms_percent"] < 4.0
-    assert "residual" in said
+    assert "residual" in output
     assert cv2.imread(str(tmp_path / "flat.png")) is not None
 
 
 def test_the_palm_from_a_board_that_lies_on_it(tree: Path, tmp_path: Path) -> None:
     board = Checkerboard(7, 4, 0.010)
-    T = np.array(RIG.T_camera_palm) @ Mounting(0.085, 0.004, 0.022, 1.0).T_palm_board(board)
+    T = np.array(RIG.T_camera_palm) @ BoardOffset(0.085, 0.004, 0.022, 1.0).T_palm_board(board)
     scene = WristBoardScene(RIG, CAMERA, 7, 4, 0.010, np.stack([T, T]))
-    record_wrist_board(tmp_path / "palm", scene, kinds=(Illumination.AMBIENT, Illumination.LED))
-    said = run("palm", tmp_path / "palm", *PALM_BOARD, "--rig", "wrist", "--calibration", tree, "--out", tree)
+    record_wrist_board(tmp_path / "palm", scene, illuminations=(Illumination.AMBIENT, Illumination.LED))
+    output = run(
+        "palm", tmp_path / "palm", *PALM_BOARD, "--rig", "wrist", "--calibration", tree, "--out", tree
+    )
     np.testing.assert_allclose(np.array(rig_of(tree).T_camera_palm), np.array(RIG.T_camera_palm), atol=2e-3)
-    assert "mm above the wrist joint" in said
+    assert "mm above the wrist joint" in output
     assert rig_of(tree).provenance["T_camera_palm"].tool == "calibrate palm"
 
 
@@ -184,15 +186,17 @@ def test_without_out_nothing_is_written(tree: Path, curled: Path) -> None:
 
 
 def test_a_curl_gives_the_lines_of_the_fingers_that_moved(tree: Path, curled: Path, tmp_path: Path) -> None:
-    said = run("curl", curled, "--detections", curled, "--out", tmp_path, "--picture", tmp_path / "curl.png")
+    output = run(
+        "curl", curled, "--detections", curled, "--out", tmp_path, "--picture", tmp_path / "curl.png"
+    )
     rig = rig_of(tmp_path)
     assert set(rig.finger_lines) == {"thumb", "index", "middle", "ring"}
     for line in rig.finger_lines.values():
         assert line.range_m[1] > 0.015
         assert line.residual_m < 1.5e-3
     assert "not measured: little" in rig.provenance["finger_lines"].note
-    assert "little" in said
-    assert "0 points, at least 20 are needed" in said
+    assert "little" in output
+    assert "0 points, at least 20 are needed" in output
     assert cv2.imread(str(tmp_path / "curl.png")) is not None
     # The master takes the file as it is.
     model = HandModel.of(load(tree / "hands/default-right.json", HandProfile))
@@ -250,7 +254,7 @@ def test_broken_recordings_say_what_is_wrong(
             "expected a rig of kind 'wrist'",
         ),
         (
-            ("wearer", "nowhere", "--detections", "x", "--rig", "wrist"),
+            ("subject", "nowhere", "--detections", "x", "--rig", "wrist"),
             RecordingError,
             "phalanx-slave detect",
         ),

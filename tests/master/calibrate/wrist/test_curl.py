@@ -15,10 +15,10 @@ WAY = WAY / np.linalg.norm(WAY, axis=1, keepdims=True)
 LENGTH = np.array([0.025, 0.07, 0.08, 0.085, 0.07])
 
 
-def curl(noise: float = 3e-4, triples: int = 120, seed: int = 0) -> Float:
+def curl(noise: float = 3e-4, cycles: int = 120, seed: int = 0) -> Float:
     """Laser points (T, 5, 3) [m] of a slow curl there and back."""
     rng = np.random.default_rng(seed)
-    share = 0.5 - 0.5 * np.cos(np.linspace(0.0, 2.0 * np.pi, triples))
+    share = 0.5 - 0.5 * np.cos(np.linspace(0.0, 2.0 * np.pi, cycles))
     points = START + share[:, None, None] * (LENGTH[:, None] * WAY)
     return points + noise * rng.standard_normal(points.shape) * np.array([1.0, 0.0, 1.0])
 
@@ -60,7 +60,7 @@ def test_a_finger_seen_in_one_place_only_rested() -> None:
     assert "moved by 0.0 mm" in fit_curls(points)[2].reason
 
 
-@pytest.mark.parametrize("triples", [0, 1, 30])
-def test_nothing_seen_is_refused_with_the_reason_of_each(triples: int) -> None:
+@pytest.mark.parametrize("cycles", [0, 1, 30])
+def test_nothing_seen_is_refused_with_the_reason_of_each(cycles: int) -> None:
     with pytest.raises(FitError, match=r"no finger curled .* thumb: 0 points.* little: 0 points"):
-        fit_curls(np.full((triples, 5, 3), np.nan))
+        fit_curls(np.full((cycles, 5, 3), np.nan))

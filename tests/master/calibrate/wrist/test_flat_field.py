@@ -9,12 +9,12 @@ from common.flat_field import field_at, terms_of
 from common.frame_recording import Illumination
 from common.sim.wrist_board import LED_LOBE, LENS_POWER, WristBoardRenderer
 from common.wrist_calibration import FLAT_FIELD_TERMS
+from master.calibrate.wrist.board_pose import board_pose
 from master.calibrate.wrist.flat_field import (
     WhiteSamples,
     fit_flat_field,
     white_samples,
 )
-from master.calibrate.wrist.placed import placed_board
 from tests.master.calibrate.wrist.devices import BOARD, OPTICS, scene_of, view_of
 
 AMBIENT, LED = Illumination.AMBIENT, Illumination.LED
@@ -109,7 +109,7 @@ def test_rendered_white_squares_have_the_light_of_the_law() -> None:
     for pose in range(6):
         frames = {lit: renderer.render(pose, lit) for lit in (AMBIENT, LED)}
         try:
-            placed = placed_board(view_of("0", frames), BOARD, OPTICS)
+            placed = board_pose(view_of("0", frames), BOARD, OPTICS)
             xy, _, light = white_samples(frames[LED], frames[AMBIENT], placed, BOARD, OPTICS, leds)
         except FitError:
             continue
@@ -121,7 +121,7 @@ def test_rendered_white_squares_have_the_light_of_the_law() -> None:
 def test_saturated_and_dark_boards_say_what_to_do() -> None:
     renderer = WristBoardRenderer(scene_of(21, 1, anywhere=True))
     frames = {lit: renderer.render(0, lit) for lit in (AMBIENT, LED)}
-    placed = placed_board(view_of("0", frames), BOARD, OPTICS)
+    placed = board_pose(view_of("0", frames), BOARD, OPTICS)
     white = np.full_like(frames[LED], 255)
     leds = np.zeros((1, 3))
     with pytest.raises(FitError, match="hold the board farther away"):

@@ -7,20 +7,20 @@ import pytest
 from common.arrays import Image
 from common.errors import FitError
 from common.frame_recording import Illumination
+from master.calibrate.wrist.board_pose import BoardPose, board_pose
 from master.calibrate.wrist.line import line_on_board
-from master.calibrate.wrist.placed import PlacedBoard, placed_board
-from tests.master.calibrate.wrist.devices import BOARD, OPTICS, plane_of, scene_of, triples_of, view_of
+from tests.master.calibrate.wrist.devices import BOARD, OPTICS, cycles_of, plane_of, scene_of, view_of
 
 SEED, VIEWS = 11, 6
 AMBIENT, LASER, LED = Illumination.AMBIENT, Illumination.LASER, Illumination.LED
 
 
-def first() -> tuple[dict[Illumination, Image], PlacedBoard]:
-    frames = triples_of(SEED, VIEWS)[0]
-    return dict(frames), placed_board(view_of("0", frames), BOARD, OPTICS)
+def first() -> tuple[dict[Illumination, Image], BoardPose]:
+    frames = cycles_of(SEED, VIEWS)[0]
+    return dict(frames), board_pose(view_of("0", frames), BOARD, OPTICS)
 
 
-def off_plane_mm(laser: Image, ambient: Image, placed: PlacedBoard) -> float:
+def off_plane_mm(laser: Image, ambient: Image, placed: BoardPose) -> float:
     """Largest distance of a point from the true plane."""
     plane = plane_of(SEED)
     points = line_on_board(laser, ambient, placed, BOARD, OPTICS).points_m
@@ -30,8 +30,8 @@ def off_plane_mm(laser: Image, ambient: Image, placed: PlacedBoard) -> float:
 def test_the_board_is_where_it_was_rendered() -> None:
     _, placed = first()
     true = scene_of(SEED, VIEWS).poses[0]
-    turned = np.degrees(np.arccos((np.trace(placed.T_camera_board[:3, :3].T @ true[:3, :3]) - 1.0) / 2.0))
-    assert turned < 0.2
+    rotated = np.degrees(np.arccos((np.trace(placed.T_camera_board[:3, :3].T @ true[:3, :3]) - 1.0) / 2.0))
+    assert rotated < 0.2
     assert 1e3 * np.linalg.norm(placed.T_camera_board[:3, 3] - true[:3, 3]) < 0.3
     sigma_mm = 1e3 * np.sqrt(np.diag(placed.covariance)[3:])
     assert (sigma_mm < 0.2).all()
@@ -46,7 +46,7 @@ def test_points_lie_on_the_laser_and_within_the_squares() -> None:
     assert np.abs(on_board[:, 2]).max() < 1e-6
 
 
-def test_a_brighter_line_on_the_table_beside_the_board_is_not_taken() -> None:
+def test_a_brighter_line_on_the_table_next_to_the_board_is_not_taken() -> None:
     frames, placed = first()
     laser = frames[LASER].copy()
     corners = OPTICS.project(placed.T_camera_board[:3, 3] + np.zeros((1, 3)))
@@ -101,14 +101,14 @@ def test_a_board_that_moved_between_the_frames_is_refused() -> None:
     frames, _ = first()
     frames[LED] = np.roll(frames[LED], 4, axis=1)
     with pytest.raises(FitError, match=r"moved by [34]\.\d px .* hold it still"):
-        placed_board(view_of("0", frames), BOARD, OPTICS)
+        board_pose(view_of("0", frames), BOARD, OPTICS)
 
 
 def test_a_constant_speed_is_taken_out_by_the_mean_of_both_ends() -> None:
     frames, placed = first()
     frames[LED] = np.roll(frames[LED], 1, axis=1)
     frames.pop(LASER)
-    between = placed_board(view_of("0", frames), BOARD, OPTICS)
+    between = board_pose(view_of("0", frames), BOARD, OPTICS)
     moved = OPTICS.project(between.centre_m) - OPTICS.project(placed.centre_m)
     np.testing.assert_allclose(moved, [0.5, 0.0], atol=0.1)
 
@@ -117,4 +117,4 @@ def test_a_constant_speed_is_taken_out_by_the_mean_of_both_ends() -> None:
 def test_no_board_is_told(level: int) -> None:
     blank = np.full((480, 640), level, np.uint8)
     with pytest.raises(FitError, match="no board found"):
-        placed_board(view_of("0", {AMBIENT: blank, LED: blank}), BOARD, OPTICS)
+        board_pose(view_of("0", {AMBIENT: blank, LED: blank}), BOARD, OPTICS)

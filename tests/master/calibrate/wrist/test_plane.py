@@ -6,16 +6,16 @@ import pytest
 from common.arrays import Float
 from common.errors import FitError
 from common.geometry import rigid, rotation_vector_to_matrix
+from master.calibrate.wrist.board_pose import BoardPose
 from master.calibrate.wrist.laser_command import lines_of
-from master.calibrate.wrist.placed import PlacedBoard
 from master.calibrate.wrist.plane import ViewLine, fit_plane
 from tests.master.calibrate.wrist.devices import (
     BOARD,
     FOCAL_PX,
     OPTICS,
     angle_deg,
+    cycles_of,
     plane_of,
-    triples_of,
     view_of,
 )
 
@@ -25,11 +25,11 @@ BOARD_SIGMA = np.diag([5e-4, 5e-4, 5e-4, 2e-5, 2e-5, 4e-5]) ** 2
 
 
 def view_line(
-    name: str, turn_deg: tuple[float, float, float], centre: tuple[float, float, float]
+    name: str, rotation_deg: tuple[float, float, float], centre: tuple[float, float, float]
 ) -> ViewLine:
     """Exact line of the plane on a board at `centre` [m], turned about the camera's axes."""
-    turn = rotation_vector_to_matrix(np.radians(turn_deg))
-    facing, at = turn[:, 2], np.array(centre)
+    rotation = rotation_vector_to_matrix(np.radians(rotation_deg))
+    facing, at = rotation[:, 2], np.array(centre)
     way = np.cross(facing, NORMAL)
     way /= np.linalg.norm(way)
     # The point of both planes nearest to the centre.
@@ -37,7 +37,7 @@ def view_line(
     point = np.linalg.solve(system, np.array([facing @ at, OFFSET_M, way @ at]))
     points = point + np.linspace(-0.05, 0.05, 60)[:, None] * way
     ends = point + np.array([[-0.03], [0.03]]) * way
-    placed = PlacedBoard(rigid(turn, at), at, BOARD_SIGMA, 0.06)
+    placed = BoardPose(rigid(rotation, at), at, BOARD_SIGMA, 0.06)
     return ViewLine(name, points, ends, placed, 0.02, FOCAL_PX)
 
 
@@ -58,7 +58,7 @@ GOOD = (
 
 @pytest.mark.parametrize("seed", [11, 12, 13])
 def test_rendered_views_give_the_plane_to_a_tenth_of_a_degree_and_millimetre(seed: int) -> None:
-    views = tuple(view_of(str(k), frames) for k, frames in enumerate(triples_of(seed, 6)))
+    views = tuple(view_of(str(k), frames) for k, frames in enumerate(cycles_of(seed, 6)))
     fit = fit_plane(lines_of(views, BOARD, OPTICS).lines)
     true = plane_of(seed)
     off_deg = angle_deg(np.array(fit.plane.normal), np.array(true.normal))
@@ -82,7 +82,7 @@ def test_exact_lines_give_the_exact_plane() -> None:
 def test_the_stated_sigma_is_that_of_many_repetitions() -> None:
     # Boards drawn from their covariance move the points along their rays, as poses that are a little wrong do.
     rng = np.random.default_rng(5)
-    turns: list[float] = []
+    rotations: list[float] = []
     offsets: list[float] = []
     stated = fit_plane(GOOD)
     for _ in range(300):
@@ -94,19 +94,19 @@ def test_the_stated_sigma_is_that_of_many_repetitions() -> None:
             def moved(
                 points: Float, line: ViewLine = line, pull: Float = pull, facing: Float = facing
             ) -> Float:
-                turned = facing + np.cross(pull[:3], facing)
+                rotated = facing + np.cross(pull[:3], facing)
                 at = line.placed.centre_m + pull[3:]
-                return points * ((turned @ at) / (points @ turned))[:, None]
+                return points * ((rotated @ at) / (points @ rotated))[:, None]
 
             noisy.append(
                 ViewLine(line.name, moved(line.points_m), moved(line.ends_m), line.placed, 0.02, FOCAL_PX)
             )
         fit = fit_plane(noisy)
-        turns.append(angle_deg(np.array(fit.plane.normal), NORMAL))
+        rotations.append(angle_deg(np.array(fit.plane.normal), NORMAL))
         offsets.append(fit.plane.offset_m - OFFSET_M)
     # The floors for line and lens are in the stated sigma and not in these draws.
     assert 0.4 < np.std(offsets) / stated.offset_sigma_m < 1.1
-    assert 0.3 < np.sqrt(np.mean(np.square(turns)) / 2) / np.degrees(stated.normal_sigma_rad) < 1.1
+    assert 0.3 < np.sqrt(np.mean(np.square(rotations)) / 2) / np.degrees(stated.normal_sigma_rad) < 1.1
 
 
 @pytest.mark.parametrize("wrong", [(0.0, 0.004, 0.0), (0.0, -0.02, 0.01)])
@@ -148,7 +148,7 @@ def test_noise_beyond_the_spread_is_refused() -> None:
             one.name,
             one.points_m,
             one.ends_m,
-            PlacedBoard(one.placed.T_camera_board, one.placed.centre_m, unsure, 0.9),
+            BoardPose(one.placed.T_camera_board, one.placed.centre_m, unsure, 0.9),
             0.02,
             FOCAL_PX,
         )

@@ -1,0 +1,248 @@
+"""Markers: what each covers of the image, its paint in linear light, and the truth that a camera sees of it.
+
+Coverage is measured with everything nearer cut out, and the same coverage blends the paint into the image, so
+image and truth come from one drawing.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+
+from common.arrays import Float, Image
+from common.geometry import cross
+from common.sim import light, raster
+from common.sim.before import NO_PHALANX, REACH_PX, Places, hand_before, things_before
+from common.sim.desk import LENS_SIGMA_PX
+from common.sim.object_painter import ObjectPainter, ObjectView, PaintedFeature
+from common.sim.objects_seen import SeenBead
+from common.sim.raster import Coverage, Shape
+from common.sim.surface import unit
+from common.sim.view import Snapshot, View
+
+MARGIN_PX = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerView:
+    """What one camera truly sees of the markers in one frame.
+
+    Attributes:
+        uv: (M, 2) centroid of the visible pixels [px], averaged over the exposure; NaN where none is visible.
+        visible: (M,) visible share of the marker's own outline.
+        area: (M,) visible area [px^2].
+        t_s: (M,) scene time [s] at which the marker's row is at mid-exposure.
+        objects: Tracked object -> what is seen of it.
+    """
+
+    uv: Float
+    visible: Float
+    area: Float
+    t_s: Float
+    objects: Mapping[str, ObjectView] = field(default_factory=dict[str, ObjectView])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Painted:
+    """One marker of the hand in one frame: what it covers, and the moment of its row [s], scene time."""
+
+    marker: int
+    coverage: Coverage
+    t_s: float
+
+
+AnyPainted: TypeAlias = Painted | PaintedFeature
+Window: TypeAlias = tuple[int, int, int, int]  # x0, y0, x1, y1 [px]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Covered:
+    """All that is painted in one frame: markers of the hand in the order of the rig, beads and tags of objects."""
+
+    markers: tuple[Painted, ...]
+    features: tuple[PaintedFeature, ...]
+    snapshot: Snapshot
+
+
+class Painter:
+    """Paints the markers of one view. It holds prepared colours; every call is pure."""
+
+    def __init__(self, view: View) -> None:
+        """Prepare colours.
+
+        Raises:
+            CalibrationError: A marker of the rig has no paint.
+        """
+        self._view = view
+        self._size = (view.optics.width_px, view.optics.height_px)
+        self._tables = light.SrgbTables.make()
+        rig = view.scene.rig
+        self._colours = {
+            m: light.marker_colour(n) for m, n in enumerate(rig.markers) if n not in rig.free_markers
+        }
+        self._shades = {
+            m: (*light.shades(marker_colour, gloss=0.02), light.bgr_bytes(np.array(marker_colour) + 0.10))
+            for m, marker_colour in self._colours.items()
+        }
+        self._sides = {m: light.face_shade(marker_colour, 0.25) for m, marker_colour in self._colours.items()}
+        self._caps = {cap.marker: c for c, cap in enumerate(view.surface.caps)}
+        self._boxes = {box.marker: box.corners for box in view.surface.boxes}
+        self._objects = ObjectPainter(view, self._tables)
+
+    def cover(self, snapshot: Snapshot, cards: tuple[Shape, ...]) -> Covered:
+        """Every marker, bead and tag with what it covers, everything nearer cut out."""
+        view, speed = self._view, snapshot.speed_uv
+        caps, boxes = view.surface.caps, view.surface.boxes
+        box_uv = np.array([snapshot.uv[box.corners] for box in boxes]).reshape(-1, 8, 2)
+        ways = [*speed[view.cap_centre], *(speed[box.corners].mean(axis=0) for box in boxes)]
+        outlines = [
+            Shape(raster.hull(uv), way) for uv, way in zip((*snapshot.cap_uv, *box_uv), ways, strict=True)
+        ]
+        places = self._places(snapshot, box_uv)
+        # Caps hide each other; boxes lie flat on the palm.
+        touching = raster.overlaps(places.low[:, None], places.high[:, None], places.low, places.high)
+        touching &= places.depth[:, None] > places.depth
+        touching[:, len(caps) :] = touching[len(caps) :] = False
+        markers = [
+            raster.Marker(
+                outlines[k],
+                (
+                    *surface,
+                    *(outlines[n] for n in np.flatnonzero(touching[k])),
+                    *things_before(snapshot, places, k, float(places.depth[k])),
+                    *cards,
+                ),
+                view.own_finger(snapshot, k) if k < len(caps) else None,
+            )
+            for k, surface in enumerate(hand_before(snapshot, places))
+        ]
+        numbers = [marker.marker for marker in (*caps, *boxes)]
+        points = [*view.cap_centre.tolist(), *(box.corners.start for box in boxes)]
+        covers = raster.cover(markers, view.exposure_s, self._size)
+        painted = [
+            Painted(number, cover, float(snapshot.t_s[point]))
+            for number, cover, point in zip(numbers, covers, points, strict=True)
+        ]
+        hand = list(zip(outlines, places.depth.tolist(), strict=True))
+        features = self._objects.cover(snapshot, cards, hand) if view.objects.local.size else ()
+        return Covered(tuple(sorted(painted, key=lambda item: item.marker)), tuple(features), snapshot)
+
+    def _places(self, snapshot: Snapshot, box_uv: Float) -> Places:
+        """Where the markers of the hand are, caps first, then boxes with these corners (B, 8, 2) [px]."""
+        view = self._view
+        boxes = [box.corners for box in view.surface.boxes]
+        corners = snapshot.cap_uv, box_uv
+        centre = snapshot.points[view.cap_centre]
+        return Places(
+            uv=np.concatenate([snapshot.uv[view.cap_centre], box_uv.mean(axis=1)]),
+            depth=np.append(centre[:, 2], [snapshot.points[b, 2].mean() for b in boxes]),
+            low=np.concatenate([uv.min(axis=1) for uv in corners]) - REACH_PX,
+            high=np.concatenate([uv.max(axis=1) for uv in corners]) + REACH_PX,
+            behind_palm=np.append(
+                view.behind_palm(snapshot, centre), [not view.shows_back(snapshot)] * len(boxes)
+            ),
+            phalanx=np.array([3 * cap.finger + 2 for cap in view.surface.caps] + [NO_PHALANX] * len(boxes)),
+        )
+
+    def window(self, image: Image, group: list[AnyPainted], snapshot: Snapshot) -> tuple[int, int, Image]:
+        """Paint a group of markers and blur its window, all in linear light; where it goes, and its pixels."""
+        width, height = self._size
+        x0 = max(min(p.coverage.x for p in group) - MARGIN_PX, 0)
+        y0 = max(min(p.coverage.y for p in group) - MARGIN_PX, 0)
+        x1 = min(max(p.coverage.x + p.coverage.alpha.shape[1] for p in group) + MARGIN_PX, width)
+        y1 = min(max(p.coverage.y + p.coverage.alpha.shape[0] for p in group) + MARGIN_PX, height)
+        window = self._tables.decode(image[y0:y1, x0:x1])
+        for item in group:
+            cover = item.coverage
+            h, w = cover.alpha.shape
+            cx0, cy0, cx1, cy1 = (
+                max(cover.x, x0),
+                max(cover.y, y0),
+                min(cover.x + w, x1),
+                min(cover.y + h, y1),
+            )
+            if cx0 >= cx1 or cy0 >= cy1:
+                continue
+            alpha = cover.alpha[cy0 - cover.y : cy1 - cover.y, cx0 - cover.x : cx1 - cover.x, None]
+            box = cx0, cy0, cx1, cy1
+            if isinstance(item, Painted):
+                appearance = self._tables.decode(self._appearance(item, snapshot, box))
+            else:
+                appearance = self._objects.appearance(item, box)
+            part = window[cy0 - y0 : cy1 - y0, cx0 - x0 : cx1 - x0]
+            part += (appearance - part) * alpha
+        window = cv2.GaussianBlur(window, (3, 3), LENS_SIGMA_PX)
+        left, top = int(x0 > 0), int(y0 > 0)
+        inner = window[top : -1 if y1 < height else None, left : -1 if x1 < width else None]
+        return x0 + left, y0 + top, self._tables.encode(np.asarray(inner, dtype=np.float32))
+
+    def _appearance(self, item: Painted, snapshot: Snapshot, box: Window) -> Image:
+        """Colours of one marker's surface over a pixel box, as if it filled it."""
+        x0, y0, x1, y1 = box
+        appearance = np.empty((y1 - y0, x1 - x0, 3), dtype=np.uint8)
+        cap = self._caps.get(item.marker)
+        if cap is not None:
+            base, *bands = self._shades[item.marker]
+            cv2.rectangle(appearance, (0, 0), (x1 - x0, y1 - y0), base, cv2.FILLED)
+            corners = snapshot.bands[cap] - raster.fixed(np.array([x0, y0]))
+            for outline, colour in zip(corners, bands, strict=True):
+                raster.fill(appearance, outline, colour)
+            return appearance
+        side = self._boxes[item.marker]
+        cv2.rectangle(appearance, (0, 0), (x1 - x0, y1 - y0), self._sides[item.marker], cv2.FILLED)
+        top = snapshot.points[side][:4]
+        normal = unit(cross(top[1] - top[0], top[3] - top[0]))
+        facing = float(normal @ self._view.to_light) * (-1.0 if float(normal @ top[0]) > 0.0 else 1.0)
+        corners = raster.fixed(snapshot.uv[side][:4] - (x0, y0))
+        raster.fill(appearance, corners, light.face_shade(self._colours[item.marker], facing))
+        return appearance
+
+    def clusters(self, painted: Covered) -> list[list[AnyPainted]]:
+        """Markers whose windows touch, together; markers outside the image or hidden left out."""
+        groups: list[tuple[Window, list[AnyPainted]]] = []
+        for item in (*painted.markers, *painted.features):
+            cover = item.coverage
+            height, width = cover.alpha.shape
+            x0, y0 = cover.x - MARGIN_PX, cover.y - MARGIN_PX
+            x1, y1 = cover.x + width + MARGIN_PX, cover.y + height + MARGIN_PX
+            if x1 <= 0 or y1 <= 0 or x0 >= self._size[0] or y0 >= self._size[1] or not cover.alpha.any():
+                continue
+            box: Window = (x0, y0, x1, y1)
+            members: list[AnyPainted] = [item]
+            while touching := [group for group in groups if _touch(box, group[0])]:
+                for other, others in touching:
+                    box = _around(box, other)
+                    members += others
+                groups = [group for group in groups if group not in touching]
+            groups.append((box, members))
+        return [members for _, members in groups]
+
+    def truth(self, painted: Covered) -> MarkerView:
+        """What is visible of all markers, in the order of the rig, and of the objects."""
+        count = len(self._view.scene.rig.markers)
+        uv, t_s = np.full((count, 2), np.nan), np.full(count, np.nan)
+        visible, area = np.zeros(count), np.zeros(count)
+        for marker, cover, when in _of_markers(painted):
+            uv[marker], t_s[marker] = raster.centroid(cover), when
+            visible[marker], area[marker] = cover.share, float(cover.alpha.sum())
+        objects = self._objects.truth(painted.snapshot, painted.features)
+        return MarkerView(uv, visible, area, t_s, objects)
+
+
+def _of_markers(painted: Covered) -> Iterator[tuple[int, Coverage, float]]:
+    """Place in the rig, coverage and moment [s] of all markers, on hands and objects."""
+    for item in painted.markers:
+        yield item.marker, item.coverage, item.t_s
+    for item in painted.features:
+        if isinstance(item.feature, SeenBead) and item.feature.bead.marker is not None:
+            yield item.feature.bead.marker, item.coverage, item.feature.t_s
+
+
+def _around(a: Window, b: Window) -> Window:
+    return min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3])
+
+
+def _touch(a: Window, b: Window) -> bool:
+    return a[0] <= b[2] and b[0] <= a[2] and a[1] <= b[3] and b[1] <= a[3]

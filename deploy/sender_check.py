@@ -1,0 +1,118 @@
+"""Whether the senders of a deployment are heard: before it, as a measure of how soon that shows, and after it.
+
+A new version that runs and sends nothing costs the stream for as long as it is listened for. So where a master runs and
+took all of them before, it waits twice as long as that took, or as the slave's own start did; else `WAIT_SENDERS_S`.
+"""
+
+import json
+import sys
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import cast
+
+from deploy.remote import run_bounded
+
+WAIT_SENDERS_S = (
+    12.0  # from READY=1 to the first datagram is a second; each one of waiting is a second without pictures
+)
+LEAST_S = 4.0  # a master tells its counts once a second, a beacon comes as often
+_TIMES = 2.0
+_BEFORE_S = 5.0
+_END_S = 60.0  # of the program that listens, besides what it listens
+
+
+@dataclass(frozen=True, slots=True)
+class Ears:
+    """How datagrams are heard.
+
+    Attributes:
+        options: Of `phalanx-master hear`.
+        keys: Keys folder.
+        seconds: How long they are waited for.
+    """
+
+    options: tuple[str, ...]
+    keys: Path
+    seconds: float = WAIT_SENDERS_S
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """What was heard.
+
+    Attributes:
+        rates: Name -> datagrams a second, of those that were heard.
+        cause: Why nobody could listen; None: somebody did.
+        master: Whether it was a master that runs, which others may ask meanwhile.
+    """
+
+    rates: Mapping[str, float] = field(default_factory=dict[str, float])
+    cause: str | None = None
+    master: bool = False
+
+
+def received_of(names: Sequence[str], ears: Ears, ended: threading.Event | None = None) -> Received:
+    """Ask `phalanx-master hear` which of the senders are heard; it ends early if `ended` is set."""
+    words = [
+        sys.executable,
+        "-m",
+        "master.wait_for_senders",
+        "--json",
+        "--seconds",
+        str(ears.seconds),
+        *ears.options,
+    ]
+    words += [word for name in names for word in ("--name", name)]
+    lines: list[str] = []
+    environment = {"PHALANX_KEYS": str(ears.keys)}
+    code, errors = run_bounded(words, b"", lines.append, ears.seconds + _END_S, environment, ended)
+    results = [line for line in lines if line.startswith('{"heard"')]
+    if not results:
+        lines = [*lines, *errors] or [f"phalanx-master hear ended with {code}"]
+        return Received(cause=f"cannot listen for it: {lines[-1]}")
+    told = cast(dict[str, object], json.loads(results[-1]))
+    rates = cast(dict[str, float], told["heard"])
+    return Received({name: float(rate) for name, rate in rates.items()}, None, told.get("master") is True)
+
+
+class Before:
+    """What is heard before anything is changed, found out while wheels are gathered and sent. Holds the thread."""
+
+    def __init__(self, names: Sequence[str], ears: Ears) -> None:
+        """Begin to listen."""
+        self._names, self._ears = tuple(names), ears
+        self._received, self._took_s = Received(), 0.0
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread.start()
+
+    @property
+    def at_master(self) -> bool:
+        """Whether a master runs, so that each machine can be listened for by itself. Waits for the end."""
+        self._thread.join()
+        return self._received.master
+
+    def ears(self, start_s: float | None) -> Ears:
+        """How to listen for one machine afterwards.
+
+        Args:
+            start_s: How long its slaves took to start before [s]; None: they did not run.
+        """
+        self._thread.join()
+        if start_s is None or not self._received.master or set(self._received.rates) < set(self._names):
+            return self._ears
+        seconds = max(LEAST_S, _TIMES * self._took_s, _TIMES * start_s)
+        return replace(self._ears, seconds=min(self._ears.seconds, seconds))
+
+    def end(self) -> None:
+        """Listen no longer."""
+        self._ended.set()
+
+    def _listen(self) -> None:
+        began = time.monotonic()
+        ears = replace(self._ears, seconds=min(_BEFORE_S, self._ears.seconds))
+        self._received = received_of(self._names, ears, self._ended)
+        self._took_s = time.monotonic() - began

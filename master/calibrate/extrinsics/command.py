@@ -1,0 +1,154 @@
+"""`phalanx-master calibrate extrinsics`: how a wrist device sits, by what marker rig and device both see."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import typer
+
+from common.arrays import Float
+from common.errors import CalibrationError, FitError
+from common.frame_recording import FrameRecording, open_recording
+from common.imu_fusion import OrientationFilter
+from common.imu_recording import IMU, read_imu
+from common.messages import HandPose, ImuSample
+from master.calibrate.wrist.device import device_of, print_line, write_device
+from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
+from master.recorded import recorded_cycles, recorded_detections
+from master.rig import load_hand
+from master.rig_pipeline import build_pipeline
+from master.rig_setup import RigSetup
+from master.stages import StageTimes
+from master.summary import write_summary
+
+if TYPE_CHECKING:
+    from master.calibrate.extrinsics.extrinsics import Extrinsics
+
+Recording = Annotated[
+    Path, typer.Argument(help="Folder of a recording of kind `both`: the joint motion.", show_default=False)
+]
+Detections = Annotated[
+    Path,
+    typer.Option(help="Folder with detections_<camera>.npz of all its cameras, from `phalanx-slave detect`."),
+]
+Hand = Annotated[
+    Path | None,
+    typer.Option("--hand", help="Hand file; default: the marker rig's `hand` in CALIBRATION/hands."),
+]
+Picture = Annotated[
+    Path | None, typer.Option(help="Write a picture of what was seen and fitted to this .png.")
+]
+
+
+def extrinsics(
+    recording: Recording,
+    detections: Detections,
+    hand: Hand = None,
+    rig: RecordingRig = None,
+    calibration: Calibration = CALIB_JSON,
+    out: ResultTree = None,
+    json_file: JsonFile = None,
+    picture: Picture = None,
+) -> None:
+    """Measure how the wrist device sits on the forearm, how its IMU lies, and how late both clocks are.
+
+    With the device on, before the marker cameras, for ten seconds, each to and fro about once a second: bend fingers
+    one by one and together, bend the wrist as far one way as the other, and turn the forearm about all its axes. It
+    needs the laser plane, a pose of the palm that is right to a centimetre and ten degrees (the drawing of the
+    device), and the hand file of that hand. Three markers on the back of the hand (rig desk-back3) tell it best.
+    Nothing is written without --out.
+
+    Examples:
+
+      phalanx-slave detect RECORDING --camera wrist --calibration calib_json -o found/detections_wrist.npz
+
+      phalanx-master calibrate extrinsics RECORDING --detections found --out calib_json
+    """
+    # Imported here: scipy.optimize takes a second.
+    from master.calibrate.extrinsics.extrinsics import calibrate_extrinsics
+
+    device = device_of(recording, rig, calibration, out)
+    if device.rig.T_camera_palm is None:
+        raise CalibrationError(
+            f"rig {device.file_name!r}: T_camera_palm: a first guess is needed, such as from the drawing of the device"
+        )
+    if device.rig.imu is None:
+        raise CalibrationError(
+            f"rig {device.file_name!r}: imu: missing; the bend of the wrist is told by it alone"
+        )
+    opened = open_recording(recording)
+    markers = opened.manifest.marker_rig()
+    setup = RigSetup.of(markers, dict(opened.manifest.cameras), load_hand(calibration, markers.hand, hand))
+    poses = marker_poses(setup, detections)
+    samples = imu_samples(opened, device.rig.imu.name, device.rig.imu.rate_hz)
+    cycles = list(recorded_cycles(detections, device.camera.name))
+    try:
+        found = calibrate_extrinsics(
+            poses, setup.markers, setup.hand, cycles, samples, device.rig, device.camera, device.source
+        )
+    except FitError as error:
+        raise FitError(f"{recording}: {error}") from error
+    print_line(found.report)
+    if picture is not None:
+        from master.calibrate.extrinsics.picture import draw_extrinsics  # matplotlib takes a second to import
+
+        draw_extrinsics(picture, found, device.optics)
+        typer.echo(f"drew {picture}")
+    written = write_device(out, device, found.rig, "T_camera_palm, imu, stamp_offset_us")
+    if json_file is not None:
+        write_summary(json_file, summary(found) | {"written": None if written is None else str(written)})
+
+
+def marker_poses(setup: RigSetup, detections: Path) -> list[HandPose]:
+    """What the line of a marker rig makes of recorded detections.
+
+    Raises:
+        RecordingError: A file of detections is missing or broken.
+    """
+    messages = [
+        message
+        for camera in setup.rig.cameras
+        for message in recorded_detections(detections, camera, len(setup.markers))
+    ]
+    pipeline = build_pipeline(setup, StageTimes())
+    solved = [one for message in sorted(messages, key=lambda one: one.t_ns) for one in pipeline.push(message)]
+    return [one.pose for one in [*solved, *pipeline.flush()]]
+
+
+def imu_samples(recording: FrameRecording, name: str, rate_hz: float) -> Sequence[ImuSample]:
+    """What the IMU measured, with the orientation that a slave's filter makes of it where the file has none.
+
+    Raises:
+        RecordingError: imu.csv is broken.
+        FitError: There is none.
+    """
+    if not (recording.folder / IMU).exists():
+        raise FitError(f"{recording.folder}: no {IMU}: record the IMU of the device as well")
+    samples = read_imu(recording.folder, name)
+    if any(np.isfinite(one.orientation_wxyz).all() for one in samples):
+        return samples
+    fusion = OrientationFilter(rate_hz)
+    return [fusion.push(one) for one in samples]
+
+
+def summary(found: "Extrinsics") -> dict[str, object]:
+    """What was measured, as numbers."""
+    from master.calibrate.extrinsics.report import left_of
+
+    imu = found.rig.imu
+    return {
+        "T_camera_palm": [list(row) for row in found.rig.T_camera_palm or ()],
+        "q_palm_imu": None if imu is None else imu.q_palm_imu,
+        "q_rig_world": None if imu is None else imu.q_rig_world,
+        "camera_late_ms": 1e3 * found.fit.unknown.camera_late_s,
+        "imu_late_ms": 1e3 * found.fit.unknown.imu_late_s,
+        "sigma": found.sigma,
+        "residual": left_of(found.fit),
+        "cycles": len(found.cycles.t_s),
+        "wrist_deg": _span(np.degrees(found.fit.wrist_angles_rad)),
+    }
+
+
+def _span(values: Float) -> list[list[float]]:
+    return [[round(float(v), 2) for v in row] for row in (values.min(axis=0), values.max(axis=0))]

@@ -1,0 +1,228 @@
+"""How a wrist device sits on its forearm, from ten seconds that marker rig and device see together.
+
+What is made of it is in `start`, `fit` and `unknown`, what is told of it in `report`; here are what goes in and out.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from dataclasses import replace as replaced
+
+import numpy as np
+from msgspec.structs import replace
+
+from common.arrays import Bool, Float
+from common.calibration import CameraCalibration, ImuCalibration, RigCalibration
+from common.errors import CalibrationError, FitError
+from common.geometry import cross, matrix_to_quaternion, transform
+from common.hand_model import CHAINS, FINGERS, HandModel
+from common.messages import HandPose, ImuSample, WristDetections
+from master.calibrate.cameras.lens_files import matrix_of
+from master.calibrate.extrinsics.fit import fit_extrinsics
+from master.calibrate.extrinsics.lines_of_sight import FINGERS as LASER_FINGERS
+from master.calibrate.extrinsics.lines_of_sight import LinesOfSight
+from master.calibrate.extrinsics.report import left_of, refuse, report_lines, sigmas
+from master.calibrate.extrinsics.seen import Fit, StrobeCycles
+from master.calibrate.extrinsics.start import started
+from master.calibrate.extrinsics.tracks import GAP_S, HandTrack, ImuTrack
+from master.calibrate.tree_files import provenance
+from master.estimator.laser_plane import in_image, laser_points
+from master.wrist_setup import WristSetup
+
+TOOL = "calibrate extrinsics"
+MOTION = (
+    "for ten seconds bend fingers one by one and together, bend the wrist as far one way as the other, and turn the"
+    " forearm about all its axes, before the marker cameras"
+)
+_MOST = 200  # triples: more of the same motion add time, not knowledge
+_FEWEST, _LEAST_S = 60, 5.0
+_LINES_OF_SIGHT = 2  # fingers with a laser point or a tip
+_MARKERS = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Extrinsics:
+    """A mounting that explains what was seen.
+
+    Attributes:
+        rig: The wrist rig with its new keys: T_camera_palm, imu, stamp_offset_us.
+        report: Lines for a person.
+        fit: What was fitted.
+        cycles: To what.
+        sigma: Quantity with its unit -> standard deviation.
+    """
+
+    rig: RigCalibration
+    report: tuple[str, ...]
+    fit: Fit
+    cycles: StrobeCycles
+    sigma: dict[str, float]
+
+
+def calibrate_extrinsics(
+    poses: Sequence[HandPose],
+    markers: tuple[str, ...],
+    model: HandModel,
+    cycles: Sequence[WristDetections],
+    samples: Sequence[ImuSample],
+    rig: RigCalibration,
+    camera: CameraCalibration,
+    source: str = "a joint motion",
+) -> Extrinsics:
+    """Fit the mounting of a wrist device to one motion.
+
+    Args:
+        poses: What the line of the marker rig made of it, by markers alone.
+        markers: Their names, in the order of the poses'.
+        model: The hand.
+        cycles: What the slave of the device saw, in order.
+        samples: What its IMU measured, in order, with the orientation of its filter.
+        rig: The device: laser plane, a palm pose that is right to a centimetre and ten degrees, an IMU.
+        camera: Its camera.
+        source: Name of the data, for the provenance.
+
+    Raises:
+        FitError: The motion was not done, or not seen, or does not tell the mounting; the text says what to do.
+        CalibrationError: The rig lacks its laser plane, palm pose or IMU.
+    """
+    if rig.imu is None:
+        raise CalibrationError(f"rig {rig.name!r}: imu: missing; nothing else tells how the wrist is bent")
+    if not (poses and cycles and samples):
+        missing = "the markers" if not poses else "the wrist camera" if not cycles else "the IMU"
+        raise FitError(f"{missing} saw nothing: {MOTION}")
+    setup = WristSetup.of(rig, camera, model)
+    lines_of_sight, zero_ns = LinesOfSight(setup), cycles[0].t_ns
+    hand, imu = HandTrack.of(poses, model, zero_ns), ImuTrack(samples, zero_ns)
+    seen = _cycles(setup, lines_of_sight, camera, cycles, zero_ns)
+    chosen = _chosen(hand, imu, seen)
+    tips = hand.points_m[:, [_marker_of(model, markers, finger) for finger in FINGERS[LASER_FINGERS]]]
+    start = started(hand, tips, imu, setup.optics, setup.T_camera_palm, seen)
+    if start is None:
+        raise FitError(f"hand and IMU were hardly seen at the same time: {MOTION}")
+    distance = np.linalg.norm(
+        transform(setup.T_camera_palm, model.rest_position_m[CHAINS[1:, 0]].mean(axis=0))
+    )
+    px_per_m = float(setup.optics.matrix[0, 0] / distance)
+    firsts = [replaced(start, camera_late_s=late_s).unknown for late_s in (start.camera_late_s, 0.0)]
+    fit = fit_extrinsics(lines_of_sight, model, markers, hand, imu, seen.of(chosen), px_per_m, firsts)
+    sigma = sigmas(fit)
+    refuse(fit, sigma)
+    new = _documented(rig, camera, rig.imu, fit, imu, sigma, source)
+    return Extrinsics(new, report_lines(fit, sigma, len(cycles)), fit, seen.of(chosen), sigma)
+
+
+def _marker_of(model: HandModel, markers: tuple[str, ...], finger: str) -> int:
+    """The marker at the tip of a finger.
+
+    Raises:
+        FitError: There is none.
+    """
+    wanted = CHAINS[FINGERS.index(finger), 3]
+    for number, name in enumerate(markers):
+        if model.mount(name).joint == wanted:
+            return number
+    raise FitError(f"no marker sits on the tip of the {finger} finger, which the mounting is found by")
+
+
+def _cycles(
+    setup: WristSetup,
+    lines_of_sight: LinesOfSight,
+    camera: CameraCalibration,
+    messages: Sequence[WristDetections],
+    zero_ns: int,
+) -> StrobeCycles:
+    """What was seen of index ... little, on the laser plane and in the image."""
+    laser, sigma, tips, tip_sigma = (list[Float]() for _ in range(4))
+    for one in messages:
+        shown = in_image(setup, one.laser_uv, one.laser_sigma_px)
+        found = laser_points(setup, np.where(shown[:, None], one.laser_uv, np.nan), one.laser_sigma_px)
+        laser.append(lines_of_sight.flat(found.point_m))
+        sigma.append(np.sqrt(np.einsum("fii->fi", lines_of_sight.flat_cov(found.cov_m2))))
+        shown = in_image(setup, one.tip_uv, one.tip_sigma_px)
+        tips.append(np.where(shown[:, None], one.tip_uv, np.nan))
+        tip_sigma.append(one.tip_sigma_px)
+    return StrobeCycles(
+        np.array([1e-9 * (one.t_ns - zero_ns) for one in messages]),
+        np.array(laser)[:, LASER_FINGERS],
+        np.array(sigma)[:, LASER_FINGERS],
+        np.array(tips)[:, LASER_FINGERS],
+        np.array(tip_sigma)[:, LASER_FINGERS],
+        1.0 / camera.frame_rate_hz,  # the frame with the LEDs follows that with the laser
+    )
+
+
+def _chosen(hand: HandTrack, imu: ImuTrack, seen: StrobeCycles) -> Bool:
+    """(T,) which triples count: those whose hand both sensors see, at most 200.
+
+    Raises:
+        FitError: There are too few of them, or the IMU was silent.
+    """
+    if len(hand.t_s) < _FEWEST or len(imu) < _FEWEST:
+        raise FitError(
+            f"the markers told {len(hand.t_s)} hands, the IMU {len(imu)} orientations with rates; at least {_FEWEST} of"
+            f" each are needed: {MOTION}"
+        )
+    fingers = (np.isfinite(seen.laser_m[..., 0]) | np.isfinite(seen.tip_uv[..., 0])).sum(axis=1)
+    near = hand.nearest(seen.t_s)
+    marked = np.isfinite(hand.points_m[near, :, 0]).sum(axis=1) >= _MARKERS
+    both = (fingers >= _LINES_OF_SIGHT) & marked & (np.abs(hand.t_s[near] - seen.t_s) < GAP_S)
+    both &= (seen.t_s > imu.t_s[0]) & (seen.t_s < imu.t_s[-1])
+    rows = np.flatnonzero(both)
+    if len(rows) < _FEWEST or np.ptp(seen.t_s[rows]) < _LEAST_S:
+        raise FitError(
+            f"marker cameras and wrist device saw the hand together in {len(rows)} triples, at least {_FEWEST} of"
+            f" {_LEAST_S:.0f} s are needed: {MOTION}"
+        )
+    if imu.gap_s > GAP_S:
+        raise FitError(
+            f"the IMU was silent for {imu.gap_s:.2f} s: its turns cannot be summed up; record again"
+        )
+    out = np.zeros(len(seen.t_s), np.bool_)
+    out[rows[np.unique(np.linspace(0, len(rows) - 1, min(_MOST, len(rows))).astype(np.int64))]] = True
+    return out
+
+
+def _documented(
+    rig: RigCalibration,
+    camera: CameraCalibration,
+    old: ImuCalibration,
+    fit: Fit,
+    imu: ImuTrack,
+    sigma: dict[str, float],
+    source: str,
+) -> RigCalibration:
+    """The rig with what was measured, and where that comes from."""
+    unknown = fit.unknown
+    place = replace(
+        old,
+        q_palm_imu=_quaternion(unknown.R_forearm_imu),
+        q_rig_world=_quaternion(_rig_world(fit, imu)),
+        stamp_offset_us=round(1e6 * unknown.imu_late_s, 1),
+    )
+    residual = {name: round(value, 4) for name, value in (sigma | left_of(fit)).items()}
+    how = provenance(TOOL, (source,), residual, "the wrist is called straight in the middle of its bends")
+    world = provenance(TOOL, (source,), residual, "heading: of this recording only")
+    return replace(
+        rig,
+        T_camera_palm=matrix_of(unknown.T_camera_palm),
+        imu=place,
+        stamp_offset_us=rig.stamp_offset_us | {camera.name: round(1e6 * unknown.camera_late_s, 1)},
+        provenance=rig.provenance | {"T_camera_palm": how, "stamp_offset_us": how, "imu": world},
+    )
+
+
+def _rig_world(fit: Fit, imu: ImuTrack) -> Float:
+    """R_rig_world (3, 3) of the world that the IMU's samples name: the mean of its vertical, the first heading."""
+    orientations = imu.mended(fit.unknown.gyro).at(imu.t_s)
+    rig_world = fit.unknown.R_rig_world @ orientations.R_world_imu @ np.swapaxes(imu.held_at(imu.t_s), 1, 2)
+    known = np.isfinite(rig_world[:, 0, 0])
+    rig_world = rig_world[known]
+    up: Float = rig_world[..., 2].mean(axis=0)
+    first: Float = rig_world[0, :, 0]
+    ahead: Float = first - (first @ up) / (up @ up) * up
+    ahead, up = ahead / np.linalg.norm(ahead), up / np.linalg.norm(up)
+    return np.stack([ahead, cross(up, ahead), up], axis=1)
+
+
+def _quaternion(R: Float) -> tuple[float, float, float, float]:
+    w, x, y, z = (round(float(value), 8) for value in matrix_to_quaternion(R))
+    return w, x, y, z

@@ -1,0 +1,102 @@
+"""The hands of all instants: their cost and normal equations given markers and habits, batched over instants.
+
+The residuals are the markers' distances, whitened by their covariances; habits add a quadratic of the free angles.
+The Jacobian is closed form: turn, shift and angles move a marker on the hand as `master.estimator.body_points` has it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float
+from common.geometry import rotation_vector_to_matrix, skew
+from common.hand_model import Chains, HandModel
+from master.estimator.body_points import BodyPoints
+from master.estimator.priors import Habits
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hands:
+    """Hands of all instants: palms (T, 4, 4), palm frame -> rig frame, and free angles (T, n) [rad]."""
+
+    T_rig_palm: Float
+    x: Float
+
+    def moved(self, step: Float) -> "Hands":
+        """The hands after steps (T, 6 + n) of turn [rad], shift [m], both in rig axes, and angles [rad]."""
+        T = self.T_rig_palm.copy()
+        T[:, :3, :3] = rotation_vector_to_matrix(step[:, :3]) @ T[:, :3, :3]
+        T[:, :3, 3] += step[:, 3:6]
+        return Hands(T, self.x + step[:, 6:])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linear:
+    """Gradient (T, L) and Gauss-Newton normal matrix (T, L, L) of the cost at a place; L = 6 + n."""
+
+    gradient: Float
+    normal: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandProblem:
+    """What markers and habits say of the hands.
+
+    Attributes:
+        model: The hand.
+        markers: The M markers on it.
+        habits: Those of one hypothesis.
+        points_m: (T, M, 3) [m] where markers were seen, rig frame.
+        whiten: (T, M, 3, 3) inverse square roots of their covariances [1/m]; 0: not seen.
+    """
+
+    model: HandModel
+    markers: BodyPoints
+    habits: Habits
+    points_m: Float
+    whiten: Float
+
+    def place(self, hands: Hands) -> Float:
+        """Where the markers (T, M, 3) [m] of hands are, rig frame."""
+        arm = self._arm(hands, self.markers.place(self._chains(hands)))
+        return arm + hands.T_rig_palm[:, None, :3, 3]
+
+    def cost(self, hands: Hands) -> Float:
+        """Half the sum of squares (T,) of the whitened distances and of the habits."""
+        arm = self._arm(hands, self.markers.place(self._chains(hands)))
+        residual = self._residual(hands, arm)
+        pushed = self._pushed(hands)
+        habit = np.vecdot(0.5 * pushed - self.habits.pull, hands.x) + self.habits.constant
+        return habit + 0.5 * np.vecdot(residual, residual)
+
+    def linearise(self, hands: Hands) -> Linear:
+        """Gradient and normal matrix at these hands."""
+        R, chains = hands.T_rig_palm[:, :3, :3], self._chains(hands)
+        local = self.markers.place(chains)
+        arm = self._arm(hands, local)
+        by_rotation = self.whiten @ skew(-arm)
+        by_x = (self.whiten @ R[:, None]) @ self.markers.jacobian(chains, local, hands.x)
+        J = np.concatenate([by_rotation, self.whiten, by_x], axis=-1).reshape(
+            len(R), -1, 6 + hands.x.shape[1]
+        )
+        J_t = np.swapaxes(J, 1, 2)
+        gradient, normal = (J_t @ self._residual(hands, arm)[..., None])[..., 0], J_t @ J
+        gradient[:, 6:] += self._pushed(hands) - self.habits.pull
+        normal[:, 6:, 6:] += self.habits.normal
+        return Linear(gradient, normal)
+
+    def _chains(self, hands: Hands) -> Chains:
+        return self.model.chains(self.markers.parameters.angles(hands.x))
+
+    def _arm(self, hands: Hands, local: Float) -> Float:
+        """From the wrists to markers (T, M, 3) [m], palm axes -> rig axes."""
+        return local @ np.swapaxes(hands.T_rig_palm[:, :3, :3], 1, 2)
+
+    def _residual(self, hands: Hands, arm: Float) -> Float:
+        """Whitened distances (T, 3 M)."""
+        off = arm + (hands.T_rig_palm[:, None, :3, 3] - self.points_m)
+        return (self.whiten @ off[..., None]).reshape(len(off), -1)
+
+    def _pushed(self, hands: Hands) -> Float:
+        """The habits' information times the free angles (T, n)."""
+        return (hands.x[:, None] @ self.habits.normal)[:, 0]

@@ -1,0 +1,363 @@
+"""The most probable mounting, given what marker rig, wrist camera and IMU saw of one motion: one least-squares problem.
+
+Unknown in each instant is the hand, palm and fingers, as markers and the loosest habits have it (`hands`); all instants
+share the mounting (`unknown.Unknown`). Four kinds of sight pull at them:
+
+- **markers**, where they were at that instant of the rig's clock;
+- **laser points and tips**, of the palm as it lies before the camera. Camera and IMU are one body, so that is
+
+      R_camera_palm = R_camera_imu (R_rig_world R_world_imu)' R_rig_palm
+
+  however the wrist is bent, and its joint stays where it is;
+- **the wrist**, which bends and does not twist:
+  R_forearm_palm = R_forearm_imu (R_rig_world R_world_imu)' R_rig_palm has two angles and no third
+  (`common.wrist_joint`);
+- **its zero**, which no sensor knows: a wrist that bends as far one way as the other is straight in the mean.
+
+The hand of each instant is eliminated (Schur's complement), which leaves 34 unknowns. Steps are those of Levenberg and
+Marquardt; sights that stray are weighed down (Cauchy). What skin and tips are off by lasts as long as a bend does, so
+all instants of a second together count as a few.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from common.arrays import Float
+from common.geometry import rotation_vector_to_matrix
+from common.hand_model import HandModel
+from master.calibrate.extrinsics.hands import HandProblem, Hands
+from master.calibrate.extrinsics.lines_of_sight import FINGERS, SEEN, LinesOfSight
+from master.calibrate.extrinsics.normal import Normal
+from master.calibrate.extrinsics.seen import STRAYS, Fit, StrobeCycles
+from master.calibrate.extrinsics.tracks import HandTrack, ImuOrientations, ImuTrack, Markers
+from master.calibrate.extrinsics.unknown import (
+    CAMERA_IMU,
+    CAMERA_LATE,
+    FOREARM_IMU,
+    GAIN,
+    IMU_LATE,
+    REACH,
+    RIG_WORLD,
+    SHIFT,
+    THICK,
+    UNKNOWN,
+    ZERO,
+    Unknown,
+    believed,
+)
+from master.calibrate.extrinsics.wrists import bends_by_rotation, wrist_rotation_angles
+from master.estimator.body_points import BodyPoints
+from master.estimator.parameters import HandParameters
+from master.estimator.priors import Habits, habits_of
+
+_SURFACE_M, _TIP_M = 8e-4, 1e-3  # skin of another shape than the cones; a tip is seen anywhere on its pulp
+_CAP_M = 5e-4  # where caps sit, beyond the noise of the cameras
+_HABITS = 1e-2  # of their information: what sensors tell is to count
+_TWIST_RAD = np.radians(1.0)
+_WRIST_RAD = np.radians(15.0)
+_PER_S = 4.0  # independent instants
+_FARTHEST = 8.0  # of a finger that the laser should meet and does not
+_TRIALS, _SETTLED = 6, 0.03  # of a step; the gain that is none
+_EYE = np.eye(3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Told:
+    """What the tracks say while the clocks' errors are near to `about`: markers, turns."""
+
+    about: Unknown
+    markers: Markers
+    orientations: ImuOrientations
+    tip_px: Float
+
+
+class Problem:
+    """Residuals and steps. Holds what the tracks say about the last guess of the clocks."""
+
+    def __init__(
+        self,
+        lines_of_sight: LinesOfSight,
+        model: HandModel,
+        names: tuple[str, ...],
+        hand: HandTrack,
+        imu: ImuTrack,
+        cycles: StrobeCycles,
+        px_per_m: float,
+        first: Unknown,
+    ) -> None:
+        self._lines_of_sight, self._hand, self._imu, self._cycles, self._first = (
+            lines_of_sight,
+            hand,
+            imu,
+            cycles,
+            first,
+        )
+        model = replace(model, tolerance_rad=np.zeros((5, 4)))  # nothing here weighs what is beyond limits
+        self._model, self._parameters = model, HandParameters.of(model)
+        count = len(cycles.t_s)
+        self._hands = HandProblem(
+            model,
+            BodyPoints.markers(model, self._parameters, names),
+            _loosest(habits_of(model, self._parameters)),
+            np.zeros((count, len(names), 3)),
+            np.zeros((count, len(names), 3, 3)),
+        )
+        tip_px = np.hypot(np.nan_to_num(cycles.tip_sigma_px), _TIP_M * px_per_m)
+        laser_m = np.hypot(np.nan_to_num(cycles.laser_sigma_m), _SURFACE_M)
+        self.sigma = np.concatenate([laser_m, np.repeat(tip_px[..., None], 2, axis=-1)], axis=-1)
+        last_s, first_s = cycles.t_s[-1], cycles.t_s[0]
+        self._share = min(_PER_S * (last_s - first_s) / count, 1.0)
+        self._wrist_sigma = np.array([_WRIST_RAD, _WRIST_RAD, _TWIST_RAD])
+        self._believed = believed()
+
+    def followed(self, unknown: Unknown, rounds: Sequence[int]) -> tuple[Unknown, Hands, int]:
+        """From a guess downhill, round by round; and the steps taken."""
+        hands, steps = self.guessed(unknown), 0
+        for most in rounds:
+            self.tell(unknown, hands)
+            unknown, hands, taken = self.solved(unknown, hands, most)
+            steps += taken
+        return unknown, hands, steps
+
+    def guessed(self, unknown: Unknown) -> Hands:
+        """The hands as the markers alone have them."""
+        near = self._hand.nearest(self._cycles.t_s + unknown.camera_late_s)
+        x = np.array([self._parameters.of_angles(angles) for angles in self._hand.angles_rad[near]])
+        return Hands(self._hand.T_rig_palm[near], x)
+
+    def tell(self, unknown: Unknown, hands: Hands) -> None:
+        """Ask the tracks where the clocks and the errors of the gyroscope are believed to be."""
+        self._mended, self._mended_of = self._imu.mended(unknown.gyro), unknown.gyro
+        at = self._cycles.t_s + unknown.camera_late_s
+        markers = self._hand.markers(at)
+        orientations = self._mended.at(at - unknown.imu_late_s)
+        self._known = orientations.known & (markers.seen.sum(axis=1) > 0)
+        seen = markers.seen & self._known[:, None]
+        cov = np.where(seen[..., None, None], markers.cov_m2, 0.0) + _CAP_M**2 * _EYE
+        whiten = np.linalg.inv(np.linalg.cholesky(cov)) * seen[..., None, None]
+        place = self._hands.place(hands)
+        far = (whiten @ (place - np.nan_to_num(markers.points_m))[..., None])[..., 0]
+        whiten = whiten * ((1.0 + np.vecdot(far, far) / STRAYS**2) ** -0.5)[..., None, None]
+        told = [
+            np.nan_to_num(part) for part in (markers.points_m, markers.speed_m_s, markers.acceleration_m_s2)
+        ]
+        self._told = _Told(
+            unknown,
+            Markers(told[0], told[1], told[2], markers.cov_m2),
+            ImuOrientations(
+                np.where(self._known[:, None, None], orientations.R_world_imu, _EYE),
+                orientations.rate_rad_s,
+                orientations.drift,
+            ),
+            self._tips_with_the_laser(unknown, hands),
+        )
+        self._hands = replace(self._hands, whiten=whiten)
+        data = np.concatenate([self._cycles.laser_m, self._told.tip_px], axis=-1)
+        self._data = np.where(self._known[:, None, None], data, np.nan)
+
+    def _tips_with_the_laser(self, unknown: Unknown, hands: Hands) -> Float:
+        """Tips (T, 4, 2) [px] as they were when the laser shone: moved back by how the hand moved meanwhile."""
+        late_s, t_s = self._cycles.tip_late_s, self._cycles.t_s
+        at = t_s + unknown.camera_late_s
+        orientations = self._mended.at(at - unknown.imu_late_s)
+        R = self._camera_rig(
+            unknown, replace(orientations, R_world_imu=np.nan_to_num(orientations.R_world_imu))
+        )
+        angles = self._parameters.angles(hands.x)
+        seen = self._lines_of_sight(
+            R @ hands.T_rig_palm[:, :3, :3], unknown.shift_m, angles, unknown.thick, unknown.reach_m
+        )
+        speed = np.gradient(seen[..., 2:], t_s, axis=0)
+        jump = np.diff(t_s, prepend=t_s[0]) > 0.2
+        speed[jump | np.r_[jump[1:], False] | ~orientations.known] = 0.0
+        return self._cycles.tip_uv - late_s * np.nan_to_num(speed)
+
+    def solved(self, unknown: Unknown, hands: Hands, rounds: int) -> tuple[Unknown, Hands, int]:
+        """The least cost from a guess, and the steps taken."""
+        damping, cost, taken = 1e-3, self.cost(unknown, hands), 0
+        for _ in range(rounds):
+            normal, gain = self.normal(unknown, hands), 0.0
+            for _ in range(_TRIALS):
+                trial = self._stepped(unknown, hands, *normal.step(damping))
+                trial_cost = self.cost(*trial)
+                if trial_cost < cost:
+                    break
+                damping *= 8.0
+            else:
+                break
+            (unknown, hands), gain, cost, damping = trial, cost - trial_cost, trial_cost, 0.2 * damping
+            taken += 1
+            if gain < _SETTLED:
+                break
+        return unknown, hands, taken
+
+    def result(self, unknown: Unknown, hands: Hands, steps: int) -> Fit:
+        """What is told of the end."""
+        covariance = np.asarray(np.linalg.inv(self.normal(unknown, hands).reduced(0.0)[0]), np.float64)
+        shown, wrist_angles = self._shown(unknown, hands)
+        off = (self._data - shown) / self.sigma
+        here = self._here(unknown)
+        far = self._hands.place(hands) - here.points_m
+        seen = self._hands.whiten[..., 0, 0] > 0.0
+        marker_m = float(np.sqrt((far[seen] ** 2).sum(axis=-1).mean()))
+        return Fit(
+            unknown,
+            covariance,
+            wrist_angles[:, :2],
+            wrist_angles[:, 2],
+            off,
+            self.sigma,
+            shown,
+            marker_m,
+            steps,
+        )
+
+    def _stepped(self, unknown: Unknown, hands: Hands, step: Float, own: Float) -> tuple[Unknown, Hands]:
+        after = hands.moved(own)
+        x = np.minimum(np.maximum(after.x, self._parameters.low), self._parameters.high)
+        return unknown.moved(step), replace(after, x=x)
+
+    def _here(self, unknown: Unknown) -> Markers:
+        """The markers when the frames were taken."""
+        late_s, told = unknown.camera_late_s - self._told.about.camera_late_s, self._told.markers
+        speed = told.speed_m_s + late_s * told.acceleration_m_s2
+        points = told.points_m + late_s * (told.speed_m_s + 0.5 * late_s * told.acceleration_m_s2)
+        return Markers(points, speed, told.acceleration_m_s2, told.cov_m2)
+
+    def _orientations(self, unknown: Unknown) -> ImuOrientations:
+        """The IMU when the frames were taken."""
+        about, told = self._told.about, self._told.orientations
+        late_s = unknown.camera_late_s - unknown.imu_late_s - about.camera_late_s + about.imu_late_s
+        return replace(
+            told, R_world_imu=told.R_world_imu @ rotation_vector_to_matrix(late_s * told.rate_rad_s)
+        )
+
+    def _rig_imu(self, unknown: Unknown, orientations: ImuOrientations) -> Float:
+        """(T, 3, 3) IMU axes -> rig axes."""
+        drift = rotation_vector_to_matrix(-(orientations.drift @ (unknown.gyro - self._mended_of)))
+        return unknown.R_rig_world @ drift @ orientations.R_world_imu
+
+    def _camera_rig(self, unknown: Unknown, orientations: ImuOrientations) -> Float:
+        """(T, 3, 3) rig axes -> camera axes."""
+        return unknown.R_camera_imu @ np.swapaxes(self._rig_imu(unknown, orientations), 1, 2)
+
+    def _wrists(self, unknown: Unknown, hands: Hands, orientations: ImuOrientations) -> Float:
+        """R_forearm_palm (T, 3, 3)."""
+        palm = np.swapaxes(self._rig_imu(unknown, orientations), 1, 2) @ hands.T_rig_palm[:, :3, :3]
+        return unknown.R_forearm_imu @ palm
+
+    def _shown(self, unknown: Unknown, hands: Hands) -> tuple[Float, Float]:
+        """LinesOfSight (T, 4, SEEN), and flexion, deviation and twist of the wrist (T, 3) [rad]."""
+        orientations = self._orientations(unknown)
+        R = self._camera_rig(unknown, orientations) @ hands.T_rig_palm[:, :3, :3]
+        angles = self._parameters.angles(hands.x)
+        seen = self._lines_of_sight(R, unknown.shift_m, angles, unknown.thick, unknown.reach_m)
+        return seen, wrist_rotation_angles(self._wrists(unknown, hands, orientations))
+
+    def _off(self, shown: Float) -> Float:
+        """Fitted minus seen (T, 4, SEEN) in standard deviations, 0 where not seen; what the laser misses is far."""
+        off = (shown - self._data) / self.sigma
+        missed = np.isnan(shown) & np.isfinite(self._data)
+        return np.where(missed, _FARTHEST, np.nan_to_num(off))
+
+    def cost(self, unknown: Unknown, hands: Hands) -> float:
+        """Sum of squares, strays weighed down."""
+        shown, wrist_angles = self._shown(unknown, hands)
+        off = self._off(shown)
+        pairs = off[..., 0::2] ** 2 + off[..., 1::2] ** 2
+        data = (STRAYS**2 * np.log1p(pairs / STRAYS**2)).sum()
+        chi2 = ((wrist_angles / self._wrist_sigma) ** 2).sum(axis=-1) * self._known
+        wrist = (STRAYS**2 * np.log1p(chi2 / STRAYS**2)).sum()
+        markers = replace(self._hands, points_m=self._here(unknown).points_m)
+        held = 2.0 * markers.cost(hands).sum()
+        believed_off = unknown.off(self._first) / self._believed
+        return float(self._share * (data + wrist + held) + (believed_off**2).sum())
+
+    def normal(self, unknown: Unknown, hands: Hands) -> Normal:
+        """Normal equations about a place."""
+        orientations, here = self._orientations(unknown), self._here(unknown)
+        problem = replace(self._hands, points_m=here.points_m)
+        linear = problem.linearise(hands)
+        out = Normal.of_markers(problem, linear, hands, here.speed_m_s)
+        rows = (
+            self._line_of_sight_rows(unknown, hands, orientations),
+            self._wrist_rows(unknown, hands, orientations),
+        )
+        for residual, own, shared in rows:
+            out = out.and_rows(residual, own, shared)
+        out = out.shared_out(self._share, unknown.off(self._first), self._believed)
+        return out.within(hands.x, self._parameters)
+
+    def _line_of_sight_rows(
+        self, unknown: Unknown, hands: Hands, orientations: ImuOrientations
+    ) -> tuple[Float, Float, Float]:
+        """Residuals (T, 16), and derivatives by own (T, 16, 6 + n) and shared unknowns (T, 16, UNKNOWN)."""
+        camera_rig = self._camera_rig(unknown, orientations)
+        R = camera_rig @ hands.T_rig_palm[:, :3, :3]
+        angles = self._parameters.angles(hands.x)
+        shown, by = self._lines_of_sight.derivatives(
+            R, unknown.shift_m, angles, unknown.thick, unknown.reach_m
+        )
+        off = self._off(shown)
+        pairs = off[..., 0::2] ** 2 + off[..., 1::2] ** 2
+        root = np.repeat((1.0 + pairs / STRAYS**2) ** -0.5, 2, axis=-1)
+        told = np.isfinite(self._data) & np.isfinite(shown)
+        by = by * (np.where(told, root, 0.0) / self.sigma)[..., None]
+        count, n = len(hands.x), hands.x.shape[1]
+        by_rotation = by[..., :3].reshape(count, -1, 3)
+        own = np.zeros((count, 4 * SEEN, 6 + n))
+        own[..., :3] = by_rotation @ camera_rig
+        complete = self._parameters.complete.reshape(5, 4, n)[FINGERS]
+        by_x = np.einsum("tfya,fan->tfyn", by[..., 6:10], complete)
+        own[..., 6:] = self._parameters.by_parameters(by_x, hands.x).reshape(count, -1, n)
+        shared = np.zeros((count, 4, SEEN, UNKNOWN))
+        for f in range(4):
+            shared[:, f, :, THICK.start + f] = by[:, f, :, 10]
+            shared[:, f, :, REACH.start + f] = by[:, f, :, 11]
+        shared = shared.reshape(count, -1, UNKNOWN)
+        shared[..., CAMERA_IMU] = by_rotation
+        shared[..., SHIFT] = by[..., 3:6].reshape(count, -1, 3)
+        self._world_columns(shared, -by_rotation @ camera_rig, unknown, orientations)
+        return (off * root).reshape(count, -1), own, shared
+
+    def _wrist_rows(
+        self, unknown: Unknown, hands: Hands, orientations: ImuOrientations
+    ) -> tuple[Float, Float, Float]:
+        """As `_line_of_sight_rows`, of flexion, deviation and twist."""
+        wrist = self._wrists(unknown, hands, orientations)
+        chi2 = wrist_rotation_angles(wrist) / self._wrist_sigma
+        root = (1.0 + np.vecdot(chi2, chi2) / STRAYS**2) ** -0.5  # where the hand itself was mistaken
+        weight = (self._known * root)[:, None] / self._wrist_sigma
+        by_rotation = weight[..., None] * bends_by_rotation(wrist)
+        forearm_rig = unknown.R_forearm_imu @ np.swapaxes(self._rig_imu(unknown, orientations), 1, 2)
+        own = np.zeros((len(wrist), 3, 6 + hands.x.shape[1]))
+        own[..., :3] = by_rotation @ forearm_rig
+        shared = np.zeros((len(wrist), 3, UNKNOWN))
+        shared[..., FOREARM_IMU] = by_rotation
+        self._world_columns(shared, -by_rotation @ forearm_rig, unknown, orientations)
+        return wrist_rotation_angles(wrist) * weight, own, shared
+
+    def _world_columns(
+        self, shared: Float, by_imu: Float, unknown: Unknown, orientations: ImuOrientations
+    ) -> None:
+        """Fill what turns the IMU in the rig: its world, the errors of its gyroscope, and clocks.
+
+        Args:
+            shared: (T, R, UNKNOWN) which is changed.
+            by_imu: (T, R, 3) derivatives by a turn of the IMU, rig axes.
+            unknown, orientations: Where.
+        """
+        shared[..., RIG_WORLD] = by_imu
+        by_gyro = -by_imu @ (unknown.R_rig_world @ orientations.drift)
+        shared[..., ZERO], shared[..., GAIN] = by_gyro[..., :3], by_gyro[..., 3:]
+        rate = (self._rig_imu(unknown, orientations) @ orientations.rate_rad_s[..., None])[..., 0]
+        later = (by_imu @ rate[..., None])[..., 0]
+        shared[..., CAMERA_LATE], shared[..., IMU_LATE] = later, -later
+
+
+def _loosest(habits: Habits) -> Habits:
+    """Those of the free hand, the last hypothesis, with a share of their information."""
+    normal, pull, constant = (_HABITS * part[-1:] for part in (habits.normal, habits.pull, habits.constant))
+    return Habits(normal, pull, constant, habits.log_density[-1:])

@@ -1,0 +1,222 @@
+"""What marker rig and IMU say at any instant: the hand's markers with how they move, the IMU's turn with its rate.
+
+Cameras, IMU and marker rig have no instants in common, and by how much their clocks differ is to be found. So markers
+and orientations are asked for at instants that shift while the fit goes on: each answer comes with its derivatives.
+"""
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float, Int
+from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix, rotation_vector_to_matrix
+from common.hand_model import WRIST, HandModel
+from common.messages import HandPose, ImuSample
+
+_NEAR_S = 0.08  # of an instant: fingers move smoothly for twice as long
+_SUPPORT = 10  # frames to either side
+_TERMS, _NEIGHBOURS = 4, 2  # of a cubic; frames to each side that it needs
+_POOR_M = 0.03  # a cap of which so little is seen that its place is off by as much as this
+GAP_S = 0.06  # between samples of an IMU
+_EYE = np.eye(3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Markers:
+    """The markers at instants (T).
+
+    Attributes:
+        points_m: (T, M, 3) cap centroids, rig frame; NaN: not seen, or a gap nearby.
+        speed_m_s, acceleration_m_s2: (T, M, 3) first and second derivative.
+        cov_m2: (T, M, 3, 3).
+    """
+
+    points_m: Float
+    speed_m_s: Float
+    acceleration_m_s2: Float
+    cov_m2: Float
+
+    @property
+    def seen(self) -> Bool:
+        """(T, M)."""
+        return np.isfinite(self.points_m[..., 0]) & np.isfinite(self.cov_m2[..., 0, 0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandTrack:
+    """The hand as the marker rig alone saw it (N instants).
+
+    Attributes:
+        t_s: (N,) [s], rising.
+        points_m, cov_m2: (N, M, 3), (N, M, 3, 3) markers as measured, rig frame.
+        T_rig_palm: (N, 4, 4).
+        angles_rad: (N, 5, 4).
+    """
+
+    t_s: Float
+    points_m: Float
+    cov_m2: Float
+    T_rig_palm: Float
+    angles_rad: Float
+
+    @classmethod
+    def of(cls, poses: Sequence[HandPose], model: HandModel, zero_ns: int) -> "HandTrack":
+        """From poses of the markers' line, those that are valid; times count from `zero_ns`."""
+        known = [pose for pose in poses if pose.valid[WRIST] and np.isfinite(pose.angles_rad).all()]
+        cov = np.array([pose.markers_cov_m2 for pose in known])
+        poor = ~(np.einsum("tmii->tm", cov) < _POOR_M**2)
+        points = np.where(poor[..., None], np.nan, np.array([pose.markers_raw_m for pose in known]))
+        T = np.tile(np.eye(4), (len(known), 1, 1))
+        integrated = np.array([pose.orientation_wxyz[WRIST] for pose in known]).reshape(-1, 4)
+        T[:, :3, :3] = quaternion_to_matrix(integrated) @ model.rest_rotation[WRIST].T
+        place = np.array([pose.position_m[WRIST] for pose in known]).reshape(-1, 3)
+        T[:, :3, 3] = place - T[:, :3, :3] @ model.rest_position_m[WRIST]
+        return cls(
+            np.array([1e-9 * (pose.t_ns - zero_ns) for pose in known]),
+            points,
+            np.where(poor[..., None, None], np.nan, cov),
+            T,
+            np.array([pose.angles_rad for pose in known]),
+        )
+
+    def nearest(self, t_s: Float) -> Int:
+        """Numbers (T,) of the instants nearest to times (T,) [s]."""
+        after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self.t_s) - 1)
+        return after - (t_s - self.t_s[after - 1] < self.t_s[after] - t_s)
+
+    def markers(self, t_s: Float) -> Markers:
+        """The markers at times (T,) [s], by a cubic through what was seen within 80 ms of each.
+
+        One through four neighbours would pass on their noise to the speed, and both to the clock's error: triples are
+        often taken at the same share of the time between two frames.
+        """
+        near = self.nearest(t_s)
+        rows = np.clip(near[:, None] + np.arange(-_SUPPORT, _SUPPORT + 1), 0, len(self.t_s) - 1)
+        off = (self.t_s[rows] - t_s[:, None]) / _NEAR_S  # (T, K)
+        points, cov = self.points_m[rows], self.cov_m2[rows]  # (T, K, M, 3), (T, K, M, 3, 3)
+        within = (np.abs(off) < 1.0) & np.diff(rows, axis=1, prepend=-1).astype(np.bool_)
+        seen = within[..., None] & np.isfinite(points[..., 0]) & np.isfinite(cov[..., 0, 0])
+        weight = np.where(
+            seen, 1.0 / np.einsum("tkmii->tkm", np.where(seen[..., None, None], cov, _EYE)), 0.0
+        )
+        power = off[..., None] ** np.arange(_TERMS)
+        normal = np.einsum("tkm,tki,tkj->tmij", weight, power, power)
+        pull = np.einsum("tkm,tki,tkmd->tmid", weight, power, np.where(seen[..., None], points, 0.0))
+        before, after = ((seen & side[..., None]).sum(axis=1) for side in (off <= 0.0, off >= 0.0))
+        told = (before >= _NEIGHBOURS) & (after >= _NEIGHBOURS) & np.isfinite(self.cov_m2[near][..., 0, 0])
+        solvable = np.where(told[..., None, None], normal, np.eye(_TERMS))
+        taylor = np.asarray(np.linalg.solve(solvable, pull), np.float64)
+        taylor[~told] = np.nan
+        speed, acceleration = taylor[:, :, 1] / _NEAR_S, 2.0 * taylor[:, :, 2] / _NEAR_S**2
+        return Markers(taylor[:, :, 0], speed, acceleration, self.cov_m2[near])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuOrientations:
+    """The IMU at instants (T), in a world of its own.
+
+    Attributes:
+        R_world_imu: (T, 3, 3); NaN: no sample nearby.
+        rate_rad_s: (T, 3) IMU axes.
+        drift: (T, 3, 12) by how much too far it has turned since the middle, world axes, by errors of the gyroscope.
+    """
+
+    R_world_imu: Float
+    rate_rad_s: Float
+    drift: Float
+
+    @property
+    def known(self) -> Bool:
+        """(T,)."""
+        return np.isfinite(self.R_world_imu[:, 0, 0])
+
+
+class ImuTrack:
+    """How one IMU turned (S samples): its rates summed up. Fixed by the constructor.
+
+    The orientation that comes with the samples leans by some degrees whenever the arm is accelerated, since gravity
+    holds it; for ten seconds rates alone are better, once their errors are known. The two worlds agree in the middle.
+    Errors (12,) of a gyroscope are its zero (3) [rad/s] and its gain (3, 3), by row: what it says is too much by
+    zero + gain @ what it says.
+
+    Attributes:
+        t_s: (S,) [s], by its stamps.
+        gap_s: The longest time between two samples.
+    """
+
+    def __init__(self, samples: Sequence[ImuSample], zero_ns: int) -> None:
+        """Of samples in order, those with rates and an orientation; times count from `zero_ns`."""
+        told = [one for one in samples if np.isfinite([*one.orientation_wxyz, *one.gyro_rad_s]).all()]
+        times = np.array([1e-9 * (one.t_ns - zero_ns) for one in told])
+        rising = np.diff(times, prepend=-np.inf) > 0.0
+        self.t_s = times[rising]
+        self._rate = np.array([one.gyro_rad_s for one in told]).reshape(-1, 3)[rising]
+        held = np.array([one.orientation_wxyz for one in told]).reshape(-1, 4)[rising]
+        self._held = quaternion_to_matrix(held)
+        step = np.diff(self.t_s)[:, None]
+        self.gap_s = float(step.max(initial=0.0))
+        self._integrated, self._drift = np.empty_like(self._held), np.zeros((len(self.t_s), 3, 12))
+        if len(told):
+            self._sum_up()
+
+    def mended(self, errors: Float) -> "ImuTrack":
+        """The same without errors (12,) of its gyroscope."""
+        out = copy(self)
+        out._rate = self._rate - errors[:3] - self._rate @ errors[3:].reshape(3, 3).T
+        out._integrated = np.empty_like(self._integrated)
+        out._sum_up()
+        return out
+
+    def _sum_up(self) -> None:
+        """Orientations by rates alone, and what errors of the rates make of them.
+
+        A rate is the mean over the time that ends at its stamp.
+        """
+        step_s = np.diff(self.t_s)[:, None]
+        arcs = rotation_vector_to_matrix(step_s * self._rate[1:])
+        now = np.eye(3)
+        for k, arc in enumerate([np.eye(3), *arcs]):
+            self._integrated[k] = now = now @ arc
+        middle = len(self.t_s) // 2
+        self._integrated = self._held[middle] @ self._integrated[middle].T @ self._integrated
+        integrated = 0.5 * (self._integrated[1:] + self._integrated[:-1])
+        by_gain = integrated[..., None] * self._rate[1:, None, None]  # axis, row and column of the gain
+        mean = step_s[..., None] * np.concatenate([integrated, by_gain.reshape(-1, 3, 9)], axis=-1)
+        drift = np.concatenate([np.zeros((1, 3, 12)), np.cumsum(mean, axis=0)])
+        self._drift = drift - drift[middle]
+
+    def __len__(self) -> int:
+        """How many samples there are."""
+        return len(self.t_s)
+
+    def at(self, t_s: Float) -> ImuOrientations:
+        """The IMU at times (T,) [s] by its stamps, by its rates."""
+        after, share, known = self._between(t_s)
+        R = self._integrated[after - 1] @ _share_of_arc(
+            self._integrated[after - 1], self._integrated[after], share
+        )
+        rate = self._rate[after]
+        drift = (1.0 - share)[..., None] * self._drift[after - 1] + share[..., None] * self._drift[after]
+        R[~known] = np.nan
+        return ImuOrientations(R, rate, drift)
+
+    def held_at(self, t_s: Float) -> Float:
+        """(T, 3, 3) IMU axes -> a world whose z axis is up, as the samples say themselves; NaN: none nearby."""
+        after, share, known = self._between(t_s)
+        R = self._held[after - 1] @ _share_of_arc(self._held[after - 1], self._held[after], share)
+        R[~known] = np.nan
+        return R
+
+    def _between(self, t_s: Float) -> tuple[Int, Float, Bool]:
+        """The sample after each time, the share (T, 1) of the way to it, and whether both are near (T,)."""
+        after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self.t_s) - 1)
+        start, stop = self.t_s[after - 1], self.t_s[after]
+        known = (t_s >= start) & (t_s <= stop) & (stop - start <= GAP_S)
+        return after, ((t_s - start) / (stop - start))[:, None], known
+
+
+def _share_of_arc(first: Float, second: Float, share: Float) -> Float:
+    """Turns (T, 3, 3) from the first to a share (T, 1) of the way to the second, axes of the first."""
+    return rotation_vector_to_matrix(share * matrix_to_rotation_vector(np.swapaxes(first, 1, 2) @ second))

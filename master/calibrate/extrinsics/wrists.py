@@ -1,0 +1,23 @@
+"""How a wrist is bent: by two angles, and by a third that no wrist has; and how that changes with a turn."""
+
+import numpy as np
+
+from common.arrays import Float
+from common.geometry import rotation_vector_to_matrix
+from common.wrist_joint import wrist_angles_of
+
+_LITTLE = 1e-5
+
+
+def wrist_rotation_angles(R_forearm_palm: Float) -> Float:
+    """Flexion, deviation and twist (..., 3) [rad] of rotations (..., 3, 3)."""
+    return np.concatenate([wrist_angles_of(R_forearm_palm), R_forearm_palm[..., 1, :1]], axis=-1)
+
+
+def bends_by_rotation(R_forearm_palm: Float) -> Float:
+    """Derivatives (T, 3, 3) of `wrist_rotation_angles` by a turn of the palms (T, 3, 3), forearm axes."""
+    here, out = wrist_rotation_angles(R_forearm_palm), np.empty((len(R_forearm_palm), 3, 3))
+    for k in range(3):
+        rotated = rotation_vector_to_matrix(_LITTLE * np.eye(3)[k]) @ R_forearm_palm
+        out[..., k] = (wrist_rotation_angles(rotated) - here) / _LITTLE
+    return out

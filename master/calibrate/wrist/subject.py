@@ -1,0 +1,242 @@
+"""Who wears the device: palm pose, knuckles and fingers from one guided motion before it (row D18).
+
+The place of a knuckle is told by the laser where its finger is bent most: there the line lies beside it. One motion
+shows that, and the flat hand, from which everything is counted, and a fist, in which fingertips are seen. What is
+made of it is in `guided`, `subject_model` and `subject_fit`; here is what goes in, comes out and is refused.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from msgspec.structs import replace
+
+from common.arrays import Bool, Float
+from common.calibration import CameraCalibration, HandProfile, RigCalibration
+from common.errors import FitError
+from common.hand_model import CHAINS, FINGERS, HandModel
+from common.messages import WristDetections
+from master.calibrate.cameras.lens_files import matrix_of
+from master.calibrate.tree_files import provenance
+from master.calibrate.wrist.guided import FLAT, MOTION, Guided, guided
+from master.calibrate.wrist.subject_fit import Fit, ImageObservations, fit_subject, prior_sigma
+from master.calibrate.wrist.subject_model import MCP, SubjectModel, Unknown, fitted_profile
+from master.wrist_setup import WristSetup
+
+TOOL = "calibrate subject"
+_NAMES = FINGERS[1:]
+_GUESS = np.radians(5.0), 5e-3  # of a drawing's pose of the palm, standard deviations
+_RULER = np.radians(1.0), 1.5e-3  # of a board's: how it lies on the palm, and what was measured with a ruler
+_LENGTH, _MEASURED = (
+    0.04,
+    0.012,
+)  # of fingers: bones are 6.5 % off their shares, each alone; measured ones 1 mm
+_BENT_RAD = np.radians(60.0)  # at its knuckle: from here on the line hardly moves any more
+_MISFIT = 1.5  # standard deviations: angles are free, so what is left is small
+_UNLIKELY = 3.0  # standard deviations
+_SURPRISE = 1.5  # rms of standard deviations: one in a hundred subjects, of 14 numbers that a motion tells
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Subject:
+    """A device and a hand that explain what was seen.
+
+    Attributes:
+        rig: The rig with its new `T_camera_palm`.
+        hand: The hand file with new knuckles, lengths and `palmar_scale`, under its old name.
+        report: Lines for a person.
+        chosen: Which triples were used.
+        seen: What was seen in them.
+        fit: What was fitted to it.
+        model: The forward function about the old rig and hand.
+    """
+
+    rig: RigCalibration
+    hand: HandProfile
+    report: tuple[str, ...]
+    chosen: Guided
+    seen: ImageObservations
+    fit: Fit
+    model: SubjectModel
+
+    @property
+    def unknown(self) -> Unknown:
+        """What was fitted, as changes of the old rig and hand."""
+        return Unknown.of(self.fit.x)
+
+    @property
+    def knuckle_sigma_m(self) -> Float:
+        """(4, 3) of the knuckles in the camera's frame [m]: of palm and hand file together."""
+        by_x = self.model.knuckle_derivatives(self.fit.x)
+        return np.sqrt(np.einsum("fki,ij,fkj->fk", by_x, self.fit.covariance, by_x))
+
+
+def calibrate_subject(
+    cycles: Sequence[WristDetections],
+    rig: RigCalibration,
+    camera: CameraCalibration,
+    hand: HandProfile,
+    source: str = "a guided motion",
+) -> Subject:
+    """Fit the subject of a wrist device to one guided motion: open hand, straight fingers bent at the knuckles, fist.
+
+    Args:
+        cycles: What the slave saw, in order.
+        rig: The device: laser plane, and a palm pose that is right to a centimetre and ten degrees.
+        camera: Its camera.
+        hand: The hand as far as it is known, such as a hand of the user's length.
+        source: Name of the data, for the provenance.
+
+    Raises:
+        FitError: The motion was not done, or not seen, or nothing likely explains it; the text says what to do.
+        CalibrationError: The rig lacks its laser plane or palm pose.
+    """
+    setup = WristSetup.of(rig, camera, HandModel.of(hand))
+    model = SubjectModel(setup)
+    laser = np.array([one.laser_uv for one in cycles]).reshape(-1, 5, 2)
+    points = model.flat(setup.on_plane(laser))[:, 1:]
+    chosen = guided(points[..., 1])
+    tips = np.array([one.tip_uv for one in cycles])[chosen.row, 1:]
+    doubt = np.array([one.tip_sigma_px for one in cycles])[chosen.row, 1:]
+    seen = ImageObservations(points[chosen.row], tips, doubt, chosen.bend)
+    sigma = prior_sigma(_pose_sigma(rig), _length_sigma(hand))
+    fit = fit_subject(model, seen, sigma)
+    _check(fit, seen)
+    unknown = Unknown.of(fit.x)
+    report = report_lines(setup, fit, len(cycles))
+    new_rig, new_hand = _documented(rig, fitted_profile(setup.model, unknown), fit, source)
+    new_rig = replace(new_rig, T_camera_palm=matrix_of(model.palm(unknown)))
+    return Subject(new_rig, new_hand, report, chosen, seen, fit, model)
+
+
+def _pose_sigma(rig: RigCalibration) -> Float:
+    """(6,) how far the palm's pose in the rig file may be off [rad, m]: turned about the wrist joint, and shifted.
+
+    A rig whose maker knows how differently it is worn says so in the residual of the pose's provenance.
+    """
+    how = rig.provenance.get("T_camera_palm")
+    told = {} if how is None or how.tool == TOOL else how.residual
+    rotation, shift = np.radians(told.get("rotation_sigma_deg", 0.0)), 1e-3 * told.get("shift_sigma_mm", 0.0)
+    if how is not None and how.tool == "calibrate palm":
+        return np.repeat([np.hypot(rotation, _RULER[0]), np.hypot(shift, _RULER[1])], 3)
+    return np.repeat([rotation, shift] if rotation > 0.0 and shift > 0.0 else _GUESS, 3)
+
+
+def _length_sigma(hand: HandProfile) -> Float:
+    """(4,) how far the lengths of the fingers may be off, shares: less where markers measured them."""
+    how = [hand.provenance.get(name) for name in _NAMES]
+    return np.array(
+        [
+            _MEASURED if one and one.tool == "calibrate hand" and len(one.residual) > 1 else _LENGTH
+            for one in how
+        ]
+    )
+
+
+def _check(fit: Fit, seen: ImageObservations) -> None:
+    """Refuse what does not reach the minimum, and what is not likely.
+
+    Raises:
+        FitError: With what to do.
+    """
+    knuckles = (seen.bend != FLAT) & ~fit.fist
+    if not knuckles.any() or not fit.fist.any():
+        missing = "closes to a fist" if knuckles.any() else "bends straight fingers at their knuckles"
+        raise FitError(f"the hand never {missing}, or its tips were not seen meanwhile: {MOTION}")
+    _check_likely(fit)
+    most = np.degrees(most_bent(fit, knuckles))
+    short = most < np.degrees(_BENT_RAD)
+    if short.sum() > 1:
+        told = ", ".join(f"{name} {angle:.0f}" for name, angle in zip(_NAMES, most, strict=True))
+        raise FitError(
+            f"straight fingers were bent at their knuckles to {told} deg, at least {np.degrees(_BENT_RAD):.0f} are"
+            " needed, where the laser lies beside the knuckle: bend them towards 90 deg, straight, before the camera"
+        )
+
+
+def _check_likely(fit: Fit) -> None:
+    """Refuse what neither skin nor belief explains.
+
+    Raises:
+        FitError: With what is most unlikely.
+    """
+    pull = np.abs(fit.x) / fit.prior_sigma
+    worst = int(pull.argmax())
+    if fit.rms > _MISFIT or pull[worst] > _UNLIKELY or fit.surprise > _SURPRISE or fit.unlike > _UNLIKELY:
+        raise FitError(
+            f"no likely subject explains what was seen: it is {fit.rms:.1f} times farther off than skin explains,"
+            f" fingers {fit.unlike:.1f} times from their habits, and {_name(worst)} {pull[worst]:.1f} standard"
+            " deviations from the file; is the hand file that of this hand and side, the laser plane measured, and"
+            f" the palm's pose right to a centimetre and ten degrees? The motion is: {MOTION}"
+        )
+
+
+def most_bent(fit: Fit, knuckles: Bool) -> Float:
+    """(4,) how far straight fingers were bent at their knuckles [rad]."""
+    return fit.angles_rad[knuckles][..., MCP].max(axis=0)
+
+
+def _name(unknown: int) -> str:
+    """What number `unknown` of the vector is, for a person."""
+    if unknown < 6:
+        return f"the palm's {'rotation about' if unknown < 3 else 'shift along'} {'xyz'[unknown % 3]}"
+    if unknown < 18:
+        return f"the {_NAMES[(unknown - 6) // 3]} knuckle"
+    return f"the {'thickness' if unknown < 22 else 'length'} of the {_NAMES[(unknown - 18) % 4]} finger"
+
+
+def report_lines(setup: WristSetup, fit: Fit, count: int) -> tuple[str, ...]:
+    """Before and after, for a person; knuckles across (to the thumb), up (to the back) and along the hand."""
+    new, sigma = Unknown.of(fit.x), Unknown.of(np.sqrt(np.diag(fit.covariance)))
+    rotation, shift = np.degrees(np.linalg.norm(new.pose[:3])), 1e3 * np.linalg.norm(new.pose[3:])
+    knuckles = ~fit.fist & (fit.angles_rad[..., MCP].max(axis=1) > _BENT_RAD)
+    lines = [
+        f"subject from {len(fit.fist)} of {count} triples and {np.isfinite(fit.off[..., 2]).sum()} fingertips in them",
+        f"left: laser {1e3 * fit.laser_m:.2f} mm, tips {fit.tip_px:.1f} px; changed by {fit.surprise:.1f} of belief",
+        f"palm turned by {rotation:.1f} deg, about x, y, z ± {_three(np.degrees(sigma.pose[:3]))}",
+        f"palm shifted by {shift:.1f} mm, along x, y, z ± {_three(1e3 * sigma.pose[3:])}",
+        f"{'':8} {'bent':>4} {'knuckle before':>20} {'after, mm':>20} {'±':>14} {'thick':>11} {'long':>13}",
+    ]
+    thumbwards = np.array([setup.model.side_sign, 1.0, 1.0])
+    before = setup.model.rest_position_m[CHAINS[1:, 0]] * thumbwards
+    moved = new.knuckle_m * thumbwards
+    most = np.degrees(most_bent(fit, knuckles)) if knuckles.any() else np.full(4, np.nan)
+    for f, name in enumerate(_NAMES):
+        lines.append(
+            f"{name:8} {most[f]:4.0f} {_three(1e3 * before[f]):>20} {_three(1e3 * (before + moved)[f]):>20}"
+            f" {_three(1e3 * sigma.knuckle_m[f]):>14} {np.exp(new.thick[f]):5.2f} ±{sigma.thick[f]:5.2f}"
+            f" {np.exp(new.long[f]):6.3f} ±{sigma.long[f]:6.3f}"
+        )
+    lines.append(
+        "± are standard deviations; what is as large as its belief (3 mm, 0.10, 0.04) was not seen and kept from it"
+    )
+    return tuple(lines)
+
+
+def _three(values: Float) -> str:
+    return " ".join(f"{value:.1f}" for value in values)
+
+
+def _documented(
+    rig: RigCalibration, hand: HandProfile, fit: Fit, source: str
+) -> tuple[RigCalibration, HandProfile]:
+    """Rig and hand with where they come from."""
+    sigma = Unknown.of(np.sqrt(np.diag(fit.covariance)))
+    left = {"laser_rms_mm": round(1e3 * fit.laser_m, 4), "tip_rms_px": round(fit.tip_px, 4)}
+    rotation, shift = np.degrees(sigma.pose[:3].max()), 1e3 * sigma.pose[3:].max()
+    pose = left | {"rotation_sigma_deg": round(float(rotation), 4), "shift_sigma_mm": round(float(shift), 4)}
+    knuckles = {
+        f"{name}_sigma_mm": round(1e3 * float(np.linalg.norm(one)), 4)
+        for name, one in zip(_NAMES, sigma.knuckle_m, strict=True)
+    }
+    thick = {f"{name}_sigma": round(float(one), 4) for name, one in zip(_NAMES, sigma.thick, strict=True)}
+    note = "knuckles and palm are known together better than each alone"
+    told = {
+        key: provenance(TOOL, (source,), residual, note)
+        for key, residual in (("knuckles", left | knuckles), ("palmar_scale", left | thick))
+    }
+    how = provenance(TOOL, (source,), pose, f"hand {hand.name!r}; {note}")
+    return (
+        replace(rig, provenance=rig.provenance | {"T_camera_palm": how}),
+        replace(hand, provenance=hand.provenance | told),
+    )

@@ -1,0 +1,129 @@
+"""`phalanx-master calibrate subject`: palm pose, knuckles and fingers of who wears the device, from a guided motion."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from msgspec.structs import replace
+
+from common.arrays import Float
+from common.calibration import HandProfile, load
+from common.errors import CalibrationError, FitError
+from common.hand_model import FINGERS
+from master.calibrate.tree_files import write_hand
+from master.calibrate.wrist.device import Device, device_of, print_line, write_device
+from master.calibrate.wrist.subject import Subject, calibrate_subject
+from master.calibrate.wrist.subject_model import Unknown
+from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
+from master.recorded import recorded_cycles
+from master.summary import write_summary
+
+Recording = Annotated[
+    Path, typer.Argument(help="Folder of a recording: the guided motion.", show_default=False)
+]
+Detections = Annotated[
+    Path, typer.Option(help="Folder with detections_<camera>.npz of it, from `phalanx-slave detect`.")
+]
+Hand = Annotated[
+    Path | None, typer.Option("--hand", help="Hand file; default: the rig's `hand` in CALIBRATION/hands.")
+]
+Name = Annotated[
+    str | None, typer.Option("--name", help="Of the new hand file; default: that of the hand file.")
+]
+Picture = Annotated[
+    Path | None, typer.Option(help="Write a picture of what was seen and fitted to this .png.")
+]
+
+
+def subject(
+    recording: Recording,
+    detections: Detections,
+    hand: Hand = None,
+    name: Name = None,
+    rig: RecordingRig = None,
+    calibration: Calibration = CALIB_JSON,
+    out: ResultTree = None,
+    json_file: JsonFile = None,
+    picture: Picture = None,
+) -> None:
+    """Measure who wears the device: palm pose, knuckles, thickness and lengths of fingers, from sixteen seconds.
+
+    With the device on: open the hand flat; bend the straight fingers at their knuckles towards 90 degrees, and back;
+    open it flat; close it to a fist, and open it again. Three seconds or more for each bend. It needs the laser plane,
+    a pose of the palm that is right to a centimetre and ten degrees (the drawing of the device; a board is better),
+    and a hand file of the user's size. Nothing is written without --out.
+
+    Examples:
+
+      phalanx-slave detect RECORDING --camera wrist --calibration calib_json -o found/detections_wrist.npz
+
+      phalanx-master calibrate subject RECORDING --detections found --rig wrist --name me --out calib_json
+    """
+    device = device_of(recording, rig, calibration, out)
+    if device.rig.T_camera_palm is None:
+        raise CalibrationError(
+            f"rig {device.file_name!r}: T_camera_palm: a first guess is needed, such as from the drawing of the device;"
+            " or lay a board on the palm (calibrate palm)"
+        )
+    profile = load(hand or _hand_of(device.rig.hand, calibration, out), HandProfile)
+    cycles = list(recorded_cycles(detections, device.camera.name))
+    try:
+        found = calibrate_subject(cycles, device.rig, device.camera, profile, device.source)
+    except FitError as error:
+        raise FitError(f"{recording}: {error}") from error
+    print_line(found.report)
+    if picture is not None:
+        from master.calibrate.wrist.subject_picture import draw_subject  # matplotlib takes a second to import
+
+        draw_subject(picture, found, device.optics)
+        typer.echo(f"drew {picture}")
+    new = replace(found.hand, name=name or profile.name)
+    written = _write(out, device, found, new)
+    if json_file is not None:
+        write_summary(json_file, summary(found) | {"written": written})
+
+
+def _hand_of(name: str, calibration: Path, out: Path | None) -> Path:
+    """The rig's hand file: beside the rig in the tree of the results if that has it, as the rig itself."""
+    trees = [calibration] if out is None else [out, calibration]
+    paths = [tree / "hands" / f"{name}.json" for tree in trees]
+    return next((path for path in paths if path.exists()), paths[-1])
+
+
+def _write(out: Path | None, device: Device, found: Subject, hand: HandProfile) -> list[str]:
+    """Write hand and rig, which names the hand; their paths, none without a tree."""
+    rig = write_device(out, device, replace(found.rig, hand=hand.name), "T_camera_palm, hand")
+    if out is None or rig is None:
+        return []
+    path = write_hand(out, hand)
+    typer.echo(f"wrote {path}: knuckles, lengths and palmar_scale of index ... little")
+    return [str(rig), str(path)]
+
+
+def summary(found: Subject) -> dict[str, object]:
+    """What was measured, as numbers."""
+    sigma = Unknown.of(np.sqrt(np.diag(found.fit.covariance)))
+    new = found.unknown
+    pose = {
+        "T_camera_palm": [list(row) for row in found.rig.T_camera_palm or ()],
+        "rotation_sigma_deg": _numbers(np.degrees(sigma.pose[:3])),
+        "shift_sigma_mm": _numbers(1e3 * sigma.pose[3:]),
+    }
+    fingers = {
+        name: {
+            "knuckle_moved_mm": _numbers(1e3 * new.knuckle_m[f]),
+            "knuckle_sigma_mm": _numbers(1e3 * sigma.knuckle_m[f]),
+            "thickness": round(float(np.exp(new.thick[f])), 4),
+            "thickness_sigma": round(float(sigma.thick[f]), 4),
+            "length": round(float(np.exp(new.long[f])), 4),
+            "length_sigma": round(float(sigma.long[f]), 4),
+        }
+        for f, name in enumerate(FINGERS[1:])
+    }
+    left = {"laser_mm": round(1e3 * found.fit.laser_m, 4), "tip_px": round(found.fit.tip_px, 4)}
+    return {**pose, "fingers": fingers, "residual": left, "cycles": len(found.chosen.row)}
+
+
+def _numbers(values: Float) -> list[float]:
+    return [round(float(value), 4) for value in values]

@@ -1,0 +1,298 @@
+"""The most probable subject of a device, given what was seen of a guided motion: one least-squares problem.
+
+Laser point and tip give four numbers of a finger in a triple, its angles are three unknowns; so what is known of the
+subject comes from habits as well, and each is believed as far as people keep it. A flat hand is flat and a finger that
+bends at its knuckle is straight, to a few degrees; a fist closes in natural ratios, about. Knuckles, thickness and
+length are those of a hand of its size, about. What none of that determines keeps what is believed, and the
+covariance says so: above all, a knuckle that lies farther from the camera looks like a thicker finger, and all
+knuckles shifted alike look like a palm that is shifted.
+
+The angles of each finger in each triple are eliminated (Schur's complement), which leaves 26 unknowns. Steps are those
+of Levenberg and Marquardt; what strays is weighed down (Cauchy). Errors of skin, tips and habits last as long as a bend
+does: its triples count together as a few.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float, Int
+from common.palmar_surface import SPREAD
+from master.calibrate.wrist.guided import FLAT
+from master.calibrate.wrist.subject_model import ABDUCTION, LOCAL, MCP, PIP, UNKNOWN, SubjectModel
+
+_LASER_SIGMA_M = 8e-4  # of skin of another shape than the cones
+_TIP_SIGMA_M = 2e-3  # what is seen as the tip of a finger is anywhere on its pulp
+_FLAT_RAD = np.radians(4.0)  # how flat people hold a hand
+_STRAIGHT_RAD = np.radians(5.0)  # how straight they keep a finger that bends at its knuckle
+_RATIO_SPREAD = 0.15  # MCP of a fist against the natural ratio
+_ASIDE_RAD = np.radians(
+    17.0
+)  # 5 of a finger, who keeps to it all the time: its triples together count as one
+_ANY_RAD = np.radians(60.0)  # of an angle that the motion leaves open
+_KNUCKLE_M = 3e-3  # against a hand of this size, per axis
+_INDEPENDENT = 4.0  # triples of a bend
+_STRAYS = 2.5  # standard deviations from which a sighting is believed less
+_FARTHEST = 8.0  # of a finger that the laser should meet and does not
+_ROUGH = np.array([4e-3, 25.0])  # of a guess: laser point along the plane [m], tip [px]
+_ROUGHEST = 3.0
+_GRID_RAD = np.radians(np.arange(0.0, 97.0, 4.0))
+_PAST_RAD = np.radians(84.0)  # PIP beyond which the last phalanx may fold into the light
+_ROUNDS = (4, 4, 12)  # steps, from one guess of angles to the next
+_TRIALS, _SETTLED = 6, 0.02  # of a step; the gain that is none
+_CLEARLY = 2.0  # ratio of costs
+_KNUCKLES, _FIST = 0, 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageObservations:
+    """Triples (T) of index ... little; NaN: not seen.
+
+    Attributes:
+        laser_m: (T, 4, 2) on the plane, across and along [m].
+        tip_uv: (T, 4, 2) [px].
+        tip_sigma_px: (T, 4) as the slave says.
+        bend: (T,) as of `guided.Guided`.
+    """
+
+    laser_m: Float
+    tip_uv: Float
+    tip_sigma_px: Float
+    bend: Int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """The most probable subject.
+
+    Attributes:
+        x: (26,) as of `subject_model.Unknown`.
+        covariance: (26, 26).
+        prior_sigma: (26,) what was believed before.
+        angles_rad: (T, 4, 3) abduction, MCP, PIP.
+        fist: (T,) whether the triple is of a fist.
+        off: (T, 4, 4) seen minus fitted, in standard deviations: laser across and along, tip; NaN: not seen, or past
+            the end of the laser's branch.
+        rms: Of `off`, strays at their limit.
+        unlike: Rms of what fingers did against their habits, in standard deviations.
+        laser_m, tip_px: What is left at laser points and tips, median.
+    """
+
+    x: Float
+    covariance: Float
+    prior_sigma: Float
+    angles_rad: Float
+    fist: Bool
+    off: Float
+    rms: float
+    unlike: float
+    laser_m: float
+    tip_px: float
+
+    @property
+    def surprise(self) -> float:
+        """Rms change in standard deviations of what was believed, by as many numbers as the motion told."""
+        told = (1.0 - np.diag(self.covariance) / self.prior_sigma**2).sum()
+        return float(np.sqrt(((self.x / self.prior_sigma) ** 2).sum() / told))
+
+
+def prior_sigma(pose: Float, length: Float) -> Float:
+    """What is believed of a subject (26,), with the palm's pose (6,) [rad, m] and the lengths of fingers (4,)."""
+    return np.r_[pose, np.full(12, _KNUCKLE_M), np.full(4, SPREAD), length]
+
+
+def fit_subject(model: SubjectModel, seen: ImageObservations, sigma: Float) -> Fit:
+    """Fit subject and angles.
+
+    Args:
+        model: Forward function about the first guess.
+        seen: What was seen.
+        sigma: (26,) how far the first guess may be off, as of `prior_sigma`.
+    """
+    problem = _Problem(model, seen, sigma)
+    x, guess, covariance = np.zeros(UNKNOWN), problem.guessed(np.zeros(UNKNOWN)), np.empty(0)
+    for rounds in _ROUNDS:  # what a rough pose takes for a stray may be none
+        x, guess, covariance = problem.solved(x, problem.guessed(x), rounds)
+    return problem.told(x, guess, covariance)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Guess:
+    """Angles (T, 4, 3), which triples (T,) are of a fist, and which sightings (T, 4) count."""
+
+    angles: Float
+    fist: Bool
+    used: Bool
+
+
+class _Problem:
+    """Residuals, habits and steps. What it holds was prepared by the constructor."""
+
+    def __init__(self, model: SubjectModel, seen: ImageObservations, sigma: Float) -> None:
+        self._model, self._bend, self.prior_sigma = model, seen.bend, sigma
+        self._data = np.concatenate([seen.laser_m, seen.tip_uv], axis=-1)
+        tip_px = np.hypot(np.nan_to_num(seen.tip_sigma_px), _TIP_SIGMA_M * model.px_per_m)
+        laser = np.full_like(tip_px, _LASER_SIGMA_M)
+        self._sigma = np.stack([laser, laser, tip_px, tip_px], axis=-1)
+        count = np.array([(seen.bend == bend).sum() for bend in seen.bend])
+        self._share = np.minimum(_INDEPENDENT / count, 1.0)  # (T,) what a triple counts
+
+    def guessed(self, x: Float) -> "_Guess":
+        """Angles by habit alone; a bend is that of a fist if it suits a fist better."""
+        habits = np.zeros((2, len(_GRID_RAD), 4, LOCAL))
+        habits[_KNUCKLES, ..., MCP] = habits[_FIST, ..., PIP] = _GRID_RAD[:, None]
+        habits[_FIST, ..., MCP] = self._model.mcp_per_pip * _GRID_RAD[:, None]
+        shown = np.stack([self._model(x, poses) for poses in habits])  # (2, G, 4, 4)
+        # Abductions, of which nothing is known yet, move points and tips across.
+        along = (self._data[:, None, None, :, 1::2] - shown[..., 1::2]) / _ROUGH
+        unseen = np.isnan(self._data[:, None, None, :, 1::2])
+        far = np.where(unseen, 0.0, np.nan_to_num(np.abs(along), nan=_ROUGHEST))
+        cost: Float = (np.minimum(far, _ROUGHEST) ** 2).sum(axis=-1)  # (T, 2, G, 4)
+        least = cost.min(axis=2).sum(axis=2)
+        bends = np.unique(self._bend[self._bend != FLAT])
+        fists = bends[fists_of(np.array([least[self._bend == bend].sum(axis=0) for bend in bends]))]
+        fist = np.isin(self._bend, fists)
+        own_cost = cost[np.arange(len(fist)), fist.astype(np.int64)]  # (T, G, 4); a fist is number _FIST
+        node: Int = own_cost.argmin(axis=1)
+        angles = habits[fist.astype(np.int64)[:, None], node, np.arange(4)]
+        used: Bool = (own_cost.min(axis=1) < _ROUGHEST**2) & ~(angles[..., PIP] > _PAST_RAD)
+        flat = self._bend == FLAT
+        angles[flat], used[flat] = 0.0, True
+        return _Guess(angles, fist, used)
+
+    def solved(self, x: Float, guess: _Guess, rounds: int) -> tuple[Float, _Guess, Float]:
+        """Unknowns (26,), angles and covariance (26, 26), from a guess."""
+        damping, covariance = 1e-2, np.diag(self.prior_sigma**2)
+        cost = self._cost(x, guess)
+        for _ in range(rounds):
+            normal = self._normal(x, guess)
+            covariance = np.asarray(np.linalg.inv(normal.reduced(0.0)[0]), np.float64)
+            for _ in range(_TRIALS):
+                step, change = normal.step(damping)
+                stepped = _Guess(guess.angles + change, guess.fist, guess.used)
+                trial = self._cost(x + step, stepped)
+                if trial < cost:
+                    break
+                damping *= 6.0
+            else:
+                break
+            x, guess, gain, cost, damping = x + step, stepped, cost - trial, trial, 0.2 * damping
+            if gain < _SETTLED:
+                break
+        return x, guess, covariance
+
+    def told(self, x: Float, guess: _Guess, covariance: Float) -> Fit:
+        """The result with what is left."""
+        off = np.where(guess.used[..., None], self._off(x, guess.angles), np.nan)
+        known = np.isfinite(off)
+        rms = float(np.sqrt(np.mean(np.minimum(np.abs(off[known]), 2.0 * _STRAYS) ** 2)))
+        laser, tip = (
+            np.sqrt((part**2).sum(axis=-1)) for part in (off[..., :2], (off * self._sigma)[..., 2:])
+        )
+        unlike = float(np.sqrt(np.mean(self._habits(guess)[0][guess.used] ** 2)))
+        return Fit(
+            x, covariance, self.prior_sigma, guess.angles, guess.fist, off, rms, unlike,
+            _LASER_SIGMA_M * float(np.sqrt(np.nanmedian(laser**2))), float(np.sqrt(np.nanmedian(tip**2))),
+        )  # fmt: skip
+
+    def _off(self, x: Float, angles: Float) -> Float:
+        """Seen minus fitted (T, 4, 4) in standard deviations; NaN: not seen. A finger that the laser misses is far."""
+        shown = self._model(x, angles)
+        off = (self._data - shown) / self._sigma
+        return np.where(np.isnan(shown) & np.isfinite(self._data), _FARTHEST, off)
+
+    def _habits(self, guess: _Guess) -> tuple[Float, Float]:
+        """Residuals (T, 4, 3) of what fingers do, and their derivatives by the angles (T, 4, 3, 3)."""
+        angles, fist, flat = guess.angles, guess.fist, self._bend == FLAT
+        ratio = np.broadcast_to(self._model.mcp_per_pip, angles.shape[:2])
+        by = np.zeros((*angles.shape[:2], LOCAL, LOCAL))
+        by[..., ABDUCTION, ABDUCTION] = 1.0 / _ASIDE_RAD
+        mcp = np.hypot(_FLAT_RAD, _RATIO_SPREAD * ratio * np.maximum(angles[..., PIP], 0.0))
+        by[fist, :, MCP, MCP], by[fist, :, MCP, PIP] = 1.0 / mcp[fist], -ratio[fist] / mcp[fist]
+        by[fist, :, PIP, PIP] = 1.0 / _ANY_RAD
+        by[~fist, :, MCP, MCP] = np.where(flat[~fist], 1.0 / _FLAT_RAD, 1.0 / _ANY_RAD)[:, None]
+        by[~fist, :, PIP, PIP] = 1.0 / _STRAIGHT_RAD
+        return (by @ angles[..., None])[..., 0], by
+
+    def _cost(self, x: Float, guess: _Guess) -> float:
+        off = np.nan_to_num(self._off(x, guess.angles)) * guess.used[..., None]
+        pairs = np.stack([(off[..., :2] ** 2).sum(axis=-1), (off[..., 2:] ** 2).sum(axis=-1)])
+        data = (_STRAYS**2 * np.log1p(pairs / _STRAYS**2)).sum(axis=(0, 2))
+        habits = (self._habits(guess)[0] ** 2).sum(axis=(1, 2))
+        return float((self._share * (data + habits)).sum() + ((x / self.prior_sigma) ** 2).sum())
+
+    def _normal(self, x: Float, guess: _Guess) -> "_Normal":
+        """Normal equations about a place, strays weighed down."""
+        off = np.nan_to_num(self._off(x, guess.angles))
+        pairs = np.stack([(off[..., :2] ** 2).sum(axis=-1), (off[..., 2:] ** 2).sum(axis=-1)], axis=-1)
+        root = np.repeat((1.0 + pairs / _STRAYS**2) ** -0.5, 2, axis=-1) * guess.used[..., None]
+        root = np.where(np.isfinite(self._data), root, 0.0)
+        by_x, by_angles = self._model.derivatives(x, guess.angles)
+        habit, by_habit = self._habits(guess)
+        share = np.sqrt(self._share)[:, None, None]
+        scale = (share * root / self._sigma)[..., None]
+        residual = np.concatenate([share * root * off, share * habit], axis=-1)
+        local = np.concatenate([-scale * by_angles, share[..., None] * by_habit], axis=-2)
+        shared = np.concatenate([-scale * by_x, np.zeros((*habit.shape, UNKNOWN))], axis=-2)
+        back = np.swapaxes(local, -1, -2)
+        return _Normal(
+            back @ local,
+            back @ shared,
+            (back @ residual[..., None])[..., 0],
+            np.einsum("tfij,tfik->jk", shared, shared) + np.diag(self.prior_sigma**-2.0),
+            np.einsum("tfij,tfi->j", shared, residual) + x / self.prior_sigma**2,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Normal:
+    """Normal equations of unknowns that all triples share (26) and angles that belong to one finger in one (T, 4, 3).
+
+    Attributes:
+        own: (T, 4, 3, 3) information of the angles.
+        mixed: (T, 4, 3, 26).
+        own_pull: (T, 4, 3).
+        shared: (26, 26).
+        shared_pull: (26,).
+    """
+
+    own: Float
+    mixed: Float
+    own_pull: Float
+    shared: Float
+    shared_pull: Float
+
+    def reduced(self, damping: float) -> tuple[Float, Float, Float, Float]:
+        """Information (26, 26) and pull (26,) without the angles, and what gives their steps from that of the rest."""
+        eye = damping * np.eye(LOCAL)
+        own = self.own * (1.0 + eye) + 1e-9 * np.eye(LOCAL)
+        by_shared = _solve(own, self.mixed)
+        alone = _solve(own, self.own_pull[..., None])[..., 0]
+        information = self.shared * (1.0 + damping * np.eye(UNKNOWN))
+        information = information - np.einsum("tfij,tfik->jk", self.mixed, by_shared)
+        pull = self.shared_pull - np.einsum("tfij,tfi->j", self.mixed, alone)
+        return information, pull, by_shared, alone
+
+    def step(self, damping: float) -> tuple[Float, Float]:
+        """Of the shared unknowns (26,) and the angles (T, 4, 3)."""
+        information, pull, by_shared, alone = self.reduced(damping)
+        step = -_solve(information, pull[:, None])[:, 0]
+        return step, -alone - by_shared @ step
+
+
+def fists_of(cost: Float) -> Bool:
+    """Which bends are fists, by what either kind costs (B, 2). The kind is told by tips, of which some are false.
+
+    A bend that suits both kinds about equally is of the one that nothing else is: people are asked for both.
+    """
+    better: Float = np.log((cost[:, _KNUCKLES] + 1.0) / (cost[:, _FIST] + 1.0))
+    clear = np.abs(better) > np.log(_CLEARLY)
+    if clear.any() and (better[clear] > 0.0).all():
+        return clear
+    if clear.any() and (better[clear] < 0.0).all():
+        return ~clear
+    return better > 0.0
+
+
+def _solve(a: Float, b: Float) -> Float:
+    return np.asarray(np.linalg.solve(a, b), np.float64)

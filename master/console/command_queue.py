@@ -1,0 +1,66 @@
+"""Tells a process what a page wants, one change at a time, the newest: a slider that is dragged floods nobody."""
+
+import asyncio
+from collections.abc import Callable, Mapping
+from typing import Generic, TypeVar
+
+from nicegui import background_tasks
+
+from common.errors import PhalanxError
+
+AnswerT = TypeVar("AnswerT")
+QUIET_S = 0.12  # so long nothing more changes until the change is sent
+
+
+class CommandQueue(Generic[AnswerT]):
+    """Holds what is to be told, merged by key, while the last of it is on its way."""
+
+    def __init__(
+        self,
+        tell: Callable[[Mapping[str, object]], AnswerT],
+        on_answer: Callable[[AnswerT], object],
+        on_error: Callable[[str], object],
+    ) -> None:
+        """Nothing to tell yet.
+
+        Args:
+            tell: Sends a change and waits for the answer, on a thread.
+            on_answer: Told the answer, on the page's loop, unless more is to be told already.
+            on_error: Told the error's text as it is.
+        """
+        self._tell, self._on_answer, self._on_error = tell, on_answer, on_error
+        self._waiting: dict[tuple[str, str | None], object] = {}
+        self._task: asyncio.Task[None] | None = None
+
+    @property
+    def busy(self) -> bool:
+        """Whether something is on its way."""
+        return self._task is not None and not self._task.done()
+
+    def change(self, key: str, value: object, part: str | None = None) -> None:
+        """Tell `key: value` soon; with `part`, one entry of the map `key`. The newest of each counts."""
+        self._waiting[key, part] = value
+        if not self.busy:
+            self._task = background_tasks.create(self._work(), name="telling")
+
+    async def _work(self) -> None:
+        while self._waiting:
+            await asyncio.sleep(QUIET_S)
+            waiting, self._waiting = self._waiting, {}
+            try:
+                answer = await asyncio.to_thread(self._tell, _merged(waiting))
+            except PhalanxError as error:
+                self._on_error(str(error))
+            else:
+                if not self._waiting:
+                    self._on_answer(answer)
+
+
+def _merged(waiting: Mapping[tuple[str, str | None], object]) -> dict[str, object]:
+    """Keys and values; the parts of one key as a map."""
+    out: dict[str, object] = {key: value for (key, part), value in waiting.items() if part is None}
+    for key in {key for key, part in waiting if part is not None}:
+        out[key] = {
+            part: value for (other, part), value in waiting.items() if other == key and part is not None
+        }
+    return out

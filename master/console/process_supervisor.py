@@ -1,0 +1,59 @@
+"""End what the console started once the console is gone: `python -m master.console.process_supervisor`.
+
+It reads "+PID" and "-PID" lines from a pipe whose other end only the console holds. The end of the pipe is the end of
+the console: each process group that is still listed is told to end, and killed if it does not.
+"""
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterable
+
+ENDS_S = 4.0
+_POLL_S = 0.05
+
+
+def watch(lines: Iterable[str]) -> set[int]:
+    """Follow the list until its end; return the process groups that are left."""
+    left: set[int] = set()
+    for line in lines:
+        word = line.strip()
+        if word[:1] == "+" and word[1:].isdigit():
+            left.add(int(word[1:]))
+        elif word[:1] == "-" and word[1:].isdigit():
+            left.discard(int(word[1:]))
+    return left
+
+
+def end_groups(groups: set[int], ends_s: float = ENDS_S) -> None:
+    """Tell process groups to end; kill those that are still there after `ends_s` [s]."""
+    left = {group for group in groups if _send(group, signal.SIGTERM)}
+    deadline = time.monotonic() + ends_s
+    while left and time.monotonic() < deadline:
+        time.sleep(_POLL_S)
+        left = {group for group in left if _send(group, 0)}
+    for group in left:
+        _send(group, signal.SIGKILL)
+
+
+def _send(group: int, number: int) -> bool:
+    """Whether the group was there to be told."""
+    try:
+        os.killpg(group, number)
+    except (ProcessLookupError, PermissionError):
+        return False
+    return True
+
+
+def main() -> None:
+    """Outlive the console by as long as it takes to end its processes."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(
+            number, signal.SIG_IGN
+        )  # a terminal that closes reaches the console, which tells by the pipe
+    end_groups(watch(sys.stdin))
+
+
+if __name__ == "__main__":
+    main()

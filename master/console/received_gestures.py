@@ -1,0 +1,52 @@
+"""What hands say, as a person follows it: what lasts now, and the last things that were said. Bounded."""
+
+import time
+from collections import deque
+from dataclasses import dataclass
+
+from common.messages import Gesture
+
+HOLD_S = 0.5  # a gesture is repeated with every pose of its hand: not heard for so long, it is over
+KEPT = 30
+_MOST = 64
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedGesture:
+    """One thing that a hand said: when it was heard [s, monotonic], and the message that began or ended it."""
+
+    received_s: float
+    gesture: Gesture
+
+
+class ReceivedGestures:
+    """Holds the newest message of each gesture that lasts, and the last begins, ends and taps."""
+
+    def __init__(self) -> None:
+        """Nothing was said."""
+        self._held: dict[tuple[str, str], ReceivedGesture] = {}
+        self._events: deque[ReceivedGesture] = deque(maxlen=KEPT)
+
+    def push(self, gesture: Gesture, now_s: float) -> None:
+        """Hear one message at `now_s` [s], monotonic."""
+        key = (gesture.hand, gesture.kind)
+        received = ReceivedGesture(now_s, gesture)
+        if gesture.phase != "update":
+            self._events.append(received)
+        if gesture.phase == "end":
+            self._held.pop(key, None)
+        elif key in self._held or len(self._held) < _MOST:
+            self._held[key] = received
+
+    def held(self, now_s: float | None = None) -> dict[tuple[str, str], Gesture]:
+        """(hand, kind) -> what lasts at `now_s` [s], by default now."""
+        now_s = time.monotonic() if now_s is None else now_s
+        return {
+            key: received.gesture
+            for key, received in list(self._held.items())
+            if now_s - received.received_s < HOLD_S
+        }
+
+    def events(self) -> list[ReceivedGesture]:
+        """The last begins, ends and taps, newest first."""
+        return list(self._events)[::-1]

@@ -1,0 +1,68 @@
+"""Leads a hand that several kinds of sensors watch over what is no motion, part by part: the palm and each finger.
+
+Such a hand is solved elsewhere from one instant to the next whenever another marker is seen or one less, when another
+sensor tells a finger, and when what is told without markers is suddenly else. What is shown goes on as the hand moves,
+and all that leads elsewhere is led in, no faster than a given speed.
+
+How the hand moves meanwhile is told without solving it: the palm goes as the markers on its back go that are seen in
+both instants, and everything else at half the speed at which it was shown.
+"""
+
+from math import exp
+
+import numpy as np
+
+from common.arrays import Bool, Float, Int
+from master.estimator.observation_sources import BY_MARKERS
+
+PLACE, ROTATION, ANGLES = slice(0, 3), slice(3, 6), slice(6, 26)
+PARTS: Int = np.repeat([5, 0, 1, 2, 3, 4], [6, 4, 4, 4, 4, 4])  # signal -> finger, or 5: the palm
+_SUDDEN_M = 3e-3  # from one instant to the next, beside motion
+_SPEED_S = 0.03  # of the shown hand, which is smooth
+_GOES_ON = 0.5  # of it: a motion that is not seen any more rather ends than goes on
+_STALE_S = 0.1  # after such a gap nothing of a speed is left
+_STEP_M = 5e-3  # is the most that is led between two poses
+_EASE_S = 0.04  # in which the last of what is led fades
+_LITTLE_M, _NOTHING_M = 1e-3, 1e-5  # a part that is led by more is not yet where its markers are
+
+
+class Blend:
+    """Push machine. Holds what is left of leaps, what the hand rested on, its markers and its speed."""
+
+    def __init__(self, blend_m_s: float, on_palm: Bool) -> None:
+        """Blend each part no faster than a speed [m/s]; `on_palm` (M,) says which markers sit on the back."""
+        self._blend_m_s, self._on_palm = blend_m_s, on_palm
+        self._offset, self._speed = np.zeros(26), np.zeros(26)
+        self._sources = np.zeros(6, np.int64)
+        self._points_m = np.full((len(on_palm), 3), np.nan)
+
+    def push(self, gap_s: float, sources: Int, shown: Float, solved: Float, points_m: Float) -> Float:
+        """What is to be added to the solved signals (26,) [m] (`master.estimator.smooth`).
+
+        Args:
+            gap_s: Time since the last; 0: there is none.
+            rests: (6,) as of `Fitted`.
+            shown, solved: (26,) what was shown last, what is solved now.
+            points_m: (M, 3) the markers; NaN: not seen.
+        """
+        if gap_s > 0.0:
+            goes_on = shown + _GOES_ON * min(gap_s, _STALE_S) * self._speed
+            went = (points_m - self._points_m)[self._on_palm]
+            went = went[np.isfinite(went[:, 0])]
+            if len(went) and gap_s <= _STALE_S:
+                goes_on[PLACE] = shown[PLACE] + went.mean(axis=0)
+            off = np.sqrt(np.bincount(PARTS, np.square(goes_on - solved - self._offset)))
+            triangulated = (sources & self._sources & BY_MARKERS) > 0
+            led = np.bincount(PARTS, np.abs(self._offset)) > _LITTLE_M
+            leaps = ((sources != self._sources) | ~triangulated | led) & (off > _SUDDEN_M)
+            self._offset = np.where(leaps[PARTS], goes_on - solved, self._offset)
+            size_m = np.maximum(np.bincount(PARTS, np.abs(self._offset)), _NOTHING_M)
+            left = 1.0 - min(self._blend_m_s * gap_s, _STEP_M) / size_m
+            self._offset = self._offset * np.maximum(left, exp(-gap_s / _EASE_S))[PARTS]
+        self._sources, self._points_m = sources, points_m
+        return self._offset
+
+    def moved(self, gap_s: float, step: Float) -> None:
+        """Learn from the step (26,) [m] of what was shown."""
+        if gap_s > 0.0:
+            self._speed = self._speed + (1.0 - exp(-gap_s / _SPEED_S)) * (step / gap_s - self._speed)

@@ -1,0 +1,149 @@
+"""A hand of one epoch alone: where a search begins that has no state to go on from.
+
+From another hand of the epoch, if there is one that explains the markers; else from several, open to closed, each laid
+on the markers as a rigid body, of which the best goes on.
+"""
+
+import numpy as np
+
+from common.arrays import Float
+from common.geometry import fit_rigid
+from common.hand_model import HandModel
+from common.wrist_joint import forearm_palm
+from master.estimator.epoch import Epoch
+from master.estimator.epoch_steps import EpochSteps
+from master.estimator.parameters import HandParameters
+from master.estimator.priors import Habits, curled, habits_of
+from master.estimator.settings import Settings
+from master.estimator.solve import MAX_ITERATIONS
+from master.estimator.wrist_device import WRIST_ANGLES
+
+_BENDS_RAD = (0.1, 0.7, 1.3)  # of the PIP, from which a search afresh begins: open to closed
+_MCP_PER_PIP = 0.6
+_ABOVE_M, _ABOVE_WEIGHT, _PALM_WEIGHT = 0.05, 0.3, 3.0
+_EVEN = 0.5  # probability
+_AT_ORIGIN = np.eye(4)
+NONE = frozenset[int]()
+
+
+class HabitTables:
+    """Habits of one hand while some fingers are bent unlike the others, each worked out once."""
+
+    def __init__(
+        self, model: HandModel, parameters: HandParameters, settings: Settings, *, natural: bool
+    ) -> None:
+        """Of a hand; `natural`: it is taken to obey them."""
+        self._model, self._parameters, self._settings, self._natural = model, parameters, settings, natural
+        self._tables: dict[frozenset[int], Habits] = {}
+
+    def unlike(self, fingers: frozenset[int]) -> Habits:
+        """Those while these fingers are bent unlike the others."""
+        if fingers not in self._tables:
+            habits = habits_of(self._model, self._parameters, self._settings, fingers)
+            self._tables[fingers] = habits.natural() if self._natural else habits
+        return self._tables[fingers]
+
+
+class Reinitialiser:
+    """Fits without the state. What it holds was prepared by the constructor."""
+
+    def __init__(
+        self, steps: EpochSteps, parameters: HandParameters, habits: HabitTables, settings: Settings
+    ) -> None:
+        self._steps, self._parameters, self._habits, self._settings = steps, parameters, habits, settings
+        postures = np.zeros((len(_BENDS_RAD), 5, 4))
+        postures[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (_MCP_PER_PIP, 1.0))[:, None]
+        self._postures = np.array([parameters.of_angles(angles) for angles in postures])
+        self._finger_of_free = parameters.free // 4
+        any_finger = habits.unlike(NONE)
+        likeliest = np.asarray(np.linalg.solve(any_finger.normal[0], any_finger.pull[0]), np.float64)
+        self._natural = np.minimum(np.maximum(likeliest, parameters.low), parameters.high)
+
+    def begin(self, at: Epoch) -> float:
+        """Fit without the state; return chi square of the markers.
+
+        From the other hand, or from several starts. A finger between two that show is rather bent as they are: no hand
+        curls it alone. But straight it would show.
+        """
+        shown = frozenset(np.flatnonzero(self._steps.at.ground.shown).tolist())
+        like = frozenset(f for f in (2, 3) if f not in shown and {f - 1, f + 1} <= shown)
+        chi2 = self._begin_with(at, shown, like)
+        angles = self._parameters.angles(self._steps.at.found.x)
+        straight = frozenset(f for f in like if angles[f, 1:].sum() < self._settings.shows_rad)
+        return self._begin_with(at, shown, like - straight) if straight else chi2
+
+    def _begin_with(self, at: Epoch, shown: frozenset[int], like: frozenset[int]) -> float:
+        """As `begin`, while the hidden fingers of `like` are bent as their neighbours."""
+        steps, outliers, start = self._steps, frozenset(range(5)) - shown - like, at.start
+        task, belief, scratch = steps.at.task, steps.at.belief, steps.at.scratch
+        belief.past_w2[:], belief.past[:], belief.palm_w2[:], belief.depth_w2[:] = 0.0, 0.0, 0.0, 0.0
+        fingers = np.isin(np.arange(5), list(outliers))
+        belief.own_w2[:], belief.own[:] = curled(self._parameters, self._settings, fingers)
+        task.natural[0], task.counts[0] = _EVEN, 0.0
+        habits = self._habits.unlike(outliers)
+        try:
+            if start is not None:
+                shows = steps.at.ground.shown[self._finger_of_free] > 0
+                x = np.where(shows, self._parameters.of_angles(start.angles_rad), self._natural)
+                scratch.start_T[:], scratch.start_x[:] = start.T_rig_palm, self._as_told(x)
+                chi2 = steps.fit(habits)
+                if steps.at.found.steps[0] < MAX_ITERATIONS and not steps.unexplained():
+                    return chi2
+            ends = list[tuple[float, Float, Float]]()
+            starts = self._starts(at)
+            if len(starts) == 1:
+                scratch.start_T[:], scratch.start_x[:] = starts[0]
+                return steps.fit(habits)
+            for T, x in starts:
+                task.palm[:], task.x[:] = T, x
+                ends.append((steps.fit(habits, rough=True), task.palm.copy(), task.x.copy()))
+            _, scratch.start_T[:], scratch.start_x[:] = min(ends, key=lambda end: end[0])
+            return steps.fit(habits)
+        finally:
+            belief.own_w2[:] = 0.0
+
+    def _starts(self, epoch: Epoch) -> list[tuple[Float, Float]]:
+        """Three hands, open to closed, each laid on the markers as a rigid body; one where the palm is known."""
+        steps, measured = self._steps, self._measured_rotation(epoch)
+        if epoch.place is not None and measured is not None:
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = measured, epoch.place
+            return [(T, self._as_told(self._natural.copy()))]
+        triangulated = steps.triangulated
+        weight = np.where(steps.finger[triangulated] >= 0, 1.0, _PALM_WEIGHT)
+        observed = epoch.points_m[steps.on_hand][triangulated]
+        starts: list[tuple[Float, Float]] = []
+        for posture in self._postures:
+            x = self._as_told(posture.copy())
+            expected = steps.pose(_AT_ORIGIN, self._parameters.angles(x))[1][triangulated]
+            if measured is not None and epoch.orientation is not None and epoch.orientation.sure:
+                T = np.eye(4)
+                T[:3, :3] = measured
+                T[:3, 3] = np.average(observed - expected @ measured.T, axis=0, weights=weight)
+            elif steps.at.belief.back_normal_w2[0] > 0.0:
+                # A point above the wrist stands for "the back of the hand faces the cameras".
+                above = expected.mean(axis=0) + np.array([0.0, _ABOVE_M, 0.0])
+                towards = observed.mean(axis=0) + _ABOVE_M * epoch.back_normal
+                T = fit_rigid(
+                    np.vstack([observed, towards]),
+                    np.vstack([expected, above]),
+                    np.append(weight, _ABOVE_WEIGHT),
+                )
+            else:
+                T = fit_rigid(observed, expected, weight)
+            starts.append((np.ascontiguousarray(T), x))
+        return starts
+
+    def _measured_rotation(self, at: Epoch) -> Float | None:
+        """How the palm is turned by other sensors (3, 3), with the bend that is believed; None: they do not say."""
+        if at.orientation is None or at.orientation.axes is None:
+            return None if at.orientation is None else at.orientation.rotation
+        return at.orientation.rotation @ forearm_palm(self._steps.now.z[WRIST_ANGLES : WRIST_ANGLES + 2])
+
+    def _as_told(self, x: Float) -> Float:
+        """Free angles (n,) with those of fingers whose valley was searched."""
+        known = self._steps.at.scan.known > 0.0
+        if not known.any():
+            return x
+        scanned = self._parameters.of_angles(self._steps.at.task.scanned.reshape(5, 4))
+        return np.where(known[self._finger_of_free], scanned, x)

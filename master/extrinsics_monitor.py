@@ -1,0 +1,37 @@
+"""What a running master tells of a camera whose rays miss those of the others: knocked, or not the one of its file."""
+
+from collections.abc import Mapping
+
+_LOOKS = 5  # in a row, once a second: somebody who reaches before a camera is no knock
+_NAME = 64  # characters of a name in `Health`
+
+
+class ExtrinsicsMonitor:
+    """Belongs to the thread that reports. Holds the last counts, and for how many looks each camera was left out."""
+
+    def __init__(self, cameras: tuple[str, ...]) -> None:
+        """Watch the cameras of a rig."""
+        self._rejected = dict.fromkeys(cameras, 0)
+        self._looks = dict.fromkeys(cameras, 0)
+        self._poses = 0
+
+    def look(self, counts: Mapping[str, int]) -> list[str]:
+        """Once a second: a line for each camera that has been left out of most poses for a while; once, until it ends.
+
+        Args:
+            counts: Of the pipeline since its start.
+        """
+        lines: list[str] = []
+        poses = counts.get("poses", 0) - self._poses
+        self._poses += poses
+        for name, before in self._rejected.items():
+            now = counts.get(f"mostly_left_out.{name}"[:_NAME], 0)
+            mostly = poses > 0 and now - before > 0.5 * poses
+            self._rejected[name] = now
+            self._looks[name] = self._looks[name] + 1 if mostly else 0
+            if self._looks[name] == _LOOKS:
+                lines.append(
+                    f"camera {name}: its rays miss those of the others and are left out: it was knocked, or it is not"
+                    " the camera of its file: calibrate it anew, `phalanx-master calibrate stereo --help`"
+                )
+        return lines

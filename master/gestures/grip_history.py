@@ -1,0 +1,74 @@
+"""How a grip has gone of late: how wide it was and how far turned, so that one that loosens turns nothing.
+
+Fingers that let go of a knob go apart, and not alike: taken for a turn it is some degrees. They are quick, so that a
+grip that is suddenly wider than it was is loosening, or the instant is a bad one; a grip that slowly gets wider, as the
+picture of a hand that turns does, is not. While it loosens the angle goes on as it went, ever less: a hand that rests
+before it lets go stands still, and a bad instant in a quick turn is led over.
+"""
+
+from collections import deque
+from math import exp
+from statistics import median
+
+_LATE_S = 0.1  # what counts as of late
+_FIRM = 0.3  # of what is quick: from there on the last instants before it may be of it
+_FADE_S = 0.06  # in which a turn that nobody sees fades
+_HOLD_S = 0.15  # a grip that is wider for so long is just wider
+
+
+class GripHistory:
+    """Push machine. Holds width [m] and angle [rad] of the last tenth of a second, and since when the grip loosens."""
+
+    def __init__(self, quick_m: float) -> None:
+        """A grip that is wider, or narrower, by so much than it was of late is loosening [m]."""
+        self._quick_m = quick_m
+        self._late: deque[tuple[int, float, float]] = deque()
+        self._since_ns: int | None = None
+
+    @property
+    def loosens(self) -> bool:
+        """Whether it did at the last instant."""
+        return self._since_ns is not None
+
+    def sound(self, t_ns: int, wide_m: float, most_m: float) -> bool:
+        """Whether the fingers turn the knob at an instant, at which they are wider by so much than when they closed.
+
+        `most_m`: a grip that is wider than that is loose, however long it has been so.
+        """
+        if not self._late:
+            good = abs(wide_m) <= most_m
+        else:
+            typical = median(wide for _, wide, _ in self._late)
+            lasts = self._since_ns is not None and (t_ns - self._since_ns) * 1e-9 > _HOLD_S
+            good = abs(wide_m) <= most_m and (lasts or abs(wide_m - typical) <= self._quick_m)
+            if good and lasts:
+                self._late.clear()
+        if good:
+            self._since_ns = None
+        elif self._since_ns is None:
+            self._since_ns = t_ns
+        return good
+
+    def push(self, t_ns: int, wide_m: float, angle_rad: float) -> None:
+        """Width and angle of a sound instant."""
+        self._late.append((t_ns, wide_m, angle_rad))
+        while len(self._late) > 2 and (t_ns - self._late[0][0]) * 1e-9 > _LATE_S:
+            self._late.popleft()
+
+    def ahead_rad(self, t_ns: int) -> float | None:
+        """The angle at an instant after the last sound one, by those at which nothing had begun to loosen yet; None:
+        there was none."""
+        if not self._late:
+            return None
+        typical = median(wide for _, wide, _ in self._late)
+        firm = len(self._late)
+        while firm > 1 and abs(self._late[firm - 1][1] - typical) > _FIRM * self._quick_m:
+            firm -= 1
+        kept = list(self._late)[:firm]
+        times = [(t - kept[-1][0]) * 1e-9 for t, _, _ in kept]
+        middle = sum(times) / len(times)
+        off = [t - middle for t in times]
+        rate = sum(t * angle for t, (_, _, angle) in zip(off, kept, strict=True))
+        rate = rate / max(sum(t * t for t in off), 1e-12) if len(times) > 2 else 0.0
+        gone = (t_ns - kept[-1][0]) * 1e-9
+        return kept[-1][2] + rate * _FADE_S * (1.0 - exp(-gone / _FADE_S))

@@ -1,0 +1,101 @@
+"""The lesson with a person: a countdown, a hold that must be still, then the hand moves, and so for each example."""
+
+from collections.abc import Callable
+
+from common.clock import Clock
+from common.errors import FitError
+from common.hand_model import HandModel
+from common.messages import HandPose
+from master.gestures.features import FeatureExtractor, HandFeatures
+from master.gestures.poses import FingerSpeed
+from master.gestures.quantities import known_bends
+from master.gestures.templates import SHORTEST, Example
+
+COUNT_DOWN_S = 3
+HOLD_S = 1.0
+STILL_DEG_S = 45.0  # half of the frames of a hold are slower; noise of a resting hand is a third of that
+_TRIES = 3
+_REST_S = 1.0
+_WAIT_S = 0.05
+_STARTED_S = 0.2  # until a hand that obeys has stopped
+
+Receive = Callable[[float], HandPose | None]
+
+
+def template_session(
+    receive: Receive,
+    model: HandModel,
+    name: str,
+    count: int,
+    clock: Clock,
+    notify: Callable[[str], None],
+) -> list[Example]:
+    """Lead a person through `count` examples of the pose `name`.
+
+    Args:
+        receive: The next pose of the hand, waiting at most so long [s].
+        model: The hand.
+        name: Of the pose.
+        count: How many examples.
+        clock: For the countdown.
+        say: Told one line at a time.
+
+    Raises:
+        FitError: No hand was seen, or it did not keep still, three times.
+    """
+    out: list[Example] = []
+    for number in range(count):
+        for _ in range(_TRIES):
+            notify(f"{number + 1} of {count}: show {name!r}, as you will later")
+            for left in range(COUNT_DOWN_S, 0, -1):
+                notify(f"{left} ...")
+                during(receive, clock, 1.0)
+            notify(f"hold still ({HOLD_S:g} s)")
+            during(receive, clock, _STARTED_S)
+            frames = held(during(receive, clock, HOLD_S), model)
+            lacking = what_lacks(frames)
+            if not lacking:
+                out.append(Example.of(frames))
+                break
+            notify(f"{lacking}; once more")
+        else:
+            raise FitError(
+                f"example {number + 1}: not seen at rest in {_TRIES} tries; the poses that were there stay"
+            )
+        if number + 1 < count:
+            notify("good; open the hand, move it, turn it a little")
+            during(receive, clock, _REST_S)
+    return out
+
+
+def held(poses: list[HandPose], model: HandModel) -> list[HandFeatures]:
+    """The features of poses that have a hand, in order of time, each instant once."""
+    extractor, out = FeatureExtractor(model), list[HandFeatures]()
+    for pose in poses:
+        features = extractor.of(pose)
+        if features is not None and (not out or features.t_ns > out[-1].t_ns):
+            out.append(features)
+    return out
+
+
+def what_lacks(frames: list[HandFeatures]) -> str:
+    """Why a hold is no example; nothing where it is one."""
+    if len(frames) < SHORTEST:
+        return "no hand was seen; is `phalanx-master run` running, on this --bus, with the hand in sight"
+    speed = FingerSpeed()
+    speeds = sorted(speed.push(one.t_ns, *known_bends(one)) for one in frames)
+    middle = speeds[len(speeds) // 2]
+    if middle > STILL_DEG_S:
+        return f"the fingers moved, by {middle:.0f} degrees a second"
+    return ""
+
+
+def during(receive: Receive, clock: Clock, seconds: float) -> list[HandPose]:
+    """The poses that come within a time."""
+    until = clock.now_ns() + round(1e9 * seconds)
+    poses: list[HandPose] = []
+    while clock.now_ns() < until:
+        pose = receive(_WAIT_S)
+        if pose is not None:
+            poses.append(pose)
+    return poses

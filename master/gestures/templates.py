@@ -1,0 +1,238 @@
+"""A pose from a few examples: ranges about what was shown, refused where it cannot be told from another.
+
+An example is a hold of some frames; of each quantity it has the median. Over the examples a quantity has a mean and a
+spread, which nobody repeats better than `FLOOR` another day; few examples widen it as Student's t does (the factor that
+holds 86 % of new ones, n - 1 degrees of freedom). The range is the mean and that much either way, the border is as wide
+again.
+
+Only what was known in every example is asked, and of what says the same twice only one. A pose is refused where an
+existing one fits the examples: it would be called by both names. Where it is meant as a special case of that one, it
+has a greater weight, and so is preferred where both fit.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import sqrt
+
+import numpy as np
+from scipy.special import stdtrit
+
+from common.arrays import Bool, Float
+from common.errors import FitError
+from common.gesture_settings import GestureSettings, PoseShape, Quantity, Span
+from common.hand_model import FINGERS
+from master.gestures.features import HandFeatures
+from master.gestures.poses import PoseTable
+from master.gestures.quantities import QUANTITIES, Quantities, known_of
+
+FEWEST, MOST = 3, 10  # examples
+SHORTEST = 5  # frames of one
+_FLOOR: Mapping[str, float] = {"deg": 7.0, "mm": 7.0, "": 0.09}  # by unit: what a hold varies from day to day
+_WIDEST: Mapping[str, float] = {
+    "deg": 25.0,
+    "mm": 25.0,
+    "": 0.35,
+}  # examples that differ by more show no one pose
+_ASKED: tuple[Quantity, ...] = (
+    *("index_mcp_deg", "index_pip_deg", "middle_mcp_deg", "middle_pip_deg"),
+    *("ring_mcp_deg", "ring_pip_deg", "little_mcp_deg", "little_pip_deg"),
+    *("thumb_bend_deg", "thumb_across", "thumb_below", "thumb_ahead", "thumb_index_gap_mm"),
+    *("index_middle_spread_deg", "middle_ring_spread_deg", "ring_little_spread_deg"),
+)
+_KNOWN_SHARE = 0.6  # of an example's frames
+_LIKE = 0.25  # an example that another pose fits so well would be called by its name
+_SPECIAL = 4.0  # weight of a special case
+_APART = 3  # quantities that are named where two poses differ
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Example:
+    """One hold.
+
+    Attributes:
+        quantities: Medians over the frames in which each was known, and their doubt; unknown: inf.
+        known: (5,) fingers that were known in most frames.
+    """
+
+    quantities: Quantities
+    known: Bool
+
+    @classmethod
+    def of(cls, frames: Sequence[HandFeatures]) -> "Example":
+        """Of the frames of one hold.
+
+        Raises:
+            FitError: They are too few.
+        """
+        if len(frames) < SHORTEST:
+            raise FitError(f"an example of {len(frames)} frames: hold it longer, for {SHORTEST} at least")
+        each = [Quantities.of(frame) for frame in frames]
+        told = np.array([known_of(one) for one in each])
+        enough = told.mean(axis=0) >= _KNOWN_SHARE
+        value = np.array([np.where(known, one.value, np.nan) for known, one in zip(told, each, strict=True)])
+        sigma = np.array([np.where(known, one.sigma, np.nan) for known, one in zip(told, each, strict=True)])
+        known = np.mean([frame.known for frame in frames], axis=0) >= _KNOWN_SHARE
+        medians = [np.full(len(QUANTITIES), fill) for fill in (0.0, np.inf)]
+        for median, of in zip(medians, (value, sigma), strict=True):
+            median[enough] = np.nanmedian(of[:, enough], axis=0)
+        return cls(Quantities(*medians), known)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseTemplate:
+    """A pose that was learnt.
+
+    Attributes:
+        shape: What is asked of it.
+        said: Lines for the user: what it is told by, and what tells it from the other poses.
+        residual: For the provenance.
+    """
+
+    shape: PoseShape
+    stated: tuple[str, ...]
+    residual: dict[str, float]
+
+
+def learn(
+    name: str, examples: Sequence[Example], settings: GestureSettings, within: str | None = None
+) -> PoseTemplate:
+    """The pose that the examples show.
+
+    Args:
+        name: Of the pose; one of that name is replaced.
+        examples: FEWEST to MOST.
+        settings: The poses that there are.
+        within: The pose that this one is a special case of.
+
+    Raises:
+        FitError: Too few or too different examples, too little is known of the hand, or it is too like another pose.
+            The text says which and why.
+    """
+    if not FEWEST <= len(examples) <= MOST:
+        raise FitError(f"{name}: {len(examples)} examples, {FEWEST} to {MOST} are needed")
+    others = {other: shape for other, shape in settings.poses.items() if other != name}
+    if within is not None and within not in others:
+        raise FitError(f"{name}: there is no pose {within!r} that it could be a special case of")
+    shape = _shape(name, examples, 1.0 if within is None else _SPECIAL)
+    _refuse_alike(name, shape, examples, others, within)
+    agree = _agreement(name, examples)
+    asked = [f"{span.low:.4g} to {span.high:.4g} {quantity}" for quantity, span in shape.ranges.items()]
+    stated = [f"{name}: told by {', '.join(asked)}", f"each example fits the others by {agree:.2f} or better"]
+    stated += [_difference(other, of, examples) for other, of in others.items()]
+    return PoseTemplate(
+        shape, tuple(stated), {"examples": float(len(examples)), "agreement": round(agree, 3)}
+    )
+
+
+def _shape(name: str, examples: Sequence[Example], weight: float) -> PoseShape:
+    """Ranges of what is known in all examples."""
+    known = np.all([known_of(example.quantities) for example in examples], axis=0)
+    value = np.array([example.quantities.value for example in examples])
+    doubt = np.sqrt(
+        np.mean([np.where(known, example.quantities.sigma, 0.0) ** 2 for example in examples], axis=0)
+    )
+    n = len(examples)
+    wider = float(stdtrit(n - 1, 0.93)) * sqrt(1.0 + 1.0 / n)
+    ranges: dict[Quantity, Span] = {}
+    for quantity in _ASKED:
+        column, unit = QUANTITIES.index(quantity), _unit(quantity)
+        if not known[column] or doubt[column] > _WIDEST[unit]:
+            continue
+        spread = float(value[:, column].std(ddof=1))
+        if spread > _WIDEST[unit]:
+            raise FitError(
+                f"{name}: the examples do not show one pose: {quantity} is"
+                f" {', '.join(f'{one:.3g}' for one in value[:, column])}"
+            )
+        half, middle = max(_FLOOR[unit], wider * spread), float(value[:, column].mean())
+        ranges[quantity] = Span(
+            low=round(middle - half, 3), high=round(middle + half, 3), soft=round(half, 3)
+        )
+    fingers = np.all([example.known for example in examples], axis=0)
+    if len(ranges) < len(_ASKED) // 2:
+        hidden = ", ".join(np.array(FINGERS)[~fingers]) or "too many fingers"
+        raise FitError(f"{name}: {hidden} cannot be seen in this pose; turn the hand to the cameras")
+    return PoseShape(ranges=ranges, weight=weight)
+
+
+def _refuse_alike(
+    name: str,
+    shape: PoseShape,
+    examples: Sequence[Example],
+    others: Mapping[str, PoseShape],
+    within: str | None,
+) -> None:
+    """Refuse what another pose fits, or a taught pose whose middle fits this one.
+
+    Raises:
+        FitError: Naming the pose, and what comes nearest to telling them apart.
+    """
+    for other, of in others.items():
+        if other == within:
+            continue
+        fits = max(_scores(of, examples))
+        middle = _middle(of)
+        back = _scores(shape, [middle])[0] if middle is not None else 0.0
+        if max(fits, back) >= _LIKE:
+            hint = (
+                ""
+                if middle is not None
+                else f", or, where it is a special case of it, say so (--within {other})"
+            )
+            raise FitError(
+                f"{name}: too like {other!r}, which fits by {max(fits, back):.2f}; {_difference(other, of, examples)}."
+                f" Show a pose that differs more{hint}"
+            )
+
+
+def _middle(shape: PoseShape) -> Example | None:
+    """The middle of a pose that was taught: all that it asks has two sides. None: it is a wider one."""
+    value, sigma = np.zeros(len(QUANTITIES)), np.full(len(QUANTITIES), np.inf)
+    for quantity, span in shape.ranges.items():
+        if span.high - span.low > 4.0 * span.soft:
+            return None
+        column = QUANTITIES.index(quantity)
+        value[column], sigma[column] = 0.5 * (span.low + span.high), 0.0
+    return Example(Quantities(value, sigma), np.ones(len(FINGERS), np.bool_))
+
+
+def _scores(shape: PoseShape, examples: Sequence[Example]) -> list[float]:
+    """How well a pose fits each example, as seen by what is known of it."""
+    return [float(np.exp(-0.5 * (_misfit(shape, example) ** 2).sum())) for example in examples]
+
+
+def _misfit(shape: PoseShape, example: Example) -> Float:
+    alone = GestureSettings(version=1, name="alone", poses={"one": shape})
+    return PoseTable(alone).misfit(example.quantities)[0]
+
+
+def _difference(other: str, shape: PoseShape, examples: Sequence[Example]) -> str:
+    """What tells the examples from another pose, most telling first."""
+    misfit = np.median([_misfit(shape, example) for example in examples], axis=0)
+    value = np.median([example.quantities.value for example in examples], axis=0)
+    parts: list[str] = []
+    columns: list[int] = np.argsort(-misfit)[:_APART].tolist()
+    for column in columns:
+        if misfit[column] < 0.5:
+            break
+        quantity: Quantity = QUANTITIES[column]
+        span = shape.ranges[quantity]
+        bound = f"at most {span.high:.3g}" if value[column] > span.high else f"at least {span.low:.3g}"
+        parts.append(f"{quantity} is {value[column]:.3g}, there {bound}")
+    return f"from {other}: {'; '.join(parts) or 'nothing that it asks'}"
+
+
+def _agreement(name: str, examples: Sequence[Example]) -> float:
+    """The worst fit of an example to what the others alone would have taught; 1 of three, which are too few for it."""
+    if len(examples) <= FEWEST:
+        return min(_scores(_shape(name, examples, 1.0), examples))
+    out: list[float] = []
+    for k, example in enumerate(examples):
+        rest = [*examples[:k], *examples[k + 1 :]]
+        out += _scores(_shape(name, rest, 1.0), [example])
+    return min(out)
+
+
+def _unit(quantity: str) -> str:
+    unit = quantity.rsplit("_", 1)[-1]
+    return unit if unit in ("deg", "mm") else ""

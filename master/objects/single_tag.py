@@ -1,0 +1,133 @@
+"""The two poses of the only tag that is seen: which of them to believe, and how sure that is.
+
+A flat tag has two poses that nearly explain it, tilted one way or the other. Both are fitted; the one that was believed
+stays unless the other is clearly better over several frames, and as far as the other is possible the covariance reaches
+over to it.
+
+The other is fitted for nothing where two cameras that see the tag leave no doubt, and costs as much as the first. So
+while the same cameras see the same tag, and the other was out of the question when it was fitted last, it is taken to
+be as bad for the next frames (`_UNLOOKED`). What is told then differs by less than numbers are exact.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from common.arrays import Float
+from common.camera_model import CameraModel
+from common.geometry import matrix_to_rotation_vector
+from master.objects.association import Association, sighted_now
+from master.objects.features import Features
+from master.objects.fit import Fitted, PoseFit
+from master.objects.motion import Motion
+from master.objects.start import two_poses
+from master.objects.window import Window
+
+_FLIP_RAD = np.radians(8.0)  # poses of a tag nearer than this are one
+_BETTER = 12.0  # chi square, summed over frames, by which the other pose of a tag must be better
+_FORGET = 0.8  # of that sum, from frame to frame
+_CLEAR = (
+    -30.0
+)  # chi square of the other pose's being better at which it is out of the question: exp(-30) is nothing
+_UNLOOKED = (
+    5  # frames for which that holds: less than a tenth of a second, before a sum of it would be forgotten
+)
+
+
+@dataclass(slots=True)
+class _Clear:
+    """A tag whose other pose is out of the question: who saw it, how much better the other is, and for how long yet."""
+
+    seen_by: tuple[int, ...]
+    better: float
+    frames: int
+
+
+class SingleTag:
+    """Push machine. Holds how much better the other pose has been of late, and what was clear when it was fitted."""
+
+    def __init__(self, features: Features, cameras: tuple[CameraModel, ...], fit: PoseFit) -> None:
+        """Set up for an object's features, the rig's cameras and what fits the one in the other."""
+        self._features, self._cameras, self._fit = features, cameras, fit
+        self._doubt = 0.0
+        self._clear: _Clear | None = None
+
+    def forget(self) -> None:
+        """Begin anew: what is seen is another thing."""
+        self._doubt, self._clear = 0.0, None
+
+    def of_two(self, window: Window, seen: Association, fitted: Fitted, *, begins: bool) -> Fitted:
+        """The pose to believe, its covariance grown by the other; the fit itself where more than a tag is seen.
+
+        Args:
+            window: The sightings.
+            seen: What was fitted.
+            fitted: The pose.
+            begins: There is no pose before it: the better one is taken at once.
+        """
+        features = np.unique(seen.feature[fitted.used])
+        if len(features) != 1 or features[0] < self._features.beads:
+            self._doubt *= _FORGET
+            self._clear = None
+            return fitted
+        feature = int(features[0])
+        who = (feature, *np.unique(seen.seen.camera[fitted.used]).tolist())
+        clear = self._clear
+        if clear is not None and clear.seen_by == who and clear.frames > 0 and not begins:
+            clear.frames -= 1
+            self._doubt = _FORGET * (self._doubt + clear.better)
+            return fitted
+        self._clear = None
+        other = self._other(window, seen, fitted, feature)
+        if other is None:
+            self._doubt *= _FORGET
+            return fitted
+        better = 0.5 * (fitted.cost - other.cost)
+        self._doubt = _FORGET * self._doubt + 2.0 * better * (1.0 - _FORGET) * 2.0
+        if begins:
+            if better > 0.0:
+                fitted, other, better = other, fitted, -better
+        elif self._doubt > _BETTER:
+            fitted, other, better, self._doubt = other, fitted, -better, 0.0
+        elif better < _CLEAR:
+            self._clear = _Clear(who, better, _UNLOOKED)
+        return _reaching(fitted, other, better)
+
+    def _other(self, window: Window, seen: Association, fitted: Fitted, feature: int) -> Fitted | None:
+        """The fit of the only tag's other pose, where there is another."""
+        own = self._features.points[self._features.corners_of(feature - self._features.beads)]
+        best: Fitted | None = None
+        for sighted in sighted_now(window, self._features):
+            if sighted.feature != feature:
+                continue
+            camera = self._cameras[sighted.camera]
+            for _, T in two_poses(own, camera.undistort(sighted.uv[0])):
+                there = camera.T_rig_camera @ T
+                if _rotated(there, fitted.motion.T) < _FLIP_RAD:
+                    continue
+                other = self._fit(seen.seen, Motion.still(there), feature=seen.feature)
+                if other is None or _rotated(other.motion.T, fitted.motion.T) < _FLIP_RAD:
+                    continue
+                if best is None or other.cost < best.cost:
+                    best = other
+        return best
+
+
+def _reaching(fitted: Fitted, other: Fitted, better: float) -> Fitted:
+    """A fit whose covariance reaches over to another as far as that is possible, by how much better it is."""
+    share = 1.0 / (1.0 + np.exp(np.clip(-better, -50.0, 50.0)))
+    off = np.concatenate(
+        [
+            other.motion.T[:3, 3] - fitted.motion.T[:3, 3],
+            matrix_to_rotation_vector(other.motion.T[:3, :3] @ fitted.motion.T[:3, :3].T),
+        ]
+    )
+    cov = fitted.cov.copy()
+    cov[:6, :6] += share * np.outer(off, off)
+    return replace(fitted, cov=cov)
+
+
+def _rotated(T: Float, other: Float) -> float:
+    """Angle between two poses [rad]: the trace of a rotation is 1 + 2 cos."""
+    cosine = 0.5 * (float(np.vdot(T[:3, :3], other[:3, :3])) - 1.0)
+    return float(np.arccos(min(max(cosine, -1.0), 1.0)))

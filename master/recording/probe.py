@@ -1,0 +1,161 @@
+"""Shows what the master is told, in the order in which it is told, while somebody records.
+
+A message goes on the bus (stream `taken`) once all that it tells is out, with those of the same fifth of a second,
+on a thread of its own: no pose waits for it. That thread may wait for a reader, so that none is lost on the way; where
+it waits for too long, what does not fit its queue is dropped and counted. While nobody taps, there is no thread, and a
+message costs one comparison.
+"""
+
+import threading
+import time
+from collections import deque
+from typing import Generic, TypeVar
+
+from common.bus import Bus
+from common.clock import Clock
+from common.errors import BusError
+from common.messages import Backlog, Message
+from common.streams import MASTER, sender_of
+from master.load_shedding import LoadShedding
+from master.outputs.devices import Taking
+
+LEASE_NS = 3_000_000_000
+CAPACITY = 20_000  # messages, some seconds
+_DRAIN_S = 5.0
+_STEP_S = 0.01
+_TOGETHER_S = 0.2  # to wake a thread and a link for each message would cost several times as much
+
+ReceivedT = TypeVar("ReceivedT", bound=Message)
+
+
+class Probe:
+    """Whether somebody taps, and what is to be shown. The bus belongs to the caller.
+
+    Holds the lease, the queue, and the thread while there is one. `show` belongs to the loop; the rest is called on any
+    thread.
+    """
+
+    def __init__(self, bus: Bus, clock: Clock, *, always: bool = False) -> None:
+        """Show nothing until `lease`; with `always` everything from the first message on."""
+        self._bus, self._clock, self._always = bus, clock, always
+        self._until_ns = 0
+        self._queue: deque[Message] = deque()
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._load_shedding = threading.Event()
+        self._busy = self._closed = False
+        self._shown = self._dropped = 0
+        self._rejected, self._again = 0, False  # as was shown last; a reader may not have been there
+        if always:
+            self._start()
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """`probe.shown`, and of those `probe.dropped`, once there were any: what a recorder never received."""
+        # What waits to be published can be nobody's loss yet.
+        return (
+            {"tap.shown": self._shown - len(self._queue), "tap.dropped": self._dropped} if self._shown else {}
+        )
+
+    def lease(self) -> None:
+        """Show everything for three seconds from now, and again how far behind the master is."""
+        self._again = True
+        self._until_ns = self._clock.now_ns() + LEASE_NS
+        self._start()
+
+    def show(self, message: Message, reject: int = 0) -> None:
+        """Publish it soon, if somebody taps; and before it that so many instants are left out, if that is news."""
+        if not self._always:
+            if self._until_ns == 0:
+                return
+            if self._clock.now_ns() >= self._until_ns:
+                self._until_ns = 0
+                return
+        if reject != self._rejected or (self._again and reject):
+            self._rejected = reject
+            self._put(Backlog(MASTER, came_ns(message, self._clock.now_ns()), reject))
+        self._again = False
+        self._put(message)
+
+    def _put(self, message: Message) -> None:
+        self._shown += 1
+        if len(self._queue) >= CAPACITY:
+            self._dropped += 1
+        else:
+            self._queue.append(message)  # nobody is woken: the thread looks by itself
+
+    def end_always(self) -> None:
+        """Show nothing any more but to who taps: the recorder that wanted everything is gone."""
+        self._always = False
+
+    def drain(self) -> None:
+        """Wait until all that was shown is on its way, at most some seconds."""
+        self._start()
+        self._load_shedding.set()
+        deadline = time.monotonic() + _DRAIN_S
+        while (self._queue or self._busy) and time.monotonic() < deadline:
+            time.sleep(_STEP_S)
+        self._load_shedding.clear()
+
+    def close(self) -> None:
+        """Show nothing any more. Safe to call twice."""
+        with self._lock:
+            self._closed, thread = True, self._thread
+        self._queue.clear()
+        self._load_shedding.set()
+        if thread is not None:
+            thread.join(_DRAIN_S)
+
+    def _start(self) -> None:
+        with self._lock:
+            if self._thread is None and not self._closed:
+                self._thread = threading.Thread(target=self._work, name="tap", daemon=True)
+                self._thread.start()
+
+    def _work(self) -> None:
+        """Publish what there is, all at once, so that it travels together; end when nobody taps any more."""
+        while True:
+            while self._queue and not self._closed:
+                self._busy = True
+                message = self._queue.popleft()
+                try:
+                    self._bus.publish("taken", sender_of(message), message)
+                except BusError:
+                    self._dropped += 1  # the bus is closed: the master ends
+            self._busy = False
+            with self._lock:
+                if self._closed or not (self._always or self._until_ns or self._queue):
+                    self._thread = None
+                    return
+            self._load_shedding.wait(_STEP_S if self._load_shedding.is_set() else _TOGETHER_S)
+
+
+def came_ns(message: Message, now_ns: int) -> int:
+    """When a message was there: a frame, when its slave got it; what a device measured, when it did; else `now_ns`."""
+    return getattr(message, "ready_t_ns", None) or getattr(message, "t_ns", now_ns)
+
+
+class Tapped(Generic[ReceivedT]):
+    """A source of messages that shows each when the next is asked for: what reads it has made of it all it can by then.
+
+    With each message it sees how far behind the master is, which holds until the next. Holds the last message.
+    """
+
+    def __init__(self, source: Taking[ReceivedT], probe: Probe, load_shedding: LoadShedding) -> None:
+        """Stand between a source and who reads it."""
+        self._source, self._probe, self._load_shedding = source, probe, load_shedding
+        self._last: ReceivedT | None = None
+
+    def get(self, timeout_s: float) -> ReceivedT | None:
+        """The next message, or None when none came in time."""
+        self.flush()
+        self._last = self._source.get(timeout_s)
+        if self._last is not None:
+            self._load_shedding.look(self._last)
+        return self._last
+
+    def flush(self) -> None:
+        """At the end: the last message, too."""
+        last, self._last = self._last, None
+        if last is not None:
+            self._probe.show(last, self._load_shedding.reject)

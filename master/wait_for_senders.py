@@ -1,0 +1,198 @@
+"""`phalanx-master hear`: are these cameras and IMUs heard here? For an installer, which goes back if they are not.
+
+Where a master runs, it is asked what it takes. Where none does, this command gives the start and counts the
+datagrams that come. When it ends, slaves wait for their master again.
+"""
+
+import json
+import os
+import threading
+import time
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from common.bus import Bus
+from common.calibration import RigCalibration, load
+from common.clock import SystemClock
+from common.datagram import Address
+from common.errors import BusError, PhalanxError
+from common.keys import link_key
+from common.link_key import LinkKey
+from common.messages import Health
+from common.streams import MASTER
+from common.zenoh_bus import ZenohBus
+from master.ingest import Ingest
+from master.master_bus import join_bus
+from master.options import (
+    CALIB_JSON,
+    HERE_BEACON,
+    HERE_BIND,
+    HERE_BUS,
+    Beacon,
+    Bind,
+    BusEnd,
+    Calibration,
+    KeyFile,
+    Rig,
+    address,
+)
+from master.stopping import stop_on_signals
+
+_APPEAR_S = 1.5  # whoever has just connected is not known everywhere yet
+_POLL_S = 0.1
+_START_S = 1.0
+_RATE_S = 1.0  # how long datagrams are counted after the first of each
+Received = dict[str, float]
+
+
+def wait_for_senders(
+    names: Annotated[list[str], typer.Option("--name", help="Camera or IMU; once for each.")],
+    rig: Rig = "desk",
+    calibration: Calibration = CALIB_JSON,
+    seconds: Annotated[float, typer.Option(min=1.0, max=3600.0, help="How long they are waited for.")] = 20.0,
+    beacon: Beacon = HERE_BEACON,
+    bind: Bind = HERE_BIND,
+    bus: BusEnd = HERE_BUS,
+    key_file: KeyFile = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="As JSON: datagrams a second by name, and whether a master runs.")
+    ] = False,
+) -> None:
+    """Wait until datagrams of all these senders come, at the master that runs or, where none does, here.
+
+    Ends with 1 if one of them is not heard.
+
+    Examples:
+
+      phalanx-master hear --name left --name right --keys ~/.config/phalanx/keys
+
+      phalanx-master hear --rig wrist --name wrist --name imu --bind 0.0.0.0:47801 --beacon 192.168.1.255:47800
+    """
+    stop = stop_on_signals()
+    connection = _running(bus)
+    if connection is not None:
+        try:
+            received = at_master(connection, names, seconds, stop)
+        finally:
+            connection.close()
+    else:
+        setup = load(calibration / "rigs" / f"{rig}.json", RigCalibration)
+        received = here(names, setup, link_key(os.environ, key_file), address(beacon, "--beacon"),
+                     address(bind, "--bind"), seconds, stop)  # fmt: skip
+    if as_json:
+        typer.echo(json.dumps({"heard": received, "master": connection is not None}))
+    for name in names if not as_json else ():
+        typer.echo(
+            f"{name}: {f'{received[name]:.0f} datagrams a second' if name in received else 'not received'}"
+        )
+    if len(received) < len(set(names)):
+        raise typer.Exit(1)
+
+
+def at_master(bus: Bus, names: Sequence[str], seconds: float, stop: threading.Event) -> Received:
+    """What the master that runs takes of them: name -> datagrams a second, of those whose count rises.
+
+    Raises:
+        PhalanxError: It does not know one of them.
+    """
+    inbox = bus.subscribe("health", MASTER)
+    first: Health | None = None
+    received: Received = {}
+    end = time.monotonic() + seconds
+    while len(received) < len(set(names)) and time.monotonic() < end and not stop.is_set():
+        health = inbox.get(_POLL_S)
+        if not isinstance(health, Health):
+            continue
+        for name in names:
+            if f"{name}.received" not in health.counts:
+                raise PhalanxError(
+                    f"the master that runs here does not know {name!r}: does it run with --rig of that?"
+                )
+        if first is None or first.session != health.session:
+            first, received = health, {}
+        passed_s = (health.t_ns - first.t_ns) * 1e-9
+        for name in names:
+            count = health.counts[f"{name}.received"] - first.counts[f"{name}.received"]
+            if count > 0 and passed_s > 0.0:
+                received[name] = count / passed_s
+    inbox.close()
+    return received
+
+
+def here(
+    names: Sequence[str],
+    rig: RigCalibration,
+    key: LinkKey | bytes,
+    beacon: Address,
+    bind: Address,
+    seconds: float,
+    stop: threading.Event,
+) -> Received:
+    """Give the start, and count what comes: name -> datagrams a second, of those that are heard.
+
+    Raises:
+        PhalanxError: A name is none of the rig's.
+        BusError: The port is taken.
+    """
+    imus = () if rig.imu is None else (rig.imu.name,)
+    for name in names:
+        if name not in (*rig.cameras, *imus):
+            raise PhalanxError(f"rig {rig.name!r} has no camera or IMU {name!r}")
+    wrists = rig.cameras if rig.kind == "wrist" else ()
+    try:
+        ingest = Ingest(rig.cameras, key, SystemClock(), beacon, bind, "", _START_S, imus=imus, wrists=wrists)
+    except BusError as error:
+        raise BusError(f"{error}; if a master runs here, say where: --bus ENDPOINT") from error
+    try:
+        return _counted(ingest, names, seconds, stop)
+    finally:
+        ingest.close()
+
+
+def _counted(ingest: Ingest, names: Sequence[str], seconds: float, stop: threading.Event) -> Received:
+    began = time.monotonic()
+    first: dict[str, float] = {}
+    received: Received = {}
+    while time.monotonic() - began < seconds and len(received) < len(set(names)) and not stop.is_set():
+        ingest.get(_POLL_S)
+        while ingest.get(0.0) is not None:
+            pass  # that it came is enough
+        now = time.monotonic()
+        for name in names:
+            count = ingest.counts_of(name).received
+            if count:
+                passed_s = now - first.setdefault(name, now)
+                if passed_s >= _RATE_S or now - began > seconds - _POLL_S:
+                    received[name] = count / max(passed_s, _RATE_S)
+    return received
+
+
+def _running(endpoint: str) -> ZenohBus | None:
+    """The bus of a master that runs; None: none does."""
+    try:
+        bus = join_bus(endpoint)
+    except BusError as error:
+        if error.__cause__ is None:  # the endpoint is malformed, or keys are missing
+            raise
+        return None
+    end = time.monotonic() + _APPEAR_S
+    while time.monotonic() < end:
+        if MASTER in bus.alive():
+            return bus
+        time.sleep(_POLL_S)
+    bus.close()
+    return None
+
+
+def main() -> None:
+    """`python -m master.wait_for_senders`: the same, without loading what else the master's program can do."""
+    try:
+        typer.run(wait_for_senders)
+    except PhalanxError as error:
+        raise SystemExit(f"hear: {error}") from error
+
+
+if __name__ == "__main__":
+    main()

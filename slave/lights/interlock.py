@@ -1,0 +1,169 @@
+"""Stands between whoever makes light and the driver: no pulse too long, no duty too high, and off if nobody does it.
+
+Wrapped around every driver. It knows nothing of cameras: it holds the two limits of the rig file (`max_pulse_us`,
+`max_duty`) against what is asked for and against what happens, on the clock of this machine. A pulse is refused before
+it begins if it is to be longer than allowed, or if with it a light would have been on for more than its share of the
+last second. A watchdog, on a thread of its own, ends what has lasted as long as it may. What a driver does when the
+whole process dies is its own matter, told in each driver's file and in docs/safety.md.
+"""
+
+import atexit
+import logging
+import threading
+from collections import Counter, deque
+from collections.abc import Callable
+
+from common.clock import Clock, SystemClock
+from common.errors import LightsError
+from common.frame_recording import Illumination
+from common.strobe_calibration import StrobeCalibration
+from slave.lights.source import Lights
+
+WINDOW_NS = 1_000_000_000  # over which the duty is reckoned; any second, not every second
+RETRY_S = 0.01  # between attempts to darken a driver that fails
+EVENTS = ("pulses", "refused", "off_by_watchdog", "failed")
+_SHINING = (Illumination.LASER, Illumination.LED)
+_LOG = logging.getLogger(__name__)
+
+
+class Interlock:
+    """A driver within limits. Holds what is on, until when at most, the pulses of the last second, whether it failed.
+
+    Attributes:
+        counts: Event -> how often.
+            pulses: begun.
+            refused: not begun, as they would have been too long, or too much.
+            off_by_watchdog: ended by the watchdog.
+            failed: the driver did not do what it was told.
+    """
+
+    def __init__(
+        self,
+        lights: Lights,
+        strobe: StrobeCalibration,
+        clock: Clock | None = None,
+        watch: bool = True,
+    ) -> None:
+        """Take the driver over, dark, and start the watchdog.
+
+        Args:
+            lights: The driver; closed by `close`.
+            strobe: The limits.
+            clock: Of this machine.
+            watch: Start the watchdog's thread; without, somebody calls `look`.
+        """
+        self._lights = lights
+        self._clock: Clock = SystemClock() if clock is None else clock
+        self._longest_ns = round(strobe.max_pulse_us * 1e3)
+        self._allowed_ns = round(strobe.max_duty * WINDOW_NS)
+        self._past: dict[Illumination, deque[tuple[int, int]]] = {lit: deque() for lit in _SHINING}
+        self._changed = threading.Condition(threading.RLock())
+        self._on: Illumination | None = None
+        self._since_ns = self._until_ns = 0
+        self._closed = self._failing = False
+        self.counts: Counter[str] = Counter(dict.fromkeys(EVENTS, 0))
+        atexit.register(lights.close)  # where an exception ends the process and nobody closes
+        self._thread: threading.Thread | None = None
+        if watch:
+            self._thread = threading.Thread(target=self._watch, name="light watchdog", daemon=True)
+            self._thread.start()
+
+    def begin(self, lit: Illumination, length_ns: int) -> bool:
+        """Have a light on for so long [ns]; whoever begins also calls `end`.
+
+        Returns:
+            False, and nothing is on, if that is too long, too much, or something is on already or may be.
+
+        Raises:
+            LightsError: The driver failed.
+        """
+        with self._changed:
+            now_ns = self._clock.now_ns()
+            may_ns = self._allowance_ns(lit, now_ns)
+            if self._closed or self._failing or self._on is not None or not 0 < length_ns <= may_ns:
+                self.counts["refused"] += 1
+                return False
+            self._on, self._since_ns, self._until_ns = lit, now_ns, now_ns + may_ns
+            self._changed.notify_all()
+            self._order(lambda: self._lights.switch(lit))
+            self.counts["pulses"] += 1
+            return True
+
+    def end(self) -> None:
+        """Have nothing on.
+
+        Raises:
+            LightsError: The driver failed; the watchdog goes on trying.
+        """
+        with self._changed:
+            self._order(self._lights.off)
+            if self._on is not None:
+                self._past[self._on].append((self._since_ns, self._clock.now_ns()))
+            self._on, self._failing = None, False
+
+    def look(self) -> float | None:
+        """End what has lasted long enough; in how many seconds to look again, None: there is nothing to look for."""
+        with self._changed:
+            if not self._failing:
+                if self._on is None:
+                    return None
+                if (left_s := (self._until_ns - self._clock.now_ns()) * 1e-9) > 0.0:
+                    return left_s
+                self.counts["off_by_watchdog"] += 1
+            was_failing = self._failing
+            try:
+                self.end()
+            except LightsError as error:
+                if not was_failing:
+                    _LOG.error("laser or LEDs cannot be switched off: %s", error)
+                return RETRY_S
+            return None
+
+    def close(self) -> None:
+        """Go dark, give the driver back, end the watchdog. Safe to call twice.
+
+        Raises:
+            LightsError: The driver could not be darkened.
+        """
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        if self._thread is not None:
+            self._thread.join()
+        self._lights.close()
+        atexit.unregister(self._lights.close)
+
+    def events(self) -> dict[str, int]:
+        """Of the guard and of the driver."""
+        return {**self.counts, **self._lights.counts()}
+
+    def _order(self, order: Callable[[], None]) -> None:
+        """Tell the driver; whatever it raises is a failure, after which a light may be on: the watchdog's work."""
+        try:
+            order()
+        except (
+            Exception
+        ) as error:  # also what a library below it raises: no thread that darkens may end by it
+            self.counts["failed"] += 1
+            self._failing = True
+            self._changed.notify_all()
+            if isinstance(error, LightsError):
+                raise
+            raise LightsError(f"{type(error).__name__}: {error}") from error
+
+    def _allowance_ns(self, lit: Illumination, now_ns: int) -> int:
+        """How long a light may be on from now [ns]; 0 and below: not at all."""
+        if lit not in self._past:
+            return 0
+        past = self._past[lit]
+        while past and past[0][1] <= now_ns - WINDOW_NS:
+            past.popleft()
+        used_ns = sum(stop - max(start, now_ns - WINDOW_NS) for start, stop in past)
+        return min(self._longest_ns, self._allowed_ns - used_ns)
+
+    def _watch(self) -> None:
+        while True:
+            with self._changed:
+                if self._closed:
+                    return
+                self._changed.wait(self.look())

@@ -1,0 +1,198 @@
+"""Whether three frames of a strobed camera are ambient, laser and LED, in this order, by what they show.
+
+All is judged on a coarse image, cell by cell, by how far one frame is brighter than another *beyond* what noise, and
+ambient light that swings, explain:
+
+    broad      a square of 72 px fits into what is brighter: LEDs light a palm, which is wider than that
+    thin       much brighter, and in its column lower than 72 px: the line of the laser
+    flash      thin, and brighter than both other frames: light that was there in one frame alone
+
+LEDs are told by broad light. The laser is told by a flash on what the LEDs light, or at its edge, and nowhere else: a
+window between moving fingers, a shadow, somebody who walks by are thin at times, or near, or there for one frame, and
+hardly ever all at once. Of three frames the ambient one is nowhere brighter, as light only adds. Nothing is compared
+with a frame before them, so it does not matter what the ambient light was then.
+Where both frames are saturated neither is brighter: such cells tell nothing and are not counted.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from math import inf, log2
+
+import cv2
+import numpy as np
+
+from common.arrays import Image
+
+_Cells = cv2.typing.MatLike  # of a coarse frame
+_SIZE = (80, 60)  # cells across and down: 8 x 8 px of 640 x 480
+_NOISE = 6  # levels: five standard deviations of a cell near saturation (16 px of 5 levels of shot noise)
+_SWING = 0.125  # of the ambient light: how far lamps on the mains swing between two frames
+_EXPLAINED = (_NOISE + _SWING * np.arange(256)).astype(np.uint8)  # by the darker of two levels
+_LINE = 20  # levels beyond that: a line that a centroid can be taken of
+_SATURATED = 250  # level of a cell
+# Neighbourhoods, (rows, columns) of cells.
+_SQUARE = np.ones((9, 9), np.uint8)  # narrower than a palm, wider than a finger
+_COLUMN = np.ones((9, 1), np.uint8)
+_LINE_HIGH = np.ones((5, 1), np.uint8)  # a line hides so many from the LEDs
+_AROUND = np.ones((5, 5), np.uint8)
+_SMALL = np.ones((3, 3), np.uint8)  # narrower than a finger, wider than a window moves in one frame
+
+LED_LEAST = 0.08  # share of the cells that LEDs light broadly: a palm fills a sixth of the picture or more
+LED_NEVER = 0.04  # share up to which it is none: the halo of a laser on a near thumb, a hand that moved
+HALO = 0.5  # of the light of the LEDs: what a line scatters over near skin is mostly less
+LASER_LEAST = 8  # cells of flash: the line on one finger
+# How many times as many cells of flash on the hand as there are
+LASER_OF_ELSEWHERE = 4.0  # of flash elsewhere
+LASER_OF_OWN = 4.0  # of flash on the hand in the ambient frame: another laser frame has as many
+LASER_OF_EXCESS = 8.0  # of lines within the hand that the ambient frame has and another has not
+VALID_LEAST = 0.25  # share of the cells that are not saturated: with fewer nothing is told
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """How sure it is that three frames are ambient, laser, LED: base-2 logarithms of measures over their thresholds.
+
+    Attributes:
+        led: The LED frame has broad light that the ambient frame has not.
+        laser: The laser frame has a flash where the LEDs light.
+        alone: There are no such lines in the ambient frame, nor as many flashes there or elsewhere.
+        steady: Nothing broad came or went with the laser, or went with the LEDs.
+    """
+
+    led: float
+    laser: float
+    alone: float
+    steady: float
+
+    @property
+    def margin(self) -> float:
+        """The weakest of the four [octaves]; not positive: not sure."""
+        return min(self.led, self.laser, self.alone, self.steady)
+
+
+NO_EVIDENCE = Evidence(-inf, -inf, -inf, -inf)
+
+
+def coarse(image: Image) -> Image:
+    """(60, 80) uint8 means over cells of a frame (H, W) or (H, W, 3).
+
+    By halves as far as that goes: means of two by two are what a processor is quickest at.
+    """
+    cells: _Cells = image
+    while cells.shape[1] % (2 * _SIZE[0]) == 0 and cells.shape[0] % (2 * _SIZE[1]) == 0:
+        cells = cv2.resize(cells, (cells.shape[1] // 2, cells.shape[0] // 2), interpolation=cv2.INTER_AREA)
+    if cells.shape[1::-1] != _SIZE:
+        cells = cv2.resize(cells, _SIZE, interpolation=cv2.INTER_AREA)
+    return np.asarray(cells if cells.ndim == 2 else cells.max(axis=2), np.uint8)
+
+
+def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
+    """Of three coarse frames (60, 80), each as what it should be; -inf: not looked at, as another is not positive."""
+    darker = cv2.min(ambient, led)
+    valid = _valid(darker)
+    if valid < VALID_LEAST * ambient.size:
+        return NO_EVIDENCE
+    explained = cv2.LUT(darker, _EXPLAINED)
+    led_gain = cv2.subtract(cv2.subtract(led, ambient), explained)
+    if cv2.countNonZero(led_gain) <= LED_LEAST * valid:
+        return NO_EVIDENCE
+    lit = _octaves(_broad(led_gain) / valid, LED_LEAST)
+    laser_gain, laser_loss = _each_over(laser, ambient)
+    if not lit > 0.0 or cv2.countNonZero(laser_gain) <= LASER_LEAST:
+        return Evidence(lit, -inf, -inf, -inf)
+    led_loss = cv2.subtract(cv2.subtract(ambient, led), explained)
+    above_halo = cv2.subtract(laser_gain, cv2.convertScaleAbs(led_gain, alpha=HALO))
+    steady = -_octaves(max(_broad(over) for over in (above_halo, laser_loss, led_loss)) / valid, LED_NEVER)
+    if not steady > 0.0:
+        return Evidence(lit, -inf, -inf, steady)
+    led_over_laser, laser_over_led = _each_over(led, laser)
+    line = cv2.subtract(_above_column(laser_gain), cv2.convertScaleAbs(_above_column(led_gain), beta=_LINE))
+    flash = _thin(cv2.max(cv2.min(laser_gain, laser_over_led), line))
+    if cv2.countNonZero(flash) <= LASER_LEAST:
+        return Evidence(lit, -inf, -inf, steady)
+    near = _near(cv2.min(led_gain, led_over_laser))
+    on_hand = cv2.countNonZero(cv2.bitwise_and(flash, near))
+    elsewhere = cv2.countNonZero(cv2.subtract(flash, cv2.dilate(near, _AROUND)))
+    own = _shared(cv2.min(laser_loss, led_loss), lambda: _near(led_over_laser))
+    excess = max(_shared(loss, lambda: _inside(led_gain)) for loss in (led_loss, laser_loss))
+    rest = max(LASER_OF_ELSEWHERE * elsewhere, LASER_OF_OWN * own, LASER_OF_EXCESS * excess)
+    return Evidence(lit, _octaves(on_hand, LASER_LEAST), _octaves(on_hand, rest), steady)
+
+
+def unlit(frames: Sequence[Image]) -> bool:
+    """Whether no broad light comes or goes within these coarse frames (60, 80): the LEDs light none of them, or all."""
+    darkest = reduce(cv2.min, frames)
+    valid = _valid(darkest)
+    if valid < VALID_LEAST * darkest.size:
+        return False
+    gain = cv2.subtract(reduce(cv2.max, frames), darkest)
+    return _broad(cv2.subtract(gain, cv2.LUT(darkest, _EXPLAINED)), LED_NEVER * valid) <= LED_NEVER * valid
+
+
+def brighter(frame: Image, other: Image) -> bool:
+    """Whether one coarse frame (60, 80) has broad light that the other has not, and lacks none: that of the LEDs."""
+    darker = cv2.min(frame, other)
+    valid = max(_valid(darker), VALID_LEAST * frame.size)
+    explained = cv2.LUT(darker, _EXPLAINED)
+    gain = cv2.subtract(cv2.subtract(frame, other), explained)
+    if _broad(gain, LED_LEAST * valid) <= LED_LEAST * valid:
+        return False
+    return _broad(cv2.subtract(cv2.subtract(other, frame), explained)) <= LED_NEVER * valid
+
+
+def _valid(darker: _Cells) -> int:
+    """Number of cells in which one frame may be brighter than another, of the darker of both."""
+    return cv2.countNonZero(cv2.threshold(darker, _SATURATED - 1, 255, cv2.THRESH_BINARY_INV)[1])
+
+
+def _each_over(first: _Cells, second: _Cells) -> tuple[_Cells, _Cells]:
+    """How far each frame is brighter than the other beyond what noise and a swing of ambient light explain [levels]."""
+    explained = cv2.LUT(cv2.min(first, second), _EXPLAINED)
+    one, other = cv2.subtract(first, second), cv2.subtract(second, first)
+    return cv2.subtract(one, explained), cv2.subtract(other, explained)
+
+
+def _lit(over: _Cells) -> _Cells:
+    return cv2.threshold(over, 0, 255, cv2.THRESH_BINARY)[1]
+
+
+def _near(over: _Cells) -> _Cells:
+    """What the LEDs light, and a line's height above and below."""
+    return cv2.dilate(cv2.morphologyEx(_lit(over), cv2.MORPH_OPEN, _SMALL), _LINE_HIGH)
+
+
+def _inside(over: _Cells) -> _Cells:
+    """What lies within what the LEDs light, a line's height bridged."""
+    return cv2.erode(cv2.morphologyEx(_lit(over), cv2.MORPH_CLOSE, _LINE_HIGH), _SMALL)
+
+
+def _broad(over: _Cells, least: float = 0.0) -> int:
+    """How many cells are broadly brighter; 0 where no more than `least` are brighter at all."""
+    if cv2.countNonZero(over) <= least:
+        return 0
+    return cv2.countNonZero(cv2.morphologyEx(_lit(over), cv2.MORPH_OPEN, _SQUARE))
+
+
+def _shared(over: _Cells, where: Callable[[], _Cells]) -> int:
+    """How many cells of thin lines lie there; `where` is asked only if there can be any."""
+    if cv2.minMaxLoc(over)[1] <= _LINE:
+        return 0
+    return cv2.countNonZero(cv2.bitwise_and(_thin(over), where()))
+
+
+def _thin(over: _Cells) -> _Cells:
+    bright = cv2.threshold(over, _LINE, 255, cv2.THRESH_BINARY)[1]
+    high = cv2.morphologyEx(bright, cv2.MORPH_OPEN, _COLUMN)
+    return cv2.subtract(bright, high)
+
+
+def _above_column(over: _Cells) -> _Cells:
+    """How far cells are brighter than what is about as bright above or below them."""
+    return cv2.morphologyEx(over, cv2.MORPH_TOPHAT, _COLUMN)
+
+
+def _octaves(value: float, threshold: float) -> float:
+    if value <= 0.0:
+        return -inf
+    return log2(value / threshold) if threshold > 0.0 else inf

@@ -1,0 +1,233 @@
+"""Where in the image the laser can meet each finger, and where what it meets there is beside the palm.
+
+A known set, since the laser's plane stands still, and the palm lies as calibrated or as it was seen (`find_palm_pose`).
+"""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import cast
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from common.arrays import Bool, Float, Image, Int
+from common.camera_model import CameraModel
+from common.geometry import intersect_plane
+from common.hand_model import CHAINS
+from slave.wrist.palm_pose import PalmPose
+from slave.wrist.view import WristView
+from slave.wrist.workspace_samples import (
+    NEAREST_M,
+    PER_BONE,
+    along_bones,
+    finger_postures,
+    radius_along,
+    thumb_postures,
+)
+
+Float32 = npt.NDArray[np.float32]
+
+_CELL_PX = 8
+_THUMB = 0
+# Beyond the skin over the thumb's MCP, from its root. A thumb that is bent before the palm meets the plane at its MCP,
+# half a centimetre either way as device and bones are known; a finger folded to the palm does so a centimetre beyond.
+_THUMBS_M, _NO_THUMBS_M = 4e-3, 10e-3
+_BALL_M = -3e-3  # nearer there is no finger
+_LEAST_SPACING_M = 5e-3  # of axes, which fan out from the knuckles and meet behind the wrist
+_OUTSIDE_PALM = 0.5  # place: beyond the outside of the index
+_FOLDED_RADII = 2.0  # of the knuckle, above the palm's bones: what a finger folded to the palm is beyond
+_ORIGIN = np.zeros(3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LaserWorkspace:
+    """Which pixels can show the laser on a finger.
+
+    Attributes:
+        cells: (5, H / 8, W / 8), thumb ... little, where it can be.
+        plane_m: (H, W, 3) what each pixel shows of the laser's plane, camera frame [m]; 0: nothing.
+        focal_px: Of the camera.
+        T_camera_palm: (4, 4) how the palm lies [m].
+        flexed: Whether the wrist is.
+        palm: What is known of the palm.
+        first_row: Above it the laser meets no finger.
+    """
+
+    cells: Bool
+    plane_m: Float32
+    focal_px: float
+    T_camera_palm: Float
+    flexed: bool
+    palm: "Palm"
+    first_row: int
+
+    def at_palm_pose(self, palm_pose: PalmPose) -> "LaserWorkspace":
+        """The same where the palm lies just so."""
+        return replace(self, T_camera_palm=palm_pose.T_camera_palm, flexed=not palm_pose.straight)
+
+    def holds(self, finger: Int, uv: Float) -> Bool:
+        """Whether the laser can be on these fingers (N,) at pixels (N, 2) of the image."""
+        column, row = self._cell(uv)
+        return self.cells[finger, row // _CELL_PX, column // _CELL_PX] & (
+            (finger == _THUMB) | (self.beyond_m(uv) > _BALL_M)
+        )
+
+    def beyond_m(self, uv: Float) -> Float:
+        """How far (N,) the plane at pixels (N, 2) is beyond the skin of the thumb's MCP, from the thumb's root [m]."""
+        return self.palm.beyond_m(self._before_palm(uv))
+
+    def on_plane(self, uv: Float) -> tuple[Float, Float]:
+        """`beyond_m` (N,) of pixels (N, 2), and beside whose axis the plane is there (N,): 1 index ... 4 little.
+
+        Between and beyond them by their distances.
+        """
+        points = self._before_palm(uv)
+        return self.palm.beyond_m(points), self.palm.place(points)
+
+    def on_palm(self, uv: Float) -> Bool:
+        """Whether at pixels (N, 2) a bent wrist has brought the palm itself into the plane."""
+        if not self.flexed:
+            return np.zeros(len(uv), np.bool_)
+        points = self._before_palm(uv)
+        return self.palm.surface(points, self.palm.place(points))
+
+    def only_thumb(self, beyond_m: Float, place: Float) -> Bool:
+        """Whether there (N,) the laser meets the thumb or nothing."""
+        return (beyond_m < _THUMBS_M) & (place < 1.5)
+
+    def no_thumb(self, beyond_m: Float, place: Float) -> Bool:
+        """Whether there (N,) the laser never meets the thumb."""
+        return (beyond_m > _NO_THUMBS_M) & (place > _OUTSIDE_PALM)
+
+    def metres_per_px(self, uv: Float) -> Float:
+        """How much of the plane one pixel shows [m] at pixels (N, 2); 0 where they are NaN, or show none of it."""
+        column, row = self._cell(np.nan_to_num(uv))
+        return np.where(np.isnan(uv[:, 0]), 0.0, self.plane_m[row, column, 2] / self.focal_px)
+
+    def _before_palm(self, uv: Float) -> Float:
+        """What pixels (N, 2) show of the plane, palm frame (N, 3) [m]."""
+        column, row = self._cell(uv)
+        T = self.T_camera_palm
+        return (self.plane_m[row, column] - T[:3, 3]) @ T[:3, :3]
+
+    def _cell(self, uv: Float) -> tuple[Int, Int]:
+        column, row = (uv + 0.5).astype(np.int64).T
+        return column, np.minimum(row, self.plane_m.shape[0] - 1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Palm:
+    """The palm's bones and the thumb's root, in the palm frame.
+
+    Attributes:
+        root_m: (3,) the thumb's.
+        border_m: How far from it the skin over the thumb's MCP is [m].
+        knuckles_m: (4, 3).
+        aside: (4, 2) way x, z across the axis of each finger, towards the little one's side.
+        radius_m: (4,) of the knuckles.
+    """
+
+    root_m: Float
+    border_m: float
+    knuckles_m: Float
+    aside: Float
+    radius_m: Float
+
+    def beyond_m(self, points: Float) -> Float:
+        """How far points (N, 3) are (N,) beyond the skin over the thumb's MCP, from the thumb's root [m].
+
+        However the thumb is turned, that skin lies about as far from its root (CMC); so it is a sphere about the root,
+        and for one way the palm lies a fixed line in the image.
+        """
+        return np.linalg.norm(points - self.root_m, axis=1) - self.border_m
+
+    def place(self, points: Float) -> Float:
+        """Beside whose axis, from index 1 to little 4, points (N, 3) are (N,), seen from before the palm.
+
+        Between two axes, and beyond the outer ones, by their distances.
+        """
+        flat = self.knuckles_m[:, ::2]
+        off = points[:, ::2] @ self.aside.T - (flat * self.aside).sum(axis=1)  # falls finger by finger
+        left = np.clip((off > 0.0).sum(axis=1) - 1, 0, 2)[:, None]
+        here, there = np.take_along_axis(off, left, 1)[:, 0], np.take_along_axis(off, left + 1, 1)[:, 0]
+        return 1.0 + left[:, 0] + here / np.maximum(here - there, _LEAST_SPACING_M)
+
+    def surface(self, points: Float, place: Float) -> Bool:
+        """Whether points (N, 3) of these places (N,) are on the palm's skin: before the knuckles, near their bones.
+
+        A finger that is folded to it lies on it, and is thicker than that.
+        """
+        at = np.arange(1.0, 5.0)
+        y, z, thick = (np.interp(place, at, of) for of in (*self.knuckles_m.T[1:], self.radius_m))
+        return (points[:, 2] < z) & (y - points[:, 1] < _FOLDED_RADII * thick)
+
+
+@lru_cache(maxsize=128)  # one for each way the palm may lie
+def workspace_of(view: WristView) -> LaserWorkspace:
+    """The reach of one wrist rig and hand."""
+    thumb, fingers = (
+        along_bones(view, thumb_postures(view, 7, 7, 5, 5)),
+        along_bones(view, finger_postures(view, 5, 10, 10)),
+    )
+    radius = radius_along(view)
+    beyond = slice(PER_BONE, None)  # the metacarpal of the thumb is the palm's
+    cells = [_cells(view, thumb[:, 0, beyond], radius[0, beyond])]
+    cells += [_cells(view, fingers[:, finger], radius[finger]) for finger in range(1, 5)]
+    held = np.stack(cells).astype(np.bool_)
+    rows = np.flatnonzero(held.any(axis=(0, 2)))
+    plane = _plane(view.optics, *view.normal.tolist(), view.offset_m)
+    first = _CELL_PX * int(rows[0]) if len(rows) else view.optics.height_px - 1
+    return LaserWorkspace(
+        held, plane, float(view.optics.matrix[0, 0]), view.T_camera_palm, False, _palm(view), first
+    )
+
+
+def _cells(view: WristView, bones: Float, radius: Float) -> Image:
+    """1 in the cells (H / 8, W / 8) where the skin about points (P, K, 3) of bones, palm frame, can meet the plane.
+
+    Args:
+        view: The rig.
+        bones: Points of all postures.
+        radius: (K,) of the finger there [m].
+    """
+    T = view.T_camera_palm
+    camera = bones @ T[:3, :3].T + T[:3, 3]
+    off = camera @ view.normal - view.offset_m
+    near = (np.abs(off) < radius) & (camera[..., 2] > NEAREST_M)
+    foot = camera[near] - off[near, None] * view.normal
+    half = np.sqrt(np.broadcast_to(radius, off.shape)[near] ** 2 - off[near] ** 2)
+    grow = np.ceil(view.optics.matrix[0, 0] * half / foot[:, 2] / _CELL_PX).astype(np.int64)
+    column, row = np.floor(view.optics.project(foot) / _CELL_PX).astype(np.int64).T
+    shape = (-(-view.optics.height_px // _CELL_PX), -(-view.optics.width_px // _CELL_PX))
+    inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
+    out = np.zeros(shape, dtype=np.uint8)
+    for size in np.unique(grow[inside]):
+        some = inside & (grow == size)
+        cells = np.zeros(shape, dtype=np.uint8)
+        cells[row[some], column[some]] = 1
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(size) + 1, 2 * int(size) + 1))
+        out |= cast(Image, cv2.dilate(cells, kernel))
+    return out
+
+
+@lru_cache(maxsize=8)
+def _plane(optics: CameraModel, x: float, y: float, z: float, offset_m: float) -> Float32:
+    """What every pixel (H, W, 3) shows of the plane of normal (x, y, z), camera frame [m]; 0: nothing."""
+    u, v = np.meshgrid(np.arange(optics.width_px), np.arange(optics.height_px))
+    rays = optics.ray(np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float64))
+    points = intersect_plane(_ORIGIN, rays, np.array([x, y, z]), offset_m)
+    return np.nan_to_num(points).reshape(*u.shape, 3).astype(np.float32)
+
+
+def _palm(view: WristView) -> Palm:
+    model = view.model
+    root, knuckle = model.rest_position_m[CHAINS[0, :2]]
+    knuckles, ends = (model.rest_position_m[CHAINS[1:, k]] for k in (0, 1))
+    along = (ends - knuckles)[:, ::2]
+    along = along / np.linalg.norm(along, axis=1, keepdims=True)
+    aside = np.stack([along[:, 1], -along[:, 0]], axis=-1)
+    if aside[0] @ (knuckles[3] - knuckles[0])[::2] < 0.0:
+        aside = -aside
+    border = float(np.hypot(np.linalg.norm(knuckle - root), model.radius_m[CHAINS[0, 1]]))
+    return Palm(root, border, knuckles, aside, model.radius_m[CHAINS[1:, 0]])

@@ -1,0 +1,79 @@
+"""Whose a part of the laser line is, where the palm is not quite where calibration found it, or the seams are wrong."""
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from bench.fusion_scene import Both
+from common.geometry import rotation_vector_to_matrix
+from common.sim.wrist.render import WristRenderer
+from slave.cameras.synthetic import STROBE
+from slave.wrist.background import lit
+from slave.wrist.finger_labels import finger_labels
+from slave.wrist.finger_lines import NONE
+from slave.wrist.fingers import separate
+from slave.wrist.laser import laser_lines
+from slave.wrist.runs import line_runs
+from slave.wrist.view import WristView
+from slave.wrist.workspace import workspace_of
+from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW, scene
+
+VISIBLE_M = 2e-3
+NEAR_PX = 10.0
+
+
+def rotated_view(degrees: tuple[float, float, float]) -> WristView:
+    """The view of a device whose palm is believed to be turned against where it is."""
+    palm = VIEW.T_camera_palm.copy()
+    palm[:3, :3] = rotation_vector_to_matrix(np.radians(degrees)) @ palm[:3, :3]
+    rows = tuple(tuple(row) for row in palm.tolist())
+    return WristView.of(replace(RIG, T_camera_palm=rows), CAMERA, HAND)
+
+
+@pytest.mark.parametrize("name", ["spread@indoor", "poses@indoor"])
+@pytest.mark.parametrize("degrees", [(0.0, 2.0, 0.0), (0.0, -2.0, 0.0), (2.0, 0.0, 0.0), (0.0, 0.0, -3.0)])
+def test_fingers_are_told_apart_though_the_palm_is_not_quite_where_it_should_be(
+    name: str, degrees: tuple[float, float, float]
+) -> None:
+    one, view = scene(name, 61), rotated_view(degrees)
+    renderer = WristRenderer(one, "wrist", 2)
+    right: list[bool] = []
+    for t in np.linspace(1.0, 58.0, 9).tolist():
+        ambient, laser, led = (renderer.render(t, kind) for kind in STROBE)
+        found = laser_lines(lit(laser, ambient), separate(lit(led, ambient), view), view)
+        truth = one.truth(t)
+        near = np.linalg.norm(found.uv - truth.laser_uv[1:6], axis=1) < NEAR_PX
+        right += near[1:][truth.laser_len_vis[2:6] >= VISIBLE_M].tolist()
+    assert len(right) >= 30
+    assert np.mean(right) >= 0.85
+
+
+def test_seams_that_lie_one_finger_aside_do_not_move_the_line() -> None:
+    renderer = WristRenderer(scene("spread@indoor", 61), "wrist", 2)
+    ambient, laser, led = (renderer.render(1.0, kind) for kind in STROBE)
+    workspace = workspace_of(VIEW)
+    runs = line_runs(lit(laser, ambient), workspace.first_row)
+    points = np.stack([runs.column, runs.row], axis=-1, dtype=np.float64)
+    finger = separate(lit(led, ambient), VIEW).finger_of(points)
+    whose = finger_labels(finger, runs, points, workspace)
+    assert np.unique(whose[whose > 0]).tolist() == [1, 2, 3, 4]
+    aside = np.where(finger > 0, finger + 1, finger)
+    aside[finger == 4] = NONE
+    assert (aside != whose)[whose > 0].mean() > 0.9
+    kept = (whose > 0) & (finger != 4)
+    assert (finger_labels(aside, runs, points, workspace) == whose)[kept].mean() > 0.9
+
+
+@pytest.mark.parametrize("t", [4.9, 5.1, 17.0])
+def test_lines_of_a_palm_that_deviates_and_holds_something_are_counted_from_the_outside(t: float) -> None:
+    """What is held hides the webs, so that nobody sees how the palm lies."""
+    both = Both.of("grasp", 7, rigs=("desk-back3", "wrist-back3"))
+    name = both.wrist.rig.cameras[0]
+    view = WristView.of(both.wrist.rig, both.wrist.cameras[name], both.wrist.hand.profile)
+    renderer, truth = WristRenderer(both.wrist_scene, name, 2), both.wrist_scene.truth(t)
+    ambient, laser, led = (renderer.render(t, kind) for kind in STROBE)
+    fingers = separate(lit(led, ambient), view)
+    assert abs(np.degrees(truth.wrist_angles_rad[1])) > 5.0
+    assert fingers.palm_pose.straight
+    found = laser_lines(lit(laser, ambient), fingers, view).uv[1:]
+    assert (np.linalg.norm(found - truth.laser_uv[2:6], axis=1) < NEAR_PX).all()
