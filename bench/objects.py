@@ -75,7 +75,7 @@ def _rows_of(title: str, found: list[Outcome]) -> Iterable[Row]:
     )
     if len(sigmas):
         middle = float(np.sqrt(np.median(sigmas)))
-        yield Row(f"{title}: error by foretold sigma", middle, "", "median; goal 1")
+        yield Row(f"{title}: error by predicted sigma", middle, "", "median; goal 1")
     for what, pairs in (
         ("hidden and flagged", [one.flagged for one in found]),
         ("not hidden and flagged", [one.clear for one in found]),

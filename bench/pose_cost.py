@@ -31,7 +31,7 @@ from bench.fusion_shown import shown
 from bench.row import Row
 from bench.scale_rig import ROOM, in_order, room, told
 from common.messages import ImuSample, encode
-from master.app import told_at
+from master.app import result_at
 from master.dispatcher import Dispatcher
 from master.link import MasterLink
 from master.rig import load_setups
@@ -136,7 +136,7 @@ class Played:
         if message is None:
             return 0
         for solved in self._world.push(message):
-            encode(told_at(solved, self._clock.t_ns))
+            encode(result_at(solved, self._clock.t_ns))
             poses += hasattr(solved, "ready_t_ns")
         return poses
 

@@ -37,7 +37,7 @@ HIDDEN_S, HIDDEN_EVERY_S = 0.7, 6.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """One registration against its truth: place [mm], turn [deg] and their foretold sigmas, the lag [ms], the rest."""
+    """One registration against its truth: place [mm], turn [deg] and their predicted sigmas, the lag [ms], the rest."""
 
     mm: float
     deg: float
@@ -61,8 +61,8 @@ def rows() -> Iterable[Row]:
             ("lag of the clocks", [abs(one.late_ms) for one in results], "ms", "5"),
             ("left of the cameras' poses, place", [one.left_mm for one in results], "mm", "-"),
             ("left of the cameras' poses, turn", [one.left_deg for one in results], "deg", "-"),
-            ("error by foretold sigma, place", [one.mm / one.sigma_mm for one in results], "", "1"),
-            ("error by foretold sigma, turn", [one.deg / one.sigma_deg for one in results], "", "1"),
+            ("error by predicted sigma, place", [one.mm / one.sigma_mm for one in results], "", "1"),
+            ("error by predicted sigma, turn", [one.deg / one.sigma_deg for one in results], "", "1"),
         ):
             yield Row(
                 f"{name}: {what}", float(np.median(values)), unit, f"worst {max(values):.2f}; goal {goal}"

@@ -55,7 +55,7 @@ class UdpRelay:
         way: What happens to datagrams.
         cut: Nothing goes through: a cable is out.
         forwarded, lost: Datagrams.
-        seen: Told every datagram that came, and whether it was for the master; None: nobody is.
+        seen: Called with every datagram that came, and whether it was for the master; None: nobody is.
     """
 
     def __init__(self, slave_beacon_port: int, seed: int = 1, way: Impairment | None = None) -> None:

@@ -105,7 +105,7 @@ def _fields(camera: CameraCalibration, rig: RigCalibration) -> Iterator[Row]:
         except FitError as error:
             yield Row(f"flat field, seed {seed}", float("nan"), "%", f"refused: {error}")
             continue
-        residual.append(100.0 * fit.foretold_rms)
+        residual.append(100.0 * fit.cross_validated_rms)
         xy = seen.samples.xy
         ratio = field_at(fit.field, xy) * (1.0 + (xy**2).sum(axis=1)) ** (0.5 * (LED_LOBE + LENS_POWER))
         worst.append(100.0 * float(np.percentile(np.abs(ratio / np.median(ratio) - 1.0), 95)))

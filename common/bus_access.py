@@ -23,7 +23,7 @@ from common.streams import ALIVE_KEY, STREAMS, Path, key_of
 
 _SPEAKING = ("put", "declare_queryable", "liveliness_token", "reply")
 _LISTENING = ("declare_subscriber", "liveliness_query", "declare_liveliness_subscriber")
-_TOLD_BY_DEVICES = ("health", "preview", "still", "command")  # of the streams of the bus
+_PUBLISHED_BY_DEVICES = ("health", "preview", "still", "command")  # of the streams of the bus
 _ALL = ("put", "delete", "query", "reply", "declare_subscriber", "declare_queryable", "liveliness_token",
         "liveliness_query", "declare_liveliness_subscriber")  # fmt: skip
 _EVERYTHING = ["phalanx/**"]
@@ -78,7 +78,7 @@ def rules_of_router() -> dict[str, object]:
 
 def _of_device(name: str) -> list[str]:
     """All keys under which a device speaks. The name inside a message is compared with its key by who reads it."""
-    return [*(key_of(stream, name) for stream in _TOLD_BY_DEVICES), ALIVE_KEY.format(name=name)]
+    return [*(key_of(stream, name) for stream in _PUBLISHED_BY_DEVICES), ALIVE_KEY.format(name=name)]
 
 
 def _own(name: str) -> list[str]:

@@ -58,7 +58,7 @@ class Step:
     """What the user is asked to do, and for how long [s]."""
 
     name: str
-    told: str
+    instruction: str
     seconds: float
 
 
@@ -82,12 +82,12 @@ def _script() -> Iterator[tuple[Step, list[Float]]]:
     yield Step("curl", "three times: curl the fingers, knuckles still, and open them", 3.0), [hook, flat] * 3
     yield Step("fist", "make a fist, and open it", 1.6), [fist, flat]
     for finger, name in zip(_FINGERS, ("index", "middle", "ring", "little"), strict=True):
-        told = f"{name} finger alone: bend it straight at its knuckle, and back"
-        yield Step(name, told, 1.4), [_corners((finger,), _KNUCKLE_DEG, 0.0), flat]
+        instruction = f"{name} finger alone: bend it straight at its knuckle, and back"
+        yield Step(name, instruction, 1.4), [_corners((finger,), _KNUCKLE_DEG, 0.0), flat]
     across, curled = flat.copy(), flat.copy()
     across[_THUMB, :2], curled[_THUMB, 2] = (20.0, 40.0), 50.0
-    told = "thumb alone: lay it straight across the palm, back, bend its two joints, back"
-    yield Step("thumb", told, 1.8), [across, flat, curled, flat]
+    instruction = "thumb alone: lay it straight across the palm, back, bend its two joints, back"
+    yield Step("thumb", instruction, 1.8), [across, flat, curled, flat]
 
 
 def _moves() -> tuple[tuple[Step, ...], tuple[Move, ...]]:

@@ -69,7 +69,7 @@ class Machine:
         if zones:
             now, limit = max(zones, key=lambda zone: zone[0] - zone[1])
             found |= {"temperature_c": round(now, 1), "temperature_limit_c": limit}
-        if (told := self._flags or self._weak) is not None and (flags := _text(told)) is not None:
+        if (flags_path := self._flags or self._weak) is not None and (flags := _text(flags_path)) is not None:
             with contextlib.suppress(ValueError):  # of another firmware: nothing is known
                 found["throttled"] = float(int(flags, 16) & _NOW)
         if (free := self.disk_free_mb()) is not None:

@@ -260,7 +260,7 @@ class Gesture(Message, frozen=True, eq=False, tag=True):
             refuse_beyond(self, name)
 
 
-Told: TypeAlias = HandPose | ObjectPose | Contact | Gesture  # what a master makes of it
+ResultMessage: TypeAlias = HandPose | ObjectPose | Contact | Gesture  # what a master makes of it
 
 
 @cache

@@ -59,7 +59,7 @@ from common.message_told import (
     Phase,
     SolverMode,
     Source,
-    Told,
+    ResultMessage,
 )
 
 __all__ = [
@@ -100,7 +100,7 @@ __all__ = [
     "Still",
     "TagDetections",
     "TimeNs",
-    "Told",
+    "ResultMessage",
     "TrackerPose",
     "WristDetections",
     "decode",

@@ -1,4 +1,4 @@
-"""Tell the system's service manager of a process (sd_notify(3)).
+"""Notify the system's service manager of a process (sd_notify(3)).
 
 That it is ready, that it is alive, and what it does.
 

@@ -80,15 +80,15 @@ def _deploy(options: argparse.Namespace) -> int:
     wish, ears, reached, notify = wish_of(options, rig), ears_of(options), reached_of(options), Lines(_print)
     names = [name for target in targets for name in target.names]
     with prepared_keys(options.keys, names, options.dry_run, notify) as keys:
-        return _told(deploy(targets, replace(wish, keys=keys), reached, ears, notify))
+        return _exit_code(deploy(targets, replace(wish, keys=keys), reached, ears, notify))
 
 
 def _rollback(options: argparse.Namespace) -> int:
-    return _told(roll_back(_all(options.hosts), reached_of(options), options.dry_run, Lines(_print)))
+    return _exit_code(roll_back(_all(options.hosts), reached_of(options), options.dry_run, Lines(_print)))
 
 
 def _uninstall(options: argparse.Namespace) -> int:
-    return _told(uninstall(_all(options.hosts), reached_of(options), options.dry_run, Lines(_print)))
+    return _exit_code(uninstall(_all(options.hosts), reached_of(options), options.dry_run, Lines(_print)))
 
 
 def _all(hosts: Sequence[str]) -> list[Target]:
@@ -96,7 +96,7 @@ def _all(hosts: Sequence[str]) -> list[Target]:
     return [Target(host, ()) for host in dict.fromkeys(hosts)]
 
 
-def _told(results: dict[str, str | None]) -> int:
+def _exit_code(results: dict[str, str | None]) -> int:
     """Say which machines failed; the exit code."""
     failed = {host: why for host, why in results.items() if why is not None}
     for host, why in failed.items():

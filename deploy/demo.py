@@ -84,7 +84,7 @@ class _State:
     rate: float = 0.0
     viewer: str | None = None
     viewer_ended: bool = False
-    told: set[str] = field(default_factory=set[str])
+    printed: set[str] = field(default_factory=set[str])
 
 
 def run_demo(
@@ -95,7 +95,7 @@ def run_demo(
     Args:
         settings: What the user chose.
         stop: Set by Ctrl-C; the run then ends early, cleanly, and is summed up all the same.
-        say: Told one line of progress at a time.
+        say: Called with one line of progress at a time.
 
     Raises:
         DemoError: A process does not come up, or the results cannot be made.
@@ -143,7 +143,7 @@ def play(
         keys: Keys folder of all processes.
         epoch_ns: When the scene begins, on this machine's monotonic clock.
         stop: Ends the run early.
-        say: Told one line of progress at a time.
+        say: Called with one line of progress at a time.
 
     Raises:
         DemoError: A process does not come up.
@@ -261,8 +261,8 @@ def _look_at_viewer(state: _State, processes: list[Process], notify: Callable[[s
             return
         reason = viewer.tail[-1].removeprefix("phalanx-master: ") if viewer.tail else f"exit code {code}"
         line = f"no viewer: {reason}; the run goes on" if code else "the viewer was closed; the run goes on"
-    if line and line not in state.told:
-        state.told.add(line)
+    if line and line not in state.printed:
+        state.printed.add(line)
         notify(line)
 
 

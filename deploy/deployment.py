@@ -58,7 +58,7 @@ def deploy(
         wish: What is wanted on them.
         reached: How they are reached.
         ears: How their first datagrams are heard; None: nobody listens.
-        say: Told one line a step, each with its host.
+        say: Called with one line a step, each with its host.
     """
     hosts = _hosts(targets, reached, notify)
     if ears is None or wish.dry_run:

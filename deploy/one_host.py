@@ -67,7 +67,7 @@ class Host:
     Attributes:
         target: Which, and for what.
         remote: How it is reached.
-        say: Told one line a step.
+        say: Called with one line a step.
         sudo: Whether root is reached by sudo.
         changed: Whether something was changed, which can be taken back.
         reboot: Whether it runs only after it was restarted.

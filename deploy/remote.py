@@ -151,7 +151,7 @@ def run_bounded(
     Args:
         words: The command.
         send: Its input.
-        on_line: Told each line that it says.
+        on_line: Called with each line that it says.
         limit_s: After so many seconds it is ended, with all that it started.
         environment: Variables besides those of this process.
         ended: It is ended when this is set, too.

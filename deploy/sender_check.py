@@ -73,9 +73,9 @@ def received_of(names: Sequence[str], ears: Ears, ended: threading.Event | None 
     if not results:
         lines = [*lines, *errors] or [f"phalanx-master hear ended with {code}"]
         return Received(cause=f"cannot listen for it: {lines[-1]}")
-    told = cast(dict[str, object], json.loads(results[-1]))
-    rates = cast(dict[str, float], told["heard"])
-    return Received({name: float(rate) for name, rate in rates.items()}, None, told.get("master") is True)
+    answer = cast(dict[str, object], json.loads(results[-1]))
+    rates = cast(dict[str, float], answer["heard"])
+    return Received({name: float(rate) for name, rate in rates.items()}, None, answer.get("master") is True)
 
 
 class Before:

@@ -18,7 +18,7 @@ from common.messages import (
     ImuSample,
     ObjectPose,
     TagDetections,
-    Told,
+    ResultMessage,
     TrackerPose,
     restamped,
 )
@@ -77,23 +77,23 @@ class RunFigures:
     def __init__(self) -> None:
         self.poses = 0
         # All keys from the beginning: a report on another thread never sees it grow.
-        self.told = Counter(objects=0, contacts=0, gestures=0)
+        self.published = Counter(objects=0, contacts=0, gestures=0)
         self.rates = CameraRates()
         # A ring of fixed size: the report of every second reads it in one copy, however long the run.
         self._latency_ms = np.zeros(_KEPT)
         self._object_ms = np.zeros(_OBJECT_KEPT)
         self._first_ns = self._last_ns = 0
 
-    def count(self, t_ns: int, message: Told) -> None:
+    def count(self, t_ns: int, message: ResultMessage) -> None:
         """Count what was published at `t_ns`."""
         if isinstance(message, HandPose):
             self.add(t_ns, message.latency_ns)
         elif isinstance(message, ObjectPose):
             if message.tracked:  # what is held waits for nothing that was seen
-                self._object_ms[self.told["objects"] % _OBJECT_KEPT] = message.latency_ns * 1e-6
-                self.told["objects"] += 1
+                self._object_ms[self.published["objects"] % _OBJECT_KEPT] = message.latency_ns * 1e-6
+                self.published["objects"] += 1
         else:
-            self.told["contacts" if isinstance(message, Contact) else "gestures"] += 1
+            self.published["contacts" if isinstance(message, Contact) else "gestures"] += 1
 
     def add(self, t_ns: int, latency_ns: int) -> None:
         """Count one published pose of a hand."""
@@ -115,7 +115,7 @@ class RunFigures:
         if self.poses:
             p50, p99 = np.percentile(self._latency_ms[: self.poses], [50, 99])
             out |= {"latency_p50_ms": round(float(p50), 3), "latency_p99_ms": round(float(p99), 3)}
-        if tracked := self.told["objects"]:
+        if tracked := self.published["objects"]:
             p50, p99 = np.percentile(self._object_ms[:tracked], [50, 99])
             out |= {
                 "object_latency_p50_ms": round(float(p50), 3),
@@ -158,13 +158,13 @@ def run(
             continue
         for solved in solver.push(message):
             now = clock.now_ns()
-            told = told_at(solved, now)
+            published = result_at(solved, now)
             for sink in sinks:
-                sink.write(told)
-            figures.count(now, told)
+                sink.write(published)
+            figures.count(now, published)
 
 
-def told_at(solved: Solved, t_ns: int) -> Told:
+def result_at(solved: Solved, t_ns: int) -> ResultMessage:
     """The message that is published at `t_ns`: a pose says how long it took."""
     if isinstance(solved, Contact | Gesture):
         return solved
@@ -182,6 +182,6 @@ def health(
     metrics = {name: value for name, value in figures.summary().items() if name != "poses"}
     metrics |= {f"camera_hz.{camera}"[:_NAME]: hz for camera, hz in figures.rates.camera_hz.items()}
     metrics |= times or {}
-    told = {name: number for name, number in figures.told.items() if number}
-    events = {"poses": figures.poses} | told | counts
+    published = {name: number for name, number in figures.published.items() if number}
+    events = {"poses": figures.poses} | published | counts
     return Health("master", session, clock.now_ns(), events, metrics, *program())

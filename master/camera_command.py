@@ -75,7 +75,7 @@ def camera(
     steps = commands(name, wanted, pick, load_file, save)
     connection = join_bus(bus)
     try:
-        health = tell(connection, steps)
+        health = send_all(connection, steps)
     finally:
         connection.close()
     typer.echo("\n".join(table(health)))
@@ -134,7 +134,7 @@ def commands(
     return steps or [Command(name, "settings")]
 
 
-def tell(bus: Bus, steps: list[Command]) -> Health:
+def send_all(bus: Bus, steps: list[Command]) -> Health:
     """Ask one after the other; the last answer.
 
     Raises:

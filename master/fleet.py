@@ -76,9 +76,9 @@ class Roll:
 
     def _device(self, name: str, now_s: float) -> Device:
         master = self._last.get(MASTER)
-        told = {} if master is None else master.metrics
+        reported = {} if master is None else master.metrics
         rate = self._rate(name)
-        clock = (told.get(f"{name}.clock_offset_us"), told.get(f"{name}.clock_sigma_us"))
+        clock = (reported.get(f"{name}.clock_offset_us"), reported.get(f"{name}.clock_sigma_us"))
         own = self._last.get(name)
         if own is None:
             known = "streaming" if rate else "unknown"
@@ -158,14 +158,14 @@ def main() -> None:
 
 def _listen(bus: Bus, roll: Roll, period_s: float, watch: bool, stop: threading.Event) -> None:
     inbox = bus.subscribe("health", depth=256)
-    told = time.monotonic() + period_s
+    due_s = time.monotonic() + period_s
     while not stop.is_set():
         health = inbox.get(_POLL_S)
         if isinstance(health, Health):
             roll.push(health, time.monotonic())
-        if time.monotonic() >= told:
+        if time.monotonic() >= due_s:
             typer.echo(json.dumps({"devices": [asdict(one) for one in roll.devices(time.monotonic())]}))
-            told += period_s
+            due_s += period_s
             if not watch:
                 return
 

@@ -59,9 +59,9 @@ def show_command(folder: Folder) -> None:
 
       phalanx-master keys show ~/.config/phalanx/keys
     """
-    told = certificates_of(folder)
-    wide = max(len(one.name) for one in told)
-    for one in told:
+    certificates = certificates_of(folder)
+    wide = max(len(one.name) for one in certificates)
+    for one in certificates:
         use = "listens" if one.listens else "connects"
         late = "  ENDED: renew" if one.until < _now() else ""
         typer.echo(f"{one.name:<{wide}}  {use:<8}  until {one.until:%Y-%m-%d}  {one.fingerprint}{late}")
@@ -93,7 +93,7 @@ def renew_command(
         renew_device(folder, device, _now())
         typer.echo(f"{folder}: new certificate of {device}: deploy it again")
         return
-    _tell(folder, renew(folder, _now()))
+    _report(folder, renew(folder, _now()))
 
 
 def revoke_command(
@@ -109,10 +109,10 @@ def revoke_command(
 
       phalanx-master keys revoke ~/.config/phalanx/keys --device left
     """
-    _tell(folder, renew(folder, _now(), device))
+    _report(folder, renew(folder, _now(), device))
 
 
-def _tell(folder: Path, left: list[str]) -> None:
+def _report(folder: Path, left: list[str]) -> None:
     names = ", ".join(left) or "no device"
     typer.echo(f"{folder}: all keys are new. Deploy again to {names}; restart the master and what reads it")
 

@@ -179,14 +179,14 @@ def certificates_of(folder: Path) -> list[Shown]:
     Raises:
         PhalanxError: It is not the keys folder of a PC; a certificate is broken.
     """
-    told: list[Shown] = []
+    listed: list[Shown] = []
     for path in [folder / f"{MASTER}.pem", folder / f"{OPERATOR}.pem",
                  *(folder / DEVICES / f"{name}.pem" for name in devices_of(folder))]:  # fmt: skip
         try:
-            told.append(shown(path.read_bytes()))
+            listed.append(shown(path.read_bytes()))
         except (OSError, ValueError) as error:
             raise PhalanxError(f"{path}: cannot read the certificate ({error})") from error
-    return told
+    return listed
 
 
 def _authority(folder: Path) -> KeyPair:

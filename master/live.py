@@ -88,7 +88,7 @@ def run_live(
         key: Rig key, alone or with the root of the secrets of devices.
         settings: Addresses and files.
         stop: Set by a signal handler, or by the command "stop" on the bus.
-        say: Told one line when a state changes.
+        say: Called with one line when a state changes.
 
     Returns:
         The summary.

@@ -57,9 +57,9 @@ class Reporter:
     def health(self) -> Health:
         """The report of this moment; of what never happened only `received` is told, to keep it short."""
         events = self._ingest.counts | self._bus.counts
-        told = {name: number for name, number in events.items() if number or name.endswith("received")}
+        happened = {name: number for name, number in events.items() if number or name.endswith("received")}
         changes = {} if self._tuning is None else self._tuning.counts()
-        counts = dict(self._dispatcher.counts) | told | changes | self._probe.counts
+        counts = dict(self._dispatcher.counts) | happened | changes | self._probe.counts
         times = dict(self._monitor.metrics(self._ingest.clock_of)) | (
             {"open_bus": 1.0} if self._bus.open else {}
         )

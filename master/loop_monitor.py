@@ -1,4 +1,4 @@
-"""Tell the service manager that the live loop goes round.
+"""Notify the service manager that the live loop goes round.
 
 A loop that hangs is ended by the watchdog, and started again.
 

@@ -37,14 +37,14 @@ def recorded_samples(recording: FrameRecording, setup: RigSetup) -> tuple[tuple[
             _LOG.warning("%s: not used: rig %r: %s", path, setup.rig.name, _UNPLACED)
         return (), setup
     samples = read_imu(recording.folder, imu.name)
-    told = any(np.isfinite(one.orientation_wxyz).all() for one in samples)
-    reckoned = not told or any(isfinite(one.heading_sigma_rad) for one in samples)
+    oriented = any(np.isfinite(one.orientation_wxyz).all() for one in samples)
+    reckoned = not oriented or any(isfinite(one.heading_sigma_rad) for one in samples)
     if reckoned and samples and imu.heading_sigma_rad is not None:
         _LOG.warning(
             "%s: orientations of rates and forces: imu.heading_sigma_rad not used", recording.folder / IMU
         )
         setup = _with_imu(setup, replace(imu, heading_sigma_rad=None))
-    if told:
+    if oriented:
         return samples, setup
     fusion = OrientationFilter(imu.rate_hz)
     return tuple(fusion.push(one) for one in samples), setup

@@ -37,7 +37,7 @@ class Relay:
         """
         self.session = secrets.randbits(63)
         self._below, self._above, self._clock = below, above, clock
-        self._told: Counter[str] = Counter(dict.fromkeys(STREAMS, 0))
+        self._repeated: Counter[str] = Counter(dict.fromkeys(STREAMS, 0))
         self._stop = threading.Event()
         self._from = {stream: below.subscribe(stream, depth=DEPTH) for stream in STREAMS}
         self._threads = [
@@ -52,7 +52,7 @@ class Relay:
 
     def health(self) -> Health:
         """Counts of each stream: repeated.NAME, and dropped.NAME and refused.NAME where there are any."""
-        counts = {f"repeated.{stream}": number for stream, number in dict(self._told).items()}
+        counts = {f"repeated.{stream}": number for stream, number in dict(self._repeated).items()}
         for stream, source in self._from.items():
             lost = {f"dropped.{stream}": source.dropped, f"refused.{stream}": source.refused}
             counts |= {name: number for name, number in lost.items() if number}
@@ -91,4 +91,4 @@ class Relay:
             message = source.get(_WAIT_S)
             if message is not None:
                 self._above.publish(stream, sender_of(message), message)
-                self._told[stream] += 1
+                self._repeated[stream] += 1

@@ -17,7 +17,7 @@ from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from master.outputs.files import load_poses
 from master.outputs.picture import best_row, draw_summary
-from master.outputs.picture_told import ToldPicture
+from master.outputs.picture_told import ResultPicture
 from master.outputs.picture_wrist import WristPicture
 from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
@@ -25,7 +25,7 @@ from master.outputs.truth import PosesTruth
 from master.rig_setup import RigSetup
 from master.score import Truth, score, score_hidden
 from master.solve import fingers_of
-from master.told_report import ToldRun
+from master.told_report import RunResults
 from master.wrist_report import forearm_tilt, laser_scores, lit_view, wrist_images, wrist_truth_of
 from master.wrist_score import score_wrist
 
@@ -86,7 +86,7 @@ def report_scene(
     epoch_ns: int,
     out: Path,
     summary: dict[str, object],
-    tell: Progress,
+    progress: Progress,
 ) -> dict[str, object]:
     """Score poses of a simulated run; write hand.png and run.rrd into `out`.
 
@@ -97,7 +97,7 @@ def report_scene(
         epoch_ns: Scene time 0 on the master's clock.
         out: Existing folder.
         summary: Figures of the run so far; drawn with the scores.
-        tell: Told what is being done, and how much of how much.
+        tell: Called with what is being done, and how much of how much.
 
     Returns:
         The summary with the scores added.
@@ -109,56 +109,56 @@ def report_scene(
     poses = poses.rows(int(np.searchsorted(poses.t_ns, epoch_ns)), len(poses))
     if len(poses) == 0:
         return summary
-    told = ToldRun.load(poses_file.parent, setup, epoch_ns)
-    shown = ToldPicture(setup.objects, told.objects, told.contacts, told.gestures)
+    results = RunResults.load(poses_file.parent, setup, epoch_ns)
+    shown = ResultPicture(setup.objects, results.objects, results.contacts, results.gestures)
     row = best_row(poses, shown)
-    judged = _judge(poses, row, setup, played, epoch_ns, tell)
+    judged = _judge(poses, row, setup, played, epoch_ns, progress)
     full = (
         summary
         | judged.scores
-        | told.figures(played.shown, epoch_ns, int(poses.t_ns[0]), int(poses.t_ns[-1]))
+        | results.figures(played.shown, epoch_ns, int(poses.t_ns[0]), int(poses.t_ns[-1]))
     )
     figures = {name: float(value) for name, value in full.items() if isinstance(value, int | float)}
-    tell("drawing the hand", 0, 1)
+    progress("drawing the hand", 0, 1)
     picture, truth = out / "hand.png", judged.truth
     draw_summary(picture, poses, setup.rig, setup.hand, figures, truth, row, judged.wrist, shown)
-    write_rrd(out / "run.rrd", poses, setup, truth=truth, images=judged.images, told=told.messages())
+    write_rrd(out / "run.rrd", poses, setup, truth=truth, images=judged.images, results=results.messages())
     return full
 
 
 def _judge(
-    poses: Poses, row: int | None, setup: RigSetup, played: Played, epoch_ns: int, tell: Progress
+    poses: Poses, row: int | None, setup: RigSetup, played: Played, epoch_ns: int, progress: Progress
 ) -> _Judged:
     """Against what was truly there, whichever sensors there are."""
     if played.shown is None:
         assert played.wrist_scene is not None, "one of the two there is"
-        return _of_wrist(poses, row, setup, played.wrist_scene, epoch_ns, tell)
-    judged = _of_markers(poses, setup, played.shown, epoch_ns, tell, hidden=played.together)
+        return _of_wrist(poses, row, setup, played.wrist_scene, epoch_ns, progress)
+    judged = _of_markers(poses, setup, played.shown, epoch_ns, progress, hidden=played.together)
     if played.wrist_scene is None:
         return judged
-    wrist_scene = laser_scores(poses, played.wrist_scene, epoch_ns, tell)
-    images = chain(judged.images, wrist_images(poses, played.wrist_scene, epoch_ns, tell))
+    wrist_scene = laser_scores(poses, played.wrist_scene, epoch_ns, progress)
+    images = chain(judged.images, wrist_images(poses, played.wrist_scene, epoch_ns, progress))
     return _Judged(judged.scores | wrist_scene, judged.truth, images, WristPicture.of(setup))
 
 
 def _of_markers(
-    poses: Poses, setup: RigSetup, scene: Scene, epoch_ns: int, tell: Progress, *, hidden: bool
+    poses: Poses, setup: RigSetup, scene: Scene, epoch_ns: int, progress: Progress, *, hidden: bool
 ) -> _Judged:
-    truth, fingers = truth_of(poses, scene, epoch_ns, tell), fingers_of(setup)
+    truth, fingers = truth_of(poses, scene, epoch_ns, progress), fingers_of(setup)
     scores = score(poses, truth, fingers)
     if hidden:
         scores |= score_hidden(poses, truth, fingers)
     return _Judged(
         scores,
         PosesTruth.of_webxr(truth.joints_m, truth.markers_m),
-        _images(poses, scene, epoch_ns, tell),
+        _images(poses, scene, epoch_ns, progress),
     )
 
 
 def _of_wrist(
-    poses: Poses, row: int | None, setup: RigSetup, scene: WristScene, epoch_ns: int, tell: Progress
+    poses: Poses, row: int | None, setup: RigSetup, scene: WristScene, epoch_ns: int, progress: Progress
 ) -> _Judged:
-    truth = wrist_truth_of(poses.t_ns, scene, epoch_ns, tell)
+    truth = wrist_truth_of(poses.t_ns, scene, epoch_ns, progress)
     frame = None
     if row is not None:
         renderer = WristRenderer(scene, scene.rig.cameras[0])
@@ -166,12 +166,12 @@ def _of_wrist(
     return _Judged(
         score_wrist(poses, truth) | forearm_tilt(poses, scene, epoch_ns),
         PosesTruth.of_webxr(truth.joints_m, poses.markers_m, truth.laser_m[:, 1:6]),
-        wrist_images(poses, scene, epoch_ns, tell),
+        wrist_images(poses, scene, epoch_ns, progress),
         WristPicture.of(setup, frame),
     )
 
 
-def truth_of(poses: Poses, scene: Scene, epoch_ns: int, tell: Progress) -> Truth:
+def truth_of(poses: Poses, scene: Scene, epoch_ns: int, progress: Progress) -> Truth:
     """The scene at the instants of the poses, with what each camera could see."""
     times = (poses.t_ns - epoch_ns) * 1e-9
     renderers = [Renderer(scene, camera) for camera in scene.rig.cameras]
@@ -185,7 +185,7 @@ def truth_of(poses: Poses, scene: Scene, epoch_ns: int, tell: Progress) -> Truth
         for c, renderer in enumerate(renderers):
             visible[row, c] = _fraction(renderer, float(t))
         if row % 20 == 0:
-            tell("comparing with the truth", row, len(times))
+            progress("comparing with the truth", row, len(times))
     return Truth(poses.t_ns, joints, pip, markers, visible)
 
 
@@ -193,10 +193,10 @@ def _fraction(renderer: Renderer, t_s: float) -> Float:
     return np.nan_to_num(renderer.visible_fraction(t_s))
 
 
-def _images(poses: Poses, scene: Scene, epoch_ns: int, tell: Progress) -> Iterator[tuple[str, int, Image]]:
+def _images(poses: Poses, scene: Scene, epoch_ns: int, progress: Progress) -> Iterator[tuple[str, int, Image]]:
     first, last = int(poses.t_ns[0]), int(poses.t_ns[-1])
     for camera in scene.rig.cameras:
         renderer = Renderer(scene, camera)
         for t_ns in range(first, last, int(1e9 / _IMAGES_HZ)):
-            tell(f"rendering camera {camera}", t_ns - first, last - first)
+            progress(f"rendering camera {camera}", t_ns - first, last - first)
             yield camera, t_ns, renderer.render((t_ns - epoch_ns) * 1e-9)

@@ -121,10 +121,10 @@ def score_hidden(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[s
     of_finger = (_FINGER_OF_JOINT[1:] >= 0) & hidden[:, _FINGER_OF_JOINT[1:]]
     out: dict[str, float] = {}
     put(out, "joint_mm_hidden", 1e3 * np.linalg.norm(found - exact, axis=2)[of_finger & valid], np.mean)
-    told = np.stack([valid[:, [j - 1 for j in chain[1:]]].all(axis=1) for chain in FINGER_JOINTS[1:]], axis=1)
+    all_valid = np.stack([valid[:, [j - 1 for j in chain[1:]]].all(axis=1) for chain in FINGER_JOINTS[1:]], axis=1)
     pip = np.degrees(np.abs(poses.angles_rad[rows][:, 1:, 2] - truth.pip_rad[columns]))
-    put(out, "pip_deg_hidden", pip[hidden[:, 1:] & told], np.mean)
-    put(out, "hidden_invalid", (~told)[hidden[:, 1:]].astype(np.float64), np.mean)
+    put(out, "pip_deg_hidden", pip[hidden[:, 1:] & all_valid], np.mean)
+    put(out, "hidden_invalid", (~all_valid)[hidden[:, 1:]].astype(np.float64), np.mean)
     step = 1e3 * np.linalg.norm(np.diff(found, axis=0) - np.diff(exact, axis=0), axis=2)
     t_ns = poses.t_ns[rows]
     follows = (np.diff(t_ns) <= _FOLLOWS_NS)[:, None] & valid[1:] & valid[:-1]

@@ -24,7 +24,7 @@ from common.messages import (
     ImuSample,
     ObjectPose,
     TagDetections,
-    Told,
+    ResultMessage,
     WristDetections,
 )
 from master.app import Solved
@@ -108,7 +108,7 @@ def solve_hands(
         setups: Of each hand rigs, cameras and hand: of markers, of a wrist device, or of both.
         detections: Folder with detections_<camera>.npz of every camera, and tags_<camera>.npz where objects have tags.
         out: Existing folder for the results.
-        progress: Told how many of how many messages are done.
+        progress: Called with how many of how many messages are done.
 
     Returns:
         The summary of the first hand and of the objects.
@@ -127,28 +127,28 @@ def solve_hands(
     dispatcher = Dispatcher(setups, pipelines, stages[0], gestures=continuous)
     counts = {setup.hand.profile.name: len(setup.markers) for setup in setups}
     files = RunFiles(out / "poses.npz", counts, [one.name for setup in setups for one in setup.objects])
-    told = _Told({name: [] for name in counts})
+    output = _Output({name: [] for name in counts})
     messages = _messages(recording, setups, detections)
     done = 0
     for message in heapq.merge(*(samples for samples, _ in sensed), messages, key=lambda one: one.t_ns):
-        told.take(dispatcher.push(message), files)
+        output.take(dispatcher.push(message), files)
         if not isinstance(message, ImuSample):
             if not isinstance(message, TagDetections):
-                told.rates.push(message)
+                output.rates.push(message)
             progress(done := done + 1, len(messages))
-    told.take(dispatcher.flush(), files)
+    output.take(dispatcher.flush(), files)
     files.close()
     summaries: list[dict[str, object]] = []
     for number, (setup, pipeline, stage) in enumerate(zip(setups, pipelines, stages, strict=True)):
         auxiliary = dict[str, int]() if number else dispatcher.auxiliary_counts
         own = [one for one in messages if not isinstance(one, TagDetections) and one.camera in setup.cameras]
-        summary = _summarise(recording, setup, own, told.poses[setup.hand.profile.name]) | {
-            "camera_hz": {name: hz for name, hz in told.rates.camera_hz.items() if name in setup.cameras},
+        summary = _summarise(recording, setup, own, output.poses[setup.hand.profile.name]) | {
+            "camera_hz": {name: hz for name, hz in output.rates.camera_hz.items() if name in setup.cameras},
             "lost": _lost(setup, own),
             "counts": dict(sorted((dict(pipeline.counts) | auxiliary).items())),
             "stage_us": stage.mean_us(),
         }
-        summary |= score_objects(_object_scores(recording, setup, told.objects))
+        summary |= score_objects(_object_scores(recording, setup, output.objects))
         path = out / "summary.json"
         write_summary(path_of_hand(path, setup.hand.profile.name) if number else path, summary)
         summaries.append(summary)
@@ -167,7 +167,7 @@ def solve(
 
 
 @dataclass(slots=True)
-class _Told:
+class _Output:
     """What came out: of each hand its poses, of each object its own; and how fast the cameras ran."""
 
     poses: dict[str, list[HandPose]]
@@ -177,7 +177,7 @@ class _Told:
     def take(self, solved: Iterable[Solved], files: RunFiles) -> None:
         """Write it and keep what is scored."""
         for one in solved:
-            message: Told = one if isinstance(one, Contact | Gesture) else one.pose
+            message: ResultMessage = one if isinstance(one, Contact | Gesture) else one.pose
             files.write(message)
             if isinstance(message, HandPose):
                 self.poses[message.hand].append(message)
@@ -186,14 +186,14 @@ class _Told:
 
 
 def _object_scores(
-    recording: FrameRecording, setup: RigSetup, told: Mapping[str, Sequence[ObjectPose]]
+    recording: FrameRecording, setup: RigSetup, poses: Mapping[str, Sequence[ObjectPose]]
 ) -> dict[str, dict[str, float]]:
     """Of each object of this setup whose truth the recording carries."""
     scores: dict[str, dict[str, float]] = {}
     for one in setup.objects:
         truth = load_object_truth(recording.folder, one.name)
         if truth is not None:
-            scores[one.name] = score_object(ObjectPoses.of(one.name, told.get(one.name, ())), truth)
+            scores[one.name] = score_object(ObjectPoses.of(one.name, poses.get(one.name, ())), truth)
     return scores
 
 

@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from common.arrays import Bool, Int
-from common.messages import Contact, Gesture, ObjectPose, Told
+from common.messages import Contact, Gesture, ObjectPose, ResultMessage
 from common.sim.scene import Scene
 from master.object_score import ObjectTruth, score_object, score_objects
 from master.outputs.told_files import (
@@ -18,7 +18,7 @@ from master.outputs.told_files import (
     ObjectPoses,
     contact_path,
     load_contact,
-    load_gestures_told,
+    load_gesture_messages,
     load_object,
     object_path,
 )
@@ -62,7 +62,7 @@ class Annotated(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ToldRun:
+class RunResults:
     """What a run told of one hand and of its objects.
 
     Attributes:
@@ -76,7 +76,7 @@ class ToldRun:
     gestures: tuple[Gesture, ...] = ()
 
     @classmethod
-    def load(cls, folder: Path, setup: RigSetup, from_ns: int) -> "ToldRun":
+    def load(cls, folder: Path, setup: RigSetup, from_ns: int) -> "RunResults":
         """Read the files beside poses.npz; what a run did not write is not there. Gestures from a time on.
 
         Raises:
@@ -86,16 +86,16 @@ class ToldRun:
         objects = [object_path(folder, name) for name in names]
         contacts = [contact_path(folder, hand, name) for name in names]
         spoken = folder / GESTURES
-        gestures = load_gestures_told(spoken) if spoken.exists() else []
+        gestures = load_gesture_messages(spoken) if spoken.exists() else []
         return cls(
             tuple(load_object(path) for path in objects if path.exists()),
             tuple(load_contact(path) for path in contacts if path.exists()),
             tuple(one for one in gestures if one.hand == hand and one.t_ns >= from_ns),
         )
 
-    def messages(self) -> list[Told]:
+    def messages(self) -> list[ResultMessage]:
         """All of it, each kind in the order of time."""
-        out: list[Told] = [*self.gestures]
+        out: list[ResultMessage] = [*self.gestures]
         for poses in self.objects:
             out += [object_row(poses, row) for row in range(len(poses))]
         for near in self.contacts:
@@ -139,7 +139,7 @@ def truth_of_object(scene: Scene, poses: ObjectPoses, epoch_ns: int) -> ObjectTr
 
 
 def judge_gestures(
-    told: Sequence[Gesture], motion: Annotated, epoch_ns: int, from_ns: int, until_ns: int
+    published: Sequence[Gesture], motion: Annotated, epoch_ns: int, from_ns: int, until_ns: int
 ) -> dict[str, object]:
     """What the hand of a scene said against what was told of it; poses of the hand are not judged.
 
@@ -150,7 +150,7 @@ def judge_gestures(
         from_ns: The first pose of the run.
         until_ns: Its last one.
     """
-    begun = [one for one in _beginnings(told) if one.kind != "pose"]
+    begun = [one for one in _beginnings(published) if one.kind != "pose"]
     first_s, end_s = (from_ns - epoch_ns) * 1e-9, (until_ns - epoch_ns) * 1e-9
     made = [
         (one, cycle * motion.period_s)
@@ -163,7 +163,7 @@ def judge_gestures(
     for one, after_s in made:
         span = (one.start_s + after_s, one.stop_s + after_s + _LATE_S)
         own = [
-            k for k, told_one in enumerate(begun) if k not in received and _is(told_one, one, span, epoch_ns)
+            k for k, published_one in enumerate(begun) if k not in received and _is(published_one, one, span, epoch_ns)
         ]
         right += bool(own)
         received.update(own)
@@ -176,7 +176,7 @@ def judge_gestures(
         "gestures_made": len(made),
         "gestures_false": len(begun) - len(received) - len(cut),
     }
-    dials = [one for one in told if one.kind == "dial" and np.isfinite(one.angle_rad)]
+    dials = [one for one in published if one.kind == "dial" and np.isfinite(one.angle_rad)]
     began_s = [(one.began_t_ns - epoch_ns) * 1e-9 for one in dials]
     error = [
         abs(one.angle_rad - motion.dial_rad(_seconds_of(one, epoch_ns)) + motion.dial_rad(t_s))
@@ -218,16 +218,16 @@ def contact_row(near: Contacts, row: int) -> Contact:
     )
 
 
-def _beginnings(told: Sequence[Gesture]) -> list[Gesture]:
+def _beginnings(published: Sequence[Gesture]) -> list[Gesture]:
     """One message of each gesture: its first, of a tap the only one."""
-    return [one for one in told if one.phase == "begin" or one.kind == "tap"]
+    return [one for one in published if one.phase == "begin" or one.kind == "tap"]
 
 
 def _label(one: Gesture) -> str:
     return one.kind if one.name == one.kind else f"{one.kind} {one.name}"
 
 
-def _cut(told: Gesture, motion: Annotated, epoch_ns: int, first_s: float, end_s: float) -> bool:
+def _cut(published: Gesture, motion: Annotated, epoch_ns: int, first_s: float, end_s: float) -> bool:
     """Whether it is one that the hand had begun before the first pose, or not done at the last."""
     turns = range(int(end_s // motion.period_s) + 1)
     spans = (
@@ -236,14 +236,14 @@ def _cut(told: Gesture, motion: Annotated, epoch_ns: int, first_s: float, end_s:
         for k in turns
     )
     return any(
-        (start < first_s or stop > end_s) and _is(told, one, (start, stop + _LATE_S), epoch_ns)
+        (start < first_s or stop > end_s) and _is(published, one, (start, stop + _LATE_S), epoch_ns)
         for one, start, stop in spans
     )
 
 
-def _is(told: Gesture, made: Annotation, span_s: tuple[float, float], epoch_ns: int) -> bool:
-    same = (told.kind, told.name) == (made.kind, made.name)
-    return same and span_s[0] <= _seconds_of(told, epoch_ns) <= span_s[1]
+def _is(published: Gesture, made: Annotation, span_s: tuple[float, float], epoch_ns: int) -> bool:
+    same = (published.kind, published.name) == (made.kind, made.name)
+    return same and span_s[0] <= _seconds_of(published, epoch_ns) <= span_s[1]
 
 
 def _seconds_of(one: Gesture, epoch_ns: int) -> float:

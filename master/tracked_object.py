@@ -32,7 +32,7 @@ class TrackedObject:
         self._setup, self._counts = setup, counts
         self._line = ObjectLine(profile, setup.rig, setup.models) if shown else None
         self._device = TrackerLine(profile, setup.rig) if registered(profile, setup.rig) else None
-        self._seen_ns = self._told_ns = self._line_ns = -inf
+        self._seen_ns = self._tracker_ns = self._line_ns = -inf
         self._last_ns = -inf
 
     @property
@@ -63,10 +63,10 @@ class TrackedObject:
         for one in solved:
             t_ns = one.pose.t_ns
             if one.pose.tracked:
-                self._told_ns = t_ns
+                self._tracker_ns = t_ns
             waits_for = self._seen_ns if one.pose.tracked else self._line_ns
             if t_ns - waits_for > _PREFERRED_NS:
-                out += self._told(one)
+                out += self._published(one)
         return out
 
     def flush(self) -> list[SolvedObject]:
@@ -79,11 +79,11 @@ class TrackedObject:
             self._line_ns = t_ns = one.pose.t_ns
             if one.pose.tracked:
                 self._seen_ns = t_ns
-            if one.pose.tracked or t_ns - self._told_ns > _PREFERRED_NS:
-                out += self._told(one)
+            if one.pose.tracked or t_ns - self._tracker_ns > _PREFERRED_NS:
+                out += self._published(one)
         return out
 
-    def _told(self, one: SolvedObject) -> list[SolvedObject]:
+    def _published(self, one: SolvedObject) -> list[SolvedObject]:
         """It, if it is later than the last, and counted."""
         if one.pose.t_ns <= self._last_ns:
             return []

@@ -79,7 +79,7 @@ class LivePipeline:
         self._stage, self._dropped_epochs = stage, dropped_epochs
         self._setup: RigSetup = setup
         self._now = pipeline_of(setup, stage, dropped_epochs=dropped_epochs)
-        per_frame = _told_per_frame(setup)
+        per_frame = _messages_per_frame(setup)
         self._close = _CLOSE_FRAMES * per_frame
         self._recent: deque[tuple[int, Detections | _OrientationSample]] = deque(
             maxlen=_WARM_FRAMES * per_frame
@@ -157,9 +157,9 @@ class LivePipeline:
         """Show it the last messages; the number of the last one."""
         shown = 0
         for _ in range(_ROUNDS):  # while these are solved, more come
-            waiting = [(number, told) for number, told in list(self._recent) if number > shown]
-            for number, told in waiting:
-                _show(new, told)
+            waiting = [(number, sample) for number, sample in list(self._recent) if number > shown]
+            for number, sample in waiting:
+                _show(new, sample)
                 shown = number
             if len(waiting) <= self._close:
                 break
@@ -170,8 +170,8 @@ class LivePipeline:
         old, self._now = self._now.counts, new
         new.counts.clear()
         new.counts.update(old)
-        missed = [told for number, told in self._recent if number > shown]
-        solved = [one for told in missed for one in _show(new, told)]
+        missed = [sample for number, sample in self._recent if number > shown]
+        solved = [one for sample in missed for one in _show(new, sample)]
         later = [one for one in solved if one.pose.t_ns > self._last_ns]
         new.counts["poses"] -= len(solved) - len(later)
         return later
@@ -311,7 +311,7 @@ def _with_filter(setups: Sequence[RigSetup], trial: FilterTrial) -> list[RigSetu
     ]
 
 
-def _told_per_frame(setup: RigSetup) -> int:
+def _messages_per_frame(setup: RigSetup) -> int:
     """How many messages of all cameras and of the IMU come with each frame of the slowest camera, about."""
     slowest_hz = min(camera.frame_rate_hz for camera in setup.cameras.values())
     imus = [rig.imu for rig in (setup.rig, setup.wrist_rig) if rig is not None and rig.imu is not None]
@@ -319,12 +319,12 @@ def _told_per_frame(setup: RigSetup) -> int:
     return len(setup.camera_names) + ceil(samples)
 
 
-def _show(pipeline: Pipeline, told: Detections | _OrientationSample) -> list[SolvedPose]:
+def _show(pipeline: Pipeline, sample: Detections | _OrientationSample) -> list[SolvedPose]:
     """Tell it what came; the poses that completes."""
-    if isinstance(told, _OrientationSample):
-        pipeline.push_orientation(told.t_ns, told.orientation_wxyz, told.heading_sigma_rad)
+    if isinstance(sample, _OrientationSample):
+        pipeline.push_orientation(sample.t_ns, sample.orientation_wxyz, sample.heading_sigma_rad)
         return []
-    return pipeline.push(told)
+    return pipeline.push(sample)
 
 
 def _content(setup: RigSetup) -> tuple[object, ...]:

@@ -19,13 +19,13 @@ _IMAGES_HZ = 2.0
 Progress = Callable[[str, int, int], None]
 
 
-def wrist_truth_of(t_ns: Int, scene: WristScene, epoch_ns: int, tell: Progress) -> WristTruth:
+def wrist_truth_of(t_ns: Int, scene: WristScene, epoch_ns: int, progress: Progress) -> WristTruth:
     """The scene at the instants (N,) [ns] of poses; `epoch_ns` is scene time 0 on their clock."""
     now: list[WristEpoch] = []
     for row, at_ns in enumerate(t_ns.tolist()):
         now.append(scene.truth((at_ns - epoch_ns) * 1e-9))
         if row % 20 == 0:
-            tell("comparing with the truth", row, len(t_ns))
+            progress("comparing with the truth", row, len(t_ns))
     return WristTruth(
         t_ns=t_ns,
         laser_m=np.array([one.laser_pt for one in now]),
@@ -37,18 +37,18 @@ def wrist_truth_of(t_ns: Int, scene: WristScene, epoch_ns: int, tell: Progress) 
     )
 
 
-def laser_scores(poses: Poses, scene: WristScene, epoch_ns: int, tell: Progress) -> dict[str, float]:
+def laser_scores(poses: Poses, scene: WristScene, epoch_ns: int, progress: Progress) -> dict[str, float]:
     """Errors of the laser points, as `score_wrist` has them, of poses that also other sensors tell of.
 
     Such a pose carries the points of the last triple. Each triple counts once, at the first pose after it.
     """
     point = poses.laser_m.reshape(len(poses), -1)
-    told = np.asarray(np.isfinite(point).any(axis=1))
-    told[1:] &= (np.nan_to_num(point[1:]) != np.nan_to_num(point[:-1])).any(axis=1)
-    if not told.any():
+    measured = np.asarray(np.isfinite(point).any(axis=1))
+    measured[1:] &= (np.nan_to_num(point[1:]) != np.nan_to_num(point[:-1])).any(axis=1)
+    if not measured.any():
         return {}
-    truth = wrist_truth_of(poses.t_ns[told], scene, epoch_ns, tell)
-    return score_laser(poses.laser_m[told], truth)
+    truth = wrist_truth_of(poses.t_ns[measured], scene, epoch_ns, progress)
+    return score_laser(poses.laser_m[measured], truth)
 
 
 def forearm_tilt(poses: Poses, scene: WristScene, epoch_ns: int) -> dict[str, float]:
@@ -75,12 +75,12 @@ def lit_view(renderer: WristRenderer, t_s: float) -> Image:
 
 
 def wrist_images(
-    poses: Poses, scene: WristScene, epoch_ns: int, tell: Progress
+    poses: Poses, scene: WristScene, epoch_ns: int, progress: Progress
 ) -> Iterator[tuple[str, int, Image]]:
     """Camera, time [ns] and `lit_view`, twice a second."""
     first, last = int(poses.t_ns[0]), int(poses.t_ns[-1])
     camera = scene.rig.cameras[0]
     renderer = WristRenderer(scene, camera)
     for t_ns in range(first, last, int(1e9 / _IMAGES_HZ)):
-        tell(f"rendering camera {camera}", t_ns - first, last - first)
+        progress(f"rendering camera {camera}", t_ns - first, last - first)
         yield camera, t_ns, lit_view(renderer, (t_ns - epoch_ns) * 1e-9)

@@ -42,13 +42,13 @@ class ColourSampler:
         ranges = {name: every[name] for name in self._markers if name in every}
         light = self._detector.log_gains
         done = self._picked.sample(self._image(wish.t_ns), light, wish.marker, wish.uv, ranges)
-        told = {
+        report = {
             "pick.pixels": float(done.row.pixels),
             "pick.own_share": done.row.own,
             "pick.skin_share": done.row.skin,
             "pick.background_px": done.row.background_px,
         }
-        return replace(camera, markers=every | done.ranges), told
+        return replace(camera, markers=every | done.ranges), report
 
     def _image(self, t_ns: int | None) -> Image:
         """The picture that was clicked on, or else the newest one."""

@@ -62,13 +62,13 @@ class Failures:
             self._silent += 1
         return why
 
-    def ask(self, tell: Callable[[], Mapping[str, ValueT]]) -> dict[str, ValueT]:
+    def ask(self, query: Callable[[], Mapping[str, ValueT]]) -> dict[str, ValueT]:
         """Ask a driver for what it tells of itself.
 
         Nothing where it raises, so that the reports go on.
         """
         try:
-            return dict(tell())
+            return dict(query())
         except Exception as error:  # noqa: BLE001 - whatever a driver raises is its device's failure
             self.log("does not say how it is", error)
             return {}

@@ -18,7 +18,7 @@ from slave.cameras.source import FrameSource
 from slave.colour_sampler import ColourSampler
 from slave.counters import Counters
 from slave.light_report import LightReport
-from slave.markers.ambiguity import told_frames, told_places
+from slave.markers.ambiguity import ambiguity_counts, ambiguity_gauges
 from slave.markers.calibrated import CalibratedDetector
 from slave.markers.detector import MarkerDetector
 from slave.markers.engine import Engine
@@ -78,8 +78,8 @@ def run_live(
         scan: Whether whole frames are scanned for markers, or windows (`scan_choice`).
         engine: What scans and measures for markers, or what does the inner loops before a wrist device.
         stop: Set by a signal handler, or by the command "stop" on the bus.
-        say: Told one line when it is ready, and one at the end.
-        service: Told what it does, for the system's service manager.
+        say: Called with one line when it is ready, and one at the end.
+        service: Called with what it does, for the system's service manager.
         access: How it comes to the master's bus.
         raw_frames: Where raw frames go when somebody asks for them; None: nowhere.
 
@@ -178,9 +178,9 @@ def _marker_line(
             tags.counts()
             | _uncalibrated(detector.missing)
             | {"windows": choice.frames}
-            | told_frames(detector.plain)
+            | ambiguity_counts(detector.plain)
         ),
-        lambda: told_places(detector.plain),
+        lambda: ambiguity_gauges(detector.plain),
     )
     previews = Previews(name, clock, MarkerOverlay(detector, rig.markers))
     numbers, seen = counters, previews.offer

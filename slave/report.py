@@ -1,4 +1,4 @@
-"""Tell the master how the slave is: `Health` twice a second and on command, on a thread of its own.
+"""Report to the master how the slave is: `Health` twice a second and on command, on a thread of its own.
 
 The camera loop never waits for the bus: this thread opens it when the uplink has learned where the master's
 bus is, opens it anew when another master takes over, and lives on without it when there is none.

@@ -25,7 +25,7 @@ WAITING = "waits for the master"
 
 
 class ConnectionLost(Protocol):
-    """Told that a device is lost, before it is given back and at each try to open it; `Service.connection_lost`."""
+    """Notified that a device is lost, before it is given back and at each try to open it; `Service.connection_lost`."""
 
     def __call__(self, what: str, patience_s: float = LOST_PATIENCE_S) -> None:
         """`what` is lost; the next try may take so long [s]."""

@@ -198,7 +198,7 @@ class CameraTuning:
             camera = wanted.over(self._used.camera)
             if wanted.markers is not None:
                 refuse_strange(wanted.markers, self._used.rig.markers, "set: markers")
-                camera = _told(camera, "set", wanted.markers)
+                camera = _with_provenance(camera, "set", wanted.markers)
             self._apply(replace(self._used, camera=camera), forget=True)
         return self._settings("")
 
@@ -210,9 +210,9 @@ class CameraTuning:
                     "pick: this slave seeks no markers: the camera of a wrist device, or started with --colours none"
                 )
             refuse_strange((wish.marker,), self._used.rig.markers, "pick: marker")
-            camera, told = self._sampler.pick(wish, self._used.camera)
-            self._apply(replace(self._used, camera=_told(camera, "pick", (wish.marker,))))
-        return self._settings("") | dict(told)
+            camera, report = self._sampler.pick(wish, self._used.camera)
+            self._apply(replace(self._used, camera=_with_provenance(camera, "pick", (wish.marker,))))
+        return self._settings("") | dict(report)
 
     def _load(self, body: str) -> dict[str, float]:
         with self._lock:
@@ -274,7 +274,7 @@ def _merged(was: CameraCalibration, now: CameraCalibration, used: CameraCalibrat
     return structs.replace(now, **kept)
 
 
-def _told(camera: CameraCalibration, verb: str, markers: Iterable[str]) -> CameraCalibration:
+def _with_provenance(camera: CameraCalibration, verb: str, markers: Iterable[str]) -> CameraCalibration:
     """The file, which says when and how its colours came about."""
     note = "picked in the running slave" if verb == "pick" else "ranges set by hand in the running slave"
     tool, before = f"phalanx-slave {verb}", camera.provenance.get(MARKERS)

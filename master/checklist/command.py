@@ -56,10 +56,10 @@ def newest(lists: Subscription, where: str) -> tuple[CheckItem, ...]:
     Raises:
         BusError: None comes.
     """
-    told = lists.get(ANSWER_S)
-    if not isinstance(told, Checklist):
+    answer = lists.get(ANSWER_S)
+    if not isinstance(answer, Checklist):
         raise BusError(f"no checklist on {where} for {ANSWER_S:g} s: does a master run there?")
-    return told.items
+    return answer.items
 
 
 def lines(items: tuple[CheckItem, ...]) -> list[str]:

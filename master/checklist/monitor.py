@@ -116,14 +116,14 @@ class ChecklistMonitor:
             latch.verdict for latch in self._latches.values() if latch.shown and latch.verdict is not None
         ]
         self._causes = {key: cause for key, cause in self._causes.items() if cause[1] > t_ns}
-        told = [verdict for verdict in shown if not self._follows(verdict, shown)]
-        for verdict in told:
+        reported = [verdict for verdict in shown if not self._follows(verdict, shown)]
+        for verdict in reported:
             after_ns = (
                 BACK_NS if verdict.code in _ABSENT else AFTER_NS
             )  # who comes back settles by its own rules
             self._causes[verdict.key] = verdict, t_ns + after_ns
-        told.sort(key=lambda one: (CODES.index(one.code), one.subject))
-        return tuple(one.item() for one in told[:MAX_CHECKS])
+        reported.sort(key=lambda one: (CODES.index(one.code), one.subject))
+        return tuple(one.item() for one in reported[:MAX_CHECKS])
 
     def _verdicts(self, now: MasterNow, t_ns: int) -> Iterable[Verdict]:
         """All rules, those of the master's own files first."""

@@ -111,8 +111,8 @@ class ChecklistPublisher:
         self._monitor = ChecklistMonitor(self._plan)
         self._reports = bus.subscribe("health", depth=DEPTH)
         self._session, self._machine = session, Machine(writes_to)
-        self._told: tuple[CheckItem, ...] | None = None
-        self._told_ns = 0
+        self._published: tuple[CheckItem, ...] | None = None
+        self._published_ns = 0
 
     def work(self, stop: threading.Event, setups: Callable[[], Sequence[RigSetup]] | None) -> None:
         """Look again and again until the stop; `setups` says which are in use."""
@@ -144,8 +144,8 @@ class ChecklistPublisher:
             self._monitor.push_health(health, t_ns)
         self._monitor.push(self._now(t_ns))
         items = self._monitor.look(t_ns)
-        if _keys(items) != _keys(self._told) or t_ns - self._told_ns >= EVERY_NS:
-            self._told, self._told_ns = items, t_ns
+        if _keys(items) != _keys(self._published) or t_ns - self._published_ns >= EVERY_NS:
+            self._published, self._published_ns = items, t_ns
             self._bus.publish("checklist", MASTER, Checklist(MASTER, self._session, t_ns, items))
         return items
 

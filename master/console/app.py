@@ -93,7 +93,7 @@ def login_of(settings: ConsoleSettings, folder: Path, notify: Callable[[str], No
     Args:
         settings: How the console was started.
         folder: Where password and certificate are kept.
-        say: Told the password when it is made, and how to know the certificate.
+        say: Called with the password when it is made, and how to know the certificate.
 
     Raises:
         PhalanxError: A file of the password or of the certificate cannot be used.

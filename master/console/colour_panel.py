@@ -25,9 +25,9 @@ class ColourPanel:
 
         Args:
             markers: Names; the first is chosen.
-            on_change: Told each new colour of a marker.
-            on_forget: Told the marker whose colour is to be forgotten.
-            tint: Told whose pixels are to be tinted in the picture.
+            on_change: Called with each new colour of a marker.
+            on_forget: Called with the marker whose colour is to be forgotten.
+            tint: Called with whose pixels are to be tinted in the picture.
         """
         self._markers, self._on_change, self._tint = markers, on_change, tint
         self._colours: dict[str, Range] = {}

@@ -17,7 +17,7 @@ class CommandQueue(Generic[AnswerT]):
 
     def __init__(
         self,
-        tell: Callable[[Mapping[str, object]], AnswerT],
+        send: Callable[[Mapping[str, object]], AnswerT],
         on_answer: Callable[[AnswerT], object],
         on_error: Callable[[str], object],
     ) -> None:
@@ -25,10 +25,10 @@ class CommandQueue(Generic[AnswerT]):
 
         Args:
             tell: Sends a change and waits for the answer, on a thread.
-            on_answer: Told the answer, on the page's loop, unless more is to be told already.
-            on_error: Told the error's text as it is.
+            on_answer: Called with the answer, on the page's loop, unless more is to be told already.
+            on_error: Called with the error's text as it is.
         """
-        self._tell, self._on_answer, self._on_error = tell, on_answer, on_error
+        self._send, self._on_answer, self._on_error = send, on_answer, on_error
         self._waiting: dict[tuple[str, str | None], object] = {}
         self._task: asyncio.Task[None] | None = None
 
@@ -48,7 +48,7 @@ class CommandQueue(Generic[AnswerT]):
             await asyncio.sleep(QUIET_S)
             waiting, self._waiting = self._waiting, {}
             try:
-                answer = await asyncio.to_thread(self._tell, _merged(waiting))
+                answer = await asyncio.to_thread(self._send, _merged(waiting))
             except PhalanxError as error:
                 self._on_error(str(error))
             else:

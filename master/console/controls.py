@@ -29,7 +29,7 @@ class Setting:
             title: What it is.
             unit: Its unit, may be empty.
             low, high: What the slider spans; a number beyond may be typed, and whoever gets it may refuse.
-            on_change: Told each new value.
+            on_change: Called with each new value.
             digits: Decimals shown.
             log: Whether the slider is logarithmic.
         """

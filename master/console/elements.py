@@ -18,7 +18,7 @@ class CameraView(Element, component="static/camera_view.js"):
         Args:
             camera: Its name.
             label: What a screen reader says.
-            on_pick: Told where in the picture, as shares (0..1) of its width and height, and when that was taken [ns].
+            on_pick: Called with the place in the picture, as shares (0..1) of its width and height, and its time [ns].
         """
         super().__init__()
         self._props["camera"] = camera

@@ -71,10 +71,10 @@ def filter_panel(state: ConsoleState, rig: str) -> None:
         with client:
             ui.notify(text, type="negative", multi_line=True, close_button="OK")
 
-    def tell(change: Mapping[str, object]) -> None:
+    def apply(change: Mapping[str, object]) -> None:
         try_filter(state.link.ask, rig, values())
 
-    command_queue: CommandQueue[None] = CommandQueue(tell, tried, fail)
+    command_queue: CommandQueue[None] = CommandQueue(apply, tried, fail)
 
     def show(now: FilterCalibration) -> None:
         for name, _, _, factor, *_ in _PARAMETERS:

@@ -155,7 +155,7 @@ class LocalProcesses:
         """
         self.stop(name)
         process = LocalProcess(name, command, environment)
-        self._tell(f"+{process.pid}")
+        self._send(f"+{process.pid}")
         with self._lock:
             self._all[name] = process
         return process
@@ -184,7 +184,7 @@ class LocalProcesses:
         if process is None:
             return
         process.stop()
-        self._tell(f"-{process.pid}")
+        self._send(f"-{process.pid}")
 
     def close(self) -> None:
         """End all at once, then the warden. Safe to call twice."""
@@ -195,7 +195,7 @@ class LocalProcesses:
         for thread in stoppers:
             thread.join(ENDS_S + _KILLED_S)
         for one in running:
-            self._tell(f"-{one.pid}")
+            self._send(f"-{one.pid}")
         if self._supervisor.stdin is not None and not self._supervisor.stdin.closed:
             self._supervisor.stdin.close()
         try:
@@ -204,7 +204,7 @@ class LocalProcesses:
             self._supervisor.kill()
             self._supervisor.wait(_KILLED_S)
 
-    def _tell(self, line: str) -> None:
+    def _send(self, line: str) -> None:
         pipe = self._supervisor.stdin
         if pipe is None or pipe.closed:
             return

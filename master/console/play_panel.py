@@ -70,7 +70,7 @@ class Controls:
                 self._words = ui.label("").classes("mono play-at")
             self._speeds = ui.select(_SPEEDS, value=1.0, label="Speed").props("dense outlined")
             self._speeds.classes("known-poses")
-        self._command_queue = CommandQueue(self._tell, self._told, notify)
+        self._command_queue = CommandQueue(self._send, self._on_answer, notify)
         self._pause.on_click(lambda: self._command_queue.change("resume" if self._paused else "pause", None))
         self._slider.on_value_change(self._dragged)
         self._slider.on("change", self._sought)  # when it is let go, or its key
@@ -107,13 +107,13 @@ class Controls:
             return report
         return max(report, answer, key=lambda one: one.t_ns)
 
-    def _tell(self, change: Mapping[str, object]) -> Health | None:
+    def _send(self, change: Mapping[str, object]) -> Health | None:
         answer: Health | None = None
         for verb, body in change.items():
             answer = self._state.link.ask(Command(MASTER, verb, "" if body is None else json.dumps(body)))
         return answer
 
-    def _told(self, answer: Health | None) -> None:
+    def _on_answer(self, answer: Health | None) -> None:
         self._answer = answer
         self._notify("")
 

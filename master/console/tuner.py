@@ -100,7 +100,7 @@ class Tuner:
         Raises:
             BusError: The slave does not answer, or refuses; as all methods here.
         """
-        now = self._tell("settings", "")
+        now = self._send("settings", "")
         if self._begun is None:
             self._begun = now
         return now
@@ -108,13 +108,13 @@ class Tuner:
     def set(self, change: Mapping[str, object]) -> InUse:
         """Use other settings at once: keys and units of the command "set"."""
         self._begin()
-        return self._tell("set", json.dumps(change))
+        return self._send("set", json.dumps(change))
 
     def pick(self, marker: str, uv: Sequence[float], t_ns: int | None = None) -> InUse:
         """Take the colour of a marker from about a pixel of the whole frame, if known of that taken at `t_ns` [ns]."""
         self._begin()
         pick = ColourPick(marker=marker, uv=(round(float(uv[0]), 2), round(float(uv[1]), 2)), t_ns=t_ns)
-        return self._tell("pick", msgspec.json.encode(pick).decode())
+        return self._send("pick", msgspec.json.encode(pick).decode())
 
     def forget(self, marker: str) -> InUse:
         """Use no colour for a marker: it is looked for no more."""
@@ -122,7 +122,7 @@ class Tuner:
 
     def save(self) -> InUse:
         """Write what is in use to the slave's own camera file."""
-        self._begun = self._tell("save", "")
+        self._begun = self._send("save", "")
         return self._begun
 
     def revert(self) -> InUse:
@@ -130,13 +130,13 @@ class Tuner:
         if self._begun is None:
             raise BusError(f"{self.camera!r} has not answered yet: there is nothing to go back to")
         markers = markers_over(self._begun, self.refresh().markers)
-        return self._tell("set", json.dumps(self._begun.body() | {"markers": markers}))
+        return self._send("set", json.dumps(self._begun.body() | {"markers": markers}))
 
     def _begin(self) -> None:
         if self._begun is None:
             self.refresh()
 
-    def _tell(self, verb: str, body: str) -> InUse:
+    def _send(self, verb: str, body: str) -> InUse:
         return InUse.of(self._ask(Command(self.camera, verb, body)))
 
 

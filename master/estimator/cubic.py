@@ -53,7 +53,7 @@ def _laser_points(
 
 
 def lit(setup: WristSetup, synergy: FlexionSynergy) -> bool:
-    """Tell whether the laser meets a finger that closes naturally."""
+    """Return whether the laser meets a finger that closes naturally."""
     return bool(np.isfinite(_curl(setup, synergy)[:, 1:, 0]).any())
 
 

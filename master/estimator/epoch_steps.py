@@ -201,7 +201,7 @@ class EpochSteps:
         self._state[:] = state
 
     def enough(self, at: Epoch) -> bool:
-        """Tell whether the markers fix a hand: not in one line, or across `back_normal`.
+        """Return whether the markers fix a hand: not in one line, or across `back_normal`.
 
         What faces the cameras turns the hand about a line of markers, but not about one that points at them. With an
         orientation that is known any one marker is enough.
@@ -226,7 +226,7 @@ class EpochSteps:
         return bool(back and extent[0] > _LENGTH_M and abs(axes[0] @ at.back_normal) < _ACROSS)
 
     def unexplained(self) -> bool:
-        """Tell whether a marker is too far from what was found."""
+        """Return whether a marker is too far from what was found."""
         surprise = self.at.found.surprise[: len(self.on_hand)]
         return bool((surprise > self._settings.explained).any())
 

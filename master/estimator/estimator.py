@@ -134,8 +134,8 @@ class Estimator:
                 rejected = orientation is None
                 if rejected and np.trace(self._at.found.cov[:3, :3]) < _SURE_RAD2:
                     break
-        told = self.wrist and bool(task.solver_mode.any())
-        if ground.seen[0] > 0 or (told and (at.place is not None or self._knows_place())):
+        by_device = self.wrist and bool(task.solver_mode.any())
+        if ground.seen[0] > 0 or (by_device and (at.place is not None or self._knows_place())):
             self._now.seen_ns[0] = at.t_ns
         sources = self._sources(at, palm_shown=palm_shown)
         return (
@@ -185,7 +185,7 @@ class Estimator:
         return wrong, not wrong > limit  # NaN: there is nothing to compare
 
     def _knows_place(self) -> bool:
-        """Tell whether the place of a hand is known of which only fingers are told."""
+        """Return whether the place of a hand is known of which only fingers are told."""
         return self.known and float(np.trace(self._now.cov[3:6, 3:6])) < 3.0 * _SOMEWHERE_M**2
 
     def _sources(self, at: Epoch, *, palm_shown: bool) -> Int:
@@ -196,11 +196,11 @@ class Estimator:
         ground = self._at.ground
         sources: list[int] = ground.sources.tolist()
         if self.wrist:
-            told = zip(
-                self._now.solver_mode.tolist(), self._now.told_ns.tolist(), strict=False
+            by_device = zip(
+                self._now.solver_mode.tolist(), self._now.measured_ns.tolist(), strict=False
             )  # of fingers alone
-            for f, (solver_mode, told_ns) in enumerate(told):
-                if (at.t_ns - told_ns) * 1e-9 <= self.settings.tracked_cycle_s:
+            for f, (solver_mode, measured_ns) in enumerate(by_device):
+                if (at.t_ns - measured_ns) * 1e-9 <= self.settings.tracked_cycle_s:
                     sources[f] += ON_OTHERS * solver_mode
         if not palm_shown:
             sources[5] = 0

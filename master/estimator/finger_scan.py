@@ -388,7 +388,7 @@ def scan_finger(
 
 @inner
 def _shows(device: Any, prior: Prior, length: float, scan: Scan) -> bool:
-    """Tell whether the fingertip that `look` left is clearly in sight."""
+    """Return whether the fingertip that `look` left is clearly in sight."""
     t = scan.surface.tip
     if not t[2] > 0.0:
         return False

@@ -126,7 +126,7 @@ class WristSide:
                 heading, float(np.trace(wrist_angles) + np.trace(hand.solution.alone[:3, :3]))
             )
 
-    def told(self, pose: HandPose, estimator: Estimator) -> HandPose:
+    def completed(self, pose: HandPose, estimator: Estimator) -> HandPose:
         """The pose with what else is known of the hand."""
         changes: dict[str, Float | Code | Bool] = {}
         if self.forearm is not None:

@@ -55,7 +55,7 @@ class WristSideOf(Protocol):
         """Learn from an epoch that was solved."""
         ...
 
-    def told(self, pose: HandPose, estimator: Estimator) -> HandPose:
+    def completed(self, pose: HandPose, estimator: Estimator) -> HandPose:
         """The pose with what else is known of the hand."""
         ...
 
@@ -190,7 +190,7 @@ class MarkerPipeline:
             self._count_outliers(found, frames)
         pose = pose_of(hand, self.model, t_ns, line.smooth_m, line.markers, self._volume)
         if self._side is not None and self._estimator is not None:
-            pose = self._side.told(pose, self._estimator)
+            pose = self._side.completed(pose, self._estimator)
         if self._line.continuous:
             placed = np.isfinite(line.markers.points_m[:, 0])
             self._was_m[placed], self._was_ns[placed] = line.markers.points_m[placed], t_ns

@@ -85,7 +85,7 @@ class Reinitialiser:
             if start is not None:
                 shows = steps.at.ground.shown[self._finger_of_free] > 0
                 x = np.where(shows, self._parameters.of_angles(start.angles_rad), self._natural)
-                scratch.start_T[:], scratch.start_x[:] = start.T_rig_palm, self._as_told(x)
+                scratch.start_T[:], scratch.start_x[:] = start.T_rig_palm, self._with_scanned(x)
                 chi2 = steps.fit(habits)
                 if steps.at.found.steps[0] < MAX_ITERATIONS and not steps.unexplained():
                     return chi2
@@ -108,13 +108,13 @@ class Reinitialiser:
         if epoch.place is not None and measured is not None:
             T = np.eye(4)
             T[:3, :3], T[:3, 3] = measured, epoch.place
-            return [(T, self._as_told(self._natural.copy()))]
+            return [(T, self._with_scanned(self._natural.copy()))]
         triangulated = steps.triangulated
         weight = np.where(steps.finger[triangulated] >= 0, 1.0, _PALM_WEIGHT)
         observed = epoch.points_m[steps.on_hand][triangulated]
         starts: list[tuple[Float, Float]] = []
         for posture in self._postures:
-            x = self._as_told(posture.copy())
+            x = self._with_scanned(posture.copy())
             expected = steps.pose(_AT_ORIGIN, self._parameters.angles(x))[1][triangulated]
             if measured is not None and epoch.orientation is not None and epoch.orientation.sure:
                 T = np.eye(4)
@@ -140,7 +140,7 @@ class Reinitialiser:
             return None if at.orientation is None else at.orientation.rotation
         return at.orientation.rotation @ forearm_palm(self._steps.now.z[WRIST_ANGLES : WRIST_ANGLES + 2])
 
-    def _as_told(self, x: Float) -> Float:
+    def _with_scanned(self, x: Float) -> Float:
         """Free angles (n,) with those of fingers whose valley was searched."""
         known = self._steps.at.scan.known > 0.0
         if not known.any():

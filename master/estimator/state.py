@@ -40,7 +40,7 @@ class HandState:
         known: (1,) whether there is a hand.
         seen_ns: (1,) when anything of it was measured last.
         triangulated_ns: (1,) when two cameras, or a depth law, placed a marker of it last.
-        told_ns: (6,) when each finger, and the palm, was measured last.
+        measured_ns: (6,) when each finger, and the palm, was measured last.
         palm, x, angles: (4, 4) palm, (n,) free and (20,) all angles [rad].
         rates: (20,) [rad/s].
         cov: (N, N) of turn [rad], shift [m], rig axes, free angles [rad] and extras.
@@ -63,7 +63,7 @@ class HandState:
     known: Bool
     seen_ns: Int
     triangulated_ns: Int
-    told_ns: Int
+    measured_ns: Int
     palm: Float
     x: Float
     angles: Float
@@ -98,7 +98,7 @@ class HandState:
             known=("u1", 1),
             seen_ns=("i8", 1),
             triangulated_ns=("i8", 1),
-            told_ns=("i8", 6),
+            measured_ns=("i8", 6),
             palm=(4, 4),
             x=n,
             angles=20,
@@ -128,7 +128,7 @@ class HandState:
             state.z_ns,
             state.seen_ns,
             state.triangulated_ns,
-            state.told_ns,
+            state.measured_ns,
             state.hidden_ns,
         ):
             never[:] = NEVER_NS

@@ -120,10 +120,10 @@ def _judge(
         part = f if f >= 0 else PALM_PART
         by_wrist = f >= 0 and state.solver_mode[f] > 0
         most_s = settings.tracked_cycle_s if by_wrist else settings.tracked_age_s
-        measured_lately = (t_ns - state.told_ns[part]) * 1e-9 <= most_s
+        measured_lately = (t_ns - state.measured_ns[part]) * 1e-9 <= most_s
         sure = f < 0 or not state.vague[f]
         out.tracked[joint] = measured_lately and sure and is_small(hand, out.cov, joint, settings.tracked_m)
-        now = state.told_ns[part] == t_ns
+        now = state.measured_ns[part] == t_ns
         out.source[joint] = _SOLVED if now else _HELD
         if by_wrist and measured_lately:
             out.source[joint] = _WRIST
@@ -330,7 +330,7 @@ def take_over_epoch(
         for f in range(5):
             state.hidden_ns[f] = NEVER_NS
         for part in range(6):  # what was measured was another hand
-            state.told_ns[part] = NEVER_NS
+            state.measured_ns[part] = NEVER_NS
     if goes_on and lost:
         now = space.scratch.cov
         copy(found.cov, now)
@@ -359,9 +359,9 @@ def take_over_epoch(
     state.t_ns[0], state.known[0], state.natural[0] = t_ns, True, found.natural[0]
     for f in range(5):
         if shown[f]:
-            state.told_ns[f], state.hidden_ns[f] = t_ns, NEVER_NS
+            state.measured_ns[f], state.hidden_ns[f] = t_ns, NEVER_NS
     if palm_shown:
-        state.told_ns[PALM_PART] = t_ns
+        state.measured_ns[PALM_PART] = t_ns
     copy(found.palm, state.palm)
     since_s = dt_s if goes_on else _LONG_S  # what begins owes nothing to an epoch before
     keep_extras(settings, state, since_s, space.belief, found.z, found.cov, found.scale[0], space.extras)

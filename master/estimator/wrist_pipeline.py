@@ -111,14 +111,14 @@ class WristPipeline:
             self._hand,
             NO_WORLD if self._forearm is None else self._forearm.world_at(t_ns, *_STRAIGHT),
         )
-        told: Bool = hand.solver_mode > 0
-        self._seen_ns[told] = t_ns
+        measured: Bool = hand.solver_mode > 0
+        self._seen_ns[measured] = t_ns
         known: Bool = t_ns - self._seen_ns <= (self._forget_ns if self._continuous else 0)
         for event, fingers in (
             ("tip_refused", hand.refused),
             ("off", hand.off),
             ("ambiguous", hand.ambiguous),
-            ("held", known & ~told),
+            ("held", known & ~measured),
             ("unseen", ~known),
         ):
             for f, happens in enumerate(fingers.tolist()):
@@ -138,7 +138,7 @@ class WristPipeline:
                 valid[lost], tracked[lost], source[lost] = False, False, Source.NONE
                 position[lost], orientation[lost], cov[lost] = nan, nan, nan
                 angles[~known] = nan
-            tracked[_PALM], source[_PALM] = tracked[CHAINS[told]].any(), Source.WRIST
+            tracked[_PALM], source[_PALM] = tracked[CHAINS[measured]].any(), Source.WRIST
         return HandPose.known_good(
             hand=model.profile.name,
             t_ns=t_ns,

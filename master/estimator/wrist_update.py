@@ -50,14 +50,14 @@ def _expected(
     prior.light[0], prior.light2[0] = state.z[LED_SCALE], state.z_cov[LED_SCALE, LED_SCALE]
     for f in range(5):
         prior.twist[f], prior.twist2[f] = state.z[f], max(state.z_cov[f, f], 1e-8)
-        told_s = (task.t_ns[0] - state.told_ns[f]) * 1e-9
-        had_previous = measured_lately and told_s <= settings.forget_s
+        age_s = (task.t_ns[0] - state.measured_ns[f]) * 1e-9
+        had_previous = measured_lately and age_s <= settings.forget_s
         prior.had_previous[f] = 1.0 if had_previous else 0.0
         known = (
             had_previous
             and state.solver_mode[f] > 0
             and state.vague[f] == 0
-            and told_s <= settings.tracked_cycle_s
+            and age_s <= settings.tracked_cycle_s
         )
         state.searched[f] = state.searched[f] + 1 if known else 0
         known = known and state.searched[f] % settings.search_again != 0
@@ -67,7 +67,7 @@ def _expected(
             if had_previous:
                 scan.angles[k] = state.angles[k]
         prior.last[f] = scan.angles[4 * f + 2]
-        prior.process_noise[f] = max(settings.process_noise_rad_s * told_s, settings.goes_on_rad)
+        prior.process_noise[f] = max(settings.process_noise_rad_s * age_s, settings.goes_on_rad)
         if lines_of_sight.lit[f] == 0.0 and lines_of_sight.shown[f] == 0.0:
             continue
         look(hand, device, prior.palm, prior.wrist_axes, scan.angles, f, MOVES, scan.surface)

@@ -66,7 +66,7 @@ def write_bvh(
     skeleton: Skeleton,
     rate_hz: float,
     axes: Axes,
-    tell: Callable[[int, int], None] = lambda _done, _total: None,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> tuple[int, ...]:
     """Write a motion that was resampled.
 
@@ -76,7 +76,7 @@ def write_bvh(
         skeleton: The hand at rest.
         rate_hz: That rate.
         axes: Unit and axes.
-        tell: Told how many frames of how many are written.
+        tell: Called with how many frames of how many are written.
 
     Returns:
         The joints, without the wrist, that have position channels because their bone is not rigid.
@@ -95,7 +95,7 @@ def write_bvh(
         head = ["HIERARCHY", *_hierarchy(WRIST, rest * scale, ends, free, 0)]
         head += ["MOTION", f"Frames: {len(motion)}", f"Frame Time: {1.0 / rate_hz:.9f}"]
         file.write(("\n".join(head) + "\n").encode())
-        _frames(file, rotated, offset * scale, free, tell)
+        _frames(file, rotated, offset * scale, free, progress)
     return free
 
 
@@ -143,7 +143,7 @@ def _numbers(values: Float) -> str:
 
 
 def _frames(
-    file: IO[bytes], rotated: Float, offset: Float, free: tuple[int, ...], tell: Callable[[int, int], None]
+    file: IO[bytes], rotated: Float, offset: Float, free: tuple[int, ...], progress: Callable[[int, int], None]
 ) -> None:
     """A line a frame: the channels of the joints in the order of the hierarchy."""
     columns: list[Float] = []
@@ -154,7 +154,7 @@ def _frames(
     rows = np.concatenate(columns, axis=1) + 0.0  # -0 is written as 0
     for start in range(0, len(rows), _ROWS):
         np.savetxt(file, rows[start : start + _ROWS], fmt="%.6f")
-        tell(min(start + _ROWS, len(rows)), len(rows))
+        progress(min(start + _ROWS, len(rows)), len(rows))
 
 
 def euler_zxy_deg(rotation: Float) -> Float:

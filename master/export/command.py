@@ -171,7 +171,7 @@ def export(
         Axes(unit or "cm", up or "y"),
     )
     progress = _Progress()
-    export_source(source, wanted, progress.notify, progress.tell)
+    export_source(source, wanted, progress.notify, progress.update)
 
 
 def _refuse(wrong: bool, option: str, purpose: str, this: str) -> None:
@@ -186,7 +186,7 @@ class _Progress:
         self._line = ProgressLine(sys.stderr, "export")
         self._shown_ns = now_ns()
 
-    def tell(self, what: str, done: int, total: int) -> None:
+    def update(self, what: str, done: int, total: int) -> None:
         """It goes on. Where no terminal shows the bar in place it is left out: files are written in seconds."""
         if sys.stderr.isatty() and now_ns() - self._shown_ns > _EVERY_NS:
             self._shown_ns = now_ns()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from common.errors import CalibrationError, PhalanxError, RecordingError
-from common.messages import Detections, Told
+from common.messages import Detections, ResultMessage
 from master.export.take import Take
 from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
@@ -41,7 +41,7 @@ def setup_of(hand: str, tree: Path, rigs: Sequence[str], profiles: Sequence[Path
 
 
 def write_take(
-    path: Path, take: Take, batches: Sequence[Poses], setup: RigSetup, tell: Callable[[int, int], None]
+    path: Path, take: Take, batches: Sequence[Poses], setup: RigSetup, progress: Callable[[int, int], None]
 ) -> None:
     """Write the poses of a hand with what else was recorded.
 
@@ -50,7 +50,7 @@ def write_take(
         take: The source: objects, contact, gestures and what cameras saw.
         batches: The poses, one batch or more.
         setup: What watched the hand.
-        tell: Told how many poses of how many are written.
+        tell: Called with how many poses of how many are written.
 
     Raises:
         RecordingError: The file cannot be written, or the poses are not of one marker count.
@@ -62,7 +62,7 @@ def write_take(
         if name in setup.camera_names
     }
     seen: dict[str, list[Detections]] = {name: frames for name, frames in cameras.items() if frames}
-    write_rrd(path, poses, setup, detections=seen, told=_told(take, poses.hand), tell=tell)
+    write_rrd(path, poses, setup, detections=seen, results=_results(take, poses.hand), progress=progress)
 
 
 def _joined(batches: Sequence[Poses]) -> Poses:
@@ -80,9 +80,9 @@ def _joined(batches: Sequence[Poses]) -> Poses:
     return Poses(hand=batches[0].hand, **arrays)
 
 
-def _told(take: Take, hand: str) -> list[Told]:
+def _results(take: Take, hand: str) -> list[ResultMessage]:
     """Objects, contact and gestures of this hand, each in the order of time."""
-    out: list[Told] = [one for one in take.gestures() if one.hand == hand]
+    out: list[ResultMessage] = [one for one in take.gestures() if one.hand == hand]
     for poses in take.objects():
         out += [object_row(poses, row) for row in range(len(poses))]
     for near in take.contacts():

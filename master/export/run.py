@@ -31,7 +31,7 @@ SUFFIXES: dict[Kind, tuple[str, ...]] = {
     "gltf": (".glb", ".gltf"),
     "rrd": (".rrd",),
 }
-Tell = Callable[[str, int, int], None]
+ProgressCallback = Callable[[str, int, int], None]
 _FRAME = "rig: that of the reference camera, x right, y down, z into the scene; metres"
 
 
@@ -62,14 +62,14 @@ class Wanted:
     axes: Axes = field(default_factory=Axes)
 
 
-def export(source: Path, wanted: Wanted, notify: Callable[[str], None], tell: Tell) -> tuple[Path, ...]:
+def export(source: Path, wanted: Wanted, notify: Callable[[str], None], progress: ProgressCallback) -> tuple[Path, ...]:
     """Export a source.
 
     Args:
         source: poses.npz of a run, or an .mcap recording.
         wanted: What of it, and how.
-        say: Told each file that is there, and what is to be known of it.
-        tell: Told what is being done, and how much of how much.
+        say: Called with each file that is there, and what is to be known of it.
+        tell: Called with what is being done, and how much of how much.
 
     Returns:
         The files, in the order of writing.
@@ -85,11 +85,11 @@ def export(source: Path, wanted: Wanted, notify: Callable[[str], None], tell: Te
     hands = _chosen(take, wanted.only, source)
     target = _target(source, wanted)
     if wanted.kind in ("csv", "parquet"):
-        written = _tables(take, hands, target, wanted.kind, notify, tell)
+        written = _tables(take, hands, target, wanted.kind, notify, progress)
     elif wanted.kind == "rrd":
-        written = _viewed(take, hands, target, wanted, notify, tell)
+        written = _viewed(take, hands, target, wanted, notify, progress)
     else:
-        written = _motions(take, hands, target, wanted, notify, tell)
+        written = _motions(take, hands, target, wanted, notify, progress)
     if not written:
         part = "" if wanted.window == Window() else " in this part of time"
         raise RecordingError(f"{source}: holds no poses of a hand{part}, nothing to export as {wanted.kind}")
@@ -160,7 +160,7 @@ def _tables(
     target: Path,
     kind: TableKind,
     notify: Callable[[str], None],
-    tell: Tell,
+    progress: ProgressCallback,
 ) -> tuple[Path, ...]:
     """A table for each hand, object and pair of both, and one of gestures, where there are any."""
     begin, written = take.begin_t_ns, list[Path]()
@@ -175,7 +175,7 @@ def _tables(
         written.append(path)
 
     for hand in hands:
-        batches = (hand_columns(one, begin) for one in _counted(take, hand, tell))
+        batches = (hand_columns(one, begin) for one in _counted(take, hand, progress))
         write(_of_hand(target, hands, hand), f"hand {hand}", hand_columns(_no_poses(hand), begin), batches)
     for thing in take.objects():
         _refuse_path(thing.object, target)
@@ -200,13 +200,13 @@ def _no_poses(hand: str) -> Poses:
     return Poses(hand=hand, **arrays)
 
 
-def _counted(take: Take, hand: str, tell: Tell) -> Iterator[Poses]:
+def _counted(take: Take, hand: str, progress: ProgressCallback) -> Iterator[Poses]:
     """The poses of a hand, while it is told how many were read."""
     done, total = 0, take.count(hand)
     for batch in take.batches(hand):
         yield batch
         done += len(batch)
-        tell(f"hand {hand}", done, total)
+        progress(f"hand {hand}", done, total)
 
 
 def _motions(
@@ -215,7 +215,7 @@ def _motions(
     target: Path,
     wanted: Wanted,
     notify: Callable[[str], None],
-    tell: Tell,
+    progress: ProgressCallback,
 ) -> tuple[Path, ...]:
     """A file for each hand that has a valid pose."""
     written: list[Path] = []
@@ -223,7 +223,7 @@ def _motions(
         skeletons = {hand: skeleton_of(hand, tree, wanted.profiles) for hand in hands}
     for hand in hands:
         try:
-            motion = complete(_counted(take, hand, tell), skeletons[hand])
+            motion = complete(_counted(take, hand, progress), skeletons[hand])
         except RecordingError as error:
             if len(hands) == 1:
                 raise
@@ -231,20 +231,20 @@ def _motions(
             continue
         path = _of_hand(target, hands, hand)
         try:
-            notify(_motion(path, motion, skeletons[hand], wanted, tell))
+            notify(_motion(path, motion, skeletons[hand], wanted, progress))
         except OSError as error:
             raise cannot_write(path, error) from error
         written.append(path)
     return tuple(written)
 
 
-def _motion(path: Path, motion: Motion, skeleton: Skeleton, wanted: Wanted, tell: Tell) -> str:
+def _motion(path: Path, motion: Motion, skeleton: Skeleton, wanted: Wanted, progress: ProgressCallback) -> str:
     """Write one; what is to be said of it."""
     rate_hz = wanted.rate_hz
     if wanted.kind == "bvh":
         rate_hz = rate_hz or motion.rate_hz
         motion = resample(motion, rate_hz)
-        free = write_bvh(path, motion, skeleton, rate_hz, wanted.axes, partial(tell, path.name))
+        free = write_bvh(path, motion, skeleton, rate_hz, wanted.axes, partial(progress, path.name))
     else:
         motion = motion if rate_hz is None else resample(motion, rate_hz)
         free = write_gltf(path, motion, skeleton, wanted.axes.up)
@@ -297,7 +297,7 @@ def _viewed(
     target: Path,
     wanted: Wanted,
     notify: Callable[[str], None],
-    tell: Tell,
+    progress: ProgressCallback,
 ) -> tuple[Path, ...]:
     """An .rrd for each hand that has poses."""
     written: list[Path] = []
@@ -306,13 +306,13 @@ def _viewed(
         raise PhalanxError("--to rrd draws cameras too: say with --rig which rigs the poses were made with")
     with take.tree(wanted.calibration) as tree:
         for hand in hands:
-            poses = list(_counted(take, hand, tell))
+            poses = list(_counted(take, hand, progress))
             if not poses:
                 notify(f"hand {hand}: no poses: no file of it")
                 continue
             path = _of_hand(target, hands, hand)
             setup = setup_of(hand, tree, rigs, wanted.profiles)
-            write_take(path, take, poses, setup, partial(tell, path.name))
+            write_take(path, take, poses, setup, partial(progress, path.name))
             notify(f"wrote {path}: hand {hand}, {sum(map(len, poses))} poses (open with: rerun {path})")
             written.append(path)
     return tuple(written)

@@ -28,7 +28,7 @@ from master.outputs.told_files import (
     ObjectPoses,
     contact_record,
     load_contact,
-    load_gestures_told,
+    load_gesture_messages,
     load_object,
 )
 from master.recording.files import recorded_rigs, unpack
@@ -156,7 +156,7 @@ class RunTake:
             RecordingError: The file is broken.
         """
         path = self._folder / GESTURES
-        found = load_gestures_told(path) if path.exists() else []
+        found = load_gesture_messages(path) if path.exists() else []
         return _inside(found, self._window, self.begin_t_ns)
 
     def detections(self) -> dict[str, list[Detections]]:

@@ -53,7 +53,7 @@ def compare_source(
         source: poses.npz of a run, or an .mcap recording.
         truth: The motion capture.
         wanted: Of what, and how.
-        say: Told a line at a time.
+        say: Called with a line at a time.
 
     Returns:
         All figures, for a program.

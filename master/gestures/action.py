@@ -37,17 +37,17 @@ class ActionMonitor:
         pinch, dial, tap, point = self.pinch, self.dial, self.tap, self.point
         touch = thumb_touch(seen, self._radius_m)
         others = dial.active or tap.active or point.active
-        told = pinch.push(seen, touch, may_begin=not others and not is_pad(seen, self._taps))
+        gestures = pinch.push(seen, touch, may_begin=not others and not is_pad(seen, self._taps))
         if pinch.active or dial.active or point.active:
             tap.drop()
         else:
-            told += tap.push(seen, touch, may_begin=True)
+            gestures += tap.push(seen, touch, may_begin=True)
         others = pinch.active or tap.active
         dial_may = not others and not point.active
-        told += dial.push(
+        gestures += dial.push(
             seen, float(touch.gap_m.min()), may_begin=dial_may, wrist_device_only=wrist_device_only
         )
-        return told + point.push(seen, may_begin=not others and not dial.active)
+        return gestures + point.push(seen, may_begin=not others and not dial.active)
 
     def lost(self, t_ns: int) -> list[Gesture]:
         """What is to be told at an instant at which there is no hand."""

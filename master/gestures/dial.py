@@ -99,13 +99,13 @@ class DialMonitor:
             self._angle = 0.0
             self._take(tips, axis)
             self._closed_ns = self._known_ns = seen.t_ns
-            return [self._tell(self._dial, "begin", seen, tips)]
+            return [self._message(self._dial, "begin", seen, tips)]
         self._follow(seen.t_ns, tips)
         own = self._settings
         opened = self._grip is None and (seen.t_ns - self._closed_ns) * 1e-9 > own.regrip_s
         if opened or (seen.t_ns - self._known_ns) * 1e-9 > own.lost_s:
-            return self._end(self._tell(self._dial, "end", seen, tips))
-        return [self._tell(self._dial, "update", seen, tips)]
+            return self._end(self._message(self._dial, "end", seen, tips))
+        return [self._message(self._dial, "update", seen, tips)]
 
     def lost(self, t_ns: int) -> list[Gesture]:
         """What is to be told at an instant at which there is no hand."""
@@ -113,15 +113,15 @@ class DialMonitor:
         last = self._last
         if self._dial is None or last is None or (t_ns - self._known_ns) * 1e-9 <= self._settings.lost_s:
             return []
-        told = self._dial.told(
+        message = self._dial.message(
             "end", t_ns, 0.0, angle_rad=self._angle, origin_m=last.origin_m, direction=last.direction
         )
-        return self._end(told)
+        return self._end(message)
 
-    def _end(self, told: Gesture) -> list[Gesture]:
+    def _end(self, message: Gesture) -> list[Gesture]:
         self._dial = self._grip = self._last = None
         self._maybe.clear()
-        return [told]
+        return [message]
 
     def _held(self, t_ns: int, tips: Tips, hold_s: float, *, grips: bool) -> Float | None:
         """The axis of the tips, if they are still, and mostly a grip, so long."""
@@ -187,12 +187,12 @@ class DialMonitor:
         self._angle = twist + 2.0 * pi * round((self._angle - twist) / (2.0 * pi))
         grip.history.push(t_ns, wide_m, self._angle)
 
-    def _tell(self, dial: HeldGesture, phase: Phase, seen: HandFeatures, tips: Tips) -> Gesture:
+    def _message(self, dial: HeldGesture, phase: Phase, seen: HandFeatures, tips: Tips) -> Gesture:
         grip = self._grip
         origin = 0.5 * seen.tips_m[0] + 0.5 * seen.tips_m[1:].mean(axis=0)
         way = seen.palmar if grip is None else tips.T_still_rig.T @ grip.axis
         confidence = float(tips.known.mean()) * (0.5 if grip is None else 1.0)
-        self._last = dial.told(
+        self._last = dial.message(
             phase, seen.t_ns, confidence, angle_rad=self._angle, origin_m=origin, direction=way
         )
         return self._last

@@ -27,7 +27,7 @@ class HeldGesture:
     name: str
     began_t_ns: int
 
-    def told(
+    def message(
         self,
         phase: Phase,
         t_ns: int,

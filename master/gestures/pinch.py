@@ -41,14 +41,14 @@ class PinchMonitor:
             self._finger, self._known_ns = finger, seen.t_ns
             self._gap_m = float(touch.gap_m[finger])
             self._pinch = HeldGesture(seen.hand, "pinch", FINGERS[finger + 1], seen.t_ns)
-            return [self._tell(self._pinch, "begin", seen, touch)]
+            return [self._message(self._pinch, "begin", seen, touch)]
         if self._known(touch, self._finger):
             self._known_ns, self._gap_m = seen.t_ns, float(touch.gap_m[self._finger])
             if self._gap_m > self._settings.end_gap_m:
-                return self._end(self._tell(self._pinch, "end", seen, touch))
+                return self._end(self._message(self._pinch, "end", seen, touch))
         elif (seen.t_ns - self._known_ns) * 1e-9 > self._settings.lost_s:
-            return self._end(self._tell(self._pinch, "end", seen, touch))
-        return [self._tell(self._pinch, "update", seen, touch)]
+            return self._end(self._message(self._pinch, "end", seen, touch))
+        return [self._message(self._pinch, "update", seen, touch)]
 
     def lost(self, t_ns: int) -> list[Gesture]:
         """What is to be told at an instant at which there is no hand."""
@@ -56,12 +56,12 @@ class PinchMonitor:
         if self._pinch is None or last is None or (t_ns - self._known_ns) * 1e-9 <= self._settings.lost_s:
             return []
         return self._end(
-            self._pinch.told("end", t_ns, 0.0, distance_m=last.distance_m, strength=last.strength)
+            self._pinch.message("end", t_ns, 0.0, distance_m=last.distance_m, strength=last.strength)
         )
 
-    def _end(self, told: Gesture) -> list[Gesture]:
+    def _end(self, message: Gesture) -> list[Gesture]:
         self._pinch = self._last = None
-        return [told]
+        return [message]
 
     def _begins(self, seen: HandFeatures, touch: ThumbTouch) -> int | None:
         own = self._settings
@@ -82,11 +82,11 @@ class PinchMonitor:
     def _known(self, touch: ThumbTouch, finger: int) -> bool:
         return bool(touch.key_sigma_m[finger, 2] <= self._settings.sigma_most_m)
 
-    def _tell(self, pinch: HeldGesture, phase: Phase, seen: HandFeatures, touch: ThumbTouch) -> Gesture:
+    def _message(self, pinch: HeldGesture, phase: Phase, seen: HandFeatures, touch: ThumbTouch) -> Gesture:
         own, gap = self._settings, self._gap_m
         sigma = float(touch.key_sigma_m[self._finger, 2])
         strength = (own.open_gap_m - gap) / (own.open_gap_m - own.closed_gap_m)
-        self._last = pinch.told(
+        self._last = pinch.message(
             phase,
             seen.t_ns,
             below(gap, own.end_gap_m, sigma),

@@ -62,19 +62,19 @@ class PointMonitor:
             if (seen.t_ns - self._since_ns) * 1e-9 < own.hold_s or not (self._sure and before):
                 return []
             self._point, self._since_ns = HeldGesture(seen.hand, "point", "point", self._since_ns), None
-            return [self._tell(self._point, "begin", seen)]
+            return [self._message(self._point, "begin", seen)]
         if shape and self._sure:
             self._since_ns = None
         elif self._over(seen.t_ns):
-            return self._end(self._tell(point, "end", seen))
-        return [self._tell(point, "update", seen)]
+            return self._end(self._message(point, "end", seen))
+        return [self._message(point, "update", seen)]
 
     def lost(self, t_ns: int) -> list[Gesture]:
         """What is to be told at an instant at which there is no hand."""
         last = self._last
         if self._point is None or last is None or not self._over(t_ns):
             return []
-        return self._end(self._point.told("end", t_ns, 0.0, origin_m=last.origin_m, direction=last.direction))
+        return self._end(self._point.message("end", t_ns, 0.0, origin_m=last.origin_m, direction=last.direction))
 
     def _over(self, t_ns: int) -> bool:
         """Whether the shape has been lost for long; counts from the first time it is asked."""
@@ -82,9 +82,9 @@ class PointMonitor:
             self._since_ns = t_ns
         return (t_ns - self._since_ns) * 1e-9 >= self._settings.hold_s
 
-    def _end(self, told: Gesture) -> list[Gesture]:
+    def _end(self, message: Gesture) -> list[Gesture]:
         self._point, self._since_ns, self._last = None, None, None
-        return [told]
+        return [message]
 
     def _shape(self, seen: HandFeatures) -> bool:
         """Whether the index finger is stretched and the others are bent, as far as these are known."""
@@ -101,7 +101,7 @@ class PointMonitor:
         )
         return bent and (index <= own.stretched_rad + slack or not known[1])
 
-    def _tell(self, point: HeldGesture, phase: Phase, seen: HandFeatures) -> Gesture:
+    def _message(self, point: HeldGesture, phase: Phase, seen: HandFeatures) -> Gesture:
         tip = seen.joints_m[_TIP]
         way = tip - seen.joints_m[_KNUCKLE]
         if not self._sure and self._last is not None:
@@ -109,7 +109,7 @@ class PointMonitor:
         middle = 0.5 * (self._settings.stretched_rad + self._settings.bent_rad)
         clear = [min(max((bend - middle) / middle, 0.0), 1.0) for bend in _bends(seen)[2:]]
         known = 1.0 if seen.sigma_m[1] <= self._settings.sigma_most_m else 0.5
-        self._last = point.told(
+        self._last = point.message(
             phase, seen.t_ns, known * sum(clear) / len(clear), origin_m=tip, direction=way / sqrt(way @ way)
         )
         return self._last

@@ -179,10 +179,10 @@ class FingerSpeed:
         while self._past and t_ns - self._past[0][0] > 1e9 * _MEMORY_S:
             self._past.popleft()
         self._past.append((t_ns, bend_deg, known))
-        for then_ns, before, told in reversed(self._past):
+        for then_ns, before, known_then in reversed(self._past):
             if t_ns - then_ns >= 1e9 * _RATE_S:
                 moved = [now - then for now, then in zip(bend_deg, before, strict=True)]
-                both = [one for one, *sure in zip(moved, told, known, strict=True) if all(sure)] or moved
+                both = [one for one, *sure in zip(moved, known_then, known, strict=True) if all(sure)] or moved
                 return sqrt(sum(one * one for one in both) / len(both)) / (1e-9 * (t_ns - then_ns))
         return inf
 

@@ -147,7 +147,7 @@ class ThumbTapMonitor:
         tap = HeldGesture(seen.hand, "tap", KEYS[finger][segment], gone.began_ns)
         ends = CHAINS[finger + 1, segment : segment + 2]
         middle = 0.5 * (nearest.joints_m[ends].mean(axis=0) + nearest.joints_m[TIPS[0]])
-        return [tap.told("end", seen.t_ns, sure, distance_m=gone.least_m, origin_m=middle)]
+        return [tap.message("end", seen.t_ns, sure, distance_m=gone.least_m, origin_m=middle)]
 
 
 def is_pad(seen: HandFeatures, settings: TapSettings) -> bool:

@@ -38,7 +38,7 @@ def template_session(
         name: Of the pose.
         count: How many examples.
         clock: For the countdown.
-        say: Told one line at a time.
+        say: Called with one line at a time.
 
     Raises:
         FitError: No hand was seen, or it did not keep still, three times.

@@ -67,10 +67,10 @@ class Example:
         if len(frames) < SHORTEST:
             raise FitError(f"an example of {len(frames)} frames: hold it longer, for {SHORTEST} at least")
         each = [Quantities.of(frame) for frame in frames]
-        told = np.array([known_of(one) for one in each])
-        enough = told.mean(axis=0) >= _KNOWN_SHARE
-        value = np.array([np.where(known, one.value, np.nan) for known, one in zip(told, each, strict=True)])
-        sigma = np.array([np.where(known, one.sigma, np.nan) for known, one in zip(told, each, strict=True)])
+        measured = np.array([known_of(one) for one in each])
+        enough = measured.mean(axis=0) >= _KNOWN_SHARE
+        value = np.array([np.where(known, one.value, np.nan) for known, one in zip(measured, each, strict=True)])
+        sigma = np.array([np.where(known, one.sigma, np.nan) for known, one in zip(measured, each, strict=True)])
         known = np.mean([frame.known for frame in frames], axis=0) >= _KNOWN_SHARE
         medians = [np.full(len(QUANTITIES), fill) for fill in (0.0, np.inf)]
         for median, of in zip(medians, (value, sigma), strict=True):

@@ -77,8 +77,8 @@ def _vicon(rows: list[list[str]], path: Path) -> PointTable:
         for at, name in enumerate(names)
         if name and [axis[:1].upper() for axis in rows[head][at : at + 3]] == ["X", "Y", "Z"]
     }
-    told = rows[head + 1]
-    unit = _UNITS.get(next((cell.lower() for cell in told if cell), ""))
+    cells = rows[head + 1]
+    unit = _UNITS.get(next((cell.lower() for cell in cells if cell), ""))
     body = _until_empty(rows[head + 2 :])
     table = _table(body, head + 3, path, columns, unit, time_column=0)
     return PointTable(table.names, table.t_s / rate, table.position, unit)

@@ -142,10 +142,10 @@ def fit_offset(blocks: Float) -> TimeOffset | None:
         if total <= 0.0:
             return None
         offset = float((weight * ze).sum()) / total
-    told, lagged, weight_of_rays = (
+    information, lagged, weight_of_rays = (
         (weight[:, None] * blocks[..., part]).sum(axis=2).ravel() for part in (1, 2, 3)
     )
-    scatter = [_scatter(told, lagged - offset * told, length) for length in _LENGTHS]
+    scatter = [_scatter(information, lagged - offset * information, length) for length in _LENGTHS]
     if scatter[0][1] < _BATCHES_AT_LEAST:
         return None
     sigma, count = max([scatter[0], *(of for of in scatter[1:] if of[1] >= _LONG_BATCHES_AT_LEAST)])
@@ -154,12 +154,12 @@ def fit_offset(blocks: Float) -> TimeOffset | None:
     return TimeOffset(offset * 1e9, sigma * 1e9, count)
 
 
-def _scatter(told: Float, residual: Float, length: int) -> tuple[float, float]:
+def _scatter(information: Float, residual: Float, length: int) -> tuple[float, float]:
     """Standard deviation of the offset [s] from batches of so many tenths, and their effective number."""
-    starts = np.arange(0, len(told), length)
-    told, residual = np.add.reduceat(told, starts), np.add.reduceat(residual, starts)
-    total = told.sum()
-    share = np.clip(told / total, 0.0, _LEVERAGE_AT_MOST)
+    starts = np.arange(0, len(information), length)
+    information, residual = np.add.reduceat(information, starts), np.add.reduceat(residual, starts)
+    total = information.sum()
+    share = np.clip(information / total, 0.0, _LEVERAGE_AT_MOST)
     residual = residual / (1.0 - share)
     return float(np.sqrt((residual * residual).sum()) / total), 1.0 / max(float((share * share).sum()), 1e-12)
 

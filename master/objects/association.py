@@ -47,20 +47,20 @@ class Association:
         columns: list[tuple[Int, Int, Float, Float, Float, Float, Bool]] = []
         for c, both in enumerate(window.views):
             for kind, line in enumerate(both):
-                told = [observation for observation in line if len(observation.point)]
-                if not told:
+                observed = [observation for observation in line if len(observation.point)]
+                if not observed:
                     continue
-                point = np.concatenate([one.point for one in told])
-                uv, sigma = _nearer(told, point, features, cameras[c], T)
+                point = np.concatenate([one.point for one in observed])
+                uv, sigma = _nearer(observed, point, features, cameras[c], T)
                 if T is not None and kind == 0:
-                    area = np.concatenate([one.area_px2 for one in told]).reshape(len(told), -1)
+                    area = np.concatenate([one.area_px2 for one in observed]).reshape(len(observed), -1)
                     sigma = np.hypot(sigma, doubt(c, T, area).ravel())
                 there: Int = np.flatnonzero(np.isfinite(uv[:, 0] + uv[:, 1] + sigma))
-                t_ns = np.concatenate([one.t_ns for one in told])
-                size = [len(one.point) for one in told]
-                late = np.repeat([one.t_sigma_s for one in told], size)
+                t_ns = np.concatenate([one.t_ns for one in observed])
+                size = [len(one.point) for one in observed]
+                late = np.repeat([one.t_sigma_s for one in observed], size)
                 near = window.near(c, kind)
-                now = np.repeat([one is near for one in told], size)
+                now = np.repeat([one is near for one in observed], size)
                 tau = (t_ns[there] - (window.t_ns - window.origin_ns)) * 1e-9
                 at = np.full(len(there), c)
                 columns.append((at, point[there], tau, uv[there], sigma[there], late[there], now[there]))

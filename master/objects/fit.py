@@ -37,7 +37,7 @@ _SETTLED = 2e-4  # [m, rad]: the next step, which is taken in any case, is some 
 _LEAST: Float = np.array([1.0] * 3 + [0.1] * 3)  # information on place and turn: no matrix is singular
 _GONE = 0.05  # weight below which a feature counts as wrong
 _EYE = np.eye(3)
-_TOLD = np.eye(_N)[:, :12]  # place, turn and their speeds
+_REPORTED = np.eye(_N)[:, :12]  # place, turn and their speeds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,7 +134,7 @@ class PoseFit:
         # Unknowns are now the derivatives themselves: their priors are about 0.
         pull = problem.gradient + self._priors[-1] @ problem.rates + problem.normal @ problem.rates
         normal = problem.normal + self._priors
-        asked = np.concatenate([_TOLD, pull[:, None]], axis=1)
+        asked = np.concatenate([_REPORTED, pull[:, None]], axis=1)
         found = np.linalg.solve(normal, np.broadcast_to(asked, (len(normal), *asked.shape)))
         cov, x = found[:, :12, :12], found[:, :, 12]
         sign, size = np.linalg.slogdet(normal)

@@ -40,7 +40,7 @@ from master.objects.window import Window, Windows
 # What light does to a ball's centroid beyond what a slave says, and to a corner.
 _BEAD_FLOOR_PX, _CORNER_FLOOR_PX = 0.08, 0.03
 _POOR_M, _POOR_RAD = 6e-3, np.radians(4.0)  # less sure than this: the past counts
-_UNTOLD_M, _UNTOLD_RAD = 0.02, np.radians(12.0)  # less sure than this it does not tell all of the pose
+_INCOMPLETE_M, _INCOMPLETE_RAD = 0.02, np.radians(12.0)  # less sure than this it does not tell all of the pose
 _LOST_M, _LOST_RAD = 0.05, np.radians(30.0)  # less sure than this is no pose
 _MOST = 0.5  # share of what is seen that must be in its place
 _START_MISFIT = 25.0  # chi square per number of what a pose from nothing rests on
@@ -190,7 +190,7 @@ class ObjectLine:
             both = self._fit(seen.seen, start, past, feature=seen.feature)
         if alone is None:
             return None if both is None else replace(both, alone=False)
-        if both is None or not alone.poorer(_UNTOLD_M, _UNTOLD_RAD):
+        if both is None or not alone.poorer(_INCOMPLETE_M, _INCOMPLETE_RAD):
             return alone if both is None else both
         return unheeded(both, alone, self._trajectory.unsure_s(t_ns), _POOR_M)
 

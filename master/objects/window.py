@@ -214,14 +214,14 @@ class Windows:
             t_ns = self._pending[0]
             period_ns = max(self._period_ns)
             due = self._newest_ns - t_ns > (_TAG_DEADLINE if tagged else _DEADLINE) * period_ns
-            if not (flush or due or all(self._told(c, t_ns, tagged) for c in range(len(self._names)))):
+            if not (flush or due or all(self._complete(c, t_ns, tagged) for c in range(len(self._names)))):
                 break
             self._pending.popleft()
             self._emitted_ns = t_ns
             out.append(self._at(t_ns, period_ns))
         return out
 
-    def _told(self, c: int, t_ns: int, tagged: bool) -> bool:
+    def _complete(self, c: int, t_ns: int, tagged: bool) -> bool:
         """Whether a camera has told all it knows of an instant, or is silent."""
         if self._silent(c):
             return True

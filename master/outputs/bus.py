@@ -1,7 +1,7 @@
 """Publishes hands, objects, contact and gestures on the bus, for the viewer and for any program of the user."""
 
 from common.bus import Bus
-from common.messages import Contact, Gesture, HandPose, Told
+from common.messages import Contact, Gesture, HandPose, ResultMessage
 
 _STREAM = {HandPose: "hand", Contact: "contact", Gesture: "gesture"}
 
@@ -15,7 +15,7 @@ class BusSink:
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
 
-    def write(self, message: Told) -> None:
+    def write(self, message: ResultMessage) -> None:
         """Publish the message; a slow or absent reader never delays the master.
 
         Raises:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from common.errors import RecordingError
-from common.messages import Gesture, HandPose, ObjectPose, Told
+from common.messages import Gesture, HandPose, ObjectPose, ResultMessage
 from common.npz import read_npz
 from master.outputs.poses import Poses, record
 from master.outputs.table_file import TableFile
@@ -87,7 +87,7 @@ class RunFiles:
         }
         self._gestures = GesturesFile(folder)
 
-    def write(self, message: Told) -> None:
+    def write(self, message: ResultMessage) -> None:
         """Append a row to the file of its hand or object.
 
         Raises:

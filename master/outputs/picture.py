@@ -27,7 +27,7 @@ from master.outputs.hand_render import View, render_hand
 from master.outputs.palette import SOURCE_MEANING, SOURCE_RGB, TRUTH_RGB, Rgb, series_rgb
 from master.outputs.picture_panels import INK, PAPER, draw_panels, unit
 from master.outputs.picture_rig import STRIPS, draw_rig
-from master.outputs.picture_told import ToldPicture
+from master.outputs.picture_told import ResultPicture
 from master.outputs.picture_wrist import WristPicture
 from master.outputs.poses import Poses
 from master.outputs.truth import PosesTruth
@@ -74,7 +74,7 @@ def draw_summary(
     truth: PosesTruth | None = None,
     row: int | None = None,
     wrist: WristPicture | None = None,
-    told: ToldPicture | None = None,
+    results: ResultPicture | None = None,
 ) -> None:
     """Write the picture as PNG.
 
@@ -99,7 +99,7 @@ def draw_summary(
     if row is None:
         figure.text(0.3, 0.45, "no valid pose in this run", color=INK, size=20, ha="center")
     else:
-        _hand(figure, poses, row, model, truth, wrist, told)
+        _hand(figure, poses, row, model, truth, wrist, results)
         if wrist is None or wrist.in_rig:
             draw_rig(figure, poses, row, rig, wrist)
         else:
@@ -108,10 +108,10 @@ def draw_summary(
     _save(figure, path)
 
 
-def best_row(poses: Poses, told: ToldPicture | None = None) -> int | None:
+def best_row(poses: Poses, results: ResultPicture | None = None) -> int | None:
     """The row to show: all joints valid if possible, an object held or known, most joints tracked, fingers spread.
 
-    None: none is valid. `told` has the objects.
+    None: none is valid. `results` has the objects.
     """
     whole = poses.valid.sum(axis=1)
     if not whole.any():
@@ -119,7 +119,7 @@ def best_row(poses: Poses, told: ToldPicture | None = None) -> int | None:
     tips = poses.position_m[:, TIPS]
     reach = np.linalg.norm(tips - poses.position_m[:, WRIST, None], axis=-1).sum(axis=1)
     spread = np.linalg.norm(np.diff(tips, axis=1), axis=-1).sum(axis=1)
-    score = 0.0 if told is None else 500.0 * told.worth(poses.t_ns)
+    score = 0.0 if results is None else 500.0 * results.worth(poses.t_ns)
     score = score + whole * 100.0 + poses.tracked.sum(axis=1) * 10.0 + np.nan_to_num(reach + spread)
     score = np.where(whole > 0, score, -1.0)
     return int(np.argmax(score))
@@ -162,12 +162,12 @@ def _hand(
     model: HandModel,
     truth: PosesTruth | None,
     wrist: WristPicture | None,
-    told: ToldPicture | None,
+    results: ResultPicture | None,
 ) -> None:
     box = _HAND_BOX
-    if told is not None and told.gestures:
+    if results is not None and results.gestures:
         box = _HAND_BOX_ABOVE
-        told.draw_strip(figure, poses.t_ns, row)
+        results.draw_strip(figure, poses.t_ns, row)
     at = np.where(poses.valid[row][:, None], poses.position_m[row], np.nan)
     if wrist is None or wrist.in_rig:
         rotated = axis_rotation(0, _PITCH) @ axis_rotation(1, _YAW * model.side_sign)  # thumb to the eye
@@ -175,7 +175,7 @@ def _hand(
         rotated = axis_rotation(0, _WRIST_PITCH) @ axis_rotation(2, _WRIST_YAW * model.side_sign)
     shown = [at] if wrist is None else [at, wrist.reach_m(poses, row)]
     t_ns = int(poses.t_ns[row])
-    view = fit_view(np.concatenate(shown if told is None else [*shown, told.points_m(t_ns)]), rotated, box)
+    view = fit_view(np.concatenate(shown if results is None else [*shown, results.points_m(t_ns)]), rotated, box)
     axes = figure.add_axes(box)
     axes.set_axis_off()
     axes.set_xlim(0, view.width_px)
@@ -207,7 +207,7 @@ def _hand(
         ring = unit(series_rgb(m))
         axes.plot(caps[m, 0], caps[m, 1], "o", mfc="none", mec=ring, mew=2.4, ms=19, zorder=7)
     more = [] if wrist is None else wrist.draw_laser(axes, view, poses, row)
-    more += [] if told is None else told.draw(axes, view, t_ns)
+    more += [] if results is None else results.draw(axes, view, t_ns)
     _scale_bar(axes, view)
     _legend(figure, poses, truth, more)
 

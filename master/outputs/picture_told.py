@@ -31,7 +31,7 @@ _ROUND = np.linspace(0.0, 2.0 * np.pi, 33)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ToldPicture:
+class ResultPicture:
     """What is drawn beside the hand.
 
     Attributes:

@@ -33,7 +33,7 @@ class PictureAsker:
             cameras: Whom.
             verb: "preview", which a camera shows for three seconds, or "still", one whole frame.
             period_s: From one question to the next.
-            say: Told once when a camera does not answer, and again after it was there.
+            say: Called once when a camera does not answer, and again after it was there.
         """
         self._bus, self._verb, self._period_s, self._notify = bus, verb, period_s, notify
         self._closing = threading.Event()

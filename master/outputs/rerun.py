@@ -23,7 +23,7 @@ from common.arrays import Image
 from common.bus import Bus, Subscription
 from common.clock import now_ns
 from common.errors import PhalanxError, RecordingError
-from common.messages import Detections, HandPose, Health, Message, Preview, Told
+from common.messages import Detections, HandPose, Health, Message, Preview, ResultMessage
 from common.streams import MASTER
 from master.outputs.poses import Poses
 from master.outputs.previews import PictureAsker
@@ -53,7 +53,7 @@ class _Subscribers:
     """What comes from the bus."""
 
     hands: Subscription
-    told: tuple[Subscription, ...]  # objects, contact, gestures
+    results: tuple[Subscription, ...]  # objects, contact, gestures
     reports: Subscription
     pictures: Subscription
 
@@ -67,7 +67,7 @@ class _Subscribers:
         )
 
     def close(self) -> None:
-        for subscriber in (self.hands, *self.told, self.reports, self.pictures):
+        for subscriber in (self.hands, *self.results, self.reports, self.pictures):
             subscriber.close()
 
 
@@ -90,7 +90,7 @@ def run_viewer(
         path: The .rrd of mode "save"; None otherwise.
         stop: Set from another thread or a signal handler.
         web_port: TCP port of the web page on 127.0.0.1.
-        on_ready: Told once where the result is to be seen (an address or a file).
+        on_ready: Called once where the result is to be seen (an address or a file).
 
     Returns:
         Number of poses shown.
@@ -121,8 +121,8 @@ def write_rrd(
     detections: Mapping[str, Iterable[Detections]] | None = None,
     truth: PosesTruth | None = None,
     images: Iterable[tuple[str, int, Image | bytes]] = (),
-    told: Sequence[Told] = (),
-    tell: Callable[[int, int], None] = lambda _done, _total: None,
+    results: Sequence[ResultMessage] = (),
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> None:
     """Write a finished run as an .rrd, which `rerun FILE` opens with its layout.
 
@@ -134,7 +134,7 @@ def write_rrd(
         truth: Row by row with `poses`.
         images: (camera, t_ns, BGR image or JPEG); at most 10 Hz of each camera are kept.
         told: Objects, contact and gestures of the run, each in the order of time.
-        tell: Told how many poses of how many are written.
+        tell: Called with how many poses of how many are written.
 
     Raises:
         RecordingError: The file cannot be written; nothing half written is left.
@@ -142,15 +142,15 @@ def write_rrd(
     with _saved(path) as recording:
         recording.send_blueprint(blueprint([setup], live=False, with_truth=truth is not None))
         scene = RerunScene(recording, [setup])
-        rest = sorted(told, key=lambda one: one.t_ns)
+        rest = sorted(results, key=lambda one: one.t_ns)
         for start in range(0, len(poses), _ROWS_A_CHUNK):
             stop = min(start + _ROWS_A_CHUNK, len(poses))
             scene.log_poses(poses.rows(start, stop), truth.rows(start, stop) if truth is not None else None)
             count = bisect_right(rest, int(poses.t_ns[stop - 1]), key=lambda one: one.t_ns)
-            scene.log_told(rest[:count])
+            scene.log_results(rest[:count])
             rest = rest[count:]
-            tell(stop, len(poses))
-        scene.log_told(rest)
+            progress(stop, len(poses))
+        scene.log_results(rest)
         for frames in (detections or {}).values():
             scene.log_detections(frames)
         for camera, t_ns, image in images:
@@ -173,12 +173,12 @@ def _pump(
             scene.log_poses(poses)
             shown += len(poses)
             at_ns = scene.last_t_ns
-        scene.log_told(
+        scene.log_results(
             [
                 one
-                for subscriber in subscribers.told
+                for subscriber in subscribers.results
                 for one in _waiting(subscriber, Message)
-                if isinstance(one, Told)
+                if isinstance(one, ResultMessage)
             ]
         )
         if at_ns is not None:  # the slaves' clocks are their own: what they send stands at the master's time

@@ -35,14 +35,14 @@ from common.camera_model import CameraModel
 from common.geometry import matrix_to_quaternion
 from common.hand_limits import FLEXION
 from common.hand_model import FINGER_JOINTS, FINGERS, TIPS, WRIST, HandModel
-from common.messages import Detections, Health, MarkerDetections, Source, Told, WristDetections
+from common.messages import Detections, Health, MarkerDetections, Source, ResultMessage, WristDetections
 from master.outputs.laser_fan import fan_rays
 from master.outputs.palette import LIMIT_RGB, RAY_RGB, SOURCE_RGB, TRUTH_RGB, dim, pack, series_rgb
 from master.outputs.poses import Poses
 from master.outputs.rerun_blueprint import WORLD, camera_path, legend
 from master.outputs.rerun_columns import PIXEL_CENTRE, Columns, seen
 from master.outputs.rerun_images import CameraImages
-from master.outputs.rerun_told import ToldLayer
+from master.outputs.rerun_told import ResultLayer
 from master.outputs.rerun_wrist import WristLayer
 from master.outputs.truth import PosesTruth, distance_m, mean_known
 from master.rig_setup import RigSetup
@@ -77,7 +77,7 @@ class RerunScene:
         self._models = {name: model for setup in setups for name, model in setup.models.items()}
         self._devices: dict[str, WristLayer] = {}
         objects = {profile.name: profile for setup in setups for profile in setup.objects}
-        self._told = ToldLayer(recording, list(objects.values()))
+        self._results = ResultLayer(recording, list(objects.values()))
         self._recent_ns: Int = np.empty(0, np.int64)
         self._styled: set[str] = set()
         recording.log(WORLD, rr.ViewCoordinates.RDF, static=True)
@@ -124,11 +124,11 @@ class RerunScene:
         self._log_plots(poses, setup)
         if truth is not None:
             self._log_truth(poses, truth)
-        self._told.remember(poses)
+        self._results.remember(poses)
 
-    def log_told(self, told: Sequence[Told]) -> None:
+    def log_results(self, results: Sequence[ResultMessage]) -> None:
         """Log objects, contact and gestures, each in the order of time; after the poses of the hands they are of."""
-        self._told.log(told)
+        self._results.log(results)
 
     def log_detections(self, detections: Iterable[Detections]) -> None:
         """Log what one camera saw, in its image; frames in the order of time."""

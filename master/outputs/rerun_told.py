@@ -7,7 +7,7 @@ import rerun as rr
 
 from common.arrays import Float
 from common.hand_model import PALM, TIPS
-from common.messages import Contact, Gesture, ObjectPose, Told
+from common.messages import Contact, Gesture, ObjectPose, ResultMessage
 from common.object_profile import ObjectProfile
 from master.outputs.poses import Poses
 from master.outputs.rerun_gestures import GesturesLayer
@@ -18,7 +18,7 @@ _NAMED = [*TIPS.tolist(), PALM]
 _REMEMBERED = 1024  # poses
 
 
-class ToldLayer:
+class ResultLayer:
     """Logs to a recording that belongs to the caller; holds tips and palm of the last poses.
 
     Contact and gestures are drawn at the joints of their own instant.
@@ -37,8 +37,8 @@ class ToldLayer:
         for old in list(self._joints)[: -max(_REMEMBERED, len(poses))]:
             del self._joints[old]
 
-    def log(self, told: Sequence[Told]) -> None:
+    def log(self, results: Sequence[ResultMessage]) -> None:
         """Log a batch, each kind in the order of time; hands are passed over."""
-        self._objects.log_poses([one for one in told if isinstance(one, ObjectPose)])
-        self._objects.log_contacts([one for one in told if isinstance(one, Contact)], self._joints)
-        self._gestures.log([one for one in told if isinstance(one, Gesture)], self._joints)
+        self._objects.log_poses([one for one in results if isinstance(one, ObjectPose)])
+        self._objects.log_contacts([one for one in results if isinstance(one, Contact)], self._joints)
+        self._gestures.log([one for one in results if isinstance(one, Gesture)], self._joints)

@@ -2,13 +2,13 @@
 
 from typing import Protocol
 
-from common.messages import Told
+from common.messages import ResultMessage
 
 
 class Sink(Protocol):
     """Takes what the master tells, of each hand and object in the order of its time. Opened by its constructor."""
 
-    def write(self, message: Told) -> None:
+    def write(self, message: ResultMessage) -> None:
         """Take one message. What a sink is not for, it leaves alone.
 
         Raises:

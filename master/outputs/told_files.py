@@ -263,7 +263,7 @@ def load_contact(path: Path) -> Contacts:
     return Contacts(**_table(path, contact_record(), ("hand", "object")))
 
 
-def load_gestures_told(path: Path) -> list[Gesture]:
+def load_gesture_messages(path: Path) -> list[Gesture]:
     """Read gestures.jsonl.
 
     Raises:

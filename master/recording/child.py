@@ -39,7 +39,7 @@ class RecorderProcess:
             path: The file.
             files: Files of calibration of the rigs.
             endpoint: Of our bus, which is open already.
-            say: Told each line that it says.
+            say: Called with each line that it says.
             ended: Called, on another thread, once it is gone.
         """
         self._notify, self._ended, self._path = notify, ended, path

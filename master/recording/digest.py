@@ -9,22 +9,22 @@ from collections.abc import Iterable
 
 import msgspec
 
-from common.messages import Contact, Gesture, HandPose, ObjectPose, Told, encode
+from common.messages import Contact, Gesture, HandPose, ObjectPose, ResultMessage, encode
 
 KINDS = {HandPose: "poses", ObjectPose: "objects", Contact: "contacts", Gesture: "gestures"}
 
 
-class ToldDigest:
+class ResultDigest:
     """Holds a sum for each kind of message, and how many there were."""
 
-    def __init__(self, told: Iterable[Told] = ()) -> None:
-        """Begin with `told`."""
+    def __init__(self, results: Iterable[ResultMessage] = ()) -> None:
+        """Begin with `results`."""
         self._sums = {name: hashlib.sha256() for name in KINDS.values()}
         self.counts = dict.fromkeys(KINDS.values(), 0)
-        for message in told:
+        for message in results:
             self.take(message)
 
-    def take(self, message: Told) -> None:
+    def take(self, message: ResultMessage) -> None:
         """Count one message."""
         name = KINDS[type(message)]
         if isinstance(message, HandPose | ObjectPose) and message.latency_ns:

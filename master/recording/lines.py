@@ -101,9 +101,9 @@ def raw_lines(recording: MessageRecording) -> list[str]:
         return ["raw frames: the file does not say where they are"]
     last: dict[str, Health] = {}
     for one in recording.read(["health"]) if folders else ():
-        told = one.message
-        if isinstance(told, Health) and (told.source in last or told.metrics.get("raw.on")):
-            last[told.source] = told
+        health = one.message
+        if isinstance(health, Health) and (health.source in last or health.metrics.get("raw.on")):
+            last[health.source] = health
     return [
         f"raw frames of {name}: {last[name].counts.get('raw.frames', 0)} in {folder},"
         f" {last[name].counts.get('raw.dropped', 0)} dropped"

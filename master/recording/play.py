@@ -66,8 +66,8 @@ def run_play(
         settings: What, and how.
         bus: Where it is told; None: nowhere. Left open.
         stop: Set by a signal handler, or by the command "stop".
-        say: Told a line when something happens.
-        show: Told once a second where it is [s], of how much.
+        say: Called with a line when something happens.
+        show: Called once a second where it is [s], of how much.
 
     Returns:
         The last pass.

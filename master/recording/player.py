@@ -13,7 +13,7 @@ from typing import cast
 
 from common.clock import now_ns
 from common.errors import PhalanxError
-from common.messages import Backlog, Contact, Gesture, HandPose, Message, Told
+from common.messages import Backlog, Contact, Gesture, HandPose, Message, ResultMessage
 from common.recording import MessageRecording, Recorded
 from master.app import Solved
 from master.dispatcher import Dispatcher
@@ -21,7 +21,7 @@ from master.link_senders import SensorMessage
 from master.load_shedding import LoadShedding, Shedding
 from master.outputs.sink import Sink
 from master.recording.clock import ReplayClock
-from master.recording.digest import ToldDigest
+from master.recording.digest import ResultDigest
 from master.recording.lines import EventMonitor
 from master.rig_setup import RigSetup
 from master.stages import StageTimes
@@ -45,7 +45,7 @@ class Passed:
         whole: From the beginning to the end that was asked for, without a jump.
     """
 
-    digest: ToldDigest
+    digest: ResultDigest
     seconds: float
     whole: bool
 
@@ -98,7 +98,7 @@ class Player:
             solved: Tell what was told live instead of solving.
             again: Takes reports, lists and pictures that were recorded beside.
             taken: Shown each message that was taken, once all that it tells is out.
-            say: Told a line where something happened that a replay cannot repeat.
+            say: Called with a line where something happened that a replay cannot repeat.
 
         Raises:
             ValueError: The speed is none, or the stretch is empty.
@@ -177,7 +177,7 @@ class Player:
             PhalanxError: A sink fails.
         """
         start_ns, whole = self.first_ns, self.first_ns == self._recording.begin_t_ns
-        digest, began_ns = ToldDigest(), now_ns()
+        digest, began_ns = ResultDigest(), now_ns()
         while True:
             with self._changed:
                 self._clock.seek(start_ns, now_ns())
@@ -189,7 +189,7 @@ class Player:
                     return Passed(digest, (now_ns() - began_ns) * 1e-9, whole and ended)
             start_ns, whole = jump, False
 
-    def _pass(self, start_ns: int, digest: ToldDigest) -> bool:
+    def _pass(self, start_ns: int, digest: ResultDigest) -> bool:
         """Play from `start_ns`; False: not to the end."""
         load_shedding = LoadShedding()
         dispatcher = None if self._solved else world_of(self._setups, load_shedding)
@@ -202,19 +202,19 @@ class Player:
             if not silent and not self._due(one.t_ns):
                 return False
             if one.stream == "health":
-                self._tell_events(events.push(one.t_ns, one.message))
+                self._print_events(events.push(one.t_ns, one.message))
                 if events.restarted and dispatcher is not None:
                     load_shedding = LoadShedding()
                     dispatcher = world_of(self._setups, load_shedding)
             if isinstance(one.message, Backlog):
                 load_shedding.reject = one.message.reject
-            told = self._told(dispatcher, one)
+            results = self._results_of(dispatcher, one)
             if not silent:
-                self._write(told, digest)
+                self._write(results, digest)
                 self._auxiliary(one)
                 self.at_ns = one.t_ns
             else:
-                for _ in told:
+                for _ in results:
                     pass
         return True
 
@@ -227,21 +227,21 @@ class Player:
                     return True
                 if wait_s is not None and (gap_ns := t_ns - self._clock.position_ns(now_ns())) > GAP_NS:
                     at_s = (self.at_ns - self._recording.begin_t_ns) * 1e-9
-                    self._tell_events([f"at {at_s:.1f} s nothing comes for {gap_ns * 1e-9:.0f} s: skipped"])
+                    self._print_events([f"at {at_s:.1f} s nothing comes for {gap_ns * 1e-9:.0f} s: skipped"])
                     self._clock.seek(t_ns, now_ns())
                     return True
                 self._changed.wait(None if wait_s is None else min(wait_s, _STEP_S))
             return False
 
-    def _told(self, dispatcher: Dispatcher | None, one: Recorded) -> Iterable[Told]:
+    def _results_of(self, dispatcher: Dispatcher | None, one: Recorded) -> Iterable[ResultMessage]:
         """What a message tells: the world makes it, or it was told live."""
         if one.stream in SOLVED:
-            return (cast(Told, one.message),)
+            return (cast(ResultMessage, one.message),)
         if one.stream != "taken" or dispatcher is None or isinstance(one.message, Backlog):
             return ()
         return self._solve(dispatcher, cast(SensorMessage, one.message), one.name)
 
-    def _solve(self, dispatcher: Dispatcher, message: SensorMessage, name: str) -> Iterable[Told]:
+    def _solve(self, dispatcher: Dispatcher, message: SensorMessage, name: str) -> Iterable[ResultMessage]:
         """What the world makes of a message.
 
         Nothing of one that it cannot solve, which the recording may hold.
@@ -257,8 +257,8 @@ class Player:
             self._unsolved.add((name, kind))
             return ()
 
-    def _write(self, told: Iterable[Told], digest: ToldDigest) -> None:
-        for message in told:
+    def _write(self, results: Iterable[ResultMessage], digest: ResultDigest) -> None:
+        for message in results:
             digest.take(message)
             for sink in self._sinks:
                 sink.write(message)
@@ -270,13 +270,13 @@ class Player:
         elif one.stream in AUXILIARY and one.name not in _OWN:
             self._again(one.stream, one.name, one.message)
 
-    def _tell_events(self, lines: Sequence[str]) -> None:
+    def _print_events(self, lines: Sequence[str]) -> None:
         for line in lines:
             if line not in self._notified:  # not again with every jump
                 self._notified.add(line)
                 self._notify(line)
 
 
-def _plain(solved: Solved) -> Told:
+def _plain(solved: Solved) -> ResultMessage:
     """As it is published; how long it took to be solved here is nobody's latency."""
     return solved if isinstance(solved, Contact | Gesture) else solved.pose

@@ -76,8 +76,8 @@ def run_recorder(
         settings: What.
         connect: Waits for the master's bus; None once stopped.
         stop: Set by a signal handler, or by the command "stop".
-        say: Told a line when something changes.
-        show: Told once a second how it is, and how many messages never came.
+        say: Called with a line when something changes.
+        show: Called once a second how it is, and how many messages never came.
 
     Returns:
         How it was at the end.
@@ -95,7 +95,7 @@ def run_recorder(
         settings.path.stem,
         cameras if settings.raw else (),
         notify,
-        lambda told: recorder.offer("health", told, clock.now_ns()),
+        lambda health: recorder.offer("health", health, clock.now_ns()),
     )
     about = {"rigs": rigs_text(settings.files.rigs)}
     if settings.raw:
@@ -213,30 +213,30 @@ class _Run:
                 continue
             due_ns = max(due_ns + _PERIOD_NS, now_ns())
             try:
-                told = lease.ask()
+                health = lease.ask()
             except BusError as error:
                 if "refused" in str(error):
                     raise
                 missed += 1
                 continue
             missed = 0
-            self._look(told)
+            self._look(health)
             bus.publish("health", NAME, self.health())
             self._show(self._recorder.progress(), self._lost())
         if missed:
             self._notify("the master is gone; waiting for it")
 
-    def _look(self, told: Health) -> None:
+    def _look(self, health: Health) -> None:
         """Say what the player of this file has to know, and keep in the file where a master was started anew."""
-        if told.session != self._master:
-            self._recorder.offer("health", told, self._clock.now_ns())
+        if health.session != self._master:
+            self._recorder.offer("health", health, self._clock.now_ns())
             if self._master is None:
                 self._notify(f"recording into {self._settings.path}")
             else:
                 self._notify("the master was started again; recording goes on")
-            self._master, self._reloads = told.session, told.counts.get("reload.applied", 0)
-        if told.counts.get("reload.applied", 0) != self._reloads:
-            self._reloads = told.counts.get("reload.applied", 0)
+            self._master, self._reloads = health.session, health.counts.get("reload.applied", 0)
+        if health.counts.get("reload.applied", 0) != self._reloads:
+            self._reloads = health.counts.get("reload.applied", 0)
             self._notify("files of the rig were changed: from here on a replay is not what was told live")
 
     def _lost(self) -> int:

@@ -50,7 +50,7 @@ class RawAsker:
         Args:
             stem: Name of the recording of messages.
             cameras: Those of its rigs.
-            say: Told a line when something changes.
+            say: Called with a line when something changes.
             keep: Given what a slave answers at beginning and end.
             period_s: Time between two questions [s].
 
@@ -106,7 +106,7 @@ class RawAsker:
     def _ask(self, camera: _Camera, bus: Bus) -> None:
         wish = RawWish(name=self._folder(camera), lease_s=LEASE_S)
         try:
-            told = bus.ask(Command(camera.name, "raw", wish.body()), _ASK_S)
+            answer = bus.ask(Command(camera.name, "raw", wish.body()), _ASK_S)
         except BusError as error:
             camera.here = "refused" in str(error)  # one that refuses is there
             if camera.here:
@@ -115,11 +115,11 @@ class RawAsker:
                 camera.silent = True
                 self._notify(f"camera {camera.name} does not answer; its raw frames begin when it does")
             return
-        camera.here, camera.silent, camera.ended = True, False, told.counts.get("raw.ended", 0)
+        camera.here, camera.silent, camera.ended = True, False, answer.counts.get("raw.ended", 0)
         if not camera.begun:
             camera.begun = True
             self._notify(f"camera {camera.name}: raw frames into {self._folder(camera)}")
-            self._keep(told)
+            self._keep(answer)
 
     def _refused(self, camera: _Camera, bus: Bus, error: BusError) -> None:
         """Begin anew where the camera was away, and what it had recorded is ended; else that was it."""
@@ -134,22 +134,22 @@ class RawAsker:
     def _was_away(self, camera: _Camera, bus: Bus) -> bool:
         """Whether it ended its recording for want of us, not for a fault of its own."""
         try:
-            told = bus.ask(Command(camera.name, "report"), _ASK_S)
+            answer = bus.ask(Command(camera.name, "report"), _ASK_S)
         except BusError:
             return False
-        return told.counts.get("raw.ended", 0) <= camera.ended
+        return answer.counts.get("raw.ended", 0) <= camera.ended
 
     def _end(self, camera: _Camera, bus: Bus) -> None:
         try:
-            told = bus.ask(Command(camera.name, "raw_stop"), _STOP_S)
+            answer = bus.ask(Command(camera.name, "raw_stop"), _STOP_S)
         except BusError as error:
             self._notify(f"camera {camera.name}: raw frames end within {LEASE_S:g} s by themselves: {error}")
             return
-        self._keep(told)
-        frames, dropped = told.counts.get("raw.frames", 0), told.counts.get("raw.dropped", 0)
+        self._keep(answer)
+        frames, dropped = answer.counts.get("raw.frames", 0), answer.counts.get("raw.dropped", 0)
         self._notify(
             f"camera {camera.name}: {frames} raw frames, {dropped} dropped, in {self._folder(camera)}"
-            f" ({told.metrics.get('raw.megabytes', 0.0):.1f} MB)"
+            f" ({answer.metrics.get('raw.megabytes', 0.0):.1f} MB)"
         )
 
 

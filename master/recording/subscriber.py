@@ -25,11 +25,11 @@ class MasterClock:
         self.ahead_ns = 0
         self._doubt_ns: int | None = None
 
-    def push(self, asked_ns: int, answered_ns: int, told_ns: int) -> None:
+    def push(self, asked_ns: int, answered_ns: int, remote_ns: int) -> None:
         """Take one answer: it was told somewhere between the question and its arrival."""
         doubt = (answered_ns - asked_ns) // 2
         if self._doubt_ns is None or doubt < self._doubt_ns:
-            ahead = told_ns - (asked_ns + answered_ns) // 2
+            ahead = remote_ns - (asked_ns + answered_ns) // 2
             self.ahead_ns = 0 if abs(ahead) <= doubt else ahead  # one clock looks so, and is exact then
             self._doubt_ns = doubt
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from common.clock import Clock, SystemClock
 from common.errors import PhalanxError
-from common.messages import Told
+from common.messages import ResultMessage
 from master.outputs.sink import Sink
 
 DEPTH = 64  # messages; what a receiver was too slow for is old by then
@@ -50,7 +50,7 @@ class OutputLine:
         """Begin at once; `make` opens the sink and is called on the line's own thread, again after each failure."""
         self._name, self._make, self._counters, self._notify = name, make, counters, notify
         self._clock: Clock = SystemClock() if clock is None else clock
-        self._queue: deque[Told] = deque()
+        self._queue: deque[ResultMessage] = deque()
         self._changed = threading.Condition()
         self._closing = False
         self._sink: Sink | None = None
@@ -68,7 +68,7 @@ class OutputLine:
         """Messages in its queue."""
         return len(self._queue)
 
-    def offer(self, message: Told) -> None:
+    def offer(self, message: ResultMessage) -> None:
         """Queue one message; never waits. The oldest makes room, or the message is lost while the output is closed."""
         with self._changed:
             if self._sink is None:

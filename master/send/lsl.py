@@ -14,7 +14,7 @@ from common.arrays import Float
 from common.clock import now_ns
 from common.errors import PhalanxError
 from common.hand_model import FINGERS, JOINTS
-from common.messages import HandPose, Told
+from common.messages import HandPose, ResultMessage
 from common.output_settings import LslOutput
 from master.send.here_only import keep_here, sockets
 from master.send.lsl_library import PORTS, Library, Outlet, load_library
@@ -51,7 +51,7 @@ class LslSink:
     Holds the library, the outlets, and how LSL's clock runs against ours.
     """
 
-    _told: ClassVar[str | None] = None  # the library is one for the process, and listens once
+    _bound_scope: ClassVar[str | None] = None  # the library is one for the process, and listens once
 
     def __init__(self, settings: LslOutput, times: Times) -> None:
         """Load the library.
@@ -59,13 +59,13 @@ class LslSink:
         Raises:
             PhalanxError: It, or liblsl, is missing.
         """
-        self._library: Library = load_library(settings.scope, LslSink._told)
-        LslSink._told = settings.scope
+        self._library: Library = load_library(settings.scope, LslSink._bound_scope)
+        LslSink._bound_scope = settings.scope
         self._name, self._scope, self._times = settings.name, settings.scope, times
         self._outlets: dict[str, Outlet] = {}
         self._clock = self._compared()
 
-    def write(self, message: Told) -> None:
+    def write(self, message: ResultMessage) -> None:
         """Offer one pose.
 
         Raises:

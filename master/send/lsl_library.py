@@ -84,7 +84,7 @@ class Library(Protocol):
         ...
 
 
-def load_library(scope: str, told: str | None) -> Library:
+def load_library(scope: str, bound_scope: str | None) -> Library:
     """Import the module and say who is to find its streams.
 
     Args:
@@ -100,10 +100,10 @@ def load_library(scope: str, told: str | None) -> Library:
         raise PhalanxError(f"pylsl is not installed: {INSTALL}") from error
     except (OSError, RuntimeError) as error:  # liblsl is loaded at once
         raise PhalanxError(f"pylsl finds no liblsl that runs here: {INSTALL}") from error
-    if told is not None:
-        if told != scope:
+    if bound_scope is not None:
+        if bound_scope != scope:
             raise PhalanxError(
-                f"lsl.scope is {scope!r}, but liblsl began with {told!r} in this process: start"
+                f"lsl.scope is {scope!r}, but liblsl began with {bound_scope!r} in this process: start"
                 " `phalanx-master send` anew"
             )
         return library

@@ -9,7 +9,7 @@ from collections.abc import Callable, Hashable, Sequence
 import numpy as np
 
 from common.hand_model import FINGERS, JOINTS
-from common.messages import Contact, Gesture, HandPose, ObjectPose, Told
+from common.messages import Contact, Gesture, HandPose, ObjectPose, ResultMessage
 from common.output_settings import OscOutput
 from master.send.osc_packets import Blank, BlankBundle, Words, floats, ints
 from master.send.sides import Side, side_of
@@ -35,7 +35,7 @@ class OscSink:
         self._count = 0
         self._udp = UdpSender(settings.host, settings.port, "osc")
 
-    def write(self, message: Told) -> None:
+    def write(self, message: ResultMessage) -> None:
         """Send one message.
 
         Raises:

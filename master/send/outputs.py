@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from common.endpoints import loopback
-from common.messages import Contact, Gesture, HandPose, ObjectPose, Told
+from common.messages import Contact, Gesture, HandPose, ObjectPose, ResultMessage
 from common.output_settings import OutputPart, OutputSettings
 from master.listening import is_loopback, is_open
 from master.outputs.sink import Sink
@@ -26,7 +26,7 @@ class Output:
         make: Opens it. Called on a thread of its own; a `PhalanxError` or `OSError` is told, and it is tried again.
     """
 
-    takes: tuple[type[Told], ...]
+    takes: tuple[type[ResultMessage], ...]
     part: Callable[[OutputSettings], OutputPart]
     where: Callable[[OutputSettings], str]
     make: Callable[[OutputSettings, Times], Sink]
@@ -68,7 +68,7 @@ def _where_web(settings: OutputSettings) -> str:
     return address_of(settings.web, os.environ)
 
 
-EVERYTHING: tuple[type[Told], ...] = (HandPose, ObjectPose, Contact, Gesture)
+EVERYTHING: tuple[type[ResultMessage], ...] = (HandPose, ObjectPose, Contact, Gesture)
 OUTPUTS: dict[str, Output] = {
     "osc": Output(EVERYTHING, lambda s: s.osc, lambda s: f"udp {s.osc.host}:{s.osc.port}", _osc),
     "vmc": Output((HandPose,), lambda s: s.vmc, lambda s: f"udp {s.vmc.host}:{s.vmc.port}", _vmc),

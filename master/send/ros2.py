@@ -1,7 +1,7 @@
 """ROS 2 as a live output: hands and objects on standard topics, by rmw_zenoh's own network, without ROS."""
 
 from common.errors import BusError
-from common.messages import HandPose, ObjectPose, Told
+from common.messages import HandPose, ObjectPose, ResultMessage
 from common.output_settings import Ros2Output
 from master.send.ros2_link import RosPublishers
 from master.send.ros2_messages import hand_messages, object_messages
@@ -20,7 +20,7 @@ class Ros2Sink:
         self._times, self._router = times, settings.router
         self._publishers = RosPublishers(settings.router, settings.domain_id, "/", "phalanx")
 
-    def write(self, message: Told) -> None:
+    def write(self, message: ResultMessage) -> None:
         """Publish a hand or an object.
 
         Raises:
@@ -29,12 +29,12 @@ class Ros2Sink:
         if not self._publishers.joined:
             raise BusError(f"ros2: the router at {self._router} is gone")
         if isinstance(message, HandPose):
-            told = hand_messages(message, self._times.wall_ns(message.t_ns))
+            messages = hand_messages(message, self._times.wall_ns(message.t_ns))
         elif isinstance(message, ObjectPose):
-            told = object_messages(message, self._times.wall_ns(message.t_ns))
+            messages = object_messages(message, self._times.wall_ns(message.t_ns))
         else:
             return
-        for topic, payload in told:
+        for topic, payload in messages:
             self._publishers.publish(topic, payload)
 
     def close(self) -> None:

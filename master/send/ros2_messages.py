@@ -91,7 +91,7 @@ def object_messages(pose: ObjectPose, wall_ns: int) -> list[tuple[Topic, memoryv
     covariance: Float = np.ascontiguousarray(pose.cov).ravel()
     if not np.isfinite(covariance).all():
         covariance = np.zeros(36)  # ROS: all zero is "not known"
-    told = _TYPES[POSE](
+    encoded = _TYPES[POSE](
         header=header,
         pose=_TYPES["geometry_msgs/msg/PoseWithCovariance"](
             pose=_pose(place, quaternion), covariance=covariance
@@ -106,7 +106,7 @@ def object_messages(pose: ObjectPose, wall_ns: int) -> list[tuple[Topic, memoryv
         ),
     )
     return [
-        _cdr(f"/phalanx/object/{name}/pose", POSE, told),
+        _cdr(f"/phalanx/object/{name}/pose", POSE, encoded),
         _cdr("/tf", TRANSFORMS, _TYPES[TRANSFORMS](transforms=[frame])),
     ]
 

@@ -18,7 +18,7 @@ from common.clock import Clock, SystemClock
 from common.errors import BusError, PhalanxError
 from common.file_monitor import MonitoredFiles
 from common.machine import program
-from common.messages import Command, Health, Message, Told
+from common.messages import Command, Health, Message, ResultMessage
 from common.output_settings import OutputSettings, default_outputs
 from common.streams import MASTER
 from master.send.line import Counters, OutputLine
@@ -129,7 +129,7 @@ class Sender:
             self.switch(name, on=on)
             self._notify(f"{name}: {self.where(name)}" if on else f"{name}: off")
 
-    def push(self, message: Told) -> None:
+    def push(self, message: ResultMessage) -> None:
         """Give a message to every output that is on and takes it; never waits."""
         self._received += 1
         with self._lock:
@@ -282,7 +282,7 @@ def _drain(subscribers: list[Subscription], sender: Sender) -> None:
 
 
 def _push(sender: Sender, message: Message) -> None:
-    if isinstance(message, Told):
+    if isinstance(message, ResultMessage):
         sender.push(message)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.geometry import quaternion_to_matrix
-from common.messages import HandPose, Told
+from common.messages import HandPose, ResultMessage
 from common.output_settings import VmcOutput
 from common.wrist_joint import forearm_palm
 from master.send.osc_packets import Blank, BlankBundle, floats, ints
@@ -45,7 +45,7 @@ class VmcSink:
         self._began_ns: int | None = None
         self._udp = UdpSender(settings.host, settings.port, "vmc")
 
-    def write(self, message: Told) -> None:
+    def write(self, message: ResultMessage) -> None:
         """Send one pose.
 
         Raises:

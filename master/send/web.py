@@ -9,7 +9,7 @@ import secrets
 from collections.abc import Mapping
 
 from common.errors import PhalanxError
-from common.messages import HandPose, ObjectPose, Told
+from common.messages import HandPose, ObjectPose, ResultMessage
 from common.output_settings import WebOutput
 from master.listening import (
     is_loopback,
@@ -69,7 +69,7 @@ class WebSink:
         request_filter = request_filter_of(settings, os.environ if environment is None else environment)
         self.server = WebServer(settings.host, settings.port, request_filter=request_filter)
 
-    def write(self, message: Told) -> None:
+    def write(self, message: ResultMessage) -> None:
         """Offer a hand or an object to every client; costs nothing while there is none. Others are left alone.
 
         Raises:

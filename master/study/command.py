@@ -161,12 +161,12 @@ def _progress() -> Callable[[int, int, str], None]:
     """Says who is done and about how long the rest takes, from now on."""
     begun = time.monotonic()
 
-    def tell(done: int, total: int, what: str) -> None:
+    def show(done: int, total: int, what: str) -> None:
         spent = time.monotonic() - begun
         left = f", about {_spell(spent * (total - done) / done)} left" if done < total else ""
         typer.echo(f"study: {what} done, {done} of {total} after {_spell(spent)}{left}", err=True)
 
-    return tell
+    return show
 
 
 def _spell(seconds: float) -> str:

@@ -198,8 +198,8 @@ def _knowledge(
         if known == "all":
             rig, hand = who.rig, who.hand
         elif known == "calibrated":
-            rig, hand, told = _calibrated(task, who, folder / GUIDED, there)
-            save(there / CALIBRATED, told)
+            rig, hand, calibrated = _calibrated(task, who, folder / GUIDED, there)
+            save(there / CALIBRATED, calibrated)
         save(there / RIG, rig)
         save(there / HAND, hand)
     return load(there / RIG, RigCalibration), load(there / HAND, HandProfile)
@@ -220,7 +220,7 @@ def _calibrated(
         report, refused = (str(error),), True
     rotation, shift = _off(rig, who.rig)
     nominal_rotation, nominal_shift = _off(task.rig, who.rig)
-    told = Calibrated(
+    calibrated = Calibrated(
         report=report,
         refused=refused,
         rotation_deg=round(rotation, 3),
@@ -228,7 +228,7 @@ def _calibrated(
         nominal_rotation_deg=round(nominal_rotation, 3),
         nominal_shift_mm=round(nominal_shift, 3),
     )
-    return rig, hand, told
+    return rig, hand, calibrated
 
 
 def _off(rig: RigCalibration, true: RigCalibration) -> tuple[float, float]:

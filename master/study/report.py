@@ -158,11 +158,11 @@ def _reach_lines(cells: list[Cell], poses: list[str]) -> list[str]:
     for finger in FINGERS:
         own = [cell for cell in cells if cell.finger == finger]
         lines.append(
-            f"| {finger} | " + " | ".join(f"{cell.told} / {cell.tip} of {cell.trials}" for cell in own) + " |"
+            f"| {finger} | " + " | ".join(f"{cell.laser_seen} / {cell.tip} of {cell.trials}" for cell in own) + " |"
         )
     unseen = [cell for cell in cells if cell.unseen]
-    told = ", ".join(f"{cell.finger} {_LETTER[cell.pose]} {cell.unseen}" for cell in unseen) or "none"
-    return [*lines, "", f"Trials in which a finger was tracked and neither was in sight: {told}."]
+    listed = ", ".join(f"{cell.finger} {_LETTER[cell.pose]} {cell.unseen}" for cell in unseen) or "none"
+    return [*lines, "", f"Trials in which a finger was tracked and neither was in sight: {listed}."]
 
 
 def _icc_lines(again: list[Repeated]) -> list[str]:

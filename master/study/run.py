@@ -33,7 +33,7 @@ def simulate(study: Study, progress: Callable[[int, int, str], None]) -> Result:
 
     Args:
         study: What to do.
-        progress: Told how many of how many participants are done, and which was last.
+        progress: Called with how many of how many participants are done, and which was last.
 
     Raises:
         PhalanxError: Files cannot be written, or a process ended with an error.

@@ -20,7 +20,7 @@ class Cell:
     Attributes:
         trials: How many there were.
         reached: In how many of them the finger was tracked: a laser point or fingertip told it.
-        told: In how many the truth says that enough of the laser line was seen on it; tip: that its tip was.
+        laser_seen: In how many the truth says that enough of the laser line was seen on it; tip: that its tip was.
         blind: In how many it was tracked although neither was: whatever told it was of something else. They count in
             the error like all others.
         mean_deg, sd_deg: Of the absolute error of the PIP over the trials that were reached; NaN: not reached, fewer
@@ -31,7 +31,7 @@ class Cell:
     pose: str
     trials: int
     reached: int
-    told: int
+    laser_seen: int
     tip: int
     unseen: int
     mean_deg: float
@@ -124,7 +124,7 @@ def _cell(trials: list[Trial], finger: int, pose: str) -> Cell:
         pose=pose,
         trials=len(own),
         reached=count,
-        told=sum(one.laser_seen[finger] for one in own),
+        laser_seen=sum(one.laser_seen[finger] for one in own),
         tip=sum(one.tip_seen[finger] for one in own),
         unseen=sum(
             one.tracked[finger] and not (one.laser_seen[finger] or one.tip_seen[finger]) for one in own

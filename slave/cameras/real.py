@@ -86,7 +86,7 @@ def open_real(
         clock: The slave's clock.
         stop: Set when the slave is to end; until then a lost camera is opened again. None: losing it is an error.
         wrist: Whether it is the camera of a wrist device, whose frames are grey.
-        away: Told when it takes time to open it, now or again.
+        away: Called when it takes time to open it, now or again.
 
     Returns:
         The camera, or None if the driver is none of a real camera.

@@ -50,7 +50,7 @@ class ReconnectingCamera:
             camera: Its settings at first. Its rate counts the frames of an absence.
             clock: The clock of the frames' times.
             stop: Set when the slave is to end; `read` then gives up waiting for a camera.
-            away: Told that it is lost, and of each try to open it again.
+            away: Notified that it is lost, and of each try to open it again.
 
         Raises:
             CameraError: The camera is not there or refused a setting.

@@ -56,7 +56,7 @@ def open_lit(
         true_clock: What the simulated world goes by.
         stop: Set when the slave is to end; until then a camera that is lost is opened again. None: losing it is an
             error.
-        away: Told when it takes time to open it, now or again.
+        away: Called when it takes time to open it, now or again.
 
     Raises:
         CameraError: There is no such driver, or the camera cannot be opened.

@@ -94,7 +94,7 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     clock = clock_of(options, true_clock)
     key, access = secrets_of(options)
 
-    def tell(line: str) -> None:
+    def print_line(line: str) -> None:
         notify(f"{options.name}: {line}")
 
     service = Service(os.environ, noun="samples")
@@ -108,7 +108,7 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
                 options.name, options.imu, rig.imu.rate_hz, clock, stop, service.connection_lost
             )
         uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
-        run_live(options.name, source, orientation, uplink, clock, stop, tell, service, access)
+        run_live(options.name, source, orientation, uplink, clock, stop, print_line, service, access)
     return 0
 
 

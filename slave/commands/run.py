@@ -125,7 +125,7 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     source = open_lit(options, files.rig, files.camera, clock, true_clock, stop, service.connection_lost)
     uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
 
-    def tell(line: str) -> None:
+    def print_line(line: str) -> None:
         notify(f"{options.name}: {line}")
 
     run_live(
@@ -138,7 +138,7 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
         options.scan,
         engine,
         stop,
-        tell,
+        print_line,
         service,
         access,
         raw,

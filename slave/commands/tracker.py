@@ -61,7 +61,7 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     clock = clock_of(options, true_clock)
     key, access = secrets_of(options)
 
-    def tell(line: str) -> None:
+    def print_line(line: str) -> None:
         notify(f"{options.name}: {line}")
 
     service = Service(os.environ, noun="poses")
@@ -73,7 +73,7 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
             source.close()
             raise
         recorded = options.device.startswith("survive:")
-        run_live(options.name, source, uplink, clock, stop, tell, service, access, recorded)
+        run_live(options.name, source, uplink, clock, stop, print_line, service, access, recorded)
     return 0
 
 

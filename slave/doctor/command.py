@@ -32,8 +32,8 @@ def examine(options: argparse.Namespace, system: System) -> Iterator[Finding]:
     yield check_groups(system)
     names = [options.name] if options.name else sorted(path.stem for path in system.path(ETC).glob("*.env"))
     slaves = [_slave(options, system, name) for name in names]
-    told = [one for one in slaves if isinstance(one, argparse.Namespace)]
-    yield from check_programs(system, sorted({extra for one in told for extra in _extras(one)}))
+    given = [one for one in slaves if isinstance(one, argparse.Namespace)]
+    yield from check_programs(system, sorted({extra for one in given for extra in _extras(one)}))
     yield cameras_of(system)
     folder = folder_of(system, options.keys)
     if not names:
@@ -41,7 +41,7 @@ def examine(options: argparse.Namespace, system: System) -> Iterator[Finding]:
         yield from check_keys(system, folder, None)
     for name, slave in zip(names, slaves, strict=True):
         yield from _of(f"{name}: " if len(names) > 1 else "", _look(system, folder, name, slave))
-    port = next((one.beacon_port for one in told), options.beacon_port)
+    port = next((one.beacon_port for one in given), options.beacon_port)
     yield from check_master(system, folder, options.master, port)
 
 
@@ -64,7 +64,7 @@ def _look(
 
 def _slave(options: argparse.Namespace, system: System, name: str) -> "argparse.Namespace | Finding":
     """Options of a slave: those of its service, each replaced by what the doctor was told."""
-    told = [
+    given = [
         word
         for option in ("rig", "camera", "calibration")
         if (value := getattr(options, option)) is not None
@@ -74,7 +74,7 @@ def _slave(options: argparse.Namespace, system: System, name: str) -> "argparse.
     if text is None:
         if options.camera is None:
             return unseen("camera", f"no {ETC}/{name}.env: give --camera, and --rig, --calibration")
-        return _parsed(["run", "--name", name, *told], name)
+        return _parsed(["run", "--name", name, *given], name)
     stated = pairs(text)
     try:
         words = shlex.split(stated.get("PHALANX_OPTIONS", ""))
@@ -83,8 +83,8 @@ def _slave(options: argparse.Namespace, system: System, name: str) -> "argparse.
             "options", f"{ETC}/{name}.env: PHALANX_OPTIONS: {error}", "phalanx deploy writes it again"
         )
     if stated.get("PHALANX_COMMAND") != "run":
-        told = []
-    return _parsed([stated.get("PHALANX_COMMAND", ""), *words, *told], name)
+        given = []
+    return _parsed([stated.get("PHALANX_COMMAND", ""), *words, *given], name)
 
 
 def _parsed(words: Sequence[str], name: str) -> "argparse.Namespace | Finding":

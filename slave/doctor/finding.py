@@ -79,10 +79,10 @@ def as_text(findings: Sequence[Finding]) -> str:
 
 def as_json(findings: Sequence[Finding], program: Program) -> str:
     """The same for programs: {"host", "version", "ok", "findings": [{"check", "verdict", "text", "fix"}]}."""
-    told = {
+    report = {
         "host": program.host,
         "version": program.version,
         "ok": exit_code(findings) == 0,
         "findings": [asdict(one) for one in findings],
     }
-    return msgspec.json.format(msgspec.json.encode(told)).decode()
+    return msgspec.json.format(msgspec.json.encode(report)).decode()

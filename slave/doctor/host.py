@@ -126,5 +126,5 @@ def _flags(system: System) -> int | None:
     asked = system.run(("vcgencmd", "get_throttled"), 5.0)
     if asked.code == 0 and (found := re.search(r"throttled=(0x[0-9a-fA-F]+)", asked.out)):
         return int(found[1], 16)
-    told = Machine(system.root, system.environment).metrics().get("throttled")
-    return None if told is None else int(told)
+    flags = Machine(system.root, system.environment).metrics().get("throttled")
+    return None if flags is None else int(flags)

@@ -20,10 +20,10 @@ MAKE = "on the PC: phalanx-master keys make DIR --device {}, then phalanx deploy
 _PUBLIC = (serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo)
 
 
-def folder_of(system: System, told: Path | None) -> Path:
+def folder_of(system: System, given: Path | None) -> Path:
     """Where the keys are: as told, as the environment says, or where an installer puts them."""
-    if told is not None:
-        return told
+    if given is not None:
+        return given
     named = system.environment.get("PHALANX_KEYS")
     return Path(named) if named else system.path(FOLDER)
 

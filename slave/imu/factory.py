@@ -76,7 +76,7 @@ def open_real(
         rate_hz: Samples per second that the rig needs.
         clock: The slave's clock.
         stop: Set when the slave is to end.
-        away: Told when it is lost.
+        away: Called when it is lost.
 
     Raises:
         ImuError: There is no such driver, or the IMU cannot be opened.

@@ -97,8 +97,8 @@ def run_live(
         uplink: Where samples go.
         clock: The slave's clock.
         stop: Set by a signal handler, or by the command "stop" on the bus.
-        say: Told one line when it is ready, and one at the end.
-        service: Told what it does, for the system's service manager.
+        say: Called with one line when it is ready, and one at the end.
+        service: Called with what it does, for the system's service manager.
         access: How it comes to the master's bus.
 
     Raises:

@@ -43,7 +43,7 @@ class ReconnectingImu:
             rate_hz: Counts the samples of an absence.
             clock: The clock of the samples' times.
             stop: Set when the slave is to end; `read` then gives up waiting for the IMU.
-            away: Told that it is lost, and of each try to open it again.
+            away: Notified that it is lost, and of each try to open it again.
 
         Raises:
             ImuError: It is not there, or refused a setting.

@@ -183,9 +183,9 @@ class Ximu3Imu:
                 f"{self._place.path}: no x-IMU3 answers{received}: is it switched on, is it another device, or has it "
                 "another baud rate (behind @)? `phalanx-slave imu --list` says what is there"
             )
-        told = [str(pong.fields.get(part, "?")) for part in ("name", "sn", "interface")]
-        _LOG.info("%s: x-IMU3 %r, serial number %s, over %s", self._place.path, *told)
-        over = "serial" if told[2].lower() == "serial" else "usb"
+        answer = [str(pong.fields.get(part, "?")) for part in ("name", "sn", "interface")]
+        _LOG.info("%s: x-IMU3 %r, serial number %s, over %s", self._place.path, *answer)
+        over = "serial" if answer[2].lower() == "serial" else "usb"
         for key, value in settings(over, self._divisor):
             self._write(key, value)
         if self._ask("apply", None) is None:

@@ -32,7 +32,7 @@ def run(options: argparse.Namespace, notify: Notify, systemd: Systemd | None = N
 
     Args:
         options: Of `add_install`.
-        say: Told one line a step.
+        say: Called with one line a step.
         systemd: The machine's services; None: those of this machine.
     """
     machine = steps.Machine(options.root, systemd or Systemd(), notify, options.ready_s, options.settle_s)
@@ -75,7 +75,7 @@ def _act(options: argparse.Namespace, machine: steps.Machine) -> dict[str, objec
     finally:
         if options.bundle is not None and options.wheelhouse is not None and not options.dry_run:
             _clear(options.wheelhouse)
-    return {**asdict(outcome), "text": told(outcome, options.dry_run)}
+    return {**asdict(outcome), "text": report_line(outcome, options.dry_run)}
 
 
 def _clear(stage: Path) -> None:
@@ -87,7 +87,7 @@ def _clear(stage: Path) -> None:
         stage.parent.rmdir()
 
 
-def told(outcome: steps.Outcome, dry_run: bool) -> str:
+def report_line(outcome: steps.Outcome, dry_run: bool) -> str:
     """What was done, or would be, in one line."""
     if not outcome.changed and not outcome.restarted:
         return f"unchanged: release {outcome.release}"

@@ -43,7 +43,7 @@ class Machine:
     Attributes:
         root: Where its files are.
         systemd: Its services.
-        say: Told one line a step.
+        say: Called with one line a step.
         ready_s: How long its slaves may take until they are ready, at most.
         settle_s: How long they then have to stay so.
     """

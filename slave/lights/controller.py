@@ -102,7 +102,7 @@ class Strober:
             _LOG.warning("lights: %s", error)
 
 
-def told(interlock: Interlock, strober: Strober, schedule: StrobeSchedule) -> dict[str, int]:
+def light_counts(interlock: Interlock, strober: Strober, schedule: StrobeSchedule) -> dict[str, int]:
     """`lights.<event>` -> how often, of all three."""
     own = {**interlock.events(), **strober.counts, "restarts": schedule.restarts}
     return {f"lights.{event}": count for event, count in own.items()}
@@ -148,7 +148,7 @@ class StrobeController:
 
     def counts(self) -> dict[str, int]:
         """`lights.<event>` -> how often."""
-        return told(self._interlock, self._strober, self._schedule)
+        return light_counts(self._interlock, self._strober, self._schedule)
 
     def close(self) -> None:
         """Go dark, end the thread, give the lights back. Safe to call twice.

@@ -8,7 +8,7 @@ would be as late as the drawing of pictures in the same process makes it, which 
 from collections.abc import Callable
 
 from common.strobe_calibration import StrobeCalibration
-from slave.lights.controller import Strober, told
+from slave.lights.controller import Strober, light_counts
 from slave.lights.interlock import Interlock
 from slave.lights.schedule import StrobeSchedule
 from slave.lights.synthetic import Lit, SyntheticLights, Timeline
@@ -76,7 +76,7 @@ class SimulatedStrobe:
 
     def counts(self) -> dict[str, int]:
         """`lights.<event>` -> how often."""
-        return told(self._interlock, self._strober, self._schedule)
+        return light_counts(self._interlock, self._strober, self._schedule)
 
     def close(self) -> None:
         """Go dark. Safe to call twice."""

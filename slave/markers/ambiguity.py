@@ -81,14 +81,14 @@ class MarkerSource(Protocol):
     ambiguity: ColourAmbiguityMonitor
 
 
-def told_frames(detector: MarkerSource | None) -> dict[str, int]:
+def ambiguity_counts(detector: MarkerSource | None) -> dict[str, int]:
     """What `Health` counts: beside.<marker>, frames with something else in its colour."""
     return (
         {} if detector is None else {f"ambiguous.{name}": n for name, n in detector.ambiguity.frames.items()}
     )
 
 
-def told_places(detector: MarkerSource | None) -> dict[str, float]:
+def ambiguity_gauges(detector: MarkerSource | None) -> dict[str, float]:
     """Gauges of `Health`: beside.<marker>.u and .v, where that was last [px]."""
     if detector is None:
         return {}

@@ -85,8 +85,8 @@ def fit_gains(colour: Float, reference: Float, weight: Float, known: Float) -> G
         distance = _distance(away, information)
         heavy = (trust * (1.0 / (1.0 + (distance / CAUCHY) ** 2)))[:, None, None] * information
         total = heavy.sum(axis=0) + KNOWN
-        told = (heavy @ shift[:, :, None]).sum(axis=0)[:, 0] + KNOWN @ known
-        x = np.asarray(np.linalg.solve(total, told), np.float64)
+        right_side = (heavy @ shift[:, :, None]).sum(axis=0)[:, 0] + KNOWN @ known
+        x = np.asarray(np.linalg.solve(total, right_side), np.float64)
     misfit[seen] = _distance(shift - x, information)
     return GainFit(x, misfit)
 

@@ -66,7 +66,7 @@ def open_real(
         program: survive-cli.
         clock: The slave's clock.
         stop: Set when the slave is to end.
-        away: Told when it is lost.
+        away: Called when it is lost.
 
     Raises:
         TrackerError: There is no such system, or it cannot be opened.

@@ -48,7 +48,7 @@ class ReconnectingTracker:
             opener: Opens it; called again after each loss.
             clock: The clock of the poses' times.
             stop: Set when the slave is to end.
-            away: Told before it is given back, and of each try to open it again.
+            away: Called before it is given back, and of each try to open it again.
 
         Raises:
             TrackerError: It is not there.

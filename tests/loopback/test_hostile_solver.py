@@ -20,7 +20,7 @@ from common.datagram import MAX_DATAGRAM, OVERHEAD, Kind
 from common.messages import HandPose, decode, encode
 from common.session import EchoAnswer, Started
 from master.admission import limits_of
-from master.app import told_at
+from master.app import result_at
 from master.dispatcher import new_dispatcher
 from master.link import MasterLink
 from master.link_senders import SensorMessage
@@ -91,7 +91,7 @@ class Room:
         """Publish what comes of all that was taken, as a reader decodes it."""
         for message in self.taken():
             for solved in self.dispatcher.push(message):
-                out = decode(encode(told_at(solved, self.wires.clock.t_ns)))
+                out = decode(encode(result_at(solved, self.wires.clock.t_ns)))
                 self.poses += isinstance(out, HandPose) and out.hand == HAND
 
     def taken(self) -> Iterator[SensorMessage]:

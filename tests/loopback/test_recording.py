@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import cast
 
 from common.keys import new_key
-from common.messages import Told
+from common.messages import ResultMessage
 from common.recording import open_messages
-from master.recording.digest import ToldDigest
+from master.recording.digest import ResultDigest
 from master.recording.files import recorded_setups
 from master.recording.player import Player
 from tests.network_helpers import PATIENCE_S, free_endpoint, free_udp_port, until
@@ -74,7 +74,7 @@ def test_a_replay_is_what_was_told_live(tmp_path: Path) -> None:
     assert not recording.cut
     poses = json.loads((tmp_path / "live.json").read_text())["poses"]
     assert recording.counts["hand"] == poses >= POSES, "nothing that was told is missing"
-    live = ToldDigest(cast(Told, one.message) for one in recording.read(["hand", "gesture"]))
+    live = ResultDigest(cast(ResultMessage, one.message) for one in recording.read(["hand", "gesture"]))
     played = Player(recording, recorded_setups(recording), []).run()
     assert played.whole
     assert played.digest.counts == live.counts

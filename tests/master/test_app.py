@@ -11,7 +11,7 @@ from common.arrays import Float
 from common.calibration import ImuCalibration
 from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
 from common.hand_model import WRIST
-from common.messages import HandPose, ImuSample, MarkerDetections, Told
+from common.messages import HandPose, ImuSample, MarkerDetections, ResultMessage
 from master.app import AuxiliaryMessage, Observed, RunFigures, health, run
 from master.dispatcher import Dispatcher
 from master.live import cameras_line
@@ -51,9 +51,9 @@ class ScriptedClock:
 class Collector:
     def __init__(self) -> None:
         self.poses: list[HandPose] = []
-        self.others: list[Told] = []
+        self.others: list[ResultMessage] = []
 
-    def write(self, message: Told) -> None:
+    def write(self, message: ResultMessage) -> None:
         if isinstance(message, HandPose):
             self.poses.append(message)
         else:

@@ -13,7 +13,7 @@ from common.camera_settings import CameraSettings, ColourPick
 from common.errors import BusError, CalibrationError, CameraError, PhalanxError
 from common.messages import Command, Health
 from master import camera_command
-from master.camera_command import commands, settings, table, tell
+from master.camera_command import commands, settings, table, send_all
 
 ROOT = Path(__file__).resolve().parents[2]
 LEFT = ROOT / "calib_json/cameras/left.json"
@@ -96,7 +96,7 @@ def test_wanted_and_read_back_stand_side_by_side() -> None:
         "sync_locked": 1.0,
         "rate_hz": 60.0,
     }
-    health = tell(served("left", {"settings": lambda _body: metrics}), asked())
+    health = send_all(served("left", {"settings": lambda _body: metrics}), asked())
     assert [line.split() for line in table(health)] == [
         ["setting", "wanted", "read", "back"],
         ["exposure_us", "5000", "4989"],
@@ -114,14 +114,14 @@ def test_a_refusal_ends_the_steps() -> None:
 
     bus = served("left", {"set": refuse, "save": lambda body: output.append(body) or {}})
     with pytest.raises(BusError, match="'left' refused 'set': exposure_us: wanted 9000 us, got 8000 us"):
-        tell(bus, asked(exposure_us=9000.0, save=True))
+        send_all(bus, asked(exposure_us=9000.0, save=True))
     assert output == []
 
 
 def test_a_camera_that_is_not_there_is_named_with_those_that_are(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(camera_command, "APPEAR_S", 0.1)
     with pytest.raises(BusError, match="no camera 'left' is on the bus; there are: right"):
-        tell(served("right", {}), asked())
+        send_all(served("right", {}), asked())
 
 
 def test_a_broken_file_is_named(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from common.errors import RecordingError
-from common.messages import Contact, Gesture, ObjectPose, ObjectSource, Told
+from common.messages import Contact, Gesture, ObjectPose, ObjectSource, ResultMessage
 from master.outputs.files import RunFiles
 from master.outputs.told_files import (
     GESTURES,
@@ -16,7 +16,7 @@ from master.outputs.told_files import (
     contact_path,
     gesture_line,
     load_contact,
-    load_gestures_told,
+    load_gesture_messages,
     load_object,
     object_path,
 )
@@ -58,9 +58,9 @@ def gesture(k: int) -> Gesture:
     return Gesture(HAND, 2**60 + k, "pinch", "index", "update", 2**60, 0.25 * (k % 4), **known)  # pyright: ignore[reportArgumentType]
 
 
-def written(folder: Path) -> list[Told]:
+def written(folder: Path) -> list[ResultMessage]:
     sink = RunFiles(folder / "poses.npz", {HAND: 6, "device": 0}, ["cube"])
-    told: list[Told] = []
+    told: list[ResultMessage] = []
     for k in range(9):
         told += [random_pose(k), object_pose(k), contact(k), gesture(k)]
     for one in told:
@@ -83,7 +83,7 @@ def test_what_is_told_is_read_back_exactly(tmp_path: Path) -> None:
                 np.testing.assert_array_equal(
                     getattr(table, field)[k], getattr(message, field), err_msg=field
                 )
-    output = load_gestures_told(tmp_path / GESTURES)
+    output = load_gesture_messages(tmp_path / GESTURES)
     gestures = [one for one in told if isinstance(one, Gesture)]
     assert len(output) == len(gestures)
     for one, other in zip(output, gestures, strict=True):
@@ -117,7 +117,7 @@ def test_a_gesture_is_a_line_that_any_program_reads() -> None:
 def test_a_run_without_objects_or_gestures_has_an_empty_file_of_them(tmp_path: Path) -> None:
     RunFiles(tmp_path / "poses.npz", {HAND: 6}).close()
     assert {path.name for path in tmp_path.iterdir()} == {"poses.npz", "gestures.jsonl"}
-    assert load_gestures_told(tmp_path / GESTURES) == []
+    assert load_gesture_messages(tmp_path / GESTURES) == []
     RunFiles(tmp_path / "poses.npz", {HAND: 6}, ["cube"]).close()
     assert len(load_object(object_path(tmp_path, "cube"))) == 0
 
@@ -152,7 +152,7 @@ def test_a_broken_line_of_gestures_is_named(tmp_path: Path, line: bytes, expecte
     path = tmp_path / GESTURES
     path.write_bytes(gesture_line(gesture(1)) + line + b"\n")
     with pytest.raises(RecordingError, match=expected):
-        load_gestures_told(path)
+        load_gesture_messages(path)
 
 
 def test_a_table_of_another_kind_is_named(tmp_path: Path) -> None:

@@ -7,24 +7,24 @@ import numpy as np
 
 from master.outputs.files import RunFiles
 from master.outputs.picture import best_row, draw_summary
-from master.outputs.picture_told import STRIP_BOX, ToldPicture, spans
+from master.outputs.picture_told import STRIP_BOX, ResultPicture, spans
 from master.outputs.poses import Poses
-from master.told_report import ToldRun
+from master.told_report import RunResults
 from tests.master.test_outputs_rerun import MODEL, RIG, moving_hand
 from tests.master.test_outputs_told import START_NS, STEP_NS, WATCHED, bar, contact, gesture
 
 GREEN = np.array([115, 158, 0])  # BGR of a tracked object
 
 
-def shown(tmp_path: Path, *, held_row: int, known: bool = True) -> ToldPicture:
+def shown(tmp_path: Path, *, held_row: int, known: bool = True) -> ResultPicture:
     files = RunFiles(tmp_path / "poses.npz", {"test-hand": 6}, ("bar",))
     for row in range(6):
         files.write(bar(row, known=known, tracked=known))
         files.write(contact(row, [0.0, 0.1, 0.1, 0.1, 0.1], held=row == held_row))
     files.close()
-    run = ToldRun.load(tmp_path, WATCHED, 0)
+    run = RunResults.load(tmp_path, WATCHED, 0)
     output = [gesture(0, "pinch", "begin"), gesture(3, "pinch", "end"), gesture(4, "tap", "end")]
-    return ToldPicture(WATCHED.objects, run.objects, run.contacts, output)
+    return ResultPicture(WATCHED.objects, run.objects, run.contacts, output)
 
 
 def test_a_span_ends_with_its_message_or_with_the_run() -> None:
@@ -41,7 +41,7 @@ def test_the_moment_that_is_shown_is_one_that_holds_the_object(tmp_path: Path) -
     poses = Poses.of(moving_hand(6))
     assert best_row(poses, shown(tmp_path, held_row=2)) == 2
     assert best_row(poses, shown(tmp_path, held_row=5)) == 5
-    assert best_row(poses) == best_row(poses, ToldPicture())
+    assert best_row(poses) == best_row(poses, ResultPicture())
 
 
 def test_the_picture_has_the_object_and_the_strip(tmp_path: Path) -> None:

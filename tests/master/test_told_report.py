@@ -8,7 +8,7 @@ import pytest
 
 from common.messages import Contact, Gesture, ObjectPose
 from master.outputs.files import RunFiles
-from master.told_report import Annotated, ToldRun, judge_gestures
+from master.told_report import Annotated, RunResults, judge_gestures
 from tests.master.test_outputs_rerun import STEP_NS
 from tests.master.test_outputs_told import START_NS, WATCHED, bar, contact, gesture
 
@@ -101,7 +101,7 @@ def test_the_files_of_a_run_are_its_messages_again(tmp_path: Path) -> None:
         files.write(rows[row])
         files.write(gesture(row, "pinch", "begin" if row == 0 else "update", distance_m=0.001 * row))
     files.close()
-    run = ToldRun.load(tmp_path, WATCHED, START_NS + 1)
+    run = RunResults.load(tmp_path, WATCHED, START_NS + 1)
     kinds = [type(one) for one in run.messages()]
     assert (kinds.count(ObjectPose), kinds.count(Contact), kinds.count(Gesture)) == (8, 8, 7)
     poses = [one for one in run.messages() if isinstance(one, ObjectPose)]
@@ -116,4 +116,4 @@ def test_the_files_of_a_run_are_its_messages_again(tmp_path: Path) -> None:
 
 
 def test_a_run_that_told_nothing_has_no_figures(tmp_path: Path) -> None:
-    assert ToldRun.load(tmp_path, WATCHED, 0).figures(None, 0, 0, 10**9) == {}
+    assert RunResults.load(tmp_path, WATCHED, 0).figures(None, 0, 0, 10**9) == {}

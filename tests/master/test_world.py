@@ -22,7 +22,7 @@ from common.messages import (
     ObjectPose,
     ObjectSource,
     TagDetections,
-    Told,
+    ResultMessage,
     TrackerPose,
 )
 from master.app import Observed, RunFigures, health, run
@@ -78,7 +78,7 @@ def world_of(*setups: RigSetup) -> Dispatcher:
     return Dispatcher(setups, lines, StageTimes())
 
 
-def told(dispatcher: Dispatcher, messages: list[Sent]) -> list[Told]:
+def told(dispatcher: Dispatcher, messages: list[Sent]) -> list[ResultMessage]:
     out = [one for message in messages for one in dispatcher.push(message)]
     return [one if isinstance(one, Contact | Gesture) else one.pose for one in (*out, *dispatcher.flush())]
 
@@ -306,7 +306,7 @@ def test_other_files_take_over_between_two_messages_and_what_had_begun_ends(wand
     assert dispatcher._begun == {} or all(one.t_ns > 7 for one in dispatcher._begun.values())
 
 
-def told_only(dispatcher: Dispatcher, messages: list[Sent]) -> list[Told]:
+def told_only(dispatcher: Dispatcher, messages: list[Sent]) -> list[ResultMessage]:
     """As `told`, and more messages come."""
     out = [one for message in messages for one in dispatcher.push(message)]
     return [one if isinstance(one, Contact | Gesture) else one.pose for one in out]

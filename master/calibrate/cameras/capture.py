@@ -64,7 +64,7 @@ def capture(
         folder: Where CAMERA/NUMBER.jpg go, as they came; made by `new_folder`.
         wanted: Views to keep.
         stop: Ends it early.
-        say: Told what the person should read.
+        say: Called with what the person should read.
         advise: Called after each view that was kept: what is still missing.
 
     Raises:

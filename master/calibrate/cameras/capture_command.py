@@ -107,7 +107,7 @@ def _wait(ingest: Ingest, cameras: tuple[str, ...], stop: threading.Event) -> No
     """Until the start was given; says whom it waits for.
 
     Raises:
-        CalibrationError: Told to stop before.
+        CalibrationError: Called with to stop before.
     """
     previous: frozenset[str] | None = None
     rounds = 0

@@ -182,5 +182,5 @@ def _refuse_idle(where: str, **options: object) -> None:
     """Refuse options that `where` does not use, rather than to leave them out silently."""
     for name, value in options.items():
         if value:
-            told = "a recording or a table" if name == "source" else f"--{name}"
-            raise CalibrationError(f"{told} has no meaning with {where}: leave it out")
+            option = "a recording or a table" if name == "source" else f"--{name}"
+            raise CalibrationError(f"{option} has no meaning with {where}: leave it out")

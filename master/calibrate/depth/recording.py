@@ -226,8 +226,8 @@ def _target(messages: Sequence[MarkerDetections], names: tuple[str, ...]) -> int
     share = np.isfinite([message.uv[:, 0] for message in messages]).mean(axis=0)
     seen = np.flatnonzero(share >= 0.5).tolist()
     if len(seen) != 1:
-        told = ", ".join(names[i] for i in seen) or "none"
-        raise CalibrationError(f"--marker is missing: markers seen in half of the frames: {told}")
+        visible = ", ".join(names[i] for i in seen) or "none"
+        raise CalibrationError(f"--marker is missing: markers seen in half of the frames: {visible}")
     return seen[0]
 
 

@@ -153,8 +153,8 @@ def run_session(
         seconds: Time over which, at least.
         clock: The master's.
         ask: Shows a prompt and returns the answer; None: nobody answers any more.
-        say: Told one line for each result.
-        progress: Told the share of a reading that is done.
+        say: Called with one line for each result.
+        progress: Called with the share of a reading that is done.
         keep: Given the sweep so far after each reading, to save it.
 
     Returns:
@@ -181,7 +181,7 @@ def run_session(
             continue
         waiting.popleft()
         done.append((distance, reading))
-        notify(_told(distance, reading, cameras))
+        notify(_reading_line(distance, reading, cameras))
         keep(_sweep(done))
     return _sweep(done)
 
@@ -194,7 +194,7 @@ def _number(text: str) -> float | None:
     return value if 0.0 < value < FARTHEST_M else None
 
 
-def _told(distance: float, reading: Reading, cameras: tuple[str, str]) -> str:
+def _reading_line(distance: float, reading: Reading, cameras: tuple[str, str]) -> str:
     disparity = float(reading.uv[0, 0] - reading.uv[1, 0])
     rates = ", ".join(f"{c} {r:.1f} Hz" for c, r in zip(cameras, reading.rate_hz.tolist(), strict=True))
     return (

@@ -20,7 +20,7 @@ from master.calibrate.tree_files import load_marker_rig
 from master.fabrik.blob_bias import card_outline, centre_of_blob, round_outline
 
 _LEFT_RIGHT = ("left", "right")
-_TOLD_PX = 0.02  # shift of a centroid worth a line
+_NOTED_PX = 0.02  # shift of a centroid worth a line
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,10 +173,10 @@ def from_recording(
             " carries no colours)"
         )
     pairs, target = read_pairs(recording, detections, pair.cameras, marker)
-    sweep, told = _placed(recording, pairs, distances)
+    sweep, summary = _placed(recording, pairs, distances)
     sweep, note = straightened(sweep, pair, outline)
     frames = f"{pairs.t_ns.size} frame pairs of {folder.name}"
-    about = f"{sweep.size} places of the marker {target!r} in {frames}, {told}{note}"
+    about = f"{sweep.size} places of the marker {target!r} in {frames}, {summary}{note}"
     return Measured(sweep, pair, (folder.name,), about)
 
 
@@ -208,7 +208,7 @@ def straightened(sweep: Sweep, pair: Pair, outline: Float) -> tuple[Sweep, str]:
         ]
     )
     shift = float(np.nanmax(np.abs(uv - sweep.uv), initial=0.0))
-    note = f"; the lens shifts its centroid by up to {shift:.2f} px, corrected" if shift > _TOLD_PX else ""
+    note = f"; the lens shifts its centroid by up to {shift:.2f} px, corrected" if shift > _NOTED_PX else ""
     return replace(sweep, uv=uv, disparity_px=uv[0, :, 0] - uv[1, :, 0]), note
 
 

@@ -207,11 +207,11 @@ def _merged(sweep: Sweep) -> Sweep:
         spread = float(np.ptp(same.disparity_px))
         x, d = float(same.disparity_px.mean()), float(same.distance_m.mean())
         if spread > DISAGREE_PX + x * RULER_M / d:
-            told = ", ".join(
+            listed = ", ".join(
                 f"{p}: {v:.2f} px" for p, v in zip(same.place, same.disparity_px.tolist(), strict=True)
             )
             raise FitError(
-                f"the same distance {d:.4g} m was measured with disparities that disagree ({told}): more than"
+                f"the same distance {d:.4g} m was measured with disparities that disagree ({listed}): more than"
                 f" {1e3 * RULER_M:.0f} mm on the ruler explain; measure it again or leave one out"
             )
         parts.append(same if same.size == 1 else _mean(same))

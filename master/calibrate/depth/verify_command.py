@@ -55,7 +55,7 @@ def verify_command(
     json_file: JsonFile = None,
     picture: Picture = None,
 ) -> None:
-    """Tell how right a rig is: error of each depth model at known distances, and the budget of what to expect.
+    """Report how right a rig is: error of each depth model at known distances, and the budget of what to expect.
 
     Without a recording or a table only the budget and the off-axis errors of the rig are printed.
 

@@ -64,7 +64,7 @@ _EYE = np.eye(3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Told:
+class _Output:
     """What the tracks say while the clocks' errors are near to `about`: markers, turns."""
 
     about: Unknown
@@ -116,7 +116,7 @@ class Problem:
         """From a guess downhill, round by round; and the steps taken."""
         hands, steps = self.guessed(unknown), 0
         for most in rounds:
-            self.tell(unknown, hands)
+            self.update_observations(unknown, hands)
             unknown, hands, taken = self.solved(unknown, hands, most)
             steps += taken
         return unknown, hands, steps
@@ -127,7 +127,7 @@ class Problem:
         x = np.array([self._parameters.of_angles(angles) for angles in self._hand.angles_rad[near]])
         return Hands(self._hand.T_rig_palm[near], x)
 
-    def tell(self, unknown: Unknown, hands: Hands) -> None:
+    def update_observations(self, unknown: Unknown, hands: Hands) -> None:
         """Ask the tracks where the clocks and the errors of the gyroscope are believed to be."""
         self._mended, self._mended_of = self._imu.mended(unknown.gyro), unknown.gyro
         at = self._cycles.t_s + unknown.camera_late_s
@@ -140,12 +140,12 @@ class Problem:
         place = self._hands.place(hands)
         far = (whiten @ (place - np.nan_to_num(markers.points_m))[..., None])[..., 0]
         whiten = whiten * ((1.0 + np.vecdot(far, far) / STRAYS**2) ** -0.5)[..., None, None]
-        told = [
+        observed = [
             np.nan_to_num(part) for part in (markers.points_m, markers.speed_m_s, markers.acceleration_m_s2)
         ]
-        self._told = _Told(
+        self._observed = _Output(
             unknown,
-            Markers(told[0], told[1], told[2], markers.cov_m2),
+            Markers(observed[0], observed[1], observed[2], markers.cov_m2),
             ImuOrientations(
                 np.where(self._known[:, None, None], orientations.R_world_imu, _EYE),
                 orientations.rate_rad_s,
@@ -154,7 +154,7 @@ class Problem:
             self._tips_with_the_laser(unknown, hands),
         )
         self._hands = replace(self._hands, whiten=whiten)
-        data = np.concatenate([self._cycles.laser_m, self._told.tip_px], axis=-1)
+        data = np.concatenate([self._cycles.laser_m, self._observed.tip_px], axis=-1)
         self._data = np.where(self._known[:, None, None], data, np.nan)
 
     def _tips_with_the_laser(self, unknown: Unknown, hands: Hands) -> Float:
@@ -221,17 +221,17 @@ class Problem:
 
     def _here(self, unknown: Unknown) -> Markers:
         """The markers when the frames were taken."""
-        late_s, told = unknown.camera_late_s - self._told.about.camera_late_s, self._told.markers
-        speed = told.speed_m_s + late_s * told.acceleration_m_s2
-        points = told.points_m + late_s * (told.speed_m_s + 0.5 * late_s * told.acceleration_m_s2)
-        return Markers(points, speed, told.acceleration_m_s2, told.cov_m2)
+        late_s, observed = unknown.camera_late_s - self._observed.about.camera_late_s, self._observed.markers
+        speed = observed.speed_m_s + late_s * observed.acceleration_m_s2
+        points = observed.points_m + late_s * (observed.speed_m_s + 0.5 * late_s * observed.acceleration_m_s2)
+        return Markers(points, speed, observed.acceleration_m_s2, observed.cov_m2)
 
     def _orientations(self, unknown: Unknown) -> ImuOrientations:
         """The IMU when the frames were taken."""
-        about, told = self._told.about, self._told.orientations
+        about, observed = self._observed.about, self._observed.orientations
         late_s = unknown.camera_late_s - unknown.imu_late_s - about.camera_late_s + about.imu_late_s
         return replace(
-            told, R_world_imu=told.R_world_imu @ rotation_vector_to_matrix(late_s * told.rate_rad_s)
+            observed, R_world_imu=observed.R_world_imu @ rotation_vector_to_matrix(late_s * observed.rate_rad_s)
         )
 
     def _rig_imu(self, unknown: Unknown, orientations: ImuOrientations) -> Float:
@@ -303,8 +303,8 @@ class Problem:
         off = self._off(shown)
         pairs = off[..., 0::2] ** 2 + off[..., 1::2] ** 2
         root = np.repeat((1.0 + pairs / STRAYS**2) ** -0.5, 2, axis=-1)
-        told = np.isfinite(self._data) & np.isfinite(shown)
-        by = by * (np.where(told, root, 0.0) / self.sigma)[..., None]
+        observed = np.isfinite(self._data) & np.isfinite(shown)
+        by = by * (np.where(observed, root, 0.0) / self.sigma)[..., None]
         count, n = len(hands.x), hands.x.shape[1]
         by_rotation = by[..., :3].reshape(count, -1, 3)
         own = np.zeros((count, 4 * SEEN, 6 + n))

@@ -105,10 +105,10 @@ class HandTrack:
         normal = np.einsum("tkm,tki,tkj->tmij", weight, power, power)
         pull = np.einsum("tkm,tki,tkmd->tmid", weight, power, np.where(seen[..., None], points, 0.0))
         before, after = ((seen & side[..., None]).sum(axis=1) for side in (off <= 0.0, off >= 0.0))
-        told = (before >= _NEIGHBOURS) & (after >= _NEIGHBOURS) & np.isfinite(self.cov_m2[near][..., 0, 0])
-        solvable = np.where(told[..., None, None], normal, np.eye(_TERMS))
+        valid = (before >= _NEIGHBOURS) & (after >= _NEIGHBOURS) & np.isfinite(self.cov_m2[near][..., 0, 0])
+        solvable = np.where(valid[..., None, None], normal, np.eye(_TERMS))
         taylor = np.asarray(np.linalg.solve(solvable, pull), np.float64)
-        taylor[~told] = np.nan
+        taylor[~valid] = np.nan
         speed, acceleration = taylor[:, :, 1] / _NEAR_S, 2.0 * taylor[:, :, 2] / _NEAR_S**2
         return Markers(taylor[:, :, 0], speed, acceleration, self.cov_m2[near])
 
@@ -148,17 +148,17 @@ class ImuTrack:
 
     def __init__(self, samples: Sequence[ImuSample], zero_ns: int) -> None:
         """Of samples in order, those with rates and an orientation; times count from `zero_ns`."""
-        told = [one for one in samples if np.isfinite([*one.orientation_wxyz, *one.gyro_rad_s]).all()]
-        times = np.array([1e-9 * (one.t_ns - zero_ns) for one in told])
+        valid = [one for one in samples if np.isfinite([*one.orientation_wxyz, *one.gyro_rad_s]).all()]
+        times = np.array([1e-9 * (one.t_ns - zero_ns) for one in valid])
         rising = np.diff(times, prepend=-np.inf) > 0.0
         self.t_s = times[rising]
-        self._rate = np.array([one.gyro_rad_s for one in told]).reshape(-1, 3)[rising]
-        held = np.array([one.orientation_wxyz for one in told]).reshape(-1, 4)[rising]
+        self._rate = np.array([one.gyro_rad_s for one in valid]).reshape(-1, 3)[rising]
+        held = np.array([one.orientation_wxyz for one in valid]).reshape(-1, 4)[rising]
         self._held = quaternion_to_matrix(held)
         step = np.diff(self.t_s)[:, None]
         self.gap_s = float(step.max(initial=0.0))
         self._integrated, self._drift = np.empty_like(self._held), np.zeros((len(self.t_s), 3, 12))
-        if len(told):
+        if len(valid):
             self._sum_up()
 
     def mended(self, errors: Float) -> "ImuTrack":

@@ -124,7 +124,7 @@ def hand_command(
     template = template_of(base, side, name)
     _check_together(poses, live, length_mm, three_back)
     if poses is None and length_mm is not None and not live:
-        told: dict[str, object] = {"side": side, "hand_length_mm": length_mm, "lengths": {}}
+        report: dict[str, object] = {"side": side, "hand_length_mm": length_mm, "lengths": {}}
         scaled = quick(base, template, length_mm)
         if three_back:
             scaled = with_three_back_markers(scaled, name)
@@ -140,19 +140,19 @@ def hand_command(
         for line in report_lines(found):
             typer.echo(line)
         data = "live" if poses is None else poses.name
-        profile, told = measured_profile(found, name, data, dip_per_pip), report_json(found)
+        profile, report = measured_profile(found, name, data, dip_per_pip), report_json(found)
         if picture is not None:
             from master.calibrate.hand.picture import draw_hand
 
             draw_hand(picture, found)
-    _finish(out, profile, told, json_file)
+    _finish(out, profile, report, json_file)
 
 
-def _finish(out: Path | None, profile: HandProfile, told: dict[str, object], json_file: Path | None) -> None:
+def _finish(out: Path | None, profile: HandProfile, report: dict[str, object], json_file: Path | None) -> None:
     written = None if out is None else write_hand(out, profile)
     typer.echo("nothing written: give --out DIR" if written is None else f"wrote {written}")
     if json_file is not None:
-        write_summary(json_file, told | {"written": None if written is None else str(written)})
+        write_summary(json_file, report | {"written": None if written is None else str(written)})
 
 
 def _check_alone(**others: object) -> None:
@@ -181,7 +181,7 @@ def step_lines() -> list[str]:
         f"{ROUTINE_S:.0f} s. Lay the back of the hand on a table and leave it: palm to the cameras, tips in sight.",
         "Do one step after the other without hurry; exact times do not matter.",
     ]
-    return lines + [f"{n:3}. {step.seconds:3.1f} s  {step.told}" for n, step in enumerate(STEPS, 1)]
+    return lines + [f"{n:3}. {step.seconds:3.1f} s  {step.instruction}" for n, step in enumerate(STEPS, 1)]
 
 
 def template_of(base: Path | None, side: str, name: str) -> HandProfile:

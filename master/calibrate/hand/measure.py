@@ -25,7 +25,7 @@ from master.calibrate.hand.shape import PER_FINGER, Shape
 
 WITHIN_M = 1e-3
 CERTAIN = 2.576  # standard deviations of 99 %
-TOLD = 0.5  # of the sd before: more is told by beliefs
+PRIOR_SHARE = 0.5  # of the sd before: more is told by beliefs
 BONES = ("proximal", "middle", "distal")
 THUMB_BONES = ("metacarpal", "proximal", "distal")
 _GROUPS = ((0,), (1,), (2,), (1, 2), (0, 1), (0, 1, 2))
@@ -60,7 +60,7 @@ class Length:
     @property
     def measured(self) -> bool:
         """Whether the markers tell it."""
-        return CERTAIN * self.sigma_m <= WITHIN_M and self.sigma_m <= TOLD * self.before_m
+        return CERTAIN * self.sigma_m <= WITHIN_M and self.sigma_m <= PRIOR_SHARE * self.before_m
 
     @property
     def name(self) -> str:
@@ -115,7 +115,7 @@ def measure_hand(
         template: Proportions to begin with, and where the markers sit; its size does not matter.
         hand_length_m: Length of the hand, if it was measured; None: from the flat hand's markers.
         dip_per_pip: Mean and standard deviation of the DIP's ratio, if it was measured.
-        progress: Told the share that is done.
+        progress: Called with the share that is done.
 
     Raises:
         FitError: A step is missing, the palm moved, it is the other hand, or none at all; the text says what to do.

@@ -99,9 +99,9 @@ def hand_from_motion(motion: JointMotion, name: str) -> MotionHand:
     hand = MotionHand(
         profile, motion, palm, couplings, bones.mean(axis=0), bones.std(axis=0), int(good.sum()), length_m
     )
-    told = _provenance(hand)
+    origin = _provenance(hand)
     back = profile.markers["back"]
-    profile = replace(profile, markers=like.markers | {"back": back}, radius_m=like.radius_m, provenance=told)
+    profile = replace(profile, markers=like.markers | {"back": back}, radius_m=like.radius_m, provenance=origin)
     HandModel.of(profile)  # refuses what cannot be
     return changed(hand, profile=profile)
 

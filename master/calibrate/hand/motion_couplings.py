@@ -26,7 +26,7 @@ _MADE_RAD = np.radians(0.5)
 _NO_HABIT_RAD = np.radians(25.0)
 _HUBER = 1.345
 _OUTLIER = 4.0
-_TOLD = 0.25  # of a variance: less is noise
+_LEAST_SHARE = 0.25  # of a variance: less is noise
 _ROUNDS = 20
 
 
@@ -132,4 +132,4 @@ def _ratio(angle: Float, pip: Float, noise_rad: tuple[float, float]) -> Ratio:
     spread = float(np.sqrt((off[typical] ** 2).mean()))
     noise = float(np.hypot(noise_rad[0], slope * noise_rad[1]))
     left = spread * spread - noise * noise
-    return Ratio(slope, float(np.sqrt(left)) if left > _TOLD * spread * spread else 0.0, noise)
+    return Ratio(slope, float(np.sqrt(left)) if left > _LEAST_SHARE * spread * spread else 0.0, noise)

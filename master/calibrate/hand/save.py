@@ -32,14 +32,14 @@ def measured_profile(
     how: dict[str, Provenance] = {}
     for finger, label in enumerate(FINGERS):
         found = measurement.parted(finger)
-        told = {bone for length in found for bone in length.bones}
+        own_bones = {bone for length in found for bone in length.bones}
         residual = {f"{_key(length.name)}_sigma_mm": round(1e3 * length.sigma_m, 3) for length in found}
         residual["rms_mm"] = round(1e3 * measurement.rms_m, 3)
         shared = [length.name for length in found if len(length.bones) > 1]
         scaled = [
             part.name
             for part in measurement.lengths
-            if part.finger == finger and len(part.bones) == 1 and part.bones[0] not in told
+            if part.finger == finger and len(part.bones) == 1 and part.bones[0] not in own_bones
         ]
         note = [f"measured together, divided as in the template: {', '.join(shared)}"] if shared else []
         note += [f"not measured, scaled from the hand length: {', '.join(scaled)}"] if scaled else []
@@ -47,7 +47,7 @@ def measured_profile(
         how[label] = provenance(TOOL, (data,), residual, "; ".join(note))
     if dip_per_pip is not None:
         profile = replace(profile, couplings=replace(couplings_of(profile), dip_per_pip=dip_per_pip))
-    before = {part: told for part, told in profile.provenance.items() if part != _QUICK}
+    before = {part: one for part, one in profile.provenance.items() if part != _QUICK}
     return replace(profile, provenance=before | how)
 
 
@@ -88,13 +88,13 @@ def report_lines(measurement: HandMeasurement) -> list[str]:
     ]
     for finger in range(5):
         parted = measurement.parted(finger)
-        told: set[int] = {bone for length in parted for bone in length.bones}
+        own_bones: set[int] = {bone for length in parted for bone in length.bones}
         for length in measurement.lengths:
             if length.finger != finger or (len(length.bones) > 1 and length not in parted):
                 continue
             if length in parted:
                 verdict = "measured"
-            elif set(length.bones) <= told:
+            elif set(length.bones) <= own_bones:
                 verdict = "undetermined alone: part of a measured sum"
             else:
                 verdict = "undetermined: keeps the scaled value"

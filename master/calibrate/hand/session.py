@@ -63,7 +63,7 @@ def guide(
         tips: Rows of the five tips among the markers.
         names: Of the markers.
         clock: For the steps.
-        say: Told one line at a time.
+        say: Called with one line at a time.
 
     Raises:
         FitError: No pose comes, or a step was not seen three times.
@@ -75,7 +75,7 @@ def guide(
         _during(receive, clock, 1.0)
     for number, step in enumerate(STEPS):
         for _ in range(_TRIES):
-            notify(f"{number + 1} of {len(STEPS)}: {step.told} ({step.seconds:.0f} s)")
+            notify(f"{number + 1} of {len(STEPS)}: {step.instruction} ({step.seconds:.0f} s)")
             poses = _during(receive, clock, step.seconds + _LATE_S)
             lacking = unseen(step, number, poses, tips, names)
             if not lacking:

@@ -120,8 +120,8 @@ def first_body(seen: Seen) -> tuple[Float, Float]:
 def _medians(placed: Float, beads: Float) -> Float:
     """Beads (B, 3) by medians of places (T, B, 3); those of no place as they were."""
     out = beads.copy()
-    told = np.flatnonzero(np.isfinite(placed).all(axis=2).any(axis=0))
-    out[told] = np.nanmedian(placed[:, told], axis=0)
+    observed = np.flatnonzero(np.isfinite(placed).all(axis=2).any(axis=0))
+    out[observed] = np.nanmedian(placed[:, observed], axis=0)
     return out
 
 

@@ -82,18 +82,18 @@ def object_command(
     """
     _check_together(live, recording, detections, rig, add_to_rig, out)
     base, where = base_of(calibration, name, like)
-    told = None if markers is None else tuple(part.strip() for part in markers.split(",") if part.strip())
+    given = None if markers is None else tuple(part.strip() for part in markers.split(",") if part.strip())
     if live:
         assert rig is not None
         used = load_marker_rig(calibration, rig)
-        names = names_of(told, base, used)
+        names = names_of(given, base, used)
         from master.calibrate.object.live import observe_live
 
         seen, data = observe_live(bus, used, names, seconds, typer.echo), "live"
     else:
         assert recording is not None
         assert detections is not None
-        used, names, seen = recorded(recording, detections, rig, calibration, told, base)
+        used, names, seen = recorded(recording, detections, rig, calibration, given, base)
         data = recording.resolve().name
     try:
         found = measure_object(seen)
@@ -125,14 +125,14 @@ def base_of(calibration: Path, name: str, like: Path | None) -> tuple[ObjectProf
 
 
 def names_of(
-    told: tuple[str, ...] | None, base: ObjectProfile | None, rig: RigCalibration
+    given: tuple[str, ...] | None, base: ObjectProfile | None, rig: RigCalibration
 ) -> tuple[str, ...]:
     """The beads: as told, of the file, or all that sit on no hand.
 
     Raises:
         CalibrationError: Fewer than three, one stands twice, or the rig does not have them.
     """
-    names = told or (tuple(base.markers) if base is not None and base.markers else rig.free_markers)
+    names = given or (tuple(base.markers) if base is not None and base.markers else rig.free_markers)
     if len(names) < 3 or len(set(names)) < len(names):
         raise CalibrationError(
             "--markers: three different beads or more tell how an object is turned, these are"
@@ -155,7 +155,7 @@ def recorded(
     detections: Path,
     rig: str | None,
     calibration: Path,
-    told: tuple[str, ...] | None,
+    given: tuple[str, ...] | None,
     base: ObjectProfile | None,
 ) -> tuple[RigCalibration, tuple[str, ...], Seen]:
     """Rig, beads, and what was seen of them in a recording.
@@ -172,7 +172,7 @@ def recorded(
         )
     if len(used.cameras) < 2:
         raise CalibrationError(f"rig {used.name!r}: cameras: two or more are needed")
-    names = names_of(told, base, used)
+    names = names_of(given, base, used)
     models = {camera: CameraModel.of(cameras[camera], used.camera_pose(camera)) for camera in used.cameras}
     messages = [
         message

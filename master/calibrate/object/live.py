@@ -22,7 +22,7 @@ def observe_live(
         rig: That it runs.
         names: Of the beads.
         longest_s: How long the motion may take [s].
-        say: Told one line at a time.
+        say: Called with one line at a time.
 
     Raises:
         BusError: Nobody listens there.

@@ -129,7 +129,7 @@ def refuse_loose(seen: Seen) -> None:
     if not loose:
         return
     worst = max(loose, key=lambda pair: loose[pair][0] / loose[pair][1])
-    told = ", ".join(
+    listed = ", ".join(
         f"{seen.names[a]} - {seen.names[b]} by {1e3 * by:.1f} mm" for (a, b), (by, _) in loose.items()
     )
     guilty = guilty_of(change, len(seen.names))
@@ -139,7 +139,7 @@ def refuse_loose(seen: Seen) -> None:
         else f"{seen.names[guilty]} moved, or something else is taken for it"
     )
     raise FitError(
-        f"not rigid: distances between beads change ({told}); {blame}. Fasten it and do the motion again"
+        f"not rigid: distances between beads change ({listed}); {blame}. Fasten it and do the motion again"
     )
 
 

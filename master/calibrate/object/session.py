@@ -12,7 +12,7 @@ from master.calibrate.object.bundle import first_body, usable
 from master.calibrate.object.measure import ENOUGH, ENOUGH_LOOKS, MOTION, looks_of
 from master.calibrate.object.seen import Seen, seen_in
 
-TELL_NS = 1_000_000_000
+PRINT_NS = 1_000_000_000
 _WAIT_S = 0.05
 _SHOWN = 200  # instants from which ways of turning are counted while it goes on
 
@@ -34,7 +34,7 @@ def guide(
         rig: Of that master.
         names: Of the beads.
         clock: Of this machine.
-        say: Told one line at a time.
+        say: Called with one line at a time.
         longest_s: How long the motion may take [s].
 
     Raises:
@@ -43,15 +43,15 @@ def guide(
     """
     poses = list[HandPose]()
     notify(MOTION)
-    begin_ns = told_ns = clock.now_ns()
+    begin_ns = printed_ns = clock.now_ns()
     while clock.now_ns() - begin_ns < longest_s * 1e9:
         pose = receive(_WAIT_S)
         if pose is not None:
             poses.append(pose)
         now_ns = clock.now_ns()
-        if now_ns - told_ns < TELL_NS:
+        if now_ns - printed_ns < PRINT_NS:
             continue
-        told_ns = now_ns
+        printed_ns = now_ns
         if not poses:
             notify("no pose comes: is `phalanx-master run` running, on this --bus?")
             continue

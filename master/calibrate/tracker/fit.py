@@ -17,13 +17,13 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.geometry import invert, matrix_to_rotation_vector, rigid, rotation_vector_to_matrix, skew
-from master.calibrate.tracker.start import Placed, foretold
+from master.calibrate.tracker.start import Placed, predicted
 from master.calibrate.tracker.tracks import PoseTrack, shared_epochs
 
 MOST = 900  # instants
 BLOCKS = 12
 TRACKER_M, TRACKER_RAD = 1e-3, np.radians(0.15)
-UNTOLD_M, UNTOLD_RAD = 3e-3, np.radians(1.5)  # of an object's pose without covariance
+DEFAULT_SIGMA_M, DEFAULT_SIGMA_RAD = 3e-3, np.radians(1.5)  # of an object's pose without covariance
 OUTLIER = (
     4.1  # times sigma: 0.999 of chi with six degrees of freedom is within 4.7, at the scale of the good half
 )
@@ -81,16 +81,16 @@ class _Problem:
         self._tracker = tracker
         self.t_s, self.R, self.p_m = seen.t_s[rows], seen.R[rows], seen.p_m[rows]
         self.middle_m = self.p_m.mean(axis=0)
-        untold = np.diag(np.repeat([UNTOLD_M, UNTOLD_RAD], 3) ** 2)
-        told = np.isfinite(seen.cov[rows].sum(axis=(1, 2)))[:, None, None]
+        default_cov = np.diag(np.repeat([DEFAULT_SIGMA_M, DEFAULT_SIGMA_RAD], 3) ** 2)
+        with_cov = np.isfinite(seen.cov[rows].sum(axis=(1, 2)))[:, None, None]
         jitter = np.diag(np.repeat([TRACKER_M, TRACKER_RAD], 3) ** 2)
-        cov = np.where(told, seen.cov[rows], untold) + jitter
+        cov = np.where(with_cov, seen.cov[rows], default_cov) + jitter
         self.weight: Float = np.asarray(np.linalg.inv(cov), np.float64)
 
     def lines(self, placed: Placed) -> _Lines:
         at = self.t_s - placed.late_s
-        R, p = self._foretold(placed, at)
-        before, after = (self._foretold(placed, at + dt) for dt in (-_DT_S, _DT_S))
+        R, p = self._predicted(placed, at)
+        before, after = (self._predicted(placed, at + dt) for dt in (-_DT_S, _DT_S))
         v = (after[1] - before[1]) / (2.0 * _DT_S)
         w = matrix_to_rotation_vector(after[0] @ before[0].swapaxes(1, 2)) / (2.0 * _DT_S)
         off = np.concatenate([self.p_m - p, matrix_to_rotation_vector(self.R @ R.swapaxes(1, 2))], axis=1)
@@ -101,9 +101,9 @@ class _Problem:
         slope[:, :3, 12], slope[:, 3:, 12] = -v, -w
         return _Lines(R, p, off, slope)
 
-    def _foretold(self, placed: Placed, at_s: Float) -> tuple[Float, Float]:
+    def _predicted(self, placed: Placed, at_s: Float) -> tuple[Float, Float]:
         rotation, place, _ = self._tracker.at(at_s)
-        return foretold(placed.T_rig_tracking, placed.T_object_tracker, rotation, place)
+        return predicted(placed.T_rig_tracking, placed.T_object_tracker, rotation, place)
 
     def moved(self, placed: Placed, by: Float) -> Placed:
         rotation = rotation_vector_to_matrix(by[:3])

@@ -20,7 +20,7 @@ def observe_live(
         bus: Endpoint of the running master's bus.
         profile: The object; it has a tracker.
         longest_s: How long the motion may take [s].
-        say: Told one line at a time.
+        say: Called with one line at a time.
 
     Raises:
         BusError: Nobody listens there.

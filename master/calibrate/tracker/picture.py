@@ -21,13 +21,13 @@ def draw_registration(path: Path, found: Registration) -> None:
     figure.suptitle("\n".join(found.report[:2]))
     above, side, place, rotation = figure.subplots(2, 2).ravel()
     seen = 1e3 * (fit.p_m + fit.off[:, :3])
-    told = 1e3 * fit.p_m.copy()
-    told[np.diff(fit.t_s, prepend=fit.t_s[0]) > 0.2] = np.nan  # a gap is no way
+    track_mm = 1e3 * fit.p_m.copy()
+    track_mm[np.diff(fit.t_s, prepend=fit.t_s[0]) > 0.2] = np.nan  # a gap is no way
     for axes, (a, b), title in (
         (above, (0, 2), "from above [mm]"),
         (side, (2, 1), "from the side [mm]"),
     ):
-        axes.plot(told[:, a], told[:, b], "-", color=GREY, linewidth=0.8, label="tracker")
+        axes.plot(track_mm[:, a], track_mm[:, b], "-", color=GREY, linewidth=0.8, label="tracker")
         axes.plot(
             seen[~fit.outlier, a], seen[~fit.outlier, b], ".", color=BLUE, markersize=3, label="cameras"
         )

@@ -15,7 +15,7 @@ from master.calibrate.tracker.registration import MOTION
 from master.calibrate.tracker.start import first_lag
 from master.calibrate.tracker.tracks import object_track, tracker_track
 
-TELL_NS = 1_000_000_000
+PRINT_NS = 1_000_000_000
 SILENT_S = 3.0
 ENOUGH_S = 15.0  # of both, when all turns are there: more of it makes the result surer
 _LAG_AFTER_S = 5.0
@@ -70,7 +70,7 @@ def guide(receive: Receive, clock: Clock, notify: Callable[[str], None], longest
     Args:
         receive: The next pose of object or device, waiting at most so long [s].
         clock: The master's clock.
-        say: Told one line at a time.
+        say: Called with one line at a time.
         longest_s: How long the motion may take [s].
 
     Raises:
@@ -78,16 +78,16 @@ def guide(receive: Receive, clock: Clock, notify: Callable[[str], None], longest
     """
     session = Session()
     notify(MOTION)
-    begin_ns = told_ns = clock.now_ns()
+    begin_ns = printed_ns = clock.now_ns()
     enough = False
     while not enough and clock.now_ns() - begin_ns < longest_s * 1e9:
         message = receive(_WAIT_S)
         if message is not None:
             session.push(message)
         now_ns = clock.now_ns()
-        if now_ns - told_ns < TELL_NS:
+        if now_ns - printed_ns < PRINT_NS:
             continue
-        told_ns = now_ns
+        printed_ns = now_ns
         coverage, silent = session.coverage(), ""
         if now_ns - begin_ns > SILENT_S * 1e9:
             silent = session.silent(now_ns)

@@ -107,12 +107,12 @@ def first_places(seen: PoseTrack, tracker: PoseTrack, late_s: float, seed: int =
 
 
 def _agree(X: Float, Y: Float, RA: Float, pA: Float, RB: Float, pB: Float) -> Bool:
-    rotation, place = foretold(X, Y, RB, pB)
+    rotation, place = predicted(X, Y, RB, pB)
     off = np.linalg.norm(matrix_to_rotation_vector(RA @ rotation.swapaxes(1, 2)), axis=1)
     return (off < _NEAR_RAD) & (np.linalg.norm(pA - place, axis=1) < _NEAR_M)
 
 
-def foretold(X: Float, Y: Float, RB: Float, pB: Float) -> tuple[Float, Float]:
+def predicted(X: Float, Y: Float, RB: Float, pB: Float) -> tuple[Float, Float]:
     """The object's turns (N, 3, 3) and places (N, 3) in the rig where the device is at (RB, pB): X B inv(Y)."""
     rotation = X[:3, :3] @ RB @ Y[:3, :3].T
     device = pB @ X[:3, :3].T + X[:3, 3]

@@ -57,8 +57,8 @@ def curl(
 
         draw_curls(picture, curls)
         typer.echo(f"drew {picture}")
-    told = ", ".join(found.finger for found in curls if found.line is not None)
-    written = write_device(out, device, rig_with_lines(device, curls), f"finger_lines of {told}")
+    summary = ", ".join(found.finger for found in curls if found.line is not None)
+    written = write_device(out, device, rig_with_lines(device, curls), f"finger_lines of {summary}")
     if json_file is not None:
         write_summary(
             json_file,
@@ -100,10 +100,10 @@ def rig_with_lines(device: Device, curls: tuple[FingerCurl, ...]) -> RigCalibrat
 
 
 def _json_of(found: FingerCurl) -> dict[str, object]:
-    told: dict[str, object] = {"points": len(found.points_m), "seen": found.seen}
+    summary: dict[str, object] = {"points": len(found.points_m), "seen": found.seen}
     if found.line is None:
-        return told | {"refused": found.reason}
-    return told | {
+        return summary | {"refused": found.reason}
+    return summary | {
         "range_mm": round(1e3 * found.line.range_m[1], 4),
         "residual_mm": round(1e3 * found.line.residual_m, 4),
         "origin_m": list(found.line.origin_m),

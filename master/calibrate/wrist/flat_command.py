@@ -21,7 +21,7 @@ from master.calibrate.wrist.board_pose import board_pose
 from master.calibrate.wrist.device import Device, device_of, print_line, write_device
 from master.calibrate.wrist.flat_field import FlatFit, WhiteSamples, fit_flat_field, gathered, white_samples
 from master.calibrate.wrist.laser_command import Source
-from master.calibrate.wrist.lit_views import LitView, lit_views, told_by_reason
+from master.calibrate.wrist.lit_views import LitView, lit_views, grouped_by_reason
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.summary import write_summary
 
@@ -70,7 +70,7 @@ def flat_field(
     try:
         fit = fit_flat_field(seen.samples, device.optics)
     except FitError as error:
-        reasons = "".join(f"\n  {reason}" for reason in told_by_reason(seen.refused))
+        reasons = "".join(f"\n  {reason}" for reason in grouped_by_reason(seen.refused))
         raise FitError(f"{source}: {error}{reasons}") from error
     print_line(report_lines(fit, seen, len(views), known_leds=bool(device.rig.led)))
     if picture is not None:
@@ -80,16 +80,16 @@ def flat_field(
         typer.echo(f"drew {picture}")
     written = write_device(out, device, rig_with_field(device, fit, seen), "flat_field")
     if json_file is not None:
-        told: dict[str, object] = {
+        report: dict[str, object] = {
             "coefficients": list(fit.field.coefficients),
             "rms_percent": round(100 * fit.rms, 4),
-            "foretold_rms_percent": round(100 * fit.foretold_rms, 4),
+            "cross_validated_rms_percent": round(100 * fit.cross_validated_rms, 4),
             "samples": len(seen.samples.light),
             "views": seen.views,
             "refused": dict(seen.refused),
             "written": None if written is None else str(written),
         }
-        write_summary(json_file, told)
+        write_summary(json_file, report)
 
 
 def white_of(views: tuple[LitView, ...], board: Board, optics: CameraModel, led_m: Float) -> WhiteSeen:
@@ -118,14 +118,14 @@ def report_lines(fit: FlatFit, seen: WhiteSeen, views: int, *, known_leds: bool)
     """The result for a person."""
     lines = [
         f"flat field from {len(seen.samples.light)} samples in {seen.views} of {views} views",
-        f"  residual {100 * fit.rms:.2f} % rms; of views left out of the fit {100 * fit.foretold_rms:.2f} %",
+        f"  residual {100 * fit.rms:.2f} % rms; of views left out of the fit {100 * fit.cross_validated_rms:.2f} %",
     ]
     if not known_leds:
         lines.append("  the rig has no `led`: the LEDs were taken to be at the lens")
     if seen.refused:
         lines += [
             f"left out ({len(seen.refused)}):",
-            *(f"  {reason}" for reason in told_by_reason(seen.refused)),
+            *(f"  {reason}" for reason in grouped_by_reason(seen.refused)),
         ]
     return lines
 
@@ -134,7 +134,7 @@ def rig_with_field(device: Device, fit: FlatFit, seen: WhiteSeen) -> RigCalibrat
     """The device's rig with the flat field and where it comes from."""
     residual = {
         "rms_percent": round(100 * fit.rms, 4),
-        "foretold_rms_percent": round(100 * fit.foretold_rms, 4),
+        "cross_validated_rms_percent": round(100 * fit.cross_validated_rms, 4),
     }
     note = f"{len(seen.samples.light)} samples of white squares in {seen.views} views"
     how = provenance("calibrate flat-field", (device.source,), residual, note)

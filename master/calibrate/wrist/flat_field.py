@@ -71,13 +71,13 @@ class FlatFit:
     Attributes:
         field: 1 on the axis.
         rms: Relative residual of the samples, robust.
-        foretold_rms: The same of views that were left out of the fit.
+        cross_validated_rms: The same of views that were left out of the fit.
         residual: (S,) relative residual of each sample.
     """
 
     field: FlatField
     rms: float
-    foretold_rms: float
+    cross_validated_rms: float
     residual: Float
 
 
@@ -171,22 +171,22 @@ def fit_flat_field(samples: WhiteSamples, optics: CameraModel) -> FlatFit:
     v, u = (np.indices(_GRID) + 0.5) * np.array([optics.height_px, optics.width_px])[:, None, None]
     pixels = np.stack([u / _GRID[1], v / _GRID[0]], axis=-1).reshape(-1, 2)
     grid = optics.undistort(pixels - 0.5)
-    foretold = np.full(len(samples.light), np.nan)
+    held_out = np.full(len(samples.light), np.nan)
     for fold in range(_FOLDS):
         out = samples.view % _FOLDS == fold
-        told = _polynomial(_law(samples.xy[~out], samples.light[~out]), grid)
-        foretold[out] = samples.light[out] / (terms_of(samples.xy[out], _DEGREE) @ told) - 1.0
+        fitted = _polynomial(_law(samples.xy[~out], samples.light[~out]), grid)
+        held_out[out] = samples.light[out] / (terms_of(samples.xy[out], _DEGREE) @ fitted) - 1.0
     coefficients = _polynomial(_law(samples.xy, samples.light), grid)
     residual = samples.light / (terms_of(samples.xy, _DEGREE) @ coefficients) - 1.0
     fit = FlatFit(
         FlatField(coefficients=tuple(round(float(c / coefficients[0]), 7) for c in coefficients)),
         _spread(residual),
-        _spread(foretold),
+        _spread(held_out),
         residual,
     )
-    if fit.foretold_rms > _WORST_RMS:
+    if fit.cross_validated_rms > _WORST_RMS:
         raise FitError(
-            f"the light of the white squares strays {100 * fit.foretold_rms:.1f} % from any flat field (limit"
+            f"the light of the white squares strays {100 * fit.cross_validated_rms:.1f} % from any flat field (limit"
             f" {100 * _WORST_RMS:.0f} %): matt paper, nothing else in the light, LED positions as in the rig's `led`?"
         )
     return fit

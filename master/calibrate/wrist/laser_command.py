@@ -19,7 +19,7 @@ from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.board_pose import board_pose
 from master.calibrate.wrist.device import Device, device_of, print_line, write_device
 from master.calibrate.wrist.line import line_on_board
-from master.calibrate.wrist.lit_views import LitView, lit_views, told_by_reason
+from master.calibrate.wrist.lit_views import LitView, lit_views, grouped_by_reason
 from master.calibrate.wrist.plane import PlaneFit, ViewLine, fit_plane
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.summary import write_summary
@@ -73,7 +73,7 @@ def laser_plane(
     try:
         fit = fit_plane(seen.lines)
     except FitError as error:
-        reasons = "".join(f"\n  {reason}" for reason in told_by_reason(seen.refused))
+        reasons = "".join(f"\n  {reason}" for reason in grouped_by_reason(seen.refused))
         raise FitError(f"{source}: {error}{reasons}") from error
     print_line(report_lines(fit, seen, len(views)))
     if picture is not None:
@@ -83,8 +83,8 @@ def laser_plane(
         typer.echo(f"drew {picture}")
     written = write_device(out, device, rig_with_plane(device, fit), "laser_plane")
     if json_file is not None:
-        told = report_json(fit, seen) | {"written": None if written is None else str(written)}
-        write_summary(json_file, told)
+        report = report_json(fit, seen) | {"written": None if written is None else str(written)}
+        write_summary(json_file, report)
 
 
 def lines_of(views: tuple[LitView, ...], board: Board, optics: CameraModel) -> LinesSeen:
@@ -128,7 +128,7 @@ def report_lines(fit: PlaneFit, seen: LinesSeen, views: int) -> list[str]:
         if not own
     ]
     if seen.refused or wrong:
-        reasons = (*told_by_reason(seen.refused), *wrong)
+        reasons = (*grouped_by_reason(seen.refused), *wrong)
         lines += [f"left out ({len(seen.refused) + len(wrong)}):", *(f"  {reason}" for reason in reasons)]
     return lines
 

@@ -16,7 +16,7 @@ from common.pictures import decode_file, read_picture
 MOST_VIEWS = 60  # more of the same motion adds time, not knowledge
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _NAMED = re.compile(r"(.*?)[-_ .]?(ambient|laser|led)", re.IGNORECASE)
-_TOLD = 6  # views named with a reason
+_MOST_NAMED = 6  # views named with a reason
 _APART = 2  # rows: frames of one strobed triple
 
 
@@ -96,15 +96,15 @@ def _named(folder: Path) -> list[LitView]:
     return [LitView(name or "0", frames) for name, frames in found.items()]
 
 
-def told_by_reason(refused: Mapping[str, str]) -> list[str]:
+def grouped_by_reason(refused: Mapping[str, str]) -> list[str]:
     """Lines for a person: each reason once, after the views (name -> reason) it is of; of many the first."""
     views: dict[str, list[str]] = {}
     for name, reason in refused.items():
         views.setdefault(reason, []).append(name)
     lines: list[str] = []
     for reason, names in views.items():
-        more = f" and {len(names) - _TOLD} more" if len(names) > _TOLD else ""
-        lines.append(f"view{'s'[: len(names) > 1]} {', '.join(names[:_TOLD])}{more}: {reason}")
+        more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+        lines.append(f"view{'s'[: len(names) > 1]} {', '.join(names[:_MOST_NAMED])}{more}: {reason}")
     return lines
 
 

@@ -19,7 +19,7 @@ from master.calibrate.cameras.options import Dictionary, MarkerMm, board_of
 from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.board_pose import BoardPose, board_pose
 from master.calibrate.wrist.device import Device, device_of, print_line, write_device
-from master.calibrate.wrist.lit_views import lit_views, told_by_reason
+from master.calibrate.wrist.lit_views import lit_views, grouped_by_reason
 from master.calibrate.wrist.palm_board import BoardOffset, PalmFit, palm_from_board
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.summary import write_summary
@@ -79,14 +79,14 @@ def palm(
     print_line(report_lines(fit))
     written = write_device(out, device, rig_with_palm(device, fit), "T_camera_palm")
     if json_file is not None:
-        told: dict[str, object] = {
+        report: dict[str, object] = {
             "T_camera_palm": fit.T_camera_palm.tolist(),
             "rotation_sigma_deg": float(np.degrees(fit.rotation_sigma_rad)),
             "shift_sigma_mm": 1e3 * fit.shift_sigma_m,
             "residual": fit.residual,
             "written": None if written is None else str(written),
         }
-        write_summary(json_file, told)
+        write_summary(json_file, report)
 
 
 def _by_board(source: Path, board: Board, offset: BoardOffset, device: Device) -> PalmFit:
@@ -97,7 +97,7 @@ def _by_board(source: Path, board: Board, offset: BoardOffset, device: Device) -
             placed.append(board_pose(view, board, device.optics))
         except FitError as error:
             refused[view.name] = str(error)
-    print_line(f"left out: {reason}" for reason in told_by_reason(refused))
+    print_line(f"left out: {reason}" for reason in grouped_by_reason(refused))
     return palm_from_board(placed, board, offset)
 
 

@@ -57,7 +57,7 @@ def draw_flat_field(path: Path, fit: FlatFit, samples: WhiteSamples, optics: Cam
     """
     figure = figure_of((15.0, 4.2))
     figure.suptitle(
-        f"flat field: residual {100 * fit.rms:.2f} %, of views left out of the fit {100 * fit.foretold_rms:.2f} %"
+        f"flat field: residual {100 * fit.rms:.2f} %, cross-validated {100 * fit.cross_validated_rms:.2f} %"
     )
     field, left, law = figure.subplots(1, 3)
     u, v = np.meshgrid(np.arange(0, optics.width_px, 8.0), np.arange(0, optics.height_px, 8.0))

@@ -115,8 +115,8 @@ def _pose_sigma(rig: RigCalibration) -> Float:
     A rig whose maker knows how differently it is worn says so in the residual of the pose's provenance.
     """
     how = rig.provenance.get("T_camera_palm")
-    told = {} if how is None or how.tool == TOOL else how.residual
-    rotation, shift = np.radians(told.get("rotation_sigma_deg", 0.0)), 1e-3 * told.get("shift_sigma_mm", 0.0)
+    stated = {} if how is None or how.tool == TOOL else how.residual
+    rotation, shift = np.radians(stated.get("rotation_sigma_deg", 0.0)), 1e-3 * stated.get("shift_sigma_mm", 0.0)
     if how is not None and how.tool == "calibrate palm":
         return np.repeat([np.hypot(rotation, _RULER[0]), np.hypot(shift, _RULER[1])], 3)
     return np.repeat([rotation, shift] if rotation > 0.0 and shift > 0.0 else _GUESS, 3)
@@ -147,9 +147,9 @@ def _check(fit: Fit, seen: ImageObservations) -> None:
     most = np.degrees(most_bent(fit, knuckles))
     short = most < np.degrees(_BENT_RAD)
     if short.sum() > 1:
-        told = ", ".join(f"{name} {angle:.0f}" for name, angle in zip(_NAMES, most, strict=True))
+        reached = ", ".join(f"{name} {angle:.0f}" for name, angle in zip(_NAMES, most, strict=True))
         raise FitError(
-            f"straight fingers were bent at their knuckles to {told} deg, at least {np.degrees(_BENT_RAD):.0f} are"
+            f"straight fingers were bent at their knuckles to {reached} deg, at least {np.degrees(_BENT_RAD):.0f} are"
             " needed, where the laser lies beside the knuckle: bend them towards 90 deg, straight, before the camera"
         )
 
@@ -231,12 +231,12 @@ def _documented(
     }
     thick = {f"{name}_sigma": round(float(one), 4) for name, one in zip(_NAMES, sigma.thick, strict=True)}
     note = "knuckles and palm are known together better than each alone"
-    told = {
+    made = {
         key: provenance(TOOL, (source,), residual, note)
         for key, residual in (("knuckles", left | knuckles), ("palmar_scale", left | thick))
     }
     how = provenance(TOOL, (source,), pose, f"hand {hand.name!r}; {note}")
     return (
         replace(rig, provenance=rig.provenance | {"T_camera_palm": how}),
-        replace(hand, provenance=hand.provenance | told),
+        replace(hand, provenance=hand.provenance | made),
     )

@@ -92,8 +92,8 @@ class Fit:
     @property
     def surprise(self) -> float:
         """Rms change in standard deviations of what was believed, by as many numbers as the motion told."""
-        told = (1.0 - np.diag(self.covariance) / self.prior_sigma**2).sum()
-        return float(np.sqrt(((self.x / self.prior_sigma) ** 2).sum() / told))
+        measured = (1.0 - np.diag(self.covariance) / self.prior_sigma**2).sum()
+        return float(np.sqrt(((self.x / self.prior_sigma) ** 2).sum() / measured))
 
 
 def prior_sigma(pose: Float, length: Float) -> Float:
@@ -113,7 +113,7 @@ def fit_subject(model: SubjectModel, seen: ImageObservations, sigma: Float) -> F
     x, guess, covariance = np.zeros(UNKNOWN), problem.guessed(np.zeros(UNKNOWN)), np.empty(0)
     for rounds in _ROUNDS:  # what a rough pose takes for a stray may be none
         x, guess, covariance = problem.solved(x, problem.guessed(x), rounds)
-    return problem.told(x, guess, covariance)
+    return problem.result(x, guess, covariance)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -181,7 +181,7 @@ class _Problem:
                 break
         return x, guess, covariance
 
-    def told(self, x: Float, guess: _Guess, covariance: Float) -> Fit:
+    def result(self, x: Float, guess: _Guess, covariance: Float) -> Fit:
         """The result with what is left."""
         off = np.where(guess.used[..., None], self._off(x, guess.angles), np.nan)
         known = np.isfinite(off)

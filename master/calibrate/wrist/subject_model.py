@@ -175,5 +175,5 @@ def fitted_profile(model: HandModel, unknown: Unknown) -> HandProfile:
     without = {name: scale for name, scale in plain.palmar_scale.items() if name not in names}
     typical = PalmarSurface.of(HandModel.of(replace(plain, palmar_scale=without))).palmar_m[FINGERS]
     scale = (thick / typical).mean(axis=1)
-    told = {name: round(float(value), 4) for name, value in zip(names, scale, strict=True)}
-    return replace(plain, palmar_scale=without | told)
+    scales = {name: round(float(value), 4) for name, value in zip(names, scale, strict=True)}
+    return replace(plain, palmar_scale=without | scales)

@@ -83,8 +83,8 @@ def label(name: str) -> str:
 
 def latest_words(names: Sequence[str], history: History) -> str:
     """The newest values as text, which is also what a screen reader finds."""
-    told = [(label(name), history.latest(name)) for name in names]
-    return ", ".join(f"{who} {value:.4g}" for who, value in told if value is not None) or "nothing yet"
+    values = [(label(name), history.latest(name)) for name in names]
+    return ", ".join(f"{who} {value:.4g}" for who, value in values if value is not None) or "nothing yet"
 
 
 def _chart(plot: Plot) -> tuple[ui.echart, ui.label]:

@@ -99,7 +99,7 @@ class _ColourChoice:
     def build(self, toggle: ui.toggle) -> None:
         """Picture, what is known, and what to do with it."""
         self._toggle = toggle
-        self._told = ui.label().classes("text-subtitle1").props('role="status" data-testid="picked"')
+        self._status = ui.label().classes("text-subtitle1").props('role="status" data-testid="picked"')
         self._image = ui.interactive_image(on_mouse=self._click, events=["click"], cross=True)
         self._image.classes("w-full max-w-2xl setup-image").props(
             'tabindex=0 role="application" aria-label="Picture of the camera: click on the marker"'
@@ -109,7 +109,7 @@ class _ColourChoice:
             ui.button("Save colours", on_click=self._save).props('icon="save"')
             ui.button("Next: track", on_click=lambda: self._desk.go("track")).props("flat")
         ui.timer(_PICTURE_S, self._show)
-        self._tell()
+        self._show_state()
 
     async def _click(self, event: events.MouseEventArguments) -> None:
         self._choice.at = (event.image_x, event.image_y)
@@ -152,7 +152,7 @@ class _ColourChoice:
             missing = [name for name in self._rig.markers if name not in self._known[choice.camera]]
             if missing:
                 self._toggle.set_value(missing[0])
-            self._tell()
+            self._show_state()
 
     async def _save(self) -> None:
         session = self._desk.session
@@ -171,7 +171,7 @@ class _ColourChoice:
 
         if await self._desk.attempt(save):
             ui.notify(f"saved: {', '.join(names)}", type="positive")
-            self._told.set_text(f"saved: {', '.join(names)}")
+            self._status.set_text(f"saved: {', '.join(names)}")
 
     def _show(self) -> None:
         choice, state = self._choice, self._desk.session.state
@@ -181,7 +181,7 @@ class _ColourChoice:
         preview = state.preview(choice.camera)
         if preview is None:
             if choice.size is None:
-                self._told.set_text(
+                self._status.set_text(
                     f"{choice.camera}: {state.preview_error(choice.camera) or 'waiting for its picture'}"
                 )
             return
@@ -189,7 +189,7 @@ class _ColourChoice:
             return
         if choice.size is None:
             choice.size = jpeg_size(preview.jpeg)
-            self._tell()
+            self._show_state()
         self._newest = preview
         self._image.set_source(jpeg_url(preview.jpeg))
 
@@ -205,12 +205,12 @@ class _ColourChoice:
         )
         self._image.set_content(arms)
 
-    def _tell(self) -> None:
+    def _show_state(self) -> None:
         known = self._known[self._choice.camera]
         missing = [name for name in self._rig.markers if name not in known]
         picked = self._choice.camera in self._picked
         done = "save them" if picked else "click on one to take it anew"
         todo = f"click on {missing[0]}" if missing else f"all markers are known; {done}"
-        self._told.set_text(
+        self._status.set_text(
             f"{self._choice.camera}: {len(known)} of {len(self._rig.markers)} markers known; {todo}"
         )

@@ -28,18 +28,18 @@ def build(desk: Desk) -> None:
     ui.label("Hand").props('id="setup-side"')
     side = ui.radio({"right": "Right hand", "left": "Left hand"}, value=plan.side)
     side.props('inline aria-labelledby="setup-side"')
-    told = ui.label()
+    status = ui.label()
     length = ui.slider(min=140, max=230, step=1, value=plan.length_mm).classes("w-96")
     length.props('aria-label="Length of the hand in millimetres" label')
 
-    def tell() -> None:
-        told.set_text(
+    def show_scale() -> None:
+        status.set_text(
             f"Length of the hand: {length.value or 190:.0f} mm, from the crease of the wrist to the end of"
             " the middle finger"
         )
 
-    tell()
-    length.on_value_change(tell)
+    show_scale()
+    length.on_value_change(show_scale)
     key = desk.session.tree / KEY_FILE
     ui.label(
         f"Key: {key} {'is there' if key.exists() else 'will be made'}; it is the secret that all cameras of"

@@ -35,7 +35,7 @@ def build(desk: Desk) -> None:
         ui.button("Start tracking", on_click=start).props('icon="play_arrow"')
         ui.button("Stop", on_click=stop).props('flat icon="stop"')
         ui.button("See the hand", on_click=lambda: ui.navigate.to("/live")).props('flat icon="visibility"')
-    told = ui.label().classes("text-h6").props('role="status" data-testid="tracking"')
+    status = ui.label().classes("text-h6").props('role="status" data-testid="tracking"')
     hands = ui.label().classes("setup-text")
     items = ui.column().classes("w-full")
     wrong = ui.label().classes("setup-error").props('role="alert"')
@@ -45,7 +45,7 @@ def build(desk: Desk) -> None:
         nonlocal shown
         state = session.state
         poses = state.poses
-        told.set_text(_state(desk, any(pose.tracked.any() for pose in poses.values())))
+        status.set_text(_state(desk, any(pose.tracked.any() for pose in poses.values())))
         hands.set_text("\n".join(sentence(pose) for pose in poses.values()))
         wrong.set_text("\n".join(session.failures()))
         checklist = state.checklist

@@ -81,12 +81,12 @@ class Session:
 
     def failures(self) -> list[str]:
         """What ended by itself though it should run, and why."""
-        told: list[str] = []
+        faults: list[str] = []
         for name in (*(f"camera {camera.name}" for camera in self.plan.cameras), MASTER):
             process = self.state.local.get(name)
             if process is not None and process.ended() not in (None, 0) and not process.stopped:
-                told.append(f"{name} ended: {fault(process.lines)}")
-        return told
+                faults.append(f"{name} ended: {fault(process.lines)}")
+        return faults
 
     def choose_cameras(self, plan: Plan) -> None:
         """Write camera files; a rig that is there already gets the cameras, too.

@@ -342,19 +342,19 @@ def test_tracked_is_what_is_fresh_and_sure(tracked_m: float) -> None:
     """A joint is tracked while its region is smaller than `tracked_m` and its finger was measured just now."""
     settings = DEFAULT.changed("tracked_m", tracked_m).changed("tracked_pip_rad", 1.0)
     rng, machine = np.random.default_rng(4), estimator(settings=settings)
-    told_ns, kept = np.full(6, -(10**12)), 0
+    measured_ns, kept = np.full(6, -(10**12)), 0
     for k in range(60):
         gone = rng.random(6) < 0.4
         hand = push(machine, k * STEP_NS, bent_points(bent(k / 60.0, 30.0), np.flatnonzero(gone).tolist()))
         if hand.solution is None:
             continue
-        told_ns[:5][~gone[:5]] = k * STEP_NS
+        measured_ns[:5][~gone[:5]] = k * STEP_NS
         if (~gone).sum() >= 3 - (not gone[5]):
-            told_ns[5] = k * STEP_NS
+            measured_ns[5] = k * STEP_NS
         part = np.full(26, 5)
         for f, chain in enumerate(CHAINS):
             part[chain] = f
-        fresh = (k * STEP_NS - told_ns[part]) * 1e-9 <= DEFAULT.tracked_age_s
+        fresh = (k * STEP_NS - measured_ns[part]) * 1e-9 <= DEFAULT.tracked_age_s
         np.testing.assert_array_equal(hand.tracked, fresh & sure(hand, tracked_m))
         kept += int(hand.tracked.sum())
     assert 40 < kept < 60 * 26

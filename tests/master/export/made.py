@@ -9,7 +9,7 @@ from common.calibration import save
 from common.geometry import matrix_to_quaternion, rigid
 from common.hand_model import HandModel
 from common.hand_profiles import generated_profile
-from common.messages import Contact, Gesture, HandPose, ObjectPose, ObjectSource, Source, Told
+from common.messages import Contact, Gesture, HandPose, ObjectPose, ObjectSource, Source, ResultMessage
 from master.export.skeleton import Skeleton
 from master.outputs.poses import Poses
 from tests.hand_helpers import any_rotation, natural_angles
@@ -53,7 +53,7 @@ def poses_of(
     return out
 
 
-def told(hand: str, t_ns: int = BEGIN_NS) -> list[Told]:
+def told(hand: str, t_ns: int = BEGIN_NS) -> list[ResultMessage]:
     """An object, unknown at first, contact with it, and a pinch."""
     nowhere = np.full(3, np.nan)
     cup = ObjectPose(

@@ -12,7 +12,7 @@ from common.recording import MessageWriter
 from master.link_senders import SensorMessage
 from master.load_shedding import LoadShedding
 from master.message_queue import MessageQueue
-from master.recording.digest import ToldDigest
+from master.recording.digest import ResultDigest
 from master.recording.files import carried_files, rigs_text
 from master.recording.player import world_of
 from master.recording.probe import Probe, Tapped, came_ns
@@ -28,7 +28,7 @@ class RecordedRun(NamedTuple):
     """The file, and the sums of what was told live."""
 
     path: Path
-    live: ToldDigest
+    live: ResultDigest
 
 
 def report(t_ns: int, session: int = 5, reloads: int = 0) -> Health:
@@ -48,7 +48,7 @@ def recorded_run(
     files = RigFiles(calibration, ("desk",))
     setups = files.load()
     writer = MessageWriter(path, carried_files(files, setups), {"rigs": rigs_text(files.rigs)})
-    dispatcher, live = world_of(setups, LoadShedding()), ToldDigest()
+    dispatcher, live = world_of(setups, LoadShedding()), ResultDigest()
     messages = scene()[: 2 * frames]
     writer.write("health", report(messages[0].t_ns), messages[0].t_ns)
     for number, message in enumerate(messages):
@@ -82,7 +82,7 @@ def overloaded_run(path: Path, calibration: Path, bursts: Sequence[int]) -> tupl
     files = RigFiles(calibration, ("desk",))
     setups = files.load()
     writer = MessageWriter(path, carried_files(files, setups), {"rigs": rigs_text(files.rigs)})
-    bus, load_shedding, come, live = LoopbackBus(), LoadShedding(setups), Bursts(bursts), ToldDigest()
+    bus, load_shedding, come, live = LoopbackBus(), LoadShedding(setups), Bursts(bursts), ResultDigest()
     load_shedding.waiting, dispatcher = come.queue.frame_spans, world_of(setups, load_shedding)
     shown = bus.subscribe("taken", depth=1000)
     probe = Probe(bus, ManualClock(), always=True)

@@ -9,7 +9,7 @@ import pytest
 
 from common.bus import LoopbackBus
 from common.errors import BusError, PhalanxError, RecordingError
-from common.messages import Backlog, Command, HandPose, Told
+from common.messages import Backlog, Command, HandPose, ResultMessage
 from common.recording import open_messages
 from common.streams import MASTER
 from master.load_shedding import MOST
@@ -44,7 +44,7 @@ class Kept:
     def __init__(self) -> None:
         self.poses: list[HandPose] = []
 
-    def write(self, message: Told) -> None:
+    def write(self, message: ResultMessage) -> None:
         if isinstance(message, HandPose):
             self.poses.append(message)
 

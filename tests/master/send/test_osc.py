@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from common.errors import PhalanxError
 from common.hand_model import FINGERS, JOINTS
-from common.messages import Contact, Gesture, ObjectPose, Told
+from common.messages import Contact, Gesture, ObjectPose, ResultMessage
 from common.output_settings import OscOutput
 from master.send.osc import OscSink
 from master.send.osc_packets import Blank, BlankBundle, floats, ints
@@ -29,7 +29,7 @@ def ear() -> Iterator[socket.socket]:
         yield received
 
 
-def sent(ear: socket.socket, *messages: Told) -> list[Received]:
+def sent(ear: socket.socket, *messages: ResultMessage) -> list[Received]:
     """What arrives when these are sent, of all datagrams."""
     now_ns = T_NS + 10_000_000
     times = MasterTimes(lambda: now_ns, lambda: WALL_NS + now_ns)

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from common.bus import LoopbackBus
 from common.calibration import load, save
 from common.errors import BusError, CalibrationError, PhalanxError
-from common.messages import Command, Health, Told
+from common.messages import Command, Health, ResultMessage
 from common.output_settings import OscOutput, OutputSettings, VmcOutput, default_outputs
 from common.streams import MASTER
 from master.outputs.bus import BusSink
@@ -30,11 +30,11 @@ class Kept:
     """A sink that keeps what it is given; it may refuse to open, break, or wait for `gate` before each message."""
 
     def __init__(self, *, gate: threading.Event | None = None) -> None:
-        self.messages: list[Told] = []
+        self.messages: list[ResultMessage] = []
         self.broken, self.closed = False, 0
         self._gate = gate
 
-    def write(self, message: Told) -> None:
+    def write(self, message: ResultMessage) -> None:
         if self.broken:
             raise PhalanxError("the cable is out; put it in")
         if self._gate is not None:
@@ -184,7 +184,7 @@ def test_an_output_that_cannot_open_costs_its_messages_and_says_why_once() -> No
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_an_output_that_ends_by_an_error_nobody_foresaw_is_closed_and_not_called_open() -> None:
     class Faulty(Kept):
-        def write(self, message: Told) -> None:
+        def write(self, message: ResultMessage) -> None:
             raise KeyError(message.t_ns)
 
     sink, counters = Faulty(), Counters()

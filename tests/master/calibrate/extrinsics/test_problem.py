@@ -52,7 +52,7 @@ def problem() -> tuple[Problem, Unknown, Hands]:
         lines_of_sight, seen.both.markers.hand, seen.both.markers.markers, hand, track, chosen, 3000.0, first
     )
     hands = out.guessed(first)
-    out.tell(first, hands)
+    out.update_observations(first, hands)
     return out, first.moved(1e-3 * rng.normal(size=UNKNOWN)), hands
 
 

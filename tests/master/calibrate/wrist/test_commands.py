@@ -143,7 +143,7 @@ def test_the_flat_field_of_a_board_shown_everywhere(tree: Path, tmp_path: Path) 
     rig = rig_of(tree)
     assert rig.flat_field is not None
     assert rig.flat_field.coefficients[0] == 1.0
-    assert rig.provenance["flat_field"].residual["foretold_rms_percent"] < 4.0
+    assert rig.provenance["flat_field"].residual["cross_validated_rms_percent"] < 4.0
     assert "residual" in output
     assert cv2.imread(str(tmp_path / "flat.png")) is not None
 

@@ -49,7 +49,7 @@ def test_the_field_comes_back_to_three_per_cent_and_in_the_corners_to_ten(seed: 
     middle = np.linalg.norm(found.xy, axis=1) < 0.6
     assert worst_percent(field_at(fit.field, found.xy[middle]), truth(found.xy[middle])) < 3.0
     assert 0.015 < fit.rms < 0.035
-    assert fit.foretold_rms >= 0.95 * fit.rms
+    assert fit.cross_validated_rms >= 0.95 * fit.rms
 
 
 def test_it_is_one_on_the_axis_and_of_whole_degrees() -> None:
