@@ -82,7 +82,7 @@ def asked(constraints: Path, service: str) -> list[Package]:
         raise PhalanxError(f"{service}: {last[:300]}") from error
 
 
-def judge(versions: dict[str, str], told: Sequence[Package], who: dict[str, str]) -> Verdict:
+def judge(versions: dict[str, str], answered: Sequence[Package], who: dict[str, str]) -> Verdict:
     """What the answers come to.
 
     Args:
@@ -90,7 +90,7 @@ def judge(versions: dict[str, str], told: Sequence[Package], who: dict[str, str]
         told: What was answered.
         who: Name -> who needs it.
     """
-    answers = {one.name: one for one in told if not one.skip_reason and one.version == versions.get(one.name)}
+    answers = {one.name: one for one in answered if not one.skip_reason and one.version == versions.get(one.name)}
     lines: list[str] = []
     for name in sorted(answers):
         for one in answers[name].vulns:

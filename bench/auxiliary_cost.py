@@ -59,7 +59,7 @@ def costs_of(name: str, seconds: float) -> dict[str, Float]:
     profile = load(CALIBRATION / f"objects/{name}.json", ObjectProfile)
     pipeline, line = build_pipeline(setup, StageTimes()), ObjectLine(profile, setup.rig, setup.models)
     contact, gestures = ContactMonitor(setup.hand, [profile]), GestureRecogniser(setup.gestures, setup.hand)
-    told = list(detections(profile, setup.rig.markers, setup.models, _way(OBJECTS[name]), seconds, SEED))
+    messages = list(detections(profile, setup.rig.markers, setup.models, _way(OBJECTS[name]), seconds, SEED))
     spent: dict[str, list[float]] = {part: [] for part in ("hand", "object", "contact", "gestures")}
     waits = dict.fromkeys(spent, 0.0)
 
@@ -74,8 +74,8 @@ def costs_of(name: str, seconds: float) -> dict[str, Float]:
         return found
 
     for message in _hand(setup, name, profile, seconds):
-        while told and told[0].t_ns <= message.t_ns:
-            one = told.pop(0)
+        while messages and messages[0].t_ns <= message.t_ns:
+            one = messages.pop(0)
             for solved in timed("object", lambda one=one: line.push(one)):
                 if not solved.pose.tracked:
                     raise ValueError(

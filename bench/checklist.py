@@ -112,8 +112,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 for fault in wanted:
                     print(row(rehearse(rig, fault)), flush=True)
                 if options.clean > 0.0:
-                    told = clean(rig, options.clean)
-                    words = ", ".join(f"{code} {subject}" for code, subject in sorted(told)) or "nothing"
+                    reported = clean(rig, options.clean)
+                    words = ", ".join(f"{code} {subject}" for code, subject in sorted(reported)) or "nothing"
                     print(f"rig {name}, {options.clean:g} s with nothing wrong: told {words}", flush=True)
             finally:
                 rig.close()

@@ -65,12 +65,12 @@ class Lists:
 
     def _hear(self) -> None:
         while not self._closing.is_set():
-            told = self._lists.get(0.05)
-            if isinstance(told, Checklist):
+            reported = self._lists.get(0.05)
+            if isinstance(reported, Checklist):
                 with self._lock:
-                    keys = frozenset((item.code, item.subject) for item in told.items)
+                    keys = frozenset((item.code, item.subject) for item in reported.items)
                     self._came.append((time.monotonic(), keys))
-                self.sentences |= {(one.code, one.subject): (one.sentence, one.fix) for one in told.items}
+                self.sentences |= {(one.code, one.subject): (one.sentence, one.fix) for one in reported.items}
             while isinstance(self._health.get(0.0), Health):
                 self.reports += 1
 

@@ -41,18 +41,18 @@ def rows() -> Iterator[Row]:
     desk = load_setup(ROOT / "calib_json", "desk")
     yield from _law_rows(desk)
     for scene in SCENES:
-        told = shown(scene, SECONDS, SEED)
-        setup = replace(told.both.markers, rig=_as_desk(told.both.markers, desk))
+        played = shown(scene, SECONDS, SEED)
+        setup = replace(played.both.markers, rig=_as_desk(played.both.markers, desk))
         for name, changes in (
             ("estimator", {}),
             ("fabrik", {"solver": "fabrik"}),
             ("fabrik, triangulated instead of the power law", {"solver": "fabrik", "depth_model": "stereo"}),
             ("fabrik, without the filter", {"solver": "fabrik", "filter": UNFILTERED}),
         ):
-            poses = solved(replace(setup, rig=with_fields(setup.rig, **changes)), told)
-            joint, pip = errors(told, poses)
+            poses = solved(replace(setup, rig=with_fields(setup.rig, **changes)), played)
+            joint, pip = errors(played, poses)
             yield Row(f"{scene}: {name}: joints of fingers seen", joint, "mm", f"PIP {pip:.2f} deg")
-        yield from _cost_rows(scene, replace(setup, rig=with_fields(setup.rig, solver="fabrik")), told)
+        yield from _cost_rows(scene, replace(setup, rig=with_fields(setup.rig, solver="fabrik")), played)
 
 
 def _as_desk(setup: RigSetup, desk: RigSetup) -> RigCalibration:
@@ -67,22 +67,22 @@ def _as_desk(setup: RigSetup, desk: RigSetup) -> RigCalibration:
     )
 
 
-def solved(setup: RigSetup, told: Shown) -> list[HandPose]:
+def solved(setup: RigSetup, played: Shown) -> list[HandPose]:
     """The poses of a rig of what its cameras told."""
     pipeline = build_pipeline(setup, StageTimes())
-    messages = [message for message in told.messages if isinstance(message, MarkerDetections)]
+    messages = [message for message in played.messages if isinstance(message, MarkerDetections)]
     poses = [one.pose for message in messages for one in pipeline.push(message)]
     return [pose for pose in poses + [one.pose for one in pipeline.flush()] if pose.valid.any()]
 
 
-def errors(told: Shown, poses: list[HandPose]) -> tuple[float, float]:
+def errors(played: Shown, poses: list[HandPose]) -> tuple[float, float]:
     """Mean error of joints [mm] and PIPs [deg] of fingers that both cameras see, and of the palm."""
-    markers = told.both.markers.rig.markers
+    markers = played.both.markers.rig.markers
     names = ("thumb", "index", "middle", "ring", "little")
     joints, angles = list[Float](), list[Float]()
     for pose in poses:
-        truth = told.both.truth(pose.t_ns)
-        both = told.line_of_sight.cameras_of(np.array([truth.t_s]), _NEAR_S)[0] >= 2
+        truth = played.both.truth(pose.t_ns)
+        both = played.line_of_sight.cameras_of(np.array([truth.t_s]), _NEAR_S)[0] >= 2
         clear = np.ones(26, np.bool_)
         for finger, name in enumerate(names):
             clear[list(FINGER_JOINTS[finger])] = both[markers.index(name)]
@@ -92,9 +92,9 @@ def errors(told: Shown, poses: list[HandPose]) -> tuple[float, float]:
     return float(np.concatenate(joints).mean()), float(np.concatenate(angles).mean())
 
 
-def _cost_rows(scene: str, setup: RigSetup, told: Shown) -> Iterator[Row]:
+def _cost_rows(scene: str, setup: RigSetup, played: Shown) -> Iterator[Row]:
     line = line_of(setup, StageTimes())
-    messages = [message for message in told.messages if isinstance(message, MarkerDetections)]
+    messages = [message for message in played.messages if isinstance(message, MarkerDetections)]
     epochs = [epoch for message in messages for epoch in line.sync.push(message)]
     spent, iterations, fingers = list[float](), 0, 0
     for epoch in epochs:

@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from bench.faults_poses import Told
+from bench.faults_poses import ReceivedPose
 from bench.faults_rig import RATE_HZ, FaultRig
 from bench.processes import cpu_s, footprint
 from common.datagram import HEADER, MAGIC, MAX_DATAGRAM, Address, Kind
@@ -38,7 +38,7 @@ class Share:
     slave_cpu: float
     poses_per_s: float
     lost: float
-    told: list[Told]
+    received: list[ReceivedPose]
 
 
 class Watch:
@@ -52,7 +52,7 @@ class Watch:
     def end(self) -> Share:
         """What happened since."""
         seconds, used = time.monotonic() - self._began, self._cpu()
-        told, counts = self._rig.poses.since(self._began), self._rig.counts()
+        received, counts = self._rig.poses.since(self._began), self._rig.counts()
         rise = {
             name: sum(
                 counts.get(f"{c}.{name}", 0) - self._counts.get(f"{c}.{name}", 0) for c in ("left", "right")
@@ -61,7 +61,7 @@ class Watch:
         }
         cpu = [(b - a) / seconds for a, b in zip(self._used, used, strict=True)]
         lost = rise["lost"] / max(rise["lost"] + rise["received"], 1)
-        return Share(seconds, cpu[0], cpu[1], len(told) / seconds, lost, told)
+        return Share(seconds, cpu[0], cpu[1], len(received) / seconds, lost, received)
 
     def _cpu(self) -> tuple[float, float]:
         processes = self._rig.processes

@@ -107,7 +107,7 @@ def _crash_loop(rig: FaultRig) -> float:
 
 def _step(by_s: float) -> Callable[[FaultRig], float]:
     def bring(rig: FaultRig) -> float:
-        rig.tell("left", f"step {by_s}")
+        rig.send_line("left", f"step {by_s}")
         return time.monotonic()
 
     return bring

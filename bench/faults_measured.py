@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from bench.faults_links import Fault
-from bench.faults_poses import Told
+from bench.faults_poses import ReceivedPose
 from bench.faults_rig import FaultRig, asked
 
 GOAL_S = 2.0
@@ -86,7 +86,7 @@ class Run:
         return out
 
 
-def false(one: Told) -> bool:
+def false(one: ReceivedPose) -> bool:
     """Whether a pose says what is not so: sure of a joint and wrong about it."""
     return one.beyond > SANE_SIGMAS or (one.worst_mm > SANE_MM and one.beyond > LIKELY_SIGMAS)
 
@@ -158,20 +158,20 @@ def _measure(rig: FaultRig, fault: Fault) -> Run:
     recovery_s = rig.steady_after(ended)
     time.sleep(AFTER_S)
     codes = listed.close()
-    told = rig.poses.since(began, ended + max(recovery_s or 0.0, AFTER_S))
-    during = [one for one in told if one.came_s < ended]
+    received = rig.poses.since(began, ended + max(recovery_s or 0.0, AFTER_S))
+    during = [one for one in received if one.came_s < ended]
     after = asked(rig)
     base = {} if fault.restarts else before
     grown_mb = 0.0 if fault.restarts else rig.anonymous_mb() - memory
-    seen = [one for one in told if np.isfinite(one.worst_mm)]
+    seen = [one for one in received if np.isfinite(one.worst_mm)]
     return Run(
         lasted_s=ended - began,
         recovery_s=recovery_s,
         share=len(during) / max(rig.pace.rate_hz * (ended - began), 1.0),
         worst_mm=max((one.worst_mm for one in seen), default=float("nan")),
-        beyond=max((one.beyond for one in told), default=0.0),
-        false=sum(false(one) for one in told),
-        oldest_s=max((one.age_s for one in told), default=0.0),
+        beyond=max((one.beyond for one in received), default=0.0),
+        false=sum(false(one) for one in received),
+        oldest_s=max((one.age_s for one in received), default=0.0),
         counts={name: after.get(name, 0) - base.get(name, 0) for name in fault.counts},
         listed=codes,
         grown_mb=grown_mb,

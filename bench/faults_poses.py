@@ -20,7 +20,7 @@ SANE_MM = 20.0  # of a joint that is said to be tracked; the scene's hand is 180
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class ReceivedPose:
     """One pose.
 
     Attributes:
@@ -63,7 +63,7 @@ class Judge:
         k = int(at)
         return self._table[k] + (at - k) * (self._table[k + 1] - self._table[k])
 
-    def told(self, pose: HandPose, came_ns: int) -> Told:
+    def received(self, pose: HandPose, came_ns: int) -> ReceivedPose:
         """How right a pose is that came at `came_ns`."""
         error = np.linalg.norm(pose.position_m - self.joints_m(pose.t_ns), axis=1)
         sigma = np.sqrt(np.trace(pose.cov_m2, axis1=1, axis2=2))
@@ -72,7 +72,7 @@ class Judge:
         worst_mm, mean_mm = (
             (float(tracked_mm.max()), float(tracked_mm.mean())) if len(tracked_mm) else (np.nan, np.nan)
         )
-        return Told(came_ns * 1e-9, (came_ns - pose.t_ns) * 1e-9, worst_mm, mean_mm, float(beyond))
+        return ReceivedPose(came_ns * 1e-9, (came_ns - pose.t_ns) * 1e-9, worst_mm, mean_mm, float(beyond))
 
 
 class Poses:
@@ -82,14 +82,14 @@ class Poses:
         """Listen from now on."""
         self._hands, self._judge = bus.subscribe("hand", depth=256), judge
         self._lock, self._closing = threading.Lock(), threading.Event()
-        self._told: list[Told] = []
+        self._received: list[ReceivedPose] = []
         self._thread = threading.Thread(target=self._hear, daemon=True)
         self._thread.start()
 
-    def since(self, moment_s: float, until_s: float = float("inf")) -> list[Told]:
+    def since(self, moment_s: float, until_s: float = float("inf")) -> list[ReceivedPose]:
         """Those that came in between, `time.monotonic`."""
         with self._lock:
-            return [one for one in self._told if moment_s <= one.came_s < until_s]
+            return [one for one in self._received if moment_s <= one.came_s < until_s]
 
     def close(self) -> None:
         """Listen no more."""
@@ -100,24 +100,24 @@ class Poses:
         while not self._closing.is_set():
             pose = self._hands.get(0.05)
             if isinstance(pose, HandPose):
-                told = self._judge.told(pose, time.monotonic_ns())
+                received = self._judge.received(pose, time.monotonic_ns())
                 with self._lock:
-                    self._told.append(told)
+                    self._received.append(received)
 
 
-def pace_of(told: list[Told], began_s: float, ended_s: float, rate_hz: float) -> Pace:
+def pace_of(received: list[ReceivedPose], began_s: float, ended_s: float, rate_hz: float) -> Pace:
     """The pace of what came from `began_s` to `ended_s`: at most `rate_hz`; gaps half as long again as the longest."""
-    came = [began_s, *(one.came_s for one in told), ended_s]
+    came = [began_s, *(one.came_s for one in received), ended_s]
     longest_s = max(b - a for a, b in pairwise(came))
-    return Pace(min(rate_hz, len(told) / (ended_s - began_s)), max(GAP_S, 1.5 * longest_s))
+    return Pace(min(rate_hz, len(received) / (ended_s - began_s)), max(GAP_S, 1.5 * longest_s))
 
 
-def steady_from(told: list[Told], moment_s: float, pace: Pace) -> float | None:
+def steady_from(received: list[ReceivedPose], moment_s: float, pace: Pace) -> float | None:
     """When, after `moment_s`, poses came steadily and were right for half a second; None: not yet.
 
     Steady: four fifths of the number of the pace, no gap above its own, no tracked joint off by more than 20 mm.
     """
-    came = [one for one in told if one.came_s >= moment_s]
+    came = [one for one in received if one.came_s >= moment_s]
     for k, first in enumerate(came):
         window = [one for one in came[k:] if one.came_s < first.came_s + STEADY_S]
         if came[-1].came_s < first.came_s + STEADY_S:

@@ -124,7 +124,7 @@ class FaultRig:
         self.processes[name].kill()
         self.processes[name].wait()
 
-    def tell(self, name: str, line: str) -> None:
+    def send_line(self, name: str, line: str) -> None:
         """Notify a line to a camera's process."""
         pipe = self.processes[name].stdin
         assert pipe is not None
@@ -141,8 +141,8 @@ class FaultRig:
 
     def listed(self) -> frozenset[tuple[str, str]]:
         """Code and subject of what the newest checklist has that has come."""
-        while isinstance(told := self._lists.get(0.0), Checklist):
-            self._listed = frozenset((item.code, item.subject) for item in told.items)
+        while isinstance(reported := self._lists.get(0.0), Checklist):
+            self._listed = frozenset((item.code, item.subject) for item in reported.items)
         return self._listed
 
     def anonymous_mb(self) -> float:

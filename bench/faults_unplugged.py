@@ -31,15 +31,15 @@ def unplug(rig: Rig, away_s: float, fault: str) -> tuple[float, float, int]:
     began = time.monotonic()
     rig.fault("left", **{fault: True})
     until(lambda: ABSENT in rig.lists.now(), PATIENCE_S)
-    told_s = time.monotonic() - began
-    time.sleep(max(0.0, away_s - told_s))
+    noticed_s = time.monotonic() - began
+    time.sleep(max(0.0, away_s - noticed_s))
     counts = rig.ask(MASTER, "report").counts
     rig.fault("left")
     plugged = time.monotonic()
     until(lambda: rig.ask(MASTER, "report").counts["left.received"] > counts["left.received"], PATIENCE_S)
     back_s = time.monotonic() - plugged
     until(lambda: ABSENT not in rig.lists.now(), PATIENCE_S)
-    return told_s, back_s, counts["poses"] - poses
+    return noticed_s, back_s, counts["poses"] - poses
 
 
 def main() -> int:
@@ -57,8 +57,8 @@ def main() -> int:
             alive = rig.processes["left"].poll() is None
         finally:
             rig.close()
-    told_s, back_s, poses = zip(*runs, strict=True)
-    print(f"told after {statistics.median(told_s):.2f} s, {max(told_s):.2f} s")
+    noticed_s, back_s, poses = zip(*runs, strict=True)
+    print(f"told after {statistics.median(noticed_s):.2f} s, {max(noticed_s):.2f} s")
     print(f"first frame after its end {statistics.median(back_s):.2f} s, {max(back_s):.2f} s")
     print(f"poses while it was away {statistics.median(poses):.0f} in {AWAY_S:g} s")
     print(", ".join(f"{name} {count}" for name, count in counts.items() if name.startswith("camera.")))

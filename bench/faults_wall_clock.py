@@ -88,29 +88,29 @@ class WallClock:
     def _check(self) -> None:
         for ahead_s in (*STEPS_S, 0.0):
             self.set(ahead_s)
-            told = subprocess.run(
+            answer = subprocess.run(
                 [sys.executable, "-c", "import time; print(time.time(), time.monotonic())"],
                 env=os.environ | self.environment,
                 capture_output=True,
                 text=True,
                 check=True,
             )
-            wall, monotonic = (float(word) for word in told.stdout.split())
+            wall, monotonic = (float(word) for word in answer.stdout.split())
             if abs(wall - time.time() - ahead_s) > 4.0 or abs(monotonic - time.monotonic()) > 4.0:
                 raise PhalanxError(f"{SOURCE}: does not move the wall clock alone here")
 
 
 def jump(rig: Rig, clock: WallClock, ahead_s: float) -> Run:
     """Have the wall clock jump and come back, and see what the master counts meanwhile."""
-    told = [_counts(rig)]
+    answer = [_counts(rig)]
     for ahead in (0.0, ahead_s):
         clock.set(ahead)
         time.sleep(WATCH_S)
-        told.append(_counts(rig))
+        answer.append(_counts(rig))
     clock.set(0.0)
-    before, after = (_for_each(OTHER, *pair) for pair in pairwise(told))
+    before, after = (_for_each(OTHER, *pair) for pair in pairwise(answer))
     share = min(after[name] / before[name] for name in before)
-    return Run(share, {name: told[2].get(name, 0) - told[1].get(name, 0) for name in _COUNTS})
+    return Run(share, {name: answer[2].get(name, 0) - answer[1].get(name, 0) for name in _COUNTS})
 
 
 def wrong(run: Run) -> bool:

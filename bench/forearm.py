@@ -42,7 +42,7 @@ _WORLD = (float(np.cos(np.radians(60.0))), float(np.sin(np.radians(60.0))), 0.0,
 IMU = ImuCalibration(q_palm_imu=(0.5, 0.5, -0.5, 0.5), q_rig_world=_WORLD, heading_drift_rad_s=radians(1.0))
 _SEEDS = range(201, 213)
 _SIGMA_M = 1e-3
-_REST_S, _TOLD_S, _GONE_S, _ROUNDS, _SETTLED_S = 3.0, 10.0, 5.0, 3, 3.0
+_REST_S, _VISIBLE_S, _GONE_S, _ROUNDS, _SETTLED_S = 3.0, 10.0, 5.0, 3, 3.0
 _AFTER_S = (0.0, 0.5, 1.0, 2.0, 5.0)
 _FRAME_S = 1.0 / 60.0
 _REGION = np.array([3.841, 5.991, 7.815])  # chi square, 95 %: heading, bend, palm
@@ -72,7 +72,7 @@ class FlexedWrist:
         return self._habit + before + share * (self._posture[k] - before) + waver
 
 
-class ToldMarkers:
+class MeasuredMarkers:
     """Markers on the back of a hand, and an error. Holds the error of this recording."""
 
     def __init__(self, setup: RigSetup, seed: int, kind: Kind) -> None:
@@ -177,7 +177,7 @@ class Moment(NamedTuple):
 
 def moments(arm: Arm, kind: Kind, rigs: tuple[RigSetup, WristSetup]) -> Iterator[Moment]:
     """Play a recording; now and then while markers are told, and at the given times after the last ones, look."""
-    line, told, last = Line(*rigs), ToldMarkers(rigs[0], arm.seed, kind), STRAIGHT
+    line, markers, last = Line(*rigs), MeasuredMarkers(rigs[0], arm.seed, kind), STRAIGHT
     unseen = np.full((len(rigs[0].hand_markers), 3), np.nan)
     frame = 0
     for sample in arm.samples:
@@ -186,14 +186,14 @@ def moments(arm: Arm, kind: Kind, rigs: tuple[RigSetup, WristSetup]) -> Iterator
         t_s = sample.seq / IMU.rate_hz
         if sample.seq % 2 == 0 or t_s < _REST_S:
             continue
-        since_s = (t_s - _REST_S) % (_TOLD_S + _GONE_S)
+        since_s = (t_s - _REST_S) % (_VISIBLE_S + _GONE_S)
         frame += 1
-        shown = since_s <= _TOLD_S
-        hand = line.push(sample.t_ns, told.of(arm.palm(t_s)) if shown else unseen)
+        shown = since_s <= _VISIBLE_S
+        hand = line.push(sample.t_ns, markers.of(arm.palm(t_s)) if shown else unseen)
         if shown:
             last = line.estimator.extras[WRIST_ANGLES : WRIST_ANGLES + 2].copy()
-        looked = [s for s in _AFTER_S[1:] if abs(since_s - _TOLD_S - s) < 0.5 * _FRAME_S]
-        if _SETTLED_S < since_s <= _TOLD_S and frame % 15 == 0:
+        looked = [s for s in _AFTER_S[1:] if abs(since_s - _VISIBLE_S - s) < 0.5 * _FRAME_S]
+        if _SETTLED_S < since_s <= _VISIBLE_S and frame % 15 == 0:
             looked = [0.0]
         if looked:
             yield _moment(arm, line.estimator, hand, sample, looked[0], last)
@@ -220,7 +220,7 @@ def _moment(
 
 def rows() -> Iterator[Row]:
     """Measure; one row per figure."""
-    seconds = _REST_S + _ROUNDS * (_TOLD_S + _GONE_S)
+    seconds = _REST_S + _ROUNDS * (_VISIBLE_S + _GONE_S)
     arms = [Arm.of(seed, IMU, seconds) for seed in _SEEDS]
     rigs = _rigs()
     for kind in KINDS:
@@ -229,7 +229,7 @@ def rows() -> Iterator[Row]:
             group = [one for one in found if one.after_s == after_s]
             off = _rms(np.array([one.off_deg for one in group]))
             inside = 100.0 * (np.array([one.surprise for one in group]) < _REGION).mean(axis=0)
-            when = "told" if after_s == 0.0 else f"{after_s:g} s after"
+            when = "visible" if after_s == 0.0 else f"{after_s:g} s after"
             notes = "", f"; kept as it was {off[3]:.1f}, believed straight {off[4]:.1f}", ""
             for k, what in enumerate(("heading", "bend", "palm")):
                 note = f"{inside[k]:.0f} % of {len(group)} inside 95 %{notes[k]}"
@@ -246,12 +246,12 @@ def _rigs() -> tuple[RigSetup, WristSetup]:
 
 def _cost(arm: Arm, rigs: tuple[RigSetup, WristSetup]) -> Row:
     """Microseconds that an epoch with markers and IMU costs."""
-    line, told = Line(*rigs), ToldMarkers(rigs[0], arm.seed, "plain")
+    line, markers = Line(*rigs), MeasuredMarkers(rigs[0], arm.seed, "plain")
     assert line.side.forearm is not None
     spent: list[float] = []
     for sample in arm.samples[:1200]:
         line.side.forearm.push(sample.t_ns, sample.orientation_wxyz, sample.heading_sigma_rad)
-        points = told.of(arm.palm(sample.seq / IMU.rate_hz))
+        points = markers.of(arm.palm(sample.seq / IMU.rate_hz))
         start = perf_counter_ns()
         line.push(sample.t_ns, points)
         spent.append((perf_counter_ns() - start) * 1e-3)

@@ -21,9 +21,9 @@ SCENE, SECONDS, SEED = "grasp", 6.0, 7
 
 def rows() -> Iterator[Row]:
     """A hand that grasps, solved by markers, by the wrist device, and by both."""
-    told = shown(SCENE, SECONDS, SEED)
+    played = shown(SCENE, SECONDS, SEED)
     markers, wrist, fused = (
-        costs(setup, told.messages) for setup in (told.both.markers, told.both.wrist, told.both.fused)
+        costs(setup, played.messages) for setup in (played.both.markers, played.both.wrist, played.both.fused)
     )
     yield Row("an instant of two cameras, markers alone", 1e3 * markers["instant"], "ms", "")
     yield _row("  fused with the wrist device", fused["instant"], markers["instant"], "markers alone")

@@ -21,7 +21,7 @@ import numpy as np
 
 from bench.gesture_recorded import leap_rows, static_rows
 from bench.gesture_rigs import rows as rigs
-from bench.gesture_told import Told, pose_of, told_of
+from bench.gesture_told import RecognisedPoses, pose_of, recognised_in
 from bench.hand_draws import MARKERS
 from bench.row import Row, median_us
 from bench.solved_hand import PointHand
@@ -58,9 +58,9 @@ def rows() -> Iterator[Row]:
     yield _cost()
 
 
-def people(numbers: Sequence[int] | range, seconds: float = 15.0) -> Told:
+def people(numbers: Sequence[int] | range, seconds: float = 15.0) -> RecognisedPoses:
     """People of the study before cameras that see all markers: own bones, a measured model, 1 mm of noise."""
-    out = Told()
+    out = RecognisedPoses()
     wrist, typical = load(CALIBRATION / "rigs/wrist.json", RigCalibration), _hand("right")
     for number in numbers:
         who = participant(_SEED, number, wrist, typical)
@@ -80,15 +80,15 @@ def people(numbers: Sequence[int] | range, seconds: float = 15.0) -> Told:
             assert solved is not None
             place, orientation = solved.joints.position_m, matrix_to_quaternion(solved.joints.rotation)
             poses.append(pose_of(known, t_ns, place, orientation, solved.angles_rad))
-        out.add([motion.held(1e-9 * pose.t_ns) for pose in poses], told_of(poses, known))
+        out.add([motion.held(1e-9 * pose.t_ns) for pose in poses], recognised_in(poses, known))
     return out
 
 
-def wrist_device(numbers: Sequence[int] | range) -> Told:
+def wrist_device(numbers: Sequence[int] | range) -> RecognisedPoses:
     """Trials of the study: rendered, detected by the slave, calibrated and solved as everybody's."""
     rig = load(CALIBRATION / "rigs/wrist.json", RigCalibration)
     camera = load(CALIBRATION / "cameras/wrist.json", CameraCalibration)
-    out = Told()
+    out = RecognisedPoses()
     with tempfile.TemporaryDirectory() as folder:
         task = Task(
             rig=rig,
@@ -112,7 +112,7 @@ def wrist_device(numbers: Sequence[int] | range) -> Told:
             model = HandModel.of(load(own / "calibrated" / "hand.json", HandProfile))
             messages = [poses.pose(k) for k in range(len(poses))]
             held = read_trials(own / TRIALS / TRIALS_FILE)
-            out.add([_held_at(held, pose.t_ns) for pose in messages], told_of(messages, model))
+            out.add([_held_at(held, pose.t_ns) for pose in messages], recognised_in(messages, model))
     return out
 
 

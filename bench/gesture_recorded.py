@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.gesture_told import pose_of, told_of
+from bench.gesture_told import pose_of, recognised_in
 from bench.hand_draws import FACING_ROTATION, MARKERS
 from bench.real_motion import SIGMA_M, Recorded, recordings, wide_limits
 from bench.row import Row
@@ -74,15 +74,15 @@ def leap_rows() -> Iterator[Row]:
     wrong, count, seconds = 0, 0, 0.0
     lines: list[Row] = []
     for seed, recorded in enumerate(recordings(folder)):
-        told = told_of(_shown(recorded, recorded.model(), seed), recorded.model())
-        begun = [k for k in range(len(told)) if told[k] is not None and (k == 0 or told[k] != told[k - 1])]
-        bad = [k for k in begun if not agrees(str(told[k]), recorded.fingers_m[k])]
+        recognised = recognised_in(_shown(recorded, recorded.model(), seed), recorded.model())
+        begun = [k for k in range(len(recognised)) if recognised[k] is not None and (k == 0 or recognised[k] != recognised[k - 1])]
+        bad = [k for k in begun if not agrees(str(recognised[k]), recorded.fingers_m[k])]
         wrong, count, seconds = (
             wrong + len(bad),
             count + len(begun),
             seconds + 1e-9 * float(recorded.t_ns[-1]),
         )
-        names = ", ".join(str(told[k]) for k in begun) or "nothing"
+        names = ", ".join(str(recognised[k]) for k in begun) or "nothing"
         lines.append(Row(f"  {recorded.name}: events", float(len(begun)), "", names))
     yield Row("leapjs: wrong poses told", float(wrong), "", f"goal 0; of {count} in {seconds:.0f} s")
     yield from lines
@@ -117,7 +117,7 @@ def _static(model: HandModel, joints: Float, seed: int) -> str | None:
     caps = np.vstack([tips, T[:3, :3] @ model.mount("back").offset_m + T[:3, 3]])
     points = np.tile(caps, (_FRAMES, 1, 1))
     t_ns = [k * _PERIOD_NS for k in range(_FRAMES)]
-    return told_of(_solved(model, t_ns, points, -T[:3, 3] / np.linalg.norm(T[:3, 3]), seed), model)[-1]
+    return recognised_in(_solved(model, t_ns, points, -T[:3, 3] / np.linalg.norm(T[:3, 3]), seed), model)[-1]
 
 
 def _shown(recorded: Recorded, model: HandModel, seed: int) -> list[HandPose]:

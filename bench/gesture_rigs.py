@@ -19,7 +19,7 @@ from msgspec.structs import replace
 
 from bench.fusion_scene import Both, Observed, in_order, orientations
 from bench.fusion_watched import cycles_of
-from bench.gesture_told import Told, told_of
+from bench.gesture_told import RecognisedPoses, recognised_in
 from bench.played import START_NS, message_of, times_of
 from bench.row import Row
 from common.calibration import CameraCalibration, RigCalibration, load
@@ -47,16 +47,16 @@ _ROTATION_RAD, _SHIFT_M = np.radians(0.75), 0.65e-3  # per axis, what a calibrat
 
 def rows(people: Sequence[int] = PEOPLE) -> Iterator[Row]:
     """A table of confusions for each rig, of these people together."""
-    told: dict[str, Told] = {}
+    recognised: dict[str, RecognisedPoses] = {}
     for number in people:
         for rig, one in (*by_markers(number).items(), *by_both(number).items()):
-            told.setdefault(rig, Told()).join(one)
+            recognised.setdefault(rig, RecognisedPoses()).join(one)
     goals = {"desk": "no goal: fingers hide"}
-    for rig, one in told.items():
+    for rig, one in recognised.items():
         yield from one.rows(f"{rig}, people: {len(people)}", goals.get(rig, "goal 98"))
 
 
-def by_markers(number: int, seconds: float = SECONDS) -> dict[str, Told]:
+def by_markers(number: int, seconds: float = SECONDS) -> dict[str, RecognisedPoses]:
     """One person before four cameras, and what two of them tell."""
     four = _setup("desk4")
     who = _person(number, four)
@@ -64,10 +64,10 @@ def by_markers(number: int, seconds: float = SECONDS) -> dict[str, Told]:
     motion = StudyPoses(model, view_centre(four.rig), _MOTION + number)
     scene = Scene.of_motion(four.rig, four.cameras, who.hand, motion, _MOTION + number)
     messages = _monitored(scene, seconds)
-    return {name: _told(_known(_setup(name), who), messages, motion) for name in ("desk", "desk4")}
+    return {name: _recognised(_known(_setup(name), who), messages, motion) for name in ("desk", "desk4")}
 
 
-def by_both(number: int, seconds: float = SECONDS) -> dict[str, Told]:
+def by_both(number: int, seconds: float = SECONDS) -> dict[str, RecognisedPoses]:
     """One person before two cameras with three markers on the back, and what a wrist device adds."""
     marked, wrist_setup = _setup("desk-back3"), load_setup(CALIBRATION, "wrist-back3")
     who = _person(number, marked)
@@ -84,8 +84,8 @@ def by_both(number: int, seconds: float = SECONDS) -> dict[str, Told]:
     markers = _monitored(scene, seconds)
     everything = in_order([*markers, *orientations(both, seconds), *cycles_of(both, seconds)[0]])
     return {
-        "desk-back3": _told(alone, markers, posed),
-        "desk-back3 + wrist-back3": _told(both.fused, everything, posed),
+        "desk-back3": _recognised(alone, markers, posed),
+        "desk-back3 + wrist-back3": _recognised(both.fused, everything, posed),
     }
 
 
@@ -103,7 +103,7 @@ def _monitored(scene: Scene, seconds: float) -> list[Observed]:
     return in_order(out)
 
 
-def _told(setup: RigSetup, messages: Sequence[Observed], motion: StudyPoses) -> Told:
+def _recognised(setup: RigSetup, messages: Sequence[Observed], motion: StudyPoses) -> RecognisedPoses:
     """What is told of a rig's share of the messages."""
     pipeline = pipeline_of(setup, StageTimes())
     poses: list[HandPose] = []
@@ -112,8 +112,8 @@ def _told(setup: RigSetup, messages: Sequence[Observed], motion: StudyPoses) -> 
             pipeline.push_orientation(message.t_ns, message.orientation_wxyz, message.heading_sigma_rad)
         elif message.camera in setup.cameras:
             poses += [one.pose for one in pipeline.push(message)]
-    out = Told()
-    out.add([motion.held(1e-9 * (pose.t_ns - START_NS)) for pose in poses], told_of(poses, setup.hand))
+    out = RecognisedPoses()
+    out.add([motion.held(1e-9 * (pose.t_ns - START_NS)) for pose in poses], recognised_in(poses, setup.hand))
     return out
 
 

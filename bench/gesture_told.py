@@ -21,7 +21,7 @@ _SIGMA_M = 2e-3  # claimed of every joint
 
 
 @dataclass(slots=True)
-class Told:
+class RecognisedPoses:
     """What was told of held poses: (true, told) -> frames; episodes, those told in time, and events while none fits."""
 
     frames: Counter[tuple[str, str]] = field(default_factory=Counter[tuple[str, str]])
@@ -29,7 +29,7 @@ class Told:
     in_time: int = 0
     passing: int = 0
 
-    def add(self, truth: Sequence[str | None], told: Sequence[str | None]) -> None:
+    def add(self, truth: Sequence[str | None], recognised: Sequence[str | None]) -> None:
         """Of one hand, frame by frame."""
         begin = 0
         for k in range(1, len(truth) + 1):
@@ -38,12 +38,12 @@ class Told:
             name = truth[begin]
             if name is not None and k - begin > FORMED:
                 self.episodes += 1
-                self.in_time += told[begin + FORMED] == name
-                self.frames.update((name, told[j] or _NONE) for j in range(begin + FORMED, k))
+                self.in_time += recognised[begin + FORMED] == name
+                self.frames.update((name, recognised[j] or _NONE) for j in range(begin + FORMED, k))
             begin = k
-        self.passing += _passing(truth, told)
+        self.passing += _passing(truth, recognised)
 
-    def join(self, other: "Told") -> None:
+    def join(self, other: "RecognisedPoses") -> None:
         """What was told of others as well."""
         self.frames.update(other.frames)
         self.episodes += other.episodes
@@ -75,7 +75,7 @@ class Told:
             f"{goal}; of {self.episodes}; passing {self.passing}",
         )
         for name in POSES:
-            of = {told: n for (true, told), n in self.frames.items() if true == name}
+            of = {recognised: n for (true, recognised), n in self.frames.items() if true == name}
             if set(of) - {name}:
                 yield Row(f"  {name}", 100.0 * of.get(name, 0) / sum(of.values()), "%", str(of))
 
@@ -103,7 +103,7 @@ def pose_of(
     )
 
 
-def told_of(poses: Sequence[HandPose], model: HandModel) -> list[str | None]:
+def recognised_in(poses: Sequence[HandPose], model: HandModel) -> list[str | None]:
     """The pose that is held after each."""
     extractor, recogniser = FeatureExtractor(model), PoseRecogniser(default_gestures())
     out: list[str | None] = []
@@ -117,14 +117,14 @@ def told_of(poses: Sequence[HandPose], model: HandModel) -> list[str | None]:
     return out
 
 
-def _passing(truth: Sequence[str | None], told: Sequence[str | None]) -> int:
+def _passing(truth: Sequence[str | None], recognised: Sequence[str | None]) -> int:
     """Poses that are told between two held ones, and are neither of them."""
     held = [k for k, name in enumerate(truth) if name is not None]
     count = 0
-    for k in range(1, len(told)):
-        if told[k] is None or told[k] == told[k - 1] or not held or not held[0] < k < held[-1]:
+    for k in range(1, len(recognised)):
+        if recognised[k] is None or recognised[k] == recognised[k - 1] or not held or not held[0] < k < held[-1]:
             continue
         before = next(truth[j] for j in range(k, -1, -1) if truth[j] is not None)
         after = next(truth[j] for j in range(k, len(truth)) if truth[j] is not None)
-        count += told[k] not in (before, after)
+        count += recognised[k] not in (before, after)
     return count

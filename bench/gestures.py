@@ -69,9 +69,9 @@ class Score:
     ray_deg: list[float] = field(default_factory=lambda: list[float]())
     jitter_deg: list[float] = field(default_factory=lambda: list[float]())
 
-    def add(self, told: Sequence[Gesture], truth: GestureTruth) -> None:
+    def add(self, recognised: Sequence[Gesture], truth: GestureTruth) -> None:
         """Hold what was told against the truth."""
-        free = [one for one in told if one.phase == "begin" or one.kind == "tap"]
+        free = [one for one in recognised if one.phase == "begin" or one.kind == "tap"]
         for event in truth.events:
             self.annotations[event.kind] += 1
             at_s = event.end_s if event.kind == "tap" else event.begin_s
@@ -84,7 +84,7 @@ class Score:
             self._late(f"{event.kind} begin" if event.kind != "tap" else "tap", _s(found.t_ns) - at_s)
             if event.kind == "tap":
                 continue
-            updates = [one for one in told if (one.kind, one.began_t_ns) == (found.kind, found.began_t_ns)]
+            updates = [one for one in recognised if (one.kind, one.began_t_ns) == (found.kind, found.began_t_ns)]
             if updates[-1].phase == "end":
                 self._late(f"{event.kind} end", _s(updates[-1].t_ns) - event.end_s)
             self._values(updates, truth, event.end_s)
@@ -94,9 +94,9 @@ class Score:
         for one in free:
             self.false[one.kind] += _s(one.t_ns) < min(cut_s, last_s)
 
-    def add_silent(self, told: Iterable[Gesture]) -> None:
+    def add_silent(self, recognised: Iterable[Gesture]) -> None:
         """Of a hand that says nothing."""
-        for one in told:
+        for one in recognised:
             self.false[one.kind] += one.phase == "begin" or one.kind == "tap"
 
     def _late(self, what: str, seconds: float) -> None:
@@ -147,7 +147,7 @@ def scored(rig: str, seeds: Sequence[int], seconds: float, *, exact: bool) -> Sc
             poses = fused_poses((marked, wrist_rig), seed, seconds)
         else:
             poses = seen_poses(setup, "gestures", seed, seconds)
-        score.add(told_of(poses, scene.model, settings), truth)
+        score.add(recognised_in(poses, scene.model, settings), truth)
     return score
 
 
@@ -164,11 +164,11 @@ def silent(names: Sequence[str], rig: str | None, seconds: float) -> Score:
             poses = wrist_poses(scene, 1, seconds)
         else:
             poses = seen_poses(setup, scene, 1, seconds)
-        score.add_silent(told_of(poses, made.model, settings))
+        score.add_silent(recognised_in(poses, made.model, settings))
     return score
 
 
-def told_of(poses: Iterable[HandPose], model: HandModel, settings: GestureSettings) -> list[Gesture]:
+def recognised_in(poses: Iterable[HandPose], model: HandModel, settings: GestureSettings) -> list[Gesture]:
     """What is told of poses, but for the shapes that the hand is held in."""
     recogniser = GestureRecogniser(settings, model)
     return [one for pose in poses for one in recogniser.push(pose) if one.kind != "pose"]

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from bench.local_rig import free_port, join_bus, until
 from bench.processes import footprint
-from bench.scale_rig import ROOM, room, told
+from bench.scale_rig import ROOM, room, detections_of
 from bench.told_sender import send
 from common.bus import Subscription
 from common.clock import SystemClock
@@ -282,7 +282,7 @@ class HostileRig:
     def _start_cameras(self) -> None:
         """The two honest ones, a thread each."""
         setup = load_setup(self.tree, ROOM)
-        seen, key = told(setup, RATE_HZ), bytes.fromhex(self.key)
+        seen, key = detections_of(setup, RATE_HZ), bytes.fromhex(self.key)
         for k, name in enumerate(HONEST):
             uplink = Uplink(name, key, SystemClock(), self.port, "127.0.0.1")
             place = (name, seen[name], uplink, 0.01 * k, self._stop, RATE_HZ)

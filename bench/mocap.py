@@ -63,8 +63,8 @@ def rows() -> Iterator[Row]:
 
 
 def _compared_rows(scene: str, seed: int) -> Iterator[Row]:
-    told = shown(scene, SECONDS, seed)
-    poses = solved(told.both.markers, told)
+    played = shown(scene, SECONDS, seed)
+    poses = solved(played.both.markers, played)
     with tempfile.TemporaryDirectory(prefix="phalanx-") as folder:
         source, begin_ns = Path(folder) / "poses.npz", poses[0].t_ns
         file = PosesFile(source, poses[0].hand, len(poses[0].markers_m))
@@ -72,7 +72,7 @@ def _compared_rows(scene: str, seed: int) -> Iterator[Row]:
             file.write(pose)
         file.close()
         t_ns = begin_ns + np.arange(0, poses[-1].t_ns - begin_ns, round(1e9 / _RATE_HZ))
-        exact = np.stack([told.both.truth(t).joints.position_m for t in t_ns.tolist()])
+        exact = np.stack([played.both.truth(t).joints.position_m for t in t_ns.tolist()])
         t_s = np.asarray(1e-9 * t_ns, np.float64)
         plain = _table(Path(folder) / "plain.csv", t_s, exact)
         noise = np.random.default_rng(seed).normal(0.0, _NOISE_M, exact.shape)

@@ -29,7 +29,7 @@ from msgspec.structs import replace
 
 from bench.fusion_shown import shown
 from bench.row import Row
-from bench.scale_rig import ROOM, in_order, room, told
+from bench.scale_rig import ROOM, in_order, room, detections_of
 from common.messages import ImuSample, encode
 from master.app import result_at
 from master.dispatcher import Dispatcher
@@ -166,7 +166,7 @@ def played(rig: str, stages: StageTimes) -> tuple[Played, Sequence[Any]]:
     cameras, rate_hz = (16, 90.0) if rig == "room" else (2, 60.0)
     with tempfile.TemporaryDirectory() as name:
         setups = load_setups(room(Path(name), cameras, rate_hz), [ROOM])
-    return Played(setups, stages), in_order(told(setups[0], rate_hz))[: cameras * _POSES]
+    return Played(setups, stages), in_order(detections_of(setups[0], rate_hz))[: cameras * _POSES]
 
 
 def _since(message: Any, first_ns: int) -> Any:

@@ -118,12 +118,12 @@ def _grasp_rows(motions: list[Grasped], backs: int, half: bool) -> Iterator[Row]
         "%",
         f"goal 2; {100 * tracked.mean():.0f} % TRACKED",
     )
-    told: list[str] = []
+    texts: list[str] = []
     for low, high in pairwise(BINS_DEG):
         of = (sigma >= low) & (sigma < high)
         if of.mean() > 0.01:
-            told.append(f"{sigma[of].mean():.0f} -> {np.sqrt((pip[of] ** 2).mean()):.0f}")
-    yield Row(f"{who}: PIP, stated -> found", float(np.sqrt((pip**2).mean())), "deg RMS", ", ".join(told))
+            texts.append(f"{sigma[of].mean():.0f} -> {np.sqrt((pip[of] ** 2).mean()):.0f}")
+    yield Row(f"{who}: PIP, stated -> found", float(np.sqrt((pip**2).mean())), "deg RMS", ", ".join(texts))
 
 
 def grasped(path: Path, backs: int, half: bool) -> Grasped:

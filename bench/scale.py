@@ -21,7 +21,7 @@ import numpy as np
 
 from bench.scale_hop import hop_ms
 from bench.scale_page import into_page
-from bench.scale_rig import CALIBRATION, DESK, ROOM, told
+from bench.scale_rig import CALIBRATION, DESK, ROOM, detections_of
 from bench.scale_run import ScaleRun, measure
 from bench.scale_solve import solve_us
 from common.datagram import OVERHEAD
@@ -102,20 +102,20 @@ def summary(runs: Sequence[ScaleRun], stages: dict[int, dict[str, float]]) -> di
     return {
         "machine": dict(machine),
         "model": model,
-        "runs": {f"{one.layout} {one.cameras}": _told(one, stages) for one in runs},
+        "runs": {f"{one.layout} {one.cameras}": _json_of(one, stages) for one in runs},
         "stages_us": {str(count): dict(us) for count, us in stages.items()},
     }
 
 
-def _told(run: ScaleRun, stages: dict[int, dict[str, float]]) -> dict[str, object]:
+def _json_of(run: ScaleRun, stages: dict[int, dict[str, float]]) -> dict[str, object]:
     """A run as the pages want it; what a hand costs is taken from solving alone."""
-    told: dict[str, object] = asdict(run)
-    return told | {"without_hand": cost_per_camera(run, stages.get(run.cameras, {}))}
+    out: dict[str, object] = asdict(run)
+    return out | {"without_hand": cost_per_camera(run, stages.get(run.cameras, {}))}
 
 
 def datagram_bytes() -> int:
     """Length of a sealed datagram of six markers, all of them seen."""
-    frames = told(load_setup(CALIBRATION, DESK), 10.0)
+    frames = detections_of(load_setup(CALIBRATION, DESK), 10.0)
     return OVERHEAD + max(len(encode(one)) for one in next(iter(frames.values())))
 
 

@@ -90,9 +90,9 @@ def _ages(master: ZenohBus, source: Subscription) -> list[float]:
     ages: list[float] = []
     for _ in range(_MESSAGES):
         master.publish("gesture", "hand", _now())
-        told = source.get(1.0)
-        if isinstance(told, Gesture):
-            ages.append((time.monotonic_ns() - told.t_ns) * 1e-6)
+        message = source.get(1.0)
+        if isinstance(message, Gesture):
+            ages.append((time.monotonic_ns() - message.t_ns) * 1e-6)
         time.sleep(_PERIOD_S)
     return ages
 

@@ -81,7 +81,7 @@ def dome(cameras: int) -> list[Float]:
     return [move @ pose for pose in out]
 
 
-def told(setup: RigSetup, rate_hz: float) -> dict[str, list[MarkerDetections]]:
+def detections_of(setup: RigSetup, rate_hz: float) -> dict[str, list[MarkerDetections]]:
     """Of each camera what it tells of `LOOP_S` of the standard scene; times are since its beginning.
 
     `session` is for the sender to set, `seq` counts, `t_ns` has the camera's phase.

@@ -18,7 +18,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from bench.scale_rig import LOOP_S, told
+from bench.scale_rig import LOOP_S, detections_of
 from common.clock import SystemClock
 from common.keys import rig_key
 from common.messages import MarkerDetections
@@ -60,7 +60,7 @@ def main() -> None:
 def _of(rate_hz: float, tree: str, rig: str, port: str, key_file: str) -> list[_Camera]:
     """The cameras of one master."""
     setup, key = load_setup(Path(tree), rig), rig_key({}, Path(key_file))
-    seen = told(setup, rate_hz)
+    seen = detections_of(setup, rate_hz)
     return [
         _Camera(Uplink(name, key, SystemClock(), int(port), "127.0.0.1"), frames)
         for name, frames in seen.items()

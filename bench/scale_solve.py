@@ -4,7 +4,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from bench.scale_rig import ROOM, in_order, room, told
+from bench.scale_rig import ROOM, in_order, room, detections_of
 from master.dispatcher import Dispatcher
 from master.rig import load_setups
 from master.stages import StageTimes
@@ -17,7 +17,7 @@ def solve_us(cameras: int, rate_hz: float) -> dict[str, float]:
     """Processor time of a pose by stage [us], and `all` of it, for a room of so many cameras."""
     with tempfile.TemporaryDirectory() as name:
         setups = load_setups(room(Path(name), cameras, rate_hz), [ROOM])
-    messages = in_order(told(setups[0], rate_hz))
+    messages = in_order(detections_of(setups[0], rate_hz))
     stages = StageTimes(time.thread_time_ns)
     dispatcher = Dispatcher(setups, [LivePipeline(setup, stages) for setup in setups], stages)
     warm, last = _WARM * cameras, (_WARM + _POSES) * cameras

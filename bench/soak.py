@@ -94,7 +94,7 @@ def _run(settings: SoakSettings, stop: threading.Event) -> tuple[SoakHistory, li
                     watch.read()
                     next_read_s += settings.every_s
                 if watch.now_s >= next_minute_s:
-                    _tell(watch.end_minute(), watch.history)
+                    _print_minute(watch.end_minute(), watch.history)
                     _save(settings, watch.history)
                     next_minute_s += _MINUTE_S
             watch.end_minute()
@@ -103,7 +103,7 @@ def _run(settings: SoakSettings, stop: threading.Event) -> tuple[SoakHistory, li
             bus.close()
 
 
-def _tell(minute: Minute, history: SoakHistory) -> None:
+def _print_minute(minute: Minute, history: SoakHistory) -> None:
     """A line for each minute."""
     memory = " ".join(f"{name} {history.series(name, 'rss_mb')[-1]:.1f}" for name in history.footprints)
     counts = (

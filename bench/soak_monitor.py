@@ -76,7 +76,7 @@ class Watch:
         self.history = SoakHistory(footprints={process.name: [] for process in rig.processes})
         self._rig, self._start_s = rig, time.monotonic()
         self._hands: Subscription = bus.subscribe("hand", depth=_DEPTH)
-        self._told: Subscription = bus.subscribe("health", depth=_DEPTH)
+        self._reports: Subscription = bus.subscribe("health", depth=_DEPTH)
         self._latency_ms: list[float] = []
         self._health: dict[str, Health] = {}
         self._since_s, self._cpu_s = 0.0, {one.name: cpu_s(one.pid) for one in rig.processes}
@@ -91,8 +91,8 @@ class Watch:
         """Take what came on the bus."""
         while isinstance(pose := self._hands.get(0.0), HandPose):
             self._latency_ms.append(pose.latency_ns * 1e-6)
-        while isinstance(told := self._told.get(0.0), Health):
-            self._health[told.source] = told
+        while isinstance(report := self._reports.get(0.0), Health):
+            self._health[report.source] = report
 
     def read(self) -> None:
         """Read the memory of all processes.
@@ -130,7 +130,7 @@ class Watch:
             {name: more for name, now in held.items() if (more := grown(self._mapped[name], now))},
         )
         self.history.minutes.append(minute)
-        self.history.counts = {name: dict(told.counts) for name, told in self._health.items()}
+        self.history.counts = {name: dict(report.counts) for name, report in self._health.items()}
         self._since_s, self._cpu_s, self._mapped, self._latency_ms = now_s, spent, held, []
         return minute
 
@@ -146,7 +146,7 @@ def judged(health: dict[str, Health]) -> dict[str, int]:
     out["dropped"] = master.get("queue.dropped", 0)
     out["refused"] = sum(n for key, n in master.items() if key.startswith("refused."))
     sockets = ("would_block", "send_failed")
-    out["blocked"] = sum(told.counts.get(one, 0) for told in health.values() for one in sockets)
+    out["blocked"] = sum(report.counts.get(one, 0) for report in health.values() for one in sockets)
     return out
 
 

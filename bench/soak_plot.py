@@ -104,9 +104,9 @@ def _clocks(axes: Axes, history: SoakHistory) -> None:
     late = [one for one in history.minutes if one.t_s > warm_up_s(history.minutes[-1].t_s)]
     names = sorted({name for one in late for name in one.clock_offset_us})
     for colour, name in zip(_COLOURS, names, strict=False):
-        told = [(one.t_s, one.clock_offset_us[name]) for one in late if name in one.clock_offset_us]
-        if len(told) > 2:
-            times, offsets = np.array(told).T
+        known = [(one.t_s, one.clock_offset_us[name]) for one in late if name in one.clock_offset_us]
+        if len(known) > 2:
+            times, offsets = np.array(known).T
             ppm = slope(times, offsets).per_h / 3600.0
             left = offsets - ppm * times
             label = f"{name} {ppm:+.2f} ppm"

@@ -129,11 +129,11 @@ def _steps(history: SoakHistory, process: str) -> Finding:
     limit = f"none of {STEP_MB:g} MB"
     if found is None:
         return Finding(what, "too short to say", limit, None)
-    told = "; ".join(_told(history, process, step) for step in found)
-    return Finding(what, told or "none", limit, not found)
+    text = "; ".join(_text_of_step(history, process, step) for step in found)
+    return Finding(what, text or "none", limit, not found)
 
 
-def _told(history: SoakHistory, process: str, step: Step) -> str:
+def _text_of_step(history: SoakHistory, process: str, step: Step) -> str:
     """By how much, when, and where: what grew in that minute or the one before, for a median is late."""
     near = [one for one in history.minutes if step.minute - 1 <= one.t_s // BLOCK_S - 1 <= step.minute]
     where = [f"{name} +{mb:.1f}" for one in near for name, mb in one.grown.get(process, {}).items()]

@@ -67,9 +67,9 @@ class PointHand:
             back_normal: (3,) unit vector from the hand to the cameras.
             orientation: The measured rotation (3, 3) and its covariance (3, 3) [rad^2], rig axes; None: not known.
         """
-        told = None
+        measured = None
         if orientation is not None:
             rotation, cov_rad2 = orientation
             sure = bool(np.linalg.eigvalsh(cov_rad2)[-1] < _SURE_RAD**2)
-            told = OrientationMeasurement(rotation, np.asarray(np.linalg.inv(cov_rad2), np.float64), sure)
-        return self.estimator.push(Epoch(t_ns, points_m, back_normal, cov_m2=cov_m2, orientation=told))
+            measured = OrientationMeasurement(rotation, np.asarray(np.linalg.inv(cov_rad2), np.float64), sure)
+        return self.estimator.push(Epoch(t_ns, points_m, back_normal, cov_m2=cov_m2, orientation=measured))

@@ -26,7 +26,7 @@ RATE_HZ, APART_S, NOISE_PX = 60.0, 0.005, 0.08
 _LOOP_S = 20.0  # of the scene, then the same again
 
 
-def told(rig: str = "desk", rate_hz: float = RATE_HZ) -> dict[str, list[MarkerDetections]]:
+def detections_of(rig: str = "desk", rate_hz: float = RATE_HZ) -> dict[str, list[MarkerDetections]]:
     """Of each camera what it tells of `_LOOP_S` of the scene; session, number and times are set when it is sent."""
     setup = load_setup(CALIBRATION, rig)
     profile = load(CALIBRATION / "hands" / f"{setup.rig.hand}.json", HandProfile)
@@ -75,7 +75,7 @@ def main() -> None:
     port, seconds = int(sys.argv[1]), float(sys.argv[2])
     rate_hz = float(sys.argv[3]) if len(sys.argv) > 3 else RATE_HZ
     key, stop = rig_key(os.environ, None), threading.Event()
-    frames = told(rate_hz=rate_hz)
+    frames = detections_of(rate_hz=rate_hz)
     links = {name: Uplink(name, key, SystemClock(), port, "127.0.0.1") for name in frames}
     threads = [
         threading.Thread(target=send, args=(name, frames[name], link, APART_S * k, stop, rate_hz))

@@ -87,7 +87,7 @@ def measured(rig_name: str, seed: int, axes: tuple[float, float, float] = (1.0, 
     line = ObjectLine(profile, rig, models)
     objects = list(seen(line, profile, rig, models, where, seed))
     try:
-        found = register(objects, list(told(where, X, Y, late_s, seed)))
+        found = register(objects, list(poses_of(where, X, Y, late_s, seed)))
     except FitError:
         return None
     return against_truth(found, where, X, Y, late_s, centre, seed)
@@ -126,7 +126,7 @@ def seen(
     yield from (one.pose for one in line.flush())
 
 
-def told(where: Where, X: Float, Y: Float, late_s: float, seed: int) -> Iterator[TrackerPose]:
+def poses_of(where: Where, X: Float, Y: Float, late_s: float, seed: int) -> Iterator[TrackerPose]:
     """What the tracker says, in its system's frame."""
     rng = np.random.default_rng([seed, 13])
     back, off = np.linalg.inv(X), np.zeros(6)

@@ -87,11 +87,11 @@ def _errors(name: str, found: list[tuple[PlaneFit, LaserPlane]], note: str) -> I
     rotation = [_angle_deg(np.array(fit.plane.normal), np.array(true.normal)) for fit, true in found]
     shift = [1e3 * abs(fit.plane.offset_m - true.offset_m) for fit, true in found]
     sigma = [np.degrees(fit.normal_sigma_rad) for fit, _ in found]
-    told = f"largest {max(rotation):.4f}, stated sigma {np.median(sigma):.4f}; goal 0.1; {note}"
-    yield Row(f"{name}: normal, median", float(np.median(rotation)), "deg", told)
+    claim = f"largest {max(rotation):.4f}, stated sigma {np.median(sigma):.4f}; goal 0.1; {note}"
+    yield Row(f"{name}: normal, median", float(np.median(rotation)), "deg", claim)
     sigma_mm = np.median([1e3 * fit.offset_sigma_m for fit, _ in found])
-    told = f"largest {max(shift):.4f}, stated sigma {sigma_mm:.4f}; goal 0.1"
-    yield Row(f"{name}: offset, median", float(np.median(shift)), "mm", told)
+    claim = f"largest {max(shift):.4f}, stated sigma {sigma_mm:.4f}; goal 0.1"
+    yield Row(f"{name}: offset, median", float(np.median(shift)), "mm", claim)
 
 
 def _fields(camera: CameraCalibration, rig: RigCalibration) -> Iterator[Row]:

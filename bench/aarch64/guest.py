@@ -198,19 +198,19 @@ def _run_strobed(case: str, folder: Path, marks: Marks) -> str:
     view = WristView.of(frames.rig, frames.camera, frames.hand)
     engine = wrist_engine.engine_named("numba" if case in MACHINE_CODE else "numpy")
     detector = WristDetector(view, frames.camera.frame_rate_hz, engine)
-    told: list[WristDetections] = []
+    messages: list[WristDetections] = []
 
     def step(k: int) -> None:
         for seq, image in enumerate(frames.cycle(k), 3 * k):
             t_ns = frames.t_ns(seq)
             if (found := detector.push(Frame(seq, t_ns, t_ns, image))) is not None:
-                told.append(found.message(frames.camera.name, 7))
-                encode(told[-1])
+                messages.append(found.message(frames.camera.name, 7))
+                encode(messages[-1])
 
     _each(marks, case, step)
-    if len(told) < LAST - FIRST:
-        raise RuntimeError(f"{len(told)} of {LAST} triples were told")
-    for one in told:
+    if len(messages) < LAST - FIRST:
+        raise RuntimeError(f"{len(messages)} of {LAST} triples were told")
+    for one in messages:
         digest.add(*(np.round(array, STROBED_DECIMALS) for array in arrays_of(one)))
     return digest.hex()
 

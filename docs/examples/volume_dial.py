@@ -91,9 +91,9 @@ class Program:
 
     def read(self) -> int:
         """The volume now [%]. Raises PhalanxError: it cannot be read."""
-        told = subprocess.run(self._get, stdout=subprocess.PIPE, text=True, check=True).stdout
-        if (found := re.search(r"(\d+)%|Volume: (\d+\.\d+)", told)) is None:
-            raise PhalanxError(f"{' '.join(self._get)}: tells no volume: {told.strip()}")
+        output = subprocess.run(self._get, stdout=subprocess.PIPE, text=True, check=True).stdout
+        if (found := re.search(r"(\d+)%|Volume: (\d+\.\d+)", output)) is None:
+            raise PhalanxError(f"{' '.join(self._get)}: tells no volume: {output.strip()}")
         return int(found[1]) if found[1] else round(100 * float(found[2]))
 
     def write(self, percent: int, *, at_end: bool) -> None:

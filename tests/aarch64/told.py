@@ -126,7 +126,7 @@ def _hash(messages: list[MarkerDetections] | list[WristDetections]) -> str:
     return digest.hex()
 
 
-def told(folder: Path) -> dict[str, object]:
+def report(folder: Path) -> dict[str, object]:
     """All of it; numbers of what was really seen, so that nothing equal can be empty."""
     seen, strobed = markers(folder), cycles(folder)
     messages: list[Message] = [*seen, *strobed, *others()]
@@ -147,7 +147,7 @@ def told(folder: Path) -> dict[str, object]:
 def main(arguments: list[str]) -> int:
     """Print what this machine makes of FOLDER."""
     cv2.setNumThreads(1)
-    sys.stdout.write(json.dumps(told(Path(arguments[0]))) + "\n")
+    sys.stdout.write(json.dumps(report(Path(arguments[0]))) + "\n")
     return 0
 
 

@@ -342,9 +342,9 @@ def test_a_frame_of_six_markers_takes_the_instructions_of_the_record(six: Counte
     record = baseline.read()
     assert record is not None
     assert six.per_frame["six"] > 640 * 480 / 4  # a scan of a quarter of the pixels cannot take fewer
-    told = baseline.compared(six.per_frame["six"], record.instructions["six"])
+    differences = baseline.compared(six.per_frame["six"], record.instructions["six"])
     others = baseline.other_versions(emulated.versions, record.versions)
-    assert baseline.within(six.per_frame["six"], record.instructions["six"]), (told, others)
+    assert baseline.within(six.per_frame["six"], record.instructions["six"]), (differences, others)
 
 
 def test_detections_on_aarch64_are_those_of_this_machine_bit_by_bit(six: Counted, folder: Path) -> None:

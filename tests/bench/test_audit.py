@@ -17,7 +17,7 @@ _BAD = Vulnerability("PYSEC-1", ["2.1"], ["CVE-1"], "an overflow")
 
 
 @pytest.mark.parametrize(
-    ("told", "code", "word"),
+    ("answered", "code", "word"),
     [
         ([Package("good", "1.0"), Package("bad", "2.0")], NONE_KNOWN, "none known in 2"),
         ([Package("good", "1.0"), Package("bad", "2.0", vulns=[_BAD])], KNOWN, "mended by 2.1"),
@@ -27,8 +27,8 @@ _BAD = Vulnerability("PYSEC-1", ["2.1"], ["CVE-1"], "an overflow")
         ([Package("good", "1.0"), Package("bad", "1.9")], NOT_ASKED, "bad"),  # of another version
     ],
 )
-def test_only_answers_about_all_are_a_pass(told: list[Package], code: int, word: str) -> None:
-    verdict = judge(TWO, told, WHO)
+def test_only_answers_about_all_are_a_pass(answered: list[Package], code: int, word: str) -> None:
+    verdict = judge(TWO, answered, WHO)
     assert verdict.code == code
     assert word in "\n".join(verdict.lines)
 

@@ -11,14 +11,14 @@ from tests.master.gestures.shown_hands import posture
 
 
 def test_frames_count_from_the_third_of_a_held_pose_on() -> None:
-    told = ResultMessage()
+    recognised = ResultMessage()
     truth = [None, "pinch", "pinch", "pinch", "pinch", None, "pointing", "pointing", "pointing"]
-    told.add(truth, [None, None, None, "pinch", None, "open_palm", None, None, "pinch"])
-    assert dict(told.frames) == {("pinch", "pinch"): 1, ("pinch", "none"): 1, ("pointing", "pinch"): 1}
-    assert (told.episodes, told.in_time) == (2, 1)
-    assert told.passing == 1  # the open palm between the two
-    assert told.right == 100.0 / 3.0
-    assert told.wrong == 100.0 / 3.0
+    recognised.add(truth, [None, None, None, "pinch", None, "open_palm", None, None, "pinch"])
+    assert dict(recognised.frames) == {("pinch", "pinch"): 1, ("pinch", "none"): 1, ("pointing", "pinch"): 1}
+    assert (recognised.episodes, recognised.in_time) == (2, 1)
+    assert recognised.passing == 1  # the open palm between the two
+    assert recognised.right == 100.0 / 3.0
+    assert recognised.wrong == 100.0 / 3.0
 
 
 def test_the_rule_for_recorded_joints_agrees_with_its_own_pose() -> None:

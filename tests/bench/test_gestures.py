@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bench.gesture_truth import GestureTruth
-from bench.gestures import Score, seen_poses, told_of
+from bench.gestures import Score, seen_poses, recognised_in
 from bench.played import START_NS
 from common.gesture_settings import default_gestures
 from common.messages import Gesture
@@ -36,14 +36,14 @@ def truth(setup: RigSetup) -> GestureTruth:
 def test_a_dial_is_told_in_time_and_as_far_as_it_was_turned(setup: RigSetup, truth: GestureTruth) -> None:
     scene = scene_by_name("gestures", setup.rig, setup.cameras, setup.hand.profile, SEED)
     poses = seen_poses(setup, "gestures", SEED, SECONDS)
-    told = told_of(poses, scene.model, SETTINGS)
-    assert {one.kind for one in told} == {"dial"}
+    recognised = recognised_in(poses, scene.model, SETTINGS)
+    assert {one.kind for one in recognised} == {"dial"}
     event = next(one for one in truth.events if one.kind == "dial")
-    begins = [1e-9 * (one.t_ns - START_NS) for one in told if one.phase == "begin"]
+    begins = [1e-9 * (one.t_ns - START_NS) for one in recognised if one.phase == "begin"]
     assert len(begins) == 1
     assert -3 / 60 <= begins[0] - event.begin_s <= 3 / 60
     score = Score()
-    score._values(told, truth, SECONDS)
+    score._values(recognised, truth, SECONDS)
     assert np.degrees(abs(truth.motion.dial_rad(SECONDS))) > 20.0
     assert np.percentile(np.abs(score.dial_deg), 95) < 3.0
 

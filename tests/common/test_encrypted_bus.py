@@ -152,16 +152,16 @@ def test_a_camera_speaks_for_itself_alone(rig: Rig) -> None:
 
 def test_a_camera_tells_no_poses_and_nothing_in_the_name_of_another(rig: Rig) -> None:
     """Also not inside a message that travels under its own name, nor under a name that stands for several."""
-    told = {stream: rig.viewer.subscribe(stream) for stream in ("health", "hand", "gesture", "taken")}
-    assert until(lambda: arrives(rig.right, told["health"], "right"))
+    subscriptions = {stream: rig.viewer.subscribe(stream) for stream in ("health", "hand", "gesture", "taken")}
+    assert until(lambda: arrives(rig.right, subscriptions["health"], "right"))
     for name in ("right", "*", "r$*"):
         rig.right.publish("gesture", name, gesture())
         rig.right.publish("taken", name, gesture())
         rig.right.publish("health", name, health("left"))
     rig.right.serve("right", lambda command: health("left", 666))
-    assert until(lambda: arrives(rig.right, told["health"], "right"))
-    assert all_received(told["health"]) <= {"right"}
-    assert all(told[stream].get(0.0) is None for stream in ("hand", "gesture", "taken"))
+    assert until(lambda: arrives(rig.right, subscriptions["health"], "right"))
+    assert all_received(subscriptions["health"]) <= {"right"}
+    assert all(subscriptions[stream].get(0.0) is None for stream in ("hand", "gesture", "taken"))
     with pytest.raises(BusError, match="not its health report"):
         rig.master.ask(Command("right", "report"), 5.0)
 
@@ -202,9 +202,9 @@ def test_a_device_is_heard_once_the_master_knows_its_name(tmp_path: Path) -> Non
         with pytest.raises(BusError, match="no answer"):
             master.ask(report, 0.3)
         master.close()
-        told = ZenohBus(endpoint, None, access(MASTER, folder), devices=["late"])
-        stack.callback(told.close)
-        assert told.ask(report, 5.0).counts == {"frames": 3}
+        subscriptions = ZenohBus(endpoint, None, access(MASTER, folder), devices=["late"])
+        stack.callback(subscriptions.close)
+        assert subscriptions.ask(report, 5.0).counts == {"frames": 3}
 
 
 def test_without_a_certificate_of_the_rig_nobody_comes_in_and_hears_why(

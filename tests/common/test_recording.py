@@ -33,7 +33,7 @@ def tags(seq: int, t_ns: int) -> TagDetections:
     )
 
 
-def told(count: int = 60, step_ns: int = STEP_NS) -> list[tuple[str, Message, int]]:
+def recorded(count: int = 60, step_ns: int = STEP_NS) -> list[tuple[str, Message, int]]:
     """Stream, message and time of arrival; those of two threads are not quite in the order of their times."""
     out: list[tuple[str, Message, int]] = []
     for number in range(count):
@@ -51,7 +51,7 @@ def told(count: int = 60, step_ns: int = STEP_NS) -> list[tuple[str, Message, in
 
 def few() -> list[tuple[str, Message, int]]:
     """In as many chunks as all, but quicker to read a thousand times."""
-    return told(18, 180_000_000)
+    return recorded(18, 180_000_000)
 
 
 def written(path: Path, messages: list[tuple[str, Message, int]]) -> bytes:
@@ -76,7 +76,7 @@ def same(read: list[Recorded], messages: Plain) -> bool:
 
 
 def test_what_was_written_is_read_in_its_order(tmp_path: Path) -> None:
-    messages = told()
+    messages = recorded()
     written(tmp_path / "a.mcap", messages)
     recording = open_messages(tmp_path / "a.mcap")
     assert not recording.cut
@@ -94,7 +94,7 @@ def test_what_was_written_is_read_in_its_order(tmp_path: Path) -> None:
 
 
 def test_a_stretch_and_some_streams_can_be_read_alone(tmp_path: Path) -> None:
-    messages = told()
+    messages = recorded()
     written(tmp_path / "a.mcap", messages)
     recording = open_messages(tmp_path / "a.mcap")
     first, last = recording.begin_t_ns + 700_000_000, recording.begin_t_ns + 1_400_000_000
@@ -107,7 +107,7 @@ def test_a_stretch_and_some_streams_can_be_read_alone(tmp_path: Path) -> None:
 
 
 def test_a_stranger_reads_it_too(tmp_path: Path) -> None:
-    written(tmp_path / "a.mcap", told(8))
+    written(tmp_path / "a.mcap", recorded(8))
     with (tmp_path / "a.mcap").open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         found = [(schema, channel) for schema, channel, _ in reader.iter_messages(log_time_order=False)]
@@ -155,7 +155,7 @@ def test_a_file_cut_anywhere_reads_up_to_the_cut(tmp_path: Path) -> None:
 
 
 def test_a_cut_costs_about_half_a_second(tmp_path: Path) -> None:
-    messages = told()
+    messages = recorded()
     data = written(tmp_path / "a.mcap", messages)
     writer = MessageWriter(tmp_path / "b.mcap", FILES)
     for stream, message, t_ns in messages:
@@ -272,7 +272,7 @@ class SmallDisk:
 
 
 def test_a_full_disk_ends_the_file_and_leaves_what_was_written(tmp_path: Path) -> None:
-    messages, path = told(), tmp_path / "full.mcap"
+    messages, path = recorded(), tmp_path / "full.mcap"
     writer = MessageWriter(path, FILES, open_disk=lambda where: SmallDisk(where, 6000))
 
     def write_all() -> None:
@@ -315,4 +315,4 @@ def test_a_limit_of_the_system_ends_it_in_the_same_way(tmp_path: Path, root: Pat
         [sys.executable, "-c", LIMITED, str(path)], cwd=root, capture_output=True, text=True, check=False
     )
     assert "limited.mcap: cannot write any more: File too large" in done.stdout, done.stderr
-    assert same(list(open_messages(path).read()), plain(told()))
+    assert same(list(open_messages(path).read()), plain(recorded()))

@@ -125,13 +125,13 @@ class Board:
         )
 
     def _power(self, image: Image) -> None:
-        told = {
+        credentials = {
             "ssh.authorized_keys.root": (self.folder / "id.pub").read_text(),
             "network.network.10-board": NETWORK.format(address=self.address),
             "system.hostname": self.name,
         }
         given = " ".join(
-            f"systemd.set_credential_binary={name}:{_base64(text)}" for name, text in told.items()
+            f"systemd.set_credential_binary={name}:{_base64(text)}" for name, text in credentials.items()
         )
         kernel = f"root=/dev/nvme0n1 rw console={self.model.console} {FASTER} {given}"
         self._process = subprocess.Popen(
@@ -255,7 +255,7 @@ class BoardRig(Rig):
 
 
 @contextlib.contextmanager
-def switched_on(model: Model, what: str, told: Measured) -> Generator[BoardRig]:
+def switched_on(model: Model, what: str, credentials: Measured) -> Generator[BoardRig]:
     """A machine that is on, with nothing of ours on it, and its rig; skipped where it cannot be.
 
     Args:
@@ -268,7 +268,7 @@ def switched_on(model: Model, what: str, told: Measured) -> Generator[BoardRig]:
     board = Board(model)
     board.start()
     try:
-        told(f"{what} up, from power to ssh", board.boot_s)
+        credentials(f"{what} up, from power to ssh", board.boot_s)
         rig = BoardRig(board)
         try:
             yield rig

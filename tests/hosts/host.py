@@ -209,7 +209,7 @@ class Host:
     def files(self) -> dict[str, str]:
         """Each file, folder and link of its disk: owner, mode and content; without what the system itself writes."""
         return {
-            name: _told(path)
+            name: _text(path)
             for path in sorted(self.tree.rglob("*"))
             if not (name := str(path.relative_to(self.tree))).startswith(
                 tuple(f"{one}/" for one in OF_THE_SYSTEM)
@@ -234,7 +234,7 @@ class Host:
         return [int(pid) for one in found for pid in (one / "cgroup.procs").read_text().split()]
 
 
-def _told(path: Path) -> str:
+def _text(path: Path) -> str:
     info = path.lstat()
     what = f"{stat.filemode(info.st_mode)} {info.st_uid}:{info.st_gid}"
     if path.is_symlink():

@@ -25,8 +25,8 @@ class Measured:
         return value <= limit * strain()
 
     def _keep(self, name: str, value: float, unit: str, limit: float | None) -> None:
-        told: dict[str, object] = {"value": round(value, 3), "unit": unit, "strain": round(strain(), 1)}
-        self._numbers[name] = told if limit is None else told | {"limit": limit}
+        number: dict[str, object] = {"value": round(value, 3), "unit": unit, "strain": round(strain(), 1)}
+        self._numbers[name] = number if limit is None else number | {"limit": limit}
         self._file.parent.mkdir(exist_ok=True)
         self._file.write_text(json.dumps(self._numbers, indent=1) + "\n")
         bound = "" if limit is None else f"  at most {limit:g}"

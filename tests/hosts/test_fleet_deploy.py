@@ -45,9 +45,9 @@ def test_the_same_command_again_changes_nothing(deployed: Deployment, rig: Rig, 
 
 
 def test_the_fleet_is_told_by_name_and_version(deployed: Deployment, rig: Rig) -> None:
-    told = rig.program("deploy", "fleet", "--bus", rig.bus, "--keys", str(rig.keys), timeout_s=20.0)
-    assert told.code == 0, str(told)
+    output = rig.program("deploy", "fleet", "--bus", rig.bus, "--keys", str(rig.keys), timeout_s=20.0)
+    assert output.code == 0, str(output)
     for name in rig.fleet.hosts:
-        line = next((line for line in told.out.splitlines() if name in line), None)
-        assert line is not None, str(told)
-        assert rig.version in line, str(told)
+        line = next((line for line in output.out.splitlines() if name in line), None)
+        assert line is not None, str(output)
+        assert rig.version in line, str(output)

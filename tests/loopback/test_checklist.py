@@ -87,7 +87,7 @@ def lag() -> Iterator[Lag]:
 
 def wrong(shown: Shown, reports: int) -> list[str]:
     """In what a rehearsal is not as expected, if so many reports more than nominal are the machine's own doing."""
-    told = {
+    conditions = {
         "never shown": shown.shown_s is None,
         "never gone": shown.cleared_s is None,
         f"of {set(shown.subjects)}": not shown.subjects or not shown.subjects <= shown.fault.subjects,
@@ -95,7 +95,7 @@ def wrong(shown: Shown, reports: int) -> list[str]:
         f"shown after {shown.shown_reports} reports": shown.shown_reports > NOMINAL + reports,
         f"gone after {shown.cleared_reports} reports": shown.cleared_reports > NOMINAL + reports,
     }
-    return [what for what, holds in told.items() if holds]
+    return [what for what, holds in conditions.items() if holds]
 
 
 def rehearsed(rig: Rig, code: str, lag: Lag) -> Shown:
@@ -115,11 +115,11 @@ def rehearsed(rig: Rig, code: str, lag: Lag) -> Shown:
 def test_nothing_is_told_while_nothing_is_wrong(rig: Rig, lag: Lag) -> None:
     for last in (False, False, True):
         lag.begin()
-        told = {code for code, _ in clean(rig, 4.0)} - BEHIND
-        if not told:
+        conditions = {code for code, _ in clean(rig, 4.0)} - BEHIND
+        if not conditions:
             return
-        assert not last, told
-        assert lag.worst_s > BEHIND_S, told
+        assert not last, conditions
+        assert lag.worst_s > BEHIND_S, conditions
 
 
 @pytest.mark.parametrize("code", LIVE)
@@ -141,7 +141,7 @@ def test_a_camera_that_is_unplugged_is_told_by_its_slave_and_is_back_with_the_pl
     """The slave lives on, with the session it had; from the plug to frames of it: the longest wait of its retries."""
     until(lambda: not rig.lists.now() - {("rate_low", "left"), ("rate_low", "right")}, 10.0)
     lag.begin()
-    before, told = rig.ask("left", "report").counts, rig.ask(MASTER, "report").counts
+    before, conditions = rig.ask("left", "report").counts, rig.ask(MASTER, "report").counts
     rig.fault("left", unplugged=True)
     pulled = time.monotonic()
     assert until(lambda: ("camera_absent", "left") in rig.lists.now(), 30.0)
@@ -160,8 +160,8 @@ def test_a_camera_that_is_unplugged_is_told_by_its_slave_and_is_back_with_the_pl
     assert time.monotonic() - back < BACK_S + lag.reports
     after = rig.ask(MASTER, "report").counts
     assert rig.processes["left"].poll() is None
-    assert after.get("left.restarts", 0) == told.get("left.restarts", 0)
-    assert after["poses"] > told["poses"]
+    assert after.get("left.restarts", 0) == conditions.get("left.restarts", 0)
+    assert after["poses"] > conditions["poses"]
 
 
 @pytest.mark.parametrize(("fault", "counted"), [("raises", "camera.raised"), ("frozen", "camera.frozen")])

@@ -179,7 +179,7 @@ def _scene_s(line: str) -> int:
     return int(found[1]) if found else 0
 
 
-def _poses_told(out: Path) -> int:
+def _count_poses(out: Path) -> int:
     """How many poses the master has told so far, by its lines of every second."""
     return sum(map(int, re.findall(r"rate (\d+) poses/s", (out / "master.log").read_text())))
 
@@ -192,7 +192,7 @@ def test_a_killed_process_is_back_within_two_seconds_and_ctrl_c_still_ends_and_s
     received: list[str] = []
     killed_ns: dict[str, int] = {}
     pids: dict[str, int] = {}
-    back, told, back_s = "", 0, 0.0  # who is back, how many poses were told before, and when it was
+    back, before, back_s = "", 0, 0.0  # who is back, how many poses were told before, and when it was
 
     def kill(victim: str) -> None:
         killed_ns[victim] = time.monotonic_ns()
@@ -207,8 +207,8 @@ def test_a_killed_process_is_back_within_two_seconds_and_ctrl_c_still_ends_and_s
             if f"{victim} ended with code -9: started again" in line:
                 pids = _running(demo, pids, victim)
                 assert until(lambda v=victim, r=ready: (tmp_path / f"{v}.log").read_text().count(r) == 2)
-                back, told, back_s = victim, _poses_told(tmp_path), time.monotonic()
-        if back and _poses_told(tmp_path) > told + ENOUGH and time.monotonic() - back_s > 3.0:
+                back, before, back_s = victim, _count_poses(tmp_path), time.monotonic()
+        if back and _count_poses(tmp_path) > before + ENOUGH and time.monotonic() - back_s > 3.0:
             if back == "master":
                 kill("right")
             else:
@@ -247,7 +247,7 @@ def test_two_pairs_track_together_and_one_goes_on_while_the_other_is_gone(
 ) -> None:
     demo = demo_of(tmp_path, 180.0, "--rig", "desk4", "--scene", "poses")
     received: list[str] = []
-    killed_ns = epoch_ns = told = 0
+    killed_ns = epoch_ns = before = 0
     ended = False
     pids: dict[str, int] = {}
     gone = ("left2", "right2")
@@ -255,13 +255,13 @@ def test_two_pairs_track_together_and_one_goes_on_while_the_other_is_gone(
     for line in _lines(demo):
         received.append(line)
         pids = pids or _pids(line)
-        if _scene_s(line) >= 3 and not killed_ns and _poses_told(tmp_path) > ENOUGH:
+        if _scene_s(line) >= 3 and not killed_ns and _count_poses(tmp_path) > ENOUGH:
             epoch_ns = _epoch_ns(pids["left"])
-            killed_ns, told = time.monotonic_ns(), _poses_told(tmp_path)
+            killed_ns, before = time.monotonic_ns(), _count_poses(tmp_path)
             for name in gone:
                 os.kill(pids[name], signal.SIGKILL)
         back = killed_ns and all(log.read_text().count("ready, waiting") == 2 for log in logs)
-        if back and not ended and _poses_told(tmp_path) > told + ENOUGH:
+        if back and not ended and _count_poses(tmp_path) > before + ENOUGH:
             ended = True
             demo.send_signal(signal.SIGINT)
     assert demo.wait(90) == 0, "\n".join(received)

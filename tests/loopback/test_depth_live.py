@@ -90,8 +90,8 @@ def test_a_person_measures_a_rig(root: Path, tmp_path: Path) -> None:
             slaves.distance = distance
             person.stdin.write("\n")
             person.stdin.flush()
-            told = person.stdout.readline()
-            assert f"{distance:.3f} m: disparity" in told
+            output = person.stdout.readline()
+            assert f"{distance:.3f} m: disparity" in output
         rest = person.stdout.read()
         assert person.wait(PATIENCE_S) == 0
     assert "wrote" in rest

@@ -106,9 +106,9 @@ def _replay(rig: FaultRig, capture: Capture) -> None:
     assert sum(rise.values()) >= 0.5 * len(frames)  # where nobody has time to read, a full socket loses some
     for name in ("left.restarts", "right.restarts", "left.clock_steps", "right.clock_steps"):
         assert after.get(name, 0) == before.get(name, 0), name
-    told = rig.poses.since(began)
-    assert len(told) > 0.25 * rig.pace.rate_hz * (told[-1].came_s - began)
-    assert not any(false(one) for one in told)
+    received = rig.poses.since(began)
+    assert len(received) > 0.25 * rig.pace.rate_hz * (received[-1].came_s - began)
+    assert not any(false(one) for one in received)
 
 
 def test_hostile_datagrams_at_every_port_are_refused_while_the_hand_is_tracked(rig: FaultRig) -> None:
@@ -121,9 +121,9 @@ def test_hostile_datagrams_at_every_port_are_refused_while_the_hand_is_tracked(r
     ended = time.monotonic()
     assert well_again(rig, ended)
     after = rig.counts()
-    told = rig.poses.since(began, ended)
-    assert told
-    assert not any(false(one) for one in told)
+    received = rig.poses.since(began, ended)
+    assert received
+    assert not any(false(one) for one in received)
     rise = {name: after[name] - before.get(name, 0) for name in after if name.startswith("refused.")}
     assert {"refused.foreign", "refused.forged", "refused.stale", "refused.cut"} <= set(rise)
     assert min(rise.values()) >= 0
@@ -172,8 +172,8 @@ def test_what_was_captured_is_not_taken_again_by_either_side(rig: FaultRig) -> N
     assert refused >= 0.5 * (len(capture.to_master) + len(capture.to_slaves))
     for name in ("left.restarts", "right.restarts", "left.clock_steps", "right.clock_steps"):
         assert after.get(name, 0) == before.get(name, 0)
-    told = rig.poses.since(began - 1.0)
-    assert not any(false(one) for one in told)
+    received = rig.poses.since(began - 1.0)
+    assert not any(false(one) for one in received)
 
 
 def test_strangers_at_the_bus_neither_stop_the_hand_nor_cost_memory(rig: FaultRig) -> None:
@@ -181,9 +181,9 @@ def test_strangers_at_the_bus_neither_stop_the_hand_nor_cost_memory(rig: FaultRi
     became = assault(("127.0.0.1", rig.bus_port), 150, 60, 2.0)
     ended = time.monotonic()
     assert became["open"] > 10
-    told = rig.poses.since(began, ended)
-    assert told
-    assert not any(false(one) for one in told)
+    received = rig.poses.since(began, ended)
+    assert received
+    assert not any(false(one) for one in received)
     assert well_again(rig, ended)
     assert rig.report().source == "master"
     assert rig.anonymous_mb() - memory_mb < 20.0

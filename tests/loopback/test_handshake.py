@@ -503,13 +503,13 @@ def test_no_frame_is_of_the_future_however_the_slave_answers_echoes(ahead_ms: in
     master, slave = wires.new_master(("left",)), wires.new_slave("left")
     assert wires.run(4.0, wires.all_started)
     wires.run(1.0)
-    told_ns = wires.clock.t_ns + ahead_ms * 1_000_000
+    stamp_ns = wires.clock.t_ns + ahead_ms * 1_000_000
     wires.send(
-        slave, msgspec.structs.replace(detections("left", slave.process, 1), t_ns=told_ns, ready_t_ns=told_ns)
+        slave, msgspec.structs.replace(detections("left", slave.process, 1), t_ns=stamp_ns, ready_t_ns=stamp_ns)
     )
     assert len(wires.got) == taken
     assert master.unsynchronised == (not taken)
     for frame in wires.got:
         assert frame.t_ns <= wires.clock.t_ns
-        assert frame.t_ns == pytest.approx(min(told_ns, wires.clock.t_ns), abs=1_000_000)
+        assert frame.t_ns == pytest.approx(min(stamp_ns, wires.clock.t_ns), abs=1_000_000)
         assert frame.t_sigma_ns >= 0.9e6 * max(ahead_ms, 0) - 1e6

@@ -51,9 +51,9 @@ def test_tags_and_poses_come_on_the_masters_clock() -> None:
     t_ns = wires.clock.now_ns()
     wires.send(left, tags("left", left.process, 4, clock.now_ns()))
     wires.send(puck, tracker("puck", puck.process, 9, clock.now_ns()))
-    [seen], [told] = wires.tags, wires.tracked
+    [seen], [tracked] = wires.tags, wires.tracked
     assert seen.t_ns == pytest.approx(t_ns, abs=2_000_000)
-    assert told.t_ns == pytest.approx(t_ns, abs=2_000_000)
+    assert tracked.t_ns == pytest.approx(t_ns, abs=2_000_000)
     assert seen.ready_t_ns - seen.t_ns == pytest.approx(1000, abs=2)
     estimate = master.clock_of("left")
     assert estimate is not None

@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[2]
 POSES = 60
 
 
-def poses_told(text: str) -> int:
+def count_poses(text: str) -> int:
     return sum(int(number) for number in re.findall(r"rate (\d+) poses/s", text))
 
 
@@ -55,7 +55,7 @@ def recorded_run(folder: Path, file: Path) -> str:
                 running.append(subprocess.Popen(python, cwd=ROOT, stdout=out, stderr=subprocess.STDOUT))
             assert until(lambda: "tracking" in log.read_text(), 150.0), log.read_text()
             # As many poses as 6 s have on a slow machine: how long that takes is its own affair.
-            assert until(lambda: poses_told(log.read_text()) >= POSES, 90.0), log.read_text()
+            assert until(lambda: count_poses(log.read_text()) >= POSES, 90.0), log.read_text()
             running[0].send_signal(signal.SIGINT)
             assert running[0].wait(PATIENCE_S) == 0, log.read_text()
         finally:

@@ -88,7 +88,7 @@ class Building:
         self._stack.callback(process.kill)
         return process
 
-    def tell(self) -> None:
+    def announce(self) -> None:
         """Every master tells something."""
         for site, bus in self.masters.items():
             bus.publish("gesture", "right", probe(SITES[site]))
@@ -100,7 +100,7 @@ class Building:
         received: dict[str, set[str]] = {site: set() for site in SITES}
 
         def all_received() -> bool:
-            self.tell()
+            self.announce()
             time.sleep(0.05)
             for site, source in self.received.items():
                 received[site] |= _all(source)
@@ -146,10 +146,10 @@ def test_no_command_comes_down_and_what_a_reader_says_neither(building: Building
     reader.publish("health", "stranger", Health("stranger", 1, 1, {}, {}))
     time.sleep(0.5)
     assert building.asked == []
-    told: set[str] = set()
+    sources: set[str] = set()
     while isinstance(one := below.get(0.0), Health):
-        told.add(one.source)
-    assert "stranger" not in told
+        sources.add(one.source)
+    assert "stranger" not in sources
 
 
 def test_a_router_that_was_killed_is_found_again_by_relays_routers_and_readers(building: Building) -> None:

@@ -62,8 +62,8 @@ class Scene:
     def received(self, kind: type[HandshakeT]) -> list[HandshakeT]:
         """All handshakes of a kind that travelled, as the thief reads them."""
         read = ((parse(one, self.keys.rig_tag), one) for one, _, _ in self.wires.seen if one[5] < Kind.START)
-        told = [self.keys.open_as(header, one, kind) for header, one in read if isinstance(header, Header)]
-        return [one for one in told if not isinstance(one, Refusal)]
+        opened = [self.keys.open_as(header, one, kind) for header, one in read if isinstance(header, Header)]
+        return [one for one in opened if not isinstance(one, Refusal)]
 
     def hello(self, name: str = "left", process: int = 7, seed: int = 1) -> bytes:
         """The best hello that the thief can say for another name."""
@@ -224,8 +224,8 @@ def test_secrets_that_do_not_fit_are_named_on_both_sides(
 
 def test_an_unproven_that_the_thief_says_changes_nothing() -> None:
     scene = Scene()
-    told = Unproven(scene.master._nonce, bytes(NONCE_BYTES), has_secrets=False)
-    scene.wires.carry(seal(scene.sealer, told), THIEF, scene.address)
+    opened = Unproven(scene.master._nonce, bytes(NONCE_BYTES), has_secrets=False)
+    scene.wires.carry(seal(scene.sealer, opened), THIEF, scene.address)
     assert scene.left.refused == {Refusal.REPLAYED: 1}
     assert scene.left.wrong is None
     assert scene.frame_comes()

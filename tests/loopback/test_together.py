@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 ENOUGH = 20  # poses, however long a machine takes to draw what they are made of
 
 
-def poses_told(out: Path) -> int:
+def count_poses(out: Path) -> int:
     """How many poses the master has told so far, by its lines of every second."""
     return sum(map(int, re.findall(r"rate (\d+) poses/s", (out / "master.log").read_text())))
 
@@ -36,18 +36,18 @@ def test_the_grab_test_runs_scores_and_outlives_its_wrist_device(tmp_path: Path)
     received: list[str] = []
     pids: dict[str, int] = {}
     listening: set[Listener] = set()
-    killed_ns = told = 0
+    killed_ns = before = 0
     ended = False
     assert demo.stdout is not None
     for line in demo.stdout:
         received.append(line)
         pids = pids or {name: int(pid) for name, pid in re.findall(r"(\w+) \(pid (\d+)\)", line)}
         run_s = int(found[1]) if (found := re.search(r"(\d+) of 180 s ", line)) else 0
-        if run_s >= 14 and not killed_ns and poses_told(tmp_path) > ENOUGH:
+        if run_s >= 14 and not killed_ns and count_poses(tmp_path) > ENOUGH:
             listening = listeners(demo.pid)
-            killed_ns, told = time.monotonic_ns(), poses_told(tmp_path)
+            killed_ns, before = time.monotonic_ns(), count_poses(tmp_path)
             os.kill(pids["wrist"], signal.SIGKILL)
-        if killed_ns and not ended and run_s >= 24 and poses_told(tmp_path) > told + ENOUGH:
+        if killed_ns and not ended and run_s >= 24 and count_poses(tmp_path) > before + ENOUGH:
             ended = True
             demo.send_signal(signal.SIGINT)
     output = "".join(received)
@@ -62,9 +62,9 @@ def test_the_grab_test_runs_scores_and_outlives_its_wrist_device(tmp_path: Path)
     # How many frames a busy machine has time for is its own affair; how fast the cameras run is not. It is told from
     # two messages of one process on, and the wrist device's may send one and be killed.
     rates = {"left": 60.0, "right": 60.0, "wrist": 90.0}
-    told = summary["camera_hz"]
-    assert {"left", "right"} <= told.keys()
-    assert told == pytest.approx({name: rates[name] for name in told}, rel=2e-3)
+    before = summary["camera_hz"]
+    assert {"left", "right"} <= before.keys()
+    assert before == pytest.approx({name: rates[name] for name in before}, rel=2e-3)
     counts = summary["counts"]
     assert counts["wrist.received"] > 0
     assert counts["imu.received"] > 50

@@ -20,8 +20,8 @@ LEFT = ROOT / "calib_json/cameras/left.json"
 
 
 def asked(**options: Any) -> list[Command]:
-    told = {key: options.pop(key) for key in ("pick", "load_file", "save") if key in options}
-    return commands("left", settings(**options), **told)
+    extra = {key: options.pop(key) for key in ("pick", "load_file", "save") if key in options}
+    return commands("left", settings(**options), **extra)
 
 
 def test_without_options_it_only_asks() -> None:
@@ -29,17 +29,17 @@ def test_without_options_it_only_asks() -> None:
 
 
 def test_options_become_a_body_that_the_slave_understands() -> None:
-    (told,) = asked(exposure_us=4000.0, colour_gains="1.1,1.6")
-    assert (told.verb, msgspec.json.decode(told.body)) == (
+    (extra,) = asked(exposure_us=4000.0, colour_gains="1.1,1.6")
+    assert (extra.verb, msgspec.json.decode(extra.body)) == (
         "set",
         {"exposure_us": 4000.0, "colour_gains": [1.1, 1.6]},
     )
-    assert msgspec.json.decode(told.body, type=CameraSettings).analogue_gain is None
+    assert msgspec.json.decode(extra.body, type=CameraSettings).analogue_gain is None
 
 
 def test_rate_margin_and_a_pick_are_told_in_turn() -> None:
-    told, pick, save = asked(rate_hz=30.0, roi_margin=0.1, pick="index@310,204.5", save=True)
-    assert msgspec.json.decode(told.body) == {"frame_rate_hz": 30.0, "roi_margin": 0.1}
+    extra, pick, save = asked(rate_hz=30.0, roi_margin=0.1, pick="index@310,204.5", save=True)
+    assert msgspec.json.decode(extra.body) == {"frame_rate_hz": 30.0, "roi_margin": 0.1}
     assert (pick.verb, save.verb) == ("pick", "save")
     assert msgspec.json.decode(pick.body, type=ColourPick) == ColourPick(marker="index", uv=(310.0, 204.5))
 

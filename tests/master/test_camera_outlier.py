@@ -149,10 +149,10 @@ def test_a_thing_elsewhere_is_the_one_that_is_left_out_or_none(names: tuple[str,
     for c in range(len(names)):
         uv = images(names, c)
         uv[c] += np.random.default_rng(c).normal(0.0, 60.0, uv[c].shape)
-        told = odd(rig(names), uv)
-        assert not np.delete(told, c, axis=0).any()
+        outlying = odd(rig(names), uv)
+        assert not np.delete(outlying, c, axis=0).any()
         # Of three, whatever lies along one of the two epipolar lines, 3 px of 60 to each side, is not told.
-        assert told[c].mean() > (0.8 if len(names) == 3 else 0.95)
+        assert outlying[c].mean() > (0.8 if len(names) == 3 else 0.95)
 
 
 def test_two_wrong_of_four_and_a_marker_of_two_cameras_are_not_told() -> None:

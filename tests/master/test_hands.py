@@ -29,7 +29,7 @@ from tests.synthetic_run import SyntheticRun, setup_of, synthetic_run
 from tests.wrist_run import CYCLE_NS, START_NS, exact_cycle, wrist_scene, wrist_setup
 
 
-class Told:
+class RecordingPipeline:
     """A line that only remembers."""
 
     def __init__(self) -> None:
@@ -77,8 +77,8 @@ def test_cameras_that_watch_two_hands_solve_both(short_run: SyntheticRun) -> Non
     hands = Dispatcher(
         both, [pipeline_of(setup, StageTimes()) for setup in both], StageTimes(), gestures=False
     )
-    told = [one for message in short_run.messages for one in hands.push(with_left_markers(message))]
-    poses = [one.pose for one in told if isinstance(one, SolvedPose)]
+    results = [one for message in short_run.messages for one in hands.push(with_left_markers(message))]
+    poses = [one.pose for one in results if isinstance(one, SolvedPose)]
     of = {name: [pose for pose in poses if pose.hand == name] for name in ("made-right", "made-left")}
     assert len(of["made-right"]) == len(of["made-left"]) >= 6
     assert hands.counts["made-left.poses"] == len(of["made-left"])
@@ -93,7 +93,7 @@ def test_messages_and_samples_go_to_their_own_hand(short_run: SyntheticRun, root
     imu = ImuCalibration(name="palm")
     right = setup_of(msgspec.structs.replace(short_run.setup.rig, imu=imu))
     left = load_setup(root / "calib_json", "wrist-left")
-    lines = Told(), Told()
+    lines = RecordingPipeline(), RecordingPipeline()
     hands = Dispatcher((right, left), lines, StageTimes())
     seen = exact_cycle(left, wrist_scene(left).truth(0.5), 0)
     samples = [sample(source, t_ns) for source, t_ns in (("palm", 1), (left.imus[0], 2), ("another", 3))]

@@ -154,9 +154,9 @@ def test_objects_and_contact_come_on_the_bus_and_into_files(
     assert all(isinstance(one, Gesture) for one in drained(master, "gesture"))
     assert len(load_object(object_path(tmp_path, "cube"))) == len(poses)
     assert len(load_contact(contact_path(tmp_path, "default-right", "cube"))) == len(contacts)
-    told = msgspec.json.decode((tmp_path / "live.json").read_bytes())
-    assert told["counts"]["objects"] == sum(one.tracked for one in poses)
-    assert told["object_latency_p50_ms"] > 0.0
+    report = msgspec.json.decode((tmp_path / "live.json").read_bytes())
+    assert report["counts"]["objects"] == sum(one.tracked for one in poses)
+    assert report["object_latency_p50_ms"] > 0.0
 
 
 def drained(master: Master, name: str) -> list[object]:

@@ -71,11 +71,11 @@ class Lived:
 
     epochs: list[int]
     begun: list[int]
-    told: list[int]
+    result_ns: list[int]
     dropped_epochs: int
 
     def ages_ms(self) -> list[float]:
-        return [1e-6 * (told - epoch) for told, epoch in zip(self.told, self.epochs, strict=True)]
+        return [1e-6 * (result_ns - epoch) for result_ns, epoch in zip(self.result_ns, self.epochs, strict=True)]
 
 
 def lived(
@@ -106,7 +106,7 @@ def lived(
             out.epochs.append(epoch)
             out.begun.append(now)
             now += solve_ns(epoch)
-            out.told.append(now)
+            out.result_ns.append(now)
     return out
 
 
@@ -153,7 +153,7 @@ def test_a_pause_of_a_few_ms_leaves_nothing_out() -> None:
 def test_at_overload_what_is_told_is_new(load: float, offset_ns: int) -> None:
     solve_ns = round(load * PERIOD_NS)
     out = lived(arrivals(5.0, offset_ns, 1 * MS), lambda _t: solve_ns)
-    assert len(out.told) == pytest.approx(5e9 / solve_ns, rel=0.1), "the solver never waits for long"
+    assert len(out.result_ns) == pytest.approx(5e9 / solve_ns, rel=0.1), "the solver never waits for long"
     assert max(out.ages_ms()) < 1e-6 * (solve_ns + 2 * PERIOD_NS + offset_ns) + 2.0
 
 

@@ -152,12 +152,12 @@ def test_a_marker_on_a_bone_next_to_that_of_the_finger_tip_counts_for_the_hand(s
     )
     points = model.marker_points(truth, names)
     bias = cap_views(model, names, truth, points, cameras)[0]
-    told = [
+    messages = [
         detections(name, k, 1_000_000_000 + k * 16_666_667, setup.models[name].project(points) + bias[c])
         for k in range(8)
         for c, name in enumerate(rig.cameras)
     ]
-    poses, _ = solve(SyntheticRun(setup, told))
+    poses, _ = solve(SyntheticRun(setup, messages))
     assert poses[-1].valid.all()
     assert poses[-1].tracked[TIPS].all()
     assert 1e3 * np.linalg.norm(poses[-1].position_m - truth.position_m, axis=1).mean() < 3.0

@@ -60,31 +60,31 @@ def gesture(k: int) -> Gesture:
 
 def written(folder: Path) -> list[ResultMessage]:
     sink = RunFiles(folder / "poses.npz", {HAND: 6, "device": 0}, ["cube"])
-    told: list[ResultMessage] = []
+    results: list[ResultMessage] = []
     for k in range(9):
-        told += [random_pose(k), object_pose(k), contact(k), gesture(k)]
-    for one in told:
+        results += [random_pose(k), object_pose(k), contact(k), gesture(k)]
+    for one in results:
         sink.write(one)
     sink.close()
     sink.close()
-    return told
+    return results
 
 
 def test_what_is_told_is_read_back_exactly(tmp_path: Path) -> None:
-    told = written(tmp_path)
+    results = written(tmp_path)
     poses, near = (
         load_object(object_path(tmp_path, "cube")),
         load_contact(contact_path(tmp_path, HAND, "cube")),
     )
     assert (poses.object, near.hand, near.object, len(poses), len(near)) == ("cube", HAND, "cube", 9, 9)
     for kind, table in ((ObjectPose, poses), (Contact, near)):
-        for k, message in enumerate(one for one in told if isinstance(one, kind)):
+        for k, message in enumerate(one for one in results if isinstance(one, kind)):
             for field in set(kind.__struct_fields__) - {"object", "hand"}:
                 np.testing.assert_array_equal(
                     getattr(table, field)[k], getattr(message, field), err_msg=field
                 )
     output = load_gesture_messages(tmp_path / GESTURES)
-    gestures = [one for one in told if isinstance(one, Gesture)]
+    gestures = [one for one in results if isinstance(one, Gesture)]
     assert len(output) == len(gestures)
     for one, other in zip(output, gestures, strict=True):
         for field in Gesture.__struct_fields__:

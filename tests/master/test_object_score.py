@@ -95,9 +95,9 @@ def test_what_is_held_is_not_scored_and_is_missing() -> None:
 
 def test_the_worst_object_is_that_of_the_summary() -> None:
     scores = {"a": {"mm": 1.0, "deg": 2.0, "tracked": 0.5}, "b": {"mm": 3.0, "deg": 1.0, "tracked": 1.0}}
-    told = score_objects(scores)
-    assert (told["object_mm"], told["object_deg"], told["object_tracked"]) == (3.0, 2.0, 0.5)
-    assert told["objects"] == scores
+    scored = score_objects(scores)
+    assert (scored["object_mm"], scored["object_deg"], scored["object_tracked"]) == (3.0, 2.0, 0.5)
+    assert scored["objects"] == scores
     assert score_objects({}) == {}
     assert "object_mm" not in score_objects({"a": {"tracked": 0.0}})
 

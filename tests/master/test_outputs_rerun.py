@@ -432,22 +432,22 @@ def test_the_web_viewer_takes_poses_is_closed_to_other_addresses_and_ends_on_sto
         port = int(probe.getsockname()[1])
     bus = LoopbackBus()
     stop = threading.Event()
-    told: list[str] = []
+    addresses: list[str] = []
 
     def ready(address: str) -> None:
-        told.append(address)
+        addresses.append(address)
         # 127.0.0.2 is this machine too: it answers where a server listens on every interface.
         for host, is_open in (("127.0.0.1", True), ("127.0.0.2", False)):
             with socket.socket() as client:
-                told.append(f"{host} {(client.connect_ex((host, port)) == 0) == is_open}")
+                addresses.append(f"{host} {(client.connect_ex((host, port)) == 0) == is_open}")
         for pose in moving_hand(5):
             bus.publish("hand", pose.hand, pose)
         stop.set()
 
     shown = run_viewer(bus, [SETUP], mode="web", path=None, stop=stop, web_port=port, on_ready=ready)
     assert shown == 5
-    assert told[0].startswith(f"http://127.0.0.1:{port}?url=")
-    assert told[1:] == ["127.0.0.1 True", "127.0.0.2 True"]
+    assert addresses[0].startswith(f"http://127.0.0.1:{port}?url=")
+    assert addresses[1:] == ["127.0.0.1 True", "127.0.0.2 True"]
     with socket.socket() as client:
         assert client.connect_ex(("127.0.0.1", port)) != 0  # nothing is left running
     bus.close()

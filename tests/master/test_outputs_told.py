@@ -96,7 +96,7 @@ def test_the_look_of_an_object_is_how_well_its_place_is_known() -> None:
 
 
 def test_an_object_goes_its_way_and_is_dressed_only_when_its_look_changes(tmp_path: Path) -> None:
-    told = [
+    results = [
         bar(0),
         bar(1),
         bar(2, occluded=True),
@@ -104,7 +104,7 @@ def test_an_object_goes_its_way_and_is_dressed_only_when_its_look_changes(tmp_pa
         bar(4, known=False, tracked=False),
         bar(5),
     ]
-    write_rrd(tmp_path / "run.rrd", Poses.of(moving_hand(6)), WATCHED, told=told)
+    write_rrd(tmp_path / "run.rrd", Poses.of(moving_hand(6)), WATCHED, results=results)
     path, root = tmp_path / "run.rrd", "/world/objects/bar"
     assert times(path, root, "translation") == [0, 1, 2, 3, 5]
     moved = column(path, root, "translation")[1]
@@ -119,7 +119,7 @@ def test_an_object_goes_its_way_and_is_dressed_only_when_its_look_changes(tmp_pa
 
 
 def test_a_tag_lies_where_its_file_says_with_its_top_up(tmp_path: Path) -> None:
-    write_rrd(tmp_path / "run.rrd", Poses.of(moving_hand(1)), WATCHED, told=[bar(0)])
+    write_rrd(tmp_path / "run.rrd", Poses.of(moving_hand(1)), WATCHED, results=[bar(0)])
     corners = np.array(column(tmp_path / "run.rrd", "/world/objects/bar/tags/3", "vertex_positions")[1][0])
     # Printed x along the object's x, printed y along its z, so the paper looks along -y.
     np.testing.assert_allclose(corners[0], [-0.015, -3e-4, 0.05 + 0.015], atol=1e-6)
@@ -128,11 +128,11 @@ def test_a_tag_lies_where_its_file_says_with_its_top_up(tmp_path: Path) -> None:
 
 def test_contact_shows_what_is_near_and_plots_everything(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
-    told = [
+    results = [
         contact(0, [0.2, 0.02, np.nan, 0.04, 0.029]),
         contact(1, [0.0, -0.002, 0.01, 0.05, 0.05], held=True),
     ]
-    write_rrd(path, Poses.of(moving_hand(3)), WATCHED, told=told)
+    write_rrd(path, Poses.of(moving_hand(3)), WATCHED, results=results)
     root = "/world/contact/test-hand/bar"
     assert [len(row) for row in column(path, f"{root}/points", "positions")[1]] == [2, 3]
     assert column(path, f"{root}/gaps", ":labels")[1] == [["20 mm", "29 mm"], ["0 mm", "-2 mm", "10 mm"]]
@@ -143,7 +143,7 @@ def test_contact_shows_what_is_near_and_plots_everything(tmp_path: Path) -> None
 
 def test_the_gap_of_a_pose_that_is_not_known_is_left_out(tmp_path: Path) -> None:
     late = replace(contact(0, [0.01] * 5), t_ns=START_NS + 5)  # of no pose
-    write_rrd(tmp_path / "run.rrd", Poses.of(moving_hand(1)), WATCHED, told=[late])
+    write_rrd(tmp_path / "run.rrd", Poses.of(moving_hand(1)), WATCHED, results=[late])
     root = "/world/contact/test-hand/bar"
     assert len(column(tmp_path / "run.rrd", f"{root}/points", "positions")[1][0]) == 5
     assert column(tmp_path / "run.rrd", f"{root}/gaps", "strips")[1] == [[]]
@@ -152,7 +152,7 @@ def test_the_gap_of_a_pose_that_is_not_known_is_left_out(tmp_path: Path) -> None
 def test_gestures_stand_at_the_hand_and_go_when_they_end(tmp_path: Path) -> None:
     path, hand = tmp_path / "run.rrd", Poses.of(moving_hand(40))
     at, way = np.array([0.0, 0.0, 0.4]), np.array([0.0, 0.0, 1.0])
-    told = [
+    results = [
         gesture(0, "pose", "begin"),
         gesture(1, "pinch", "begin", distance_m=0.004, strength=0.8, origin_m=at),
         gesture(1, "dial", "begin", angle_rad=0.0, origin_m=at, direction=way),
@@ -164,7 +164,7 @@ def test_gestures_stand_at_the_hand_and_go_when_they_end(tmp_path: Path) -> None
         gesture(7, "pose", "end"),
         gesture(39, "point", "update", origin_m=at, direction=way),
     ]
-    write_rrd(path, hand, WATCHED, told=told)
+    write_rrd(path, hand, WATCHED, results=results)
     root = "/world/gestures/test-hand"
     assert times(path, f"{root}/pose", ":labels") == [0, 4]
     assert times(path, f"{root}/pose", "Clear:is_recursive") == [7]

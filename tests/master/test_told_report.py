@@ -33,7 +33,7 @@ class Script:
         return 0.5 * t_s
 
 
-def told(kind: str, name: str, at_s: float, phase: str = "begin", **more: float) -> Gesture:
+def recognised(kind: str, name: str, at_s: float, phase: str = "begin", **more: float) -> Gesture:
     t_ns = EPOCH_NS + round(at_s * 1e9)
     return Gesture("h", t_ns, kind, name, phase, t_ns, 0.9, **more)  # type: ignore[arg-type]
 
@@ -44,32 +44,32 @@ def test_the_script_is_one() -> None:
 
 def test_what_was_made_and_told_is_right_and_what_was_not_made_is_false() -> None:
     received = [
-        told("pinch", "index", 1.2),
-        told("dial", "dial", 3.5, angle_rad=0.0),
-        told("tap", "5", 6.5, "end"),
+        recognised("pinch", "index", 1.2),
+        recognised("dial", "dial", 3.5, angle_rad=0.0),
+        recognised("tap", "5", 6.5, "end"),
     ]
     made = judge_gestures(received, Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 10 * 10**9)
     assert (made["gestures_right"], made["gestures_made"], made["gestures_false"]) == (3, 3, 0)
-    wrong = [told("pinch", "ring", 1.2), told("tap", "5", 2.0, "end"), told("pose", "open_palm", 2.0)]
+    wrong = [recognised("pinch", "ring", 1.2), recognised("tap", "5", 2.0, "end"), recognised("pose", "open_palm", 2.0)]
     made = judge_gestures(wrong, Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 10 * 10**9)
     assert (made["gestures_right"], made["gestures_made"], made["gestures_false"]) == (0, 3, 2)
 
 
 def test_the_script_repeats_and_what_the_end_cuts_off_is_not_asked_for() -> None:
-    received = [told("pinch", "index", 11.2), told("dial", "dial", 13.4, angle_rad=0.0)]
+    received = [recognised("pinch", "index", 11.2), recognised("dial", "dial", 13.4, angle_rad=0.0)]
     made = judge_gestures(received, Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 14 * 10**9)
     assert (made["gestures_right"], made["gestures_made"], made["gestures_false"]) == (1, 4, 0)
 
 
 def test_what_the_beginning_of_the_run_cuts_off_is_neither_asked_for_nor_false() -> None:
     received = [
-        told("pinch", "index", 1.6),
-        told("tap", "5", 6.4, "end"),
-        told("dial", "dial", 4.0, angle_rad=0.0),
+        recognised("pinch", "index", 1.6),
+        recognised("tap", "5", 6.4, "end"),
+        recognised("dial", "dial", 4.0, angle_rad=0.0),
     ]
     made = judge_gestures(received, Script(), EPOCH_NS, EPOCH_NS + 1_500_000_000, EPOCH_NS + 10**10)
     assert (made["gestures_right"], made["gestures_made"], made["gestures_false"]) == (2, 2, 0)
-    other = [told("pinch", "ring", 1.6)]  # that one it did not make
+    other = [recognised("pinch", "ring", 1.6)]  # that one it did not make
     assert (
         judge_gestures(other, Script(), EPOCH_NS, EPOCH_NS + 1_500_000_000, EPOCH_NS + 10**10)[
             "gestures_false"
@@ -79,12 +79,12 @@ def test_what_the_beginning_of_the_run_cuts_off_is_neither_asked_for_nor_false()
 
 
 def test_too_late_is_not_right() -> None:
-    made = judge_gestures([told("pinch", "index", 2.6)], Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 10**10)
+    made = judge_gestures([recognised("pinch", "index", 2.6)], Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 10**10)
     assert (made["gestures_right"], made["gestures_false"]) == (0, 1)
 
 
 def test_the_angle_is_judged_from_where_the_dial_began() -> None:
-    began = told("dial", "dial", 3.0, angle_rad=0.0)
+    began = recognised("dial", "dial", 3.0, angle_rad=0.0)
     rotated = Gesture(
         "h", began.t_ns + 2 * 10**9, "dial", "dial", "update", began.t_ns, 0.9, angle_rad=1.0 + 0.05
     )

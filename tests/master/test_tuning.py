@@ -125,7 +125,7 @@ def tree(folder: Path, rig: RigCalibration | None = None) -> RigFiles:
     return RigFiles(folder, ("bench",))
 
 
-class Told:
+class LiveTuning:
     """A `RigTuning` on files of its own, and what it said."""
 
     def __init__(self, folder: Path) -> None:
@@ -142,45 +142,45 @@ class Told:
 
 
 @pytest.fixture
-def told(tmp_path: Path) -> Told:
-    return Told(tmp_path)
+def live(tmp_path: Path) -> LiveTuning:
+    return LiveTuning(tmp_path)
 
 
-def test_a_filter_is_tried_without_its_file_and_gone_with_a_reload(told: Told) -> None:
-    told.tuning.try_filter('{"rig": "bench", "filter": {"beta": 30.0}}')
-    assert told.upcoming
-    assert told.tuning.setups[0].rig.filter == FilterCalibration(beta=30.0)
+def test_a_filter_is_tried_without_its_file_and_gone_with_a_reload(live: LiveTuning) -> None:
+    live.tuning.try_filter('{"rig": "bench", "filter": {"beta": 30.0}}')
+    assert live.upcoming
+    assert live.tuning.setups[0].rig.filter == FilterCalibration(beta=30.0)
     for body in ('{"rig": "other", "filter": {}}', '{"rig": "bench", "filter": {"beta": -1}}', "{}"):
         with pytest.raises(CalibrationError, match=r"filter"):
-            told.tuning.try_filter(body)
-    assert told.tuning.setups[0].rig.filter.beta == 30.0, "what is refused changes nothing"
-    told.tuning.reload()
-    assert told.tuning.setups[0].rig.filter.beta != 30.0
+            live.tuning.try_filter(body)
+    assert live.tuning.setups[0].rig.filter.beta == 30.0, "what is refused changes nothing"
+    live.tuning.reload()
+    assert live.tuning.setups[0].rig.filter.beta != 30.0
 
 
-def test_the_first_look_does_not_take_a_trial_back_and_a_change_does(told: Told) -> None:
-    told.tuning.try_filter('{"rig": "bench", "filter": {"beta": 30.0}}')
-    told.tuning.look()
-    assert told.tuning.setups[0].rig.filter.beta == 30.0
-    content = msgspec.json.decode(told.rig_path.read_bytes())
-    told.rig_path.write_bytes(msgspec.json.encode(content | {"stamp_offset_us": {"right": 8000.0}}))
-    told.tuning.look()
-    assert told.tuning.setups[0].rig.filter.beta != 30.0
+def test_the_first_look_does_not_take_a_trial_back_and_a_change_does(live: LiveTuning) -> None:
+    live.tuning.try_filter('{"rig": "bench", "filter": {"beta": 30.0}}')
+    live.tuning.look()
+    assert live.tuning.setups[0].rig.filter.beta == 30.0
+    content = msgspec.json.decode(live.rig_path.read_bytes())
+    live.rig_path.write_bytes(msgspec.json.encode(content | {"stamp_offset_us": {"right": 8000.0}}))
+    live.tuning.look()
+    assert live.tuning.setups[0].rig.filter.beta != 30.0
 
 
-def test_files_that_say_the_same_are_no_change(told: Told) -> None:
-    told.tuning.look()
-    told.tuning.reload()
-    told.rig_path.write_bytes(told.rig_path.read_bytes() + b"\n")
-    told.tuning.look()
-    assert told.lines == []
-    assert told.tuning.counts() == {"reload.applied": 0, "reload.refused": 0}
+def test_files_that_say_the_same_are_no_change(live: LiveTuning) -> None:
+    live.tuning.look()
+    live.tuning.reload()
+    live.rig_path.write_bytes(live.rig_path.read_bytes() + b"\n")
+    live.tuning.look()
+    assert live.lines == []
+    assert live.tuning.counts() == {"reload.applied": 0, "reload.refused": 0}
 
 
 @pytest.mark.parametrize("part", ["rigs/bench.json", "cameras/right.json", "hands/made-right.json"])
-def test_every_file_of_the_rig_is_followed(part: str, told: Told) -> None:
-    told.tuning.look()
-    path = told.files.calibration / part
+def test_every_file_of_the_rig_is_followed(part: str, live: LiveTuning) -> None:
+    live.tuning.look()
+    path = live.files.calibration / part
     content = msgspec.json.decode(path.read_bytes())
     match part:
         case "rigs/bench.json":
@@ -190,31 +190,31 @@ def test_every_file_of_the_rig_is_followed(part: str, told: Told) -> None:
         case _:
             content["markers"]["thumb"]["painted_m"] = 0.017
     path.write_bytes(msgspec.json.encode(content))
-    told.tuning.look()
-    assert told.lines == ["changed files are in use"]
-    assert told.upcoming
-    assert told.tuning.counts() == {"reload.applied": 1, "reload.refused": 0}
+    live.tuning.look()
+    assert live.lines == ["changed files are in use"]
+    assert live.upcoming
+    assert live.tuning.counts() == {"reload.applied": 1, "reload.refused": 0}
 
 
-def test_a_broken_file_is_said_once_and_the_old_pipeline_stays(told: Told) -> None:
-    told.tuning.look()
-    told.rig_path.write_text('{"version": 1,')
-    told.tuning.look()
-    told.tuning.look()
-    assert len(told.lines) == 1
-    assert told.lines[0].startswith("changed files are not used: ")
-    assert "bench.json: Input data was truncated" in told.lines[0]
-    assert not told.upcoming
-    assert told.tuning.counts() == {"reload.applied": 0, "reload.refused": 1}
+def test_a_broken_file_is_said_once_and_the_old_pipeline_stays(live: LiveTuning) -> None:
+    live.tuning.look()
+    live.rig_path.write_text('{"version": 1,')
+    live.tuning.look()
+    live.tuning.look()
+    assert len(live.lines) == 1
+    assert live.lines[0].startswith("changed files are not used: ")
+    assert "bench.json: Input data was truncated" in live.lines[0]
+    assert not live.upcoming
+    assert live.tuning.counts() == {"reload.applied": 0, "reload.refused": 1}
 
 
-def test_another_rate_of_a_camera_is_followed(told: Told) -> None:
-    path = told.files.calibration / "cameras/left.json"
+def test_another_rate_of_a_camera_is_followed(live: LiveTuning) -> None:
+    path = live.files.calibration / "cameras/left.json"
     content = msgspec.json.decode(path.read_bytes())
     path.write_bytes(msgspec.json.encode(content | {"frame_rate_hz": 30.0}))
-    told.tuning.reload()
-    assert told.upcoming
-    assert told.tuning.setups[0].cameras["left"].frame_rate_hz == 30.0
+    live.tuning.reload()
+    assert live.upcoming
+    assert live.tuning.setups[0].cameras["left"].frame_rate_hz == 30.0
 
 
 @pytest.mark.parametrize(
@@ -245,15 +245,15 @@ def test_another_rate_of_a_camera_is_followed(told: Told) -> None:
     ],
 )
 def test_what_needs_a_restart_is_refused_with_the_reason(
-    part: str, key: str, value: object, expected: str, told: Told
+    part: str, key: str, value: object, expected: str, live: LiveTuning
 ) -> None:
-    path = told.files.calibration / part
+    path = live.files.calibration / part
     content = msgspec.json.decode(path.read_bytes())
     content[key] = value
     path.write_bytes(msgspec.json.encode(content))
     with pytest.raises(CalibrationError, match=expected):
-        told.tuning.reload()
-    assert not told.upcoming
+        live.tuning.reload()
+    assert not live.upcoming
 
 
 class Master:

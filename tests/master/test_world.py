@@ -78,7 +78,7 @@ def world_of(*setups: RigSetup) -> Dispatcher:
     return Dispatcher(setups, lines, StageTimes())
 
 
-def told(dispatcher: Dispatcher, messages: list[Sent]) -> list[ResultMessage]:
+def results_of(dispatcher: Dispatcher, messages: list[Sent]) -> list[ResultMessage]:
     out = [one for message in messages for one in dispatcher.push(message)]
     return [one if isinstance(one, Contact | Gesture) else one.pose for one in (*out, *dispatcher.flush())]
 
@@ -106,7 +106,7 @@ def test_objects_of_markers_and_of_tags_are_told_where_they_are(
 ) -> None:
     shown: ObjectRun = request.getfixturevalue(which)
     dispatcher = world_of(shown.setup)
-    poses = [one for one in told(dispatcher, shown.messages) if isinstance(one, ObjectPose)]
+    poses = [one for one in results_of(dispatcher, shown.messages) if isinstance(one, ObjectPose)]
     tracked = [one for one in poses if one.tracked]
     assert len(tracked) > 0.7 * FRAMES
     assert {one.object for one in poses} == {which}
@@ -152,7 +152,7 @@ def test_contact_is_made_for_every_hand_of_cameras_and_every_object(wand: Object
     assert set(dispatcher._now.contacts) == {"default-right", "another"}, (
         "a wrist device has a frame of its own"
     )
-    contacts = [one for one in told(dispatcher, wand.messages) if isinstance(one, Contact)]
+    contacts = [one for one in results_of(dispatcher, wand.messages) if isinstance(one, Contact)]
     assert Counter((one.hand, one.object) for one in contacts) == {
         (hand, name): FRAMES for hand in ("default-right", "another") for name in ("wand", "twin")
     }
@@ -165,7 +165,7 @@ def test_a_rig_without_objects_has_neither_objects_nor_contact(root: Path, wand:
     frames = [one for one in wand.messages if isinstance(one, MarkerDetections)]
     tags = TagDetections("left", 1, 0, 0, 0, np.array([3], np.uint16), np.ones((1, 4, 2)), np.ones(1))
     puck = tracker_pose("puck", np.eye(4), 0, 0)
-    assert {type(one) for one in told(dispatcher, [*frames, tags, puck])} <= {HandPose, Gesture}
+    assert {type(one) for one in results_of(dispatcher, [*frames, tags, puck])} <= {HandPose, Gesture}
     assert not dispatcher._now.shown
     assert not dispatcher._now.contacts
 
@@ -214,7 +214,7 @@ def test_a_tracker_tells_where_cameras_see_nothing_and_is_silent_where_they_do(w
         for k, t_ns in enumerate(range(wand.messages[0].t_ns, wand.messages[-1].t_ns, 4_000_000))
     ]
     both = sorted([*frames, *device], key=lambda one: one.t_ns)
-    poses = [one for one in told(world_of(setup), both) if isinstance(one, ObjectPose)]
+    poses = [one for one in results_of(world_of(setup), both) if isinstance(one, ObjectPose)]
     assert (np.diff([one.t_ns for one in poses]) > 0).all()
     sources = [ObjectSource(one.source) for one in poses]
     changed = sources.index(ObjectSource.TRACKER, sources.index(ObjectSource.MARKERS))
@@ -241,17 +241,17 @@ def test_an_object_with_a_tracker_alone_needs_no_camera(wand: ObjectRun) -> None
         for k in range(5)
     ]
     lost = TrackerPose("puck", 1, 5, START_NS + 5 * PERIOD_NS, np.full(3, nan), np.full(4, nan))
-    poses = [one for one in told(dispatcher, [*sent, lost]) if isinstance(one, ObjectPose)]
+    poses = [one for one in results_of(dispatcher, [*sent, lost]) if isinstance(one, ObjectPose)]
     assert [one.tracked for one in poses] == [True] * 5 + [False]
     assert dispatcher.counts["tracker.puck.lost"] == 1
-    assert told(dispatcher, [tracker_pose("another", np.eye(4), 0, 0)]) == []
+    assert results_of(dispatcher, [tracker_pose("another", np.eye(4), 0, 0)]) == []
 
 
 def test_a_tracker_that_is_not_registered_is_counted_and_said(wand: ObjectRun) -> None:
     setup = with_tracker(wand.setup, registered=False)
     dispatcher = world_of(setup)
     assert [(one.name, one.tracker) for one in dispatcher.unplaced] == [("wand", "puck")]
-    assert told(dispatcher, [tracker_pose("puck", np.eye(4), k, k) for k in range(3)]) == []
+    assert results_of(dispatcher, [tracker_pose("puck", np.eye(4), k, k) for k in range(3)]) == []
     assert dispatcher.counts == {"tracker.puck.unplaced": 3}
 
 
@@ -267,7 +267,7 @@ def test_markers_of_objects_are_found_in_a_rig_of_two_hands(wand: ObjectRun, roo
     both = setups_of([rig], wand.setup.cameras, hands.__getitem__, objects)
     assert [len(one.objects) for one in both] == [1, 0]
     frames = [with_more(one, len(theirs)) for one in wand.messages if isinstance(one, MarkerDetections)]
-    poses = [one for one in told(world_of(*both), [*frames]) if isinstance(one, ObjectPose)]
+    poses = [one for one in results_of(world_of(*both), [*frames]) if isinstance(one, ObjectPose)]
     assert np.median([off(wand, one)[0] for one in poses if one.tracked]) < 2.0
 
 
@@ -283,7 +283,7 @@ def with_more(message: MarkerDetections, count: int) -> MarkerDetections:
 def test_other_files_take_over_between_two_messages_and_what_had_begun_ends(wand: ObjectRun) -> None:
     dispatcher = world_of(wand.setup)
     half = len(wand.messages) // 2
-    before = told_only(dispatcher, wand.messages[:half])
+    before = results_with(dispatcher, wand.messages[:half])
     begun = Gesture("default-right", 7, "pinch", "index", "update", 5, 0.5)
     dispatcher._remember(begun)
     moved = tuple(
@@ -297,7 +297,7 @@ def test_other_files_take_over_between_two_messages_and_what_had_begun_ends(wand
         wand.setup, objects=(msgspec.structs.replace(wand.setup.objects[0], markers=markers),)
     )
     dispatcher.prepare([other])()
-    after = told_only(dispatcher, wand.messages[half:])
+    after = results_with(dispatcher, wand.messages[half:])
     assert isinstance(after[0], Gesture)
     assert (after[0].phase, after[0].kind, after[0].began_t_ns) == ("end", "pinch", 5)
     for poses, away_mm in ((before, 0.0), (after, 30.0)):
@@ -306,8 +306,8 @@ def test_other_files_take_over_between_two_messages_and_what_had_begun_ends(wand
     assert dispatcher._begun == {} or all(one.t_ns > 7 for one in dispatcher._begun.values())
 
 
-def told_only(dispatcher: Dispatcher, messages: list[Sent]) -> list[ResultMessage]:
-    """As `told`, and more messages come."""
+def results_with(dispatcher: Dispatcher, messages: list[Sent]) -> list[ResultMessage]:
+    """As `results_of`, and more messages come."""
     out = [one for message in messages for one in dispatcher.push(message)]
     return [one if isinstance(one, Contact | Gesture) else one.pose for one in out]
 
@@ -316,11 +316,11 @@ def test_single_pictures_have_no_gestures(wand: ObjectRun) -> None:
     lines = [Poses("default-right", len(wand.setup.markers))]
     dispatcher = Dispatcher([wand.setup], lines, StageTimes(), gestures=False)
     assert not dispatcher._now.gestures
-    assert not [one for one in told(dispatcher, wand.messages) if isinstance(one, Gesture)]
+    assert not [one for one in results_of(dispatcher, wand.messages) if isinstance(one, Gesture)]
 
 
 def test_the_same_messages_tell_the_same(cube: ObjectRun) -> None:
-    first, second = (told(world_of(cube.setup), cube.messages) for _ in range(2))
+    first, second = (results_of(world_of(cube.setup), cube.messages) for _ in range(2))
     assert [type(one) for one in first] == [type(one) for one in second]
     for one, other in zip(first, second, strict=True):
         if isinstance(one, ObjectPose) and isinstance(other, ObjectPose):
@@ -344,7 +344,7 @@ def test_a_hand_is_solved_as_without_objects(wand: ObjectRun) -> None:
     poses: list[list[HandPose]] = []
     for setup in (bare, wand.setup):
         dispatcher = Dispatcher([setup], [pipeline_of(setup, StageTimes())], StageTimes())
-        poses.append([one for one in told_only(dispatcher, [*frames]) if isinstance(one, HandPose)])
+        poses.append([one for one in results_with(dispatcher, [*frames]) if isinstance(one, HandPose)])
     assert len(poses[0]) == len(poses[1]) > 3
     for one, other in zip(*poses, strict=True):
         np.testing.assert_array_equal(one.position_m, other.position_m)

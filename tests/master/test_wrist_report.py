@@ -45,9 +45,9 @@ def test_the_forearm_is_scored_against_the_vertical_whatever_its_heading(
     lies = np.array([rig_world.T @ scene.motion.at(float(t)).T_rig_palm[:3, :3] for t in times])
     for tilt_deg in (0.0, 5.0):
         rotated = axis_rotation(2, 1.0) @ axis_rotation(0, np.radians(tilt_deg)) @ lies
-        told = replace(poses, palm_world_wxyz=matrix_to_quaternion(rotated))
-        told.palm_world_wxyz[:3] = np.nan
-        assert forearm_tilt(told, scene, START_NS)["forearm_tilt_deg"] == pytest.approx(tilt_deg, abs=1e-4)
+        measured = replace(poses, palm_world_wxyz=matrix_to_quaternion(rotated))
+        measured.palm_world_wxyz[:3] = np.nan
+        assert forearm_tilt(measured, scene, START_NS)["forearm_tilt_deg"] == pytest.approx(tilt_deg, abs=1e-4)
 
 
 @pytest.mark.parametrize("late_ms", [0, 30])
@@ -57,7 +57,7 @@ def test_a_run_is_scored_at_the_times_of_its_poses(
     poses = true_poses(setup, [scene.truth(k * CYCLE_NS * 1e-9 + 1.5) for k in range(N)])
     save_poses(tmp_path / "poses.npz", poses)
     epoch_ns = START_NS - 1_500_000_000 - late_ms * 1_000_000
-    told: list[str] = []
+    measured: list[str] = []
     full = report_scene(
         tmp_path / "poses.npz",
         setup,
@@ -65,7 +65,7 @@ def test_a_run_is_scored_at_the_times_of_its_poses(
         epoch_ns,
         tmp_path,
         {"poses_per_s": 30.0},
-        lambda what, _done, _total: told.append(what),
+        lambda what, _done, _total: measured.append(what),
     )
     assert full["poses_per_s"] == 30.0
     numbers = {name: value for name, value in full.items() if isinstance(value, float)}
@@ -80,7 +80,7 @@ def test_a_run_is_scored_at_the_times_of_its_poses(
     assert rows["/world/laser/points"] == rows["/world/truth/laser"] == N
     assert rows["/world/cameras/wrist/image"] == 3  # 1.3 s, twice a second
     assert (tmp_path / "hand.png").stat().st_size > 50_000
-    assert {"comparing with the truth", "drawing the hand", "rendering camera wrist"} <= set(told)
+    assert {"comparing with the truth", "drawing the hand", "rendering camera wrist"} <= set(measured)
 
 
 def test_a_run_without_a_pose_keeps_its_figures(setup: RigSetup, scene: WristScene, tmp_path: Path) -> None:
@@ -126,10 +126,10 @@ def test_a_hand_before_both_kinds_of_rig_is_played_by_one_motion(root: Path) -> 
 def test_laser_points_count_once_for_each_cycle(setup: RigSetup, scene: WristScene) -> None:
     poses = true_poses(setup, [scene.truth(k * CYCLE_NS * 1e-9 + 1.5) for k in range(6)])
     twice = replace(poses, laser_m=np.repeat(poses.laser_m[::2], 2, axis=0))
-    told: list[int] = []
+    measured: list[int] = []
     epoch_ns = START_NS - 1_500_000_000
-    scores = laser_scores(twice, scene, epoch_ns, lambda _what, _done, total: told.append(total))
-    assert set(told) == {3}
+    scores = laser_scores(twice, scene, epoch_ns, lambda _what, _done, total: measured.append(total))
+    assert set(measured) == {3}
     assert scores["laser_mm"] == pytest.approx(0.0, abs=1e-9)
     assert (
         laser_scores(replace(poses, laser_m=np.full_like(poses.laser_m, np.nan)), scene, epoch_ns, print)

@@ -148,7 +148,7 @@ def test_its_imu_turns_the_palm_in_the_world_and_nothing_in_the_camera(
         "\n".join([f"{header},heading_sigma", *(f"{row},0.3" for row in rows)]) + "\n"
     )
     solve(recording(tmp_path, setup), setup, tmp_path, tmp_path)
-    told = load_poses(tmp_path / "poses.npz")
+    poses = load_poses(tmp_path / "poses.npz")
     np.testing.assert_array_equal(found.position_m, without.position_m)
     np.testing.assert_array_equal(found.angles_rad, without.angles_rad)
     imu = setup.rig.imu
@@ -169,7 +169,7 @@ def test_its_imu_turns_the_palm_in_the_world_and_nothing_in_the_camera(
         found.palm_world_sigma_rad[received, 1], drift_rad, atol=0.17
     )  # 50 ms at 3 rad/s
     assert found.palm_world_sigma_rad[received, 1].min() < 0.02
-    np.testing.assert_allclose(told.palm_world_sigma_rad[received, 1], 0.3, rtol=0.15)  # as the IMU says
+    np.testing.assert_allclose(poses.palm_world_sigma_rad[received, 1], 0.3, rtol=0.15)  # as the IMU says
     counts = summary["counts"]
     assert isinstance(counts, dict)
     assert counts["orientation.used"] == received.sum()

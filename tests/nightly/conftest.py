@@ -18,15 +18,15 @@ LOAD = "modprobe vivid n_devs=1 node_types=0x1 num_inputs=1 input_types=0x0"
 
 
 @pytest.fixture(scope="session")
-def told() -> Iterator[Measured]:
+def measured() -> Iterator[Measured]:
     """Where numbers go."""
     yield from kept(ROOT / "out" / "nightly.json")
 
 
 @pytest.fixture(scope="session")
-def rig(told: Measured) -> Iterator[BoardRig]:
+def rig(measured: Measured) -> Iterator[BoardRig]:
     """The machine, on, with a camera of the kernel and the slave that `phalanx deploy` put there, and a master."""
-    with switched_on(AMD64, "PC", told) as one:
+    with switched_on(AMD64, "PC", measured) as one:
         one.board.run(LOAD)
         file = one.calibration / "cameras/left.json"
         camera = json.loads(file.read_text())
@@ -38,5 +38,5 @@ def rig(told: Measured) -> Iterator[BoardRig]:
         camera = ("--camera", "left=v4l2:/dev/video0", "--options", f"left={VIVID}")
         ran = one.deploy(*camera, *slow, timeout_s=PATIENCE_S)
         assert ran.code == 0, f"{ran}\n{one.board.journal()}"
-        told("deploy to the PC", ran.seconds)
+        measured("deploy to the PC", ran.seconds)
         yield one

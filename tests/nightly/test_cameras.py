@@ -41,10 +41,10 @@ def silent(rig: BoardRig, silence_s: float = 3.0, within_s: float = 60.0) -> Non
         time.sleep(0.1)
 
 
-def test_frames_flow(rig: BoardRig, told: Measured) -> None:
+def test_frames_flow(rig: BoardRig, measured: Measured) -> None:
     sends(rig, time.monotonic())
     rate = rig.board.tap.rate_hz(rig.board.address, 10.0)
-    told("frames of vivid, detected and sent", rate, "Hz")
+    measured("frames of vivid, detected and sent", rate, "Hz")
     assert rate > 0.2 * RATE_HZ
     assert rate < 1.2 * RATE_HZ
 
@@ -55,13 +55,13 @@ def test_settings_are_in_the_camera(rig: BoardRig) -> None:
     assert "'gain_automatic': 0" in output, output
 
 
-def test_a_camera_that_is_unplugged_is_opened_again(rig: BoardRig, told: Measured) -> None:
+def test_a_camera_that_is_unplugged_is_opened_again(rig: BoardRig, measured: Measured) -> None:
     sends(rig, time.monotonic())
     pid = rig.board.main_pid()
     rig.board.run(UNBIND)
     silent(rig)
     rig.board.run(BIND)
-    told("camera back, from its plug to the first datagram", sends(rig, time.monotonic()))
+    measured("camera back, from its plug to the first datagram", sends(rig, time.monotonic()))
     assert rig.board.main_pid() == pid, f"the slave was started again:\n{rig.board.journal()}"
 
 

@@ -51,8 +51,8 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(tmp_path: Path, small_d
         recovery_s = rig.steady_after(ended)
         assert recovery_s is not None
         assert recovery_s < 2.0
-        told = rig.poses.since(began)
-        assert not any(false(one) for one in told)
+        received = rig.poses.since(began)
+        assert not any(false(one) for one in received)
         assert rig.processes["master"].poll() is None
     finally:
         rig.close()
@@ -84,7 +84,7 @@ def test_a_million_hostile_datagrams_cost_nothing_that_lasts(tmp_path: Path) -> 
         watch = Watch(rig)
         time.sleep(3.0)
         after = watch.end()
-        assert not any(false(one) for one in during.told)
+        assert not any(false(one) for one in during.received)
         assert during.lost < 0.5
         assert after.master_cpu < 1.3 * before.master_cpu + 0.05
         assert after.slave_cpu < 1.3 * before.slave_cpu + 0.05

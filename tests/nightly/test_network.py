@@ -15,29 +15,29 @@ def card(rig: BoardRig) -> str:
     return rig.board.run("ls /sys/class/net | grep -v lo").split()[0]
 
 
-def told_by_netem(rig: BoardRig) -> dict[str, int]:
+def netem_counts(rig: BoardRig) -> dict[str, int]:
     """What netem counted."""
     one = json.loads(rig.board.run(f"tc -s -j qdisc show dev {card(rig)} root"))[0]
     return {name: int(one[name]) for name in ("packets", "drops")}
 
 
-def test_a_bad_network_ends_nothing_and_leaves_nothing(rig: BoardRig, told: Measured) -> None:
+def test_a_bad_network_ends_nothing_and_leaves_nothing(rig: BoardRig, measured: Measured) -> None:
     tap, address = rig.board.tap, rig.board.address
     assert tap.wait(address, time.monotonic(), 120.0) is not None, rig.board.journal()
     before, pid = tap.rate_hz(address, 10.0), rig.board.main_pid()
     rig.board.run("modprobe sch_netem")
     rig.board.run(f"tc qdisc add dev {card(rig)} root netem {BAD}")
     bad = tap.rate_hz(address, BAD_S)
-    counted = told_by_netem(rig)
+    counted = netem_counts(rig)
     rig.board.run(f"tc qdisc del dev {card(rig)} root", 300.0)
     good = time.monotonic()
     back = tap.wait(address, good, 60.0)
     assert back is not None, rig.board.journal()
     after = tap.rate_hz(address, 10.0)
-    told("datagrams before netem", before, "Hz")
-    told("  ... under 20 % loss, 60 ± 50 ms, reorder, duplicates", bad, "Hz")
-    told("  ... after it", after, "Hz")
-    told(
+    measured("datagrams before netem", before, "Hz")
+    measured("  ... under 20 % loss, 60 ± 50 ms, reorder, duplicates", bad, "Hz")
+    measured("  ... after it", after, "Hz")
+    measured(
         "share of packets that netem dropped",
         counted["drops"] / max(counted["packets"] + counted["drops"], 1),
         "",
@@ -46,5 +46,5 @@ def test_a_bad_network_ends_nothing_and_leaves_nothing(rig: BoardRig, told: Meas
     # The emulated machine has no rate of its own: it has what this one gives it, before and after.
     assert 0.25 * min(before, after) < bad < 1.1 * max(before, after)
     assert after > 0.6 * before
-    assert told.at_most(BACK_S, "back after netem", back - good)
+    assert measured.at_most(BACK_S, "back after netem", back - good)
     assert rig.board.main_pid() == pid, f"the slave was started again:\n{rig.board.journal()}"

@@ -8,10 +8,10 @@ from tests.nightly.raspi import started
 from tests.programs import needs
 
 
-def test_the_doctor_of_a_slave_says_what_the_board_has_and_lacks(tmp_path: Path, told: Measured) -> None:
+def test_the_doctor_of_a_slave_says_what_the_board_has_and_lacks(tmp_path: Path, measured: Measured) -> None:
     needs("qemu-system-aarch64")
     output, seconds = started(sysroot_or_skip(), tmp_path)
-    told("raspi3b, from power to the doctor's last word", seconds)
+    measured("raspi3b, from power to the doctor's last word", seconds)
     assert "Raspberry Pi 3 Model B" in output
     assert "aarch64 4" in output
     assert "PHALANX-DOCTOR 1" in output, output  # it has neither camera nor master: it says so, and fails

@@ -58,12 +58,12 @@ def part(folder: Path, name: str, first_ns: int = 1000, step_ns: int = 100, **ch
 
 def test_frames_of_all_cameras_in_the_order_of_time(tmp_path: Path) -> None:
     parts = [part(tmp_path, "left"), part(tmp_path, "right", 1050)]
-    told: list[tuple[int, int]] = []
+    steps: list[tuple[int, int]] = []
     counts = join_recordings(
-        parts, tmp_path / "wave", progress=lambda done, total: told.append((done, total))
+        parts, tmp_path / "wave", progress=lambda done, total: steps.append((done, total))
     )
     assert counts == {"left": 3, "right": 3}
-    assert told == [(k, 6) for k in range(1, 7)]
+    assert steps == [(k, 6) for k in range(1, 7)]
     joined = open_recording(tmp_path / "wave")
     assert [(row.camera, row.t_ns) for row in joined.rows] == [
         ("left", 1000), ("right", 1050), ("left", 1100), ("right", 1150), ("left", 1200), ("right", 1250),

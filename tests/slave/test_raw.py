@@ -113,14 +113,14 @@ def test_frames_between_the_commands_are_kept_to_the_last_bit_and_join(
                 one.begin("other")
         for one in (left, right):
             one.raw.close()  # as at the end of the loop, whose last frame is kept, too
-            told = one.ask("raw_stop")
-            assert (told.counts["raw.frames"], told.counts["raw.dropped"], told.counts["raw.ended"]) == (
+            answer = one.ask("raw_stop")
+            assert (answer.counts["raw.frames"], answer.counts["raw.dropped"], answer.counts["raw.ended"]) == (
                 10,
                 0,
                 0,
             )
-            assert told.metrics["raw.on"] == 0.0
-            assert told.metrics["raw.megabytes"] > 0.0
+            assert answer.metrics["raw.on"] == 0.0
+            assert answer.metrics["raw.megabytes"] > 0.0
         with pytest.raises(BusError, match="wave-left: holds something already"):
             left.begin("wave-left")
     assert check_whole(folder / "wave-left") == check_whole(folder / "wave-right") == 10

@@ -360,9 +360,9 @@ def test_the_command_records_what_the_camera_gives(
     assert recorded.note == "two hands"
     assert recorded.rig == RIG
     assert recorded.clock is not None
-    told = capsys.readouterr()
-    assert f"left: recorded in {out}" in told.out
-    assert "left: 30 frames in 0.03 s, 0 dropped, 0 lost by the camera" in told.err
+    output = capsys.readouterr()
+    assert f"left: recorded in {out}" in output.out
+    assert "left: 30 frames in 0.03 s, 0 dropped, 0 lost by the camera" in output.err
 
 
 def test_the_command_records_the_simulated_camera(tmp_path: Path) -> None:
@@ -447,9 +447,9 @@ def test_a_full_disk_ends_the_command_with_a_whole_recording(tmp_path: Path) -> 
     arguments = tree(tmp_path)
     with small_disk(tmp_path / "disk", "200k") as disk:
         process = start([*arguments, "-o", str(disk / "wave"), "--reserve-mb", "0"])
-        _, told = process.communicate(timeout=120.0)
-        assert process.returncode == 1, told
-        assert "frames.csv: cannot write: No space left" in told or "stay free (--reserve-mb)" in told
+        _, output = process.communicate(timeout=120.0)
+        assert process.returncode == 1, output
+        assert "frames.csv: cannot write: No space left" in output or "stay free (--reserve-mb)" in output
         assert 20 < same_images(disk / "wave", tmp_path / "given") == check_whole(disk / "wave") < 50
 
 
@@ -459,9 +459,9 @@ def test_a_limit_of_the_system_ends_the_command_with_a_whole_recording(
 ) -> None:
     arguments = tree(tmp_path)
     process = start([*arguments, "-o", str(tmp_path / "wave"), "--reserve-mb", "0"], limit)
-    _, told = process.communicate(timeout=120.0)
-    assert process.returncode == 1, told
-    assert "cannot write: File too large" in told
+    _, output = process.communicate(timeout=120.0)
+    assert process.returncode == 1, output
+    assert "cannot write: File too large" in output
     if count:
         assert same_images(tmp_path / "wave", tmp_path / "given") == check_whole(tmp_path / "wave") > count
     else:
@@ -475,13 +475,13 @@ def test_stopped_by_hand_or_killed_there_is_a_recording(number: signal.Signals, 
     process = start([*arguments, "-o", str(out), "--reserve-mb", "0"])
     begun = until(lambda: (out / "left/000002.png").exists(), 60.0)
     os.kill(process.pid, number)
-    told_out, told = process.communicate(timeout=120.0)
-    assert begun, told
+    output_text, output = process.communicate(timeout=120.0)
+    assert begun, output
     if number == signal.SIGKILL:
         assert process.returncode == -9
         assert 2 <= same_images(out, tmp_path / "given")
     else:
-        assert process.returncode == 0, told
-        assert f"recorded in {out}" in told_out
+        assert process.returncode == 0, output
+        assert f"recorded in {out}" in output_text
         assert 3 <= same_images(out, tmp_path / "given") == check_whole(out) < 240
     assert json.loads((out / "recording.json").read_text())["cameras"]["left"]["frame_rate_hz"] == 5.0

@@ -50,8 +50,8 @@ class Manager:
             return found
 
     def environment(self, watchdog_us: int | None = PERIOD_US) -> dict[str, str]:
-        told = {"NOTIFY_SOCKET": self.address}
-        return told if watchdog_us is None else told | {"WATCHDOG_USEC": str(watchdog_us)}
+        environment = {"NOTIFY_SOCKET": self.address}
+        return environment if watchdog_us is None else environment | {"WATCHDOG_USEC": str(watchdog_us)}
 
     def close(self) -> None:
         self._socket.close()

@@ -54,9 +54,9 @@ def test_a_slave_tells_what_the_checklist_judges(tmp_path: Path) -> None:
     )
 
     def ask(verb: str, body: str = "") -> Health:
-        told = decode(encode(reporter.answer(Command("left", verb, body))))
-        assert isinstance(told, Health)
-        return told
+        answer = decode(encode(reporter.answer(Command("left", verb, body))))
+        assert isinstance(answer, Health)
+        return answer
 
     try:
         assert until(lambda: "disk_free_mb" in ask("report").metrics)

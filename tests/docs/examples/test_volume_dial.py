@@ -166,7 +166,7 @@ def test_a_program_without_a_volume_is_said(
 
 
 @pytest.mark.parametrize(
-    ("program", "told", "percent"),
+    ("program", "output", "percent"),
     [
         ("wpctl", "Volume: 0.40 [MUTED]", 40),
         ("wpctl", "Volume: 1.25", 125),
@@ -174,9 +174,9 @@ def test_a_program_without_a_volume_is_said(
     ],
 )
 def test_what_the_programs_say_is_understood(
-    app: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, told: str, percent: int
+    app: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, output: str, percent: int
 ) -> None:
-    fake(tmp_path, program, f"#!/bin/sh\necho '{told}'\n")
+    fake(tmp_path, program, f"#!/bin/sh\necho '{output}'\n")
     fake(tmp_path, "aplay", "#!/bin/sh\n")
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     assert app.Program(program).read() == percent
@@ -229,9 +229,9 @@ def run_app(root: Path, *words: str, path: str | None = None) -> subprocess.Comp
 
 
 def test_its_help_says_what_it_is_and_the_output_must_be_chosen(root: Path) -> None:
-    told = run_app(root, "--help").stdout
-    assert "eyes-free" in told
-    assert "--output" in told
+    output = run_app(root, "--help").stdout
+    assert "eyes-free" in output
+    assert "--output" in output
     assert run_app(root).returncode == 2
 
 

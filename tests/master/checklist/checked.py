@@ -45,7 +45,7 @@ class Bench:
 
     def seconds(self, seconds: float) -> list[tuple[float, tuple[CheckItem, ...]]]:
         """Look four times a second; what each look told, with the time since now [s]."""
-        told: list[tuple[float, tuple[CheckItem, ...]]] = []
+        shown: list[tuple[float, tuple[CheckItem, ...]]] = []
         for k in range(round(seconds * 4)):
             self.t_ns += POLL_NS
             self._looks += 1
@@ -54,8 +54,8 @@ class Bench:
                 if self._looks % 2 == 0 and name not in self.away:
                     self.watch.push_health(self._health(name), self.t_ns)
             self.watch.push(self._now())
-            told.append((0.25 * (k + 1), self.watch.look(self.t_ns)))
-        return told
+            shown.append((0.25 * (k + 1), self.watch.look(self.t_ns)))
+        return shown
 
     def keys(self) -> list[tuple[str, str]]:
         """Code and subject of what a look tells now."""
@@ -89,9 +89,9 @@ class Bench:
         metrics = {"width_px": 640.0, "height_px": 480.0, "light_exposure": 1.0, "temperature_c": 50.0}
         metrics |= {"temperature_limit_c": 80.0, "disk_free_mb": 8000.0, "exposure_us": 5000.0}
         metrics |= {"wanted.exposure_us": 5000.0} | {f"colour.{marker}": 1.0 for marker in MARKERS}
-        told = metrics | self.metrics.get(name, {})
+        shown = metrics | self.metrics.get(name, {})
         counts |= self.counts.get(name, {})
-        return Health(name, self.session.get(name, 1), self.t_ns + 10**9, counts, told)
+        return Health(name, self.session.get(name, 1), self.t_ns + 10**9, counts, shown)
 
     def _now(self) -> MasterNow:
         senders = {

@@ -287,28 +287,28 @@ def test_a_fault_shows_alone_within_two_seconds_and_is_gone_within_two(case: Cas
     bench = Bench()
     assert not any(items for _, items in bench.seconds(12.0))
     case.put(bench)
-    told = bench.seconds(6.0)
-    first = next(s for s, items in told if items)
+    shown = bench.seconds(6.0)
+    first = next(s for s, items in shown if items)
     assert first <= WITHIN_S
-    for s, items in told:
+    for s, items in shown:
         if s >= first:
             assert [(item.code, item.subject) for item in items] == [(case.code, case.subject)], s
-    item = told[-1][1][0]
+    item = shown[-1][1][0]
     assert case.expected in item.sentence
     assert case.subject.split(".")[0].split("-")[0] in item.sentence
     assert case.fix in item.fix
     case.take(bench)
-    told = bench.seconds(6.0)
-    assert {(item.code, item.subject) for _, items in told for item in items} <= {(case.code, case.subject)}
-    assert not any(items for s, items in told if s > WITHIN_S)
+    shown = bench.seconds(6.0)
+    assert {(item.code, item.subject) for _, items in shown for item in items} <= {(case.code, case.subject)}
+    assert not any(items for s, items in shown if s > WITHIN_S)
 
 
 def test_who_never_came_is_told_after_a_grace() -> None:
     bench = Bench(away={"right", "imu"})
-    told = bench.seconds(8.0)
-    assert not any(items for s, items in told if s < 5.0)
-    assert [(i.code, i.subject) for i in told[-1][1]] == [("camera_absent", "right"), ("imu_silent", "imu")]
-    assert "never received" in told[-1][1][0].sentence
+    shown = bench.seconds(8.0)
+    assert not any(items for s, items in shown if s < 5.0)
+    assert [(i.code, i.subject) for i in shown[-1][1]] == [("camera_absent", "right"), ("imu_silent", "imu")]
+    assert "never received" in shown[-1][1][0].sentence
 
 
 def test_a_camera_that_gives_no_frames_is_absent_though_its_slave_is_there() -> None:

@@ -45,7 +45,7 @@ class FakeSlave:
     def __init__(self, bus: Bus, camera: Path) -> None:
         self.path, self.camera = camera, load(camera, CameraCalibration)
         self.roi_margin = self.camera.roi_margin
-        self.told: list[Command] = []
+        self.commands: list[Command] = []
         self.shown_ns: list[int] = []
         self.until_ns = 0
         self._bus, self._sent = bus, 0
@@ -63,10 +63,10 @@ class FakeSlave:
 
     def verbs(self, verb: str) -> list[dict[str, object]]:
         """Bodies of all commands of that verb."""
-        return [json.loads(one.body) if one.body else {} for one in self.told if one.verb == verb]
+        return [json.loads(one.body) if one.body else {} for one in self.commands if one.verb == verb]
 
     def answer(self, command: Command) -> Health:
-        self.told.append(command)
+        self.commands.append(command)
         body = json.loads(command.body) if command.body else {}
         match command.verb:
             case "preview":
@@ -95,8 +95,8 @@ class FakeSlave:
                 f"{self.name}: exposure_us {exposure:g}: does not fit into a frame of 11111 us"
             )
         self.roi_margin = float(str(body.pop("roi_margin", self.roi_margin)))
-        told = msgspec.convert(body.pop("markers", {}), dict[str, HsvRange | None], strict=False)
-        markers = {**(self.camera.markers or {}), **told}
+        commands = msgspec.convert(body.pop("markers", {}), dict[str, HsvRange | None], strict=False)
+        markers = {**(self.camera.markers or {}), **commands}
         self.camera = msgspec.structs.replace(
             self.camera,
             **{key: tuple(value) if isinstance(value, list) else value for key, value in body.items()},
@@ -136,7 +136,7 @@ class FakeMaster:
 
     def __init__(self, bus: Bus, slaves: list[FakeSlave], hand: bool = True) -> None:
         self.items: tuple[CheckItem, ...] = ()
-        self.told: list[Command] = []
+        self.commands: list[Command] = []
         self.extra: dict[str, float] = {}
         self._bus, self._slaves, self._hand = bus, slaves, hand
         self._ended = threading.Event()
@@ -146,7 +146,7 @@ class FakeMaster:
         self._thread.start()
 
     def answer(self, command: Command) -> Health:
-        self.told.append(command)
+        self.commands.append(command)
         return self._health(0)
 
     def close(self) -> None:

@@ -92,16 +92,16 @@ def test_the_corners_of_a_picture_are_the_edges_of_the_frames_corner_pixels() ->
 
 
 def test_a_filter_is_tried_by_command_and_saved_with_its_source(tmp_path: Path) -> None:
-    told: list[Command] = []
+    commands: list[Command] = []
 
     def ask(command: Command) -> Health:
-        told.append(command)
+        commands.append(command)
         return Health("master", 1, 2, {}, {})
 
     path = tree(tmp_path) / "rigs" / "desk.json"
     before = load(path, RigCalibration)
     try_filter(ask, "desk", {"beta": 80.0})
-    assert json.loads(told[0].body) == {"rig": "desk", "filter": {"beta": 80.0}}
+    assert json.loads(commands[0].body) == {"rig": "desk", "filter": {"beta": 80.0}}
     save_filter(path, {"beta": 80.0})
     after = load(path, RigCalibration)
     assert (after.filter.beta, after.filter.min_cutoff_hz) == (80.0, before.filter.min_cutoff_hz)

@@ -64,7 +64,7 @@ async def ask(
         "root_path": "",
         "http_version": "1.1",
     }
-    told: list[Message] = []
+    messages: list[Message] = []
     first = {"type": "http.request", "body": body} if kind == "http" else {"type": "websocket.connect"}
     waiting = [first, *then]
 
@@ -75,23 +75,23 @@ async def ask(
         raise AssertionError
 
     async def send(message: Message) -> None:
-        told.append(message)
+        messages.append(message)
 
     await app(scope, receive, send)
-    return told
+    return messages
 
 
-def status(told: list[Message]) -> int:
+def status(messages: list[Message]) -> int:
     """Of an answer; a socket that was closed before it was accepted is 403, as servers say it."""
-    return 403 if told[0]["type"] == "websocket.close" else int(told[0]["status"])
+    return 403 if messages[0]["type"] == "websocket.close" else int(messages[0]["status"])
 
 
-def header(told: list[Message], name: bytes) -> str:
-    return next((value.decode() for key, value in told[0]["headers"] if key == name), "")
+def header(messages: list[Message], name: bytes) -> str:
+    return next((value.decode() for key, value in messages[0]["headers"] if key == name), "")
 
 
-def token(told: list[Message], name: str = "phalanx-8080") -> str:
-    return f"{name}={SimpleCookie(header(told, b'set-cookie'))[name].value}"
+def token(messages: list[Message], name: str = "phalanx-8080") -> str:
+    return f"{name}={SimpleCookie(header(messages, b'set-cookie'))[name].value}"
 
 
 def form(password: str) -> bytes:
@@ -281,9 +281,9 @@ def test_guessing_is_slowed_down_also_when_it_comes_at_once() -> None:
         time = Time()
         app = login(time)
         guesses = (ask(app, "/login", "POST", body=form(f"guess {k}")) for k in range(50))
-        told = [status(one) for one in await asyncio.gather(*guesses)]
-        assert told.count(403) == 3
-        assert told.count(429) == 47
+        messages = [status(one) for one in await asyncio.gather(*guesses)]
+        assert messages.count(403) == 3
+        assert messages.count(429) == 47
         right = await ask(app, "/login", "POST", body=form(PASSWORD))
         assert status(right) == 429, "nor is the right one looked at before its time"
         assert int(header(right, b"retry-after")) >= 1
@@ -314,8 +314,8 @@ def test_a_socket_ends_with_its_session() -> None:
         while not received:
             await asyncio.sleep(0.001)
         await ask(guarded, "/logout", "POST", cookie=cookie)
-        told = await asyncio.wait_for(open_socket, 30.0)
-        assert [one["type"] for one in told] == ["websocket.accept", "websocket.close"]
+        messages = await asyncio.wait_for(open_socket, 30.0)
+        assert [one["type"] for one in messages] == ["websocket.accept", "websocket.close"]
 
     asyncio.run(story())
 
@@ -341,10 +341,10 @@ def open_to_anybody(app: ASGIApp, found: Iterable[tuple[str, str]]) -> set[str]:
         wrong: set[str] = set()
         for kind, path in found:
             for method in ("GET", "POST") if kind == "http" else ("GET",):
-                told = await ask(app, path, method, kind=kind)
-                way = header(told, b"location") if kind == "http" else ""
-                if status(told) not in (401, 403) and not way.startswith("/login"):
-                    wrong.add(f"{method} {path} {status(told)}")
+                messages = await ask(app, path, method, kind=kind)
+                way = header(messages, b"location") if kind == "http" else ""
+                if status(messages) not in (401, 403) and not way.startswith("/login"):
+                    wrong.add(f"{method} {path} {status(messages)}")
         return wrong
 
     return asyncio.run(process_noise())

@@ -84,8 +84,8 @@ def window(desk: Desk) -> Generator[Page]:
 @pytest.fixture
 def page(desk: Desk, window: Page) -> Generator[Page]:
     desk.faults.clear()
-    desk.left.told.clear()
-    desk.master.told.clear()
+    desk.left.commands.clear()
+    desk.master.commands.clear()
     yield window
     assert not [fault for fault in desk.faults if not browsers_own(fault)]
 
@@ -212,12 +212,12 @@ def test_a_click_in_the_picture_picks_the_colour_at_that_pixel_of_the_whole_fram
     assert at is not None
     page.mouse.click(at["x"] + 0.25 * at["width"], at["y"] + 0.5 * at["height"])
     assert until(lambda: bool(desk.left.verbs("pick")))
-    told = desk.left.verbs("pick")[-1]
-    assert told["marker"] == "middle"
-    u, v = (float(str(x)) for x in str(told["uv"]).strip("[]").split(","))
+    commands = desk.left.verbs("pick")[-1]
+    assert commands["marker"] == "middle"
+    u, v = (float(str(x)) for x in str(commands["uv"]).strip("[]").split(","))
     assert abs(u - (0.25 * WIDTH - 0.5)) < 1.5
     assert abs(v - (0.5 * HEIGHT - 0.5)) < 1.5
-    assert told["t_ns"] in desk.left.shown_ns, "of the very picture that was clicked"
+    assert commands["t_ns"] in desk.left.shown_ns, "of the very picture that was clicked"
     expect(page.get_by_text(re.compile(r"H 4[45]–4[45], S 80–250"))).to_be_visible(timeout=WAIT_MS)
     page.locator(".camera-view").focus()
     page.keyboard.press("ArrowRight")
@@ -238,9 +238,9 @@ def test_the_filter_is_tried_on_the_master_and_saved_with_its_source(desk: Desk,
     show(desk, page, "tune")
     page.get_by_role("tab", name="filter of desk").click()
     expect(page.get_by_label("Jitter left at rest (mm), number")).to_have_value("0.30", timeout=WAIT_MS)
-    told = lambda: any(one.verb == "filter" for one in desk.master.told)  # noqa: E731
-    enter(page, "Jitter left at rest (mm), number", "0.5", told)
-    assert '"jitter_m": 0.0005' in [one for one in desk.master.told if one.verb == "filter"][-1].body
+    commands = lambda: any(one.verb == "filter" for one in desk.master.commands)  # noqa: E731
+    enter(page, "Jitter left at rest (mm), number", "0.5", commands)
+    assert '"jitter_m": 0.0005' in [one for one in desk.master.commands if one.verb == "filter"][-1].body
     page.get_by_role("button", name="Save").click()
     path = desk.calibration / "rigs" / "desk.json"
     assert until(lambda: load(path, RigCalibration).filter.jitter_m == 5e-4)
@@ -277,16 +277,16 @@ def test_a_recording_is_played_by_its_controls(desk: Desk, page: Page) -> None:
     desk.master.extra = {"play.position_s": 4.0, "play.length_s": 20.0, "play.speed": 1.0, "play.paused": 0.0}
     show(desk, page, "outputs")
 
-    def told(verb: str) -> list[str]:
-        return [one.body for one in desk.master.told if one.verb == verb]
+    def commands(verb: str) -> list[str]:
+        return [one.body for one in desk.master.commands if one.verb == verb]
 
     page.get_by_role("button", name="Pause").click()
-    assert until(lambda: bool(told("pause")))
+    assert until(lambda: bool(commands("pause")))
     desk.master.extra["play.paused"] = 1.0
     page.get_by_role("button", name="Resume").click()
-    assert until(lambda: bool(told("resume")))
+    assert until(lambda: bool(commands("resume")))
     page.locator('[aria-label="Position in seconds"] [tabindex="0"]').press("ArrowRight")
-    assert until(lambda: told("seek") == ['{"t_s": 4.1}'])
+    assert until(lambda: commands("seek") == ['{"t_s": 4.1}'])
     option = page.get_by_role("option", name="2 ×")
 
     def opened() -> bool:
@@ -297,7 +297,7 @@ def test_a_recording_is_played_by_its_controls(desk: Desk, page: Page) -> None:
 
     assert until(opened), "where a menu is drawn too slowly it stays hidden until it is opened again"
     option.click()
-    assert until(lambda: told("speed") == ['{"factor": 2.0}'])
+    assert until(lambda: commands("speed") == ['{"factor": 2.0}'])
     desk.master.extra = {}
 
 

@@ -77,59 +77,59 @@ def test_every_mode_makes_a_file_that_validates(tmp_path: Path, root: Path) -> N
 
 
 def test_from_an_empty_folder_each_step_is_done_by_its_files_alone(tmp_path: Path) -> None:
-    tree, told = tmp_path / "new", plan()
+    tree, settings = tmp_path / "new", plan()
     to_do = dict.fromkeys(("cameras", "rig", "lens", "colours"), Done.TO_DO)
     assert states(tree, load_plan(tree)) == to_do
     with pytest.raises(CalibrationError, match="choose the cameras first"):
         write_rig(tree, Plan())
-    write_cameras(tree, told)
-    assert states(tree, told) == {**to_do, "cameras": Done.DONE}
-    write_rig(tree, told)
-    assert states(tree, told) == {**to_do, "cameras": Done.DONE, "rig": Done.DONE}
-    assert load_plan(tree) == told
+    write_cameras(tree, settings)
+    assert states(tree, settings) == {**to_do, "cameras": Done.DONE}
+    write_rig(tree, settings)
+    assert states(tree, settings) == {**to_do, "cameras": Done.DONE, "rig": Done.DONE}
+    assert load_plan(tree) == settings
     assert stat.S_IMODE((tree / KEY_FILE).stat().st_mode) == 0o600
     assert bytes.fromhex(key_of(tree, None)) == rig_key({}, tree / KEY_FILE)
     assert key_of(tree, bytes(32)) == "00" * 32
     HandModel.of(load(tree / "hands" / "desk-right.json", HandProfile))
     measured(tree)
-    assert states(tree, told) == {**dict.fromkeys(to_do, Done.DONE), "colours": Done.TO_DO}
-    assert not usable(tree, told)
+    assert states(tree, settings) == {**dict.fromkeys(to_do, Done.DONE), "colours": Done.TO_DO}
+    assert not usable(tree, settings)
     for name in ("left", "right"):
         keep_colours(tree, name, dict.fromkeys(load(tree / "rigs/desk.json", RigCalibration).markers, RANGE))
-    assert set(states(tree, told).values()) == {Done.DONE}
-    assert usable(tree, told)
+    assert set(states(tree, settings).values()) == {Done.DONE}
+    assert usable(tree, settings)
 
 
 def test_what_contradicts_is_stale_and_says_what_to_do(tmp_path: Path) -> None:
-    told = plan()
-    write_cameras(tmp_path, told)
-    write_rig(tmp_path, told)
+    settings = plan()
+    write_cameras(tmp_path, settings)
+    write_rig(tmp_path, settings)
     measured(tmp_path)
     path = tmp_path / "cameras" / "left.json"
     file = load(path, CameraCalibration)
     newer = replace(file.provenance["intrinsics"], date="2999-01-01T00:00:00Z")
     save(path, replace(file, provenance={"intrinsics": newer}))
-    (lens,) = (step for step in steps_of(tmp_path, told) if step.key == "lens")
+    (lens,) = (step for step in steps_of(tmp_path, settings) if step.key == "lens")
     assert (lens.state, lens.why) == (
         Done.STALE,
         "the lens of left is newer than the places: measure them again",
     )
-    other = replace(told, cameras=(*told.cameras, CameraPlan(name="left2", kind="usb", mode="hd30")))
+    other = replace(settings, cameras=(*settings.cameras, CameraPlan(name="left2", kind="usb", mode="hd30")))
     write_cameras(tmp_path, other)
     assert states(tmp_path, other)["rig"] is Done.STALE
     path.write_text("{")
-    (cameras, *_) = steps_of(tmp_path, told)
+    (cameras, *_) = steps_of(tmp_path, settings)
     assert (cameras.state, str(path) in cameras.why) == (Done.STALE, True)
 
 
 def test_the_same_mode_keeps_a_lens_and_another_keeps_the_old_file_aside(tmp_path: Path) -> None:
-    told = plan()
-    write_cameras(tmp_path, told)
-    write_rig(tmp_path, told)
+    settings = plan()
+    write_cameras(tmp_path, settings)
+    write_rig(tmp_path, settings)
     measured(tmp_path)
-    assert write_cameras(tmp_path, told) == []
+    assert write_cameras(tmp_path, settings) == []
     assert load(tmp_path / "cameras/left.json", CameraCalibration).intrinsics == LENS
-    hd = replace(told, cameras=tuple(replace(camera, mode="hd30") for camera in told.cameras))
+    hd = replace(settings, cameras=tuple(replace(camera, mode="hd30") for camera in settings.cameras))
     assert len(write_cameras(tmp_path, hd)) == 2
     assert load(tmp_path / "cameras/left.json", CameraCalibration).intrinsics is None
     (kept,) = tmp_path.glob("old/*/cameras/left.json")
@@ -137,12 +137,12 @@ def test_the_same_mode_keeps_a_lens_and_another_keeps_the_old_file_aside(tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("names", "told"),
+    ("names", "settings"),
     [(("left",), "two or more"), (("left", "left"), "'left' stands twice")],
 )
-def test_cameras_that_cannot_be_a_rig_are_refused(tmp_path: Path, names: tuple[str, ...], told: str) -> None:
+def test_cameras_that_cannot_be_a_rig_are_refused(tmp_path: Path, names: tuple[str, ...], settings: str) -> None:
     cameras = tuple(CameraPlan(name=name, kind="usb", mode="vga60") for name in names)
-    with pytest.raises(CalibrationError, match=told):
+    with pytest.raises(CalibrationError, match=settings):
         write_cameras(tmp_path, Plan(cameras=cameras))
     assert not (tmp_path / PLAN).exists()
 
@@ -156,9 +156,9 @@ def test_a_key_that_others_can_read_is_refused(tmp_path: Path) -> None:
 
 
 def test_eight_markers_stand_on_the_hand(tmp_path: Path) -> None:
-    told = plan(marker_set="eight", side="left", length_mm=170.0)
-    write_cameras(tmp_path, told)
-    write_rig(tmp_path, told)
+    settings = plan(marker_set="eight", side="left", length_mm=170.0)
+    write_cameras(tmp_path, settings)
+    write_rig(tmp_path, settings)
     hand = HandModel.of(load(tmp_path / "hands" / "desk-left.json", HandProfile))
     for marker in load(tmp_path / "rigs" / "desk.json", RigCalibration).markers:
         hand.mount(marker)

@@ -45,9 +45,9 @@ def test_a_form_has_every_option_of_its_command_with_its_help(command: str) -> N
     assert set(wizard.first) <= set(fields) - FILLED
     assert set(wizard.defaults) <= set(fields) - FILLED
     assert all(field.help for field in fields.values())
-    told = CliRunner().invoke(calibrate_app(), [command, "--help"], env={"COLUMNS": "300", "NO_COLOR": "1"})
+    output = CliRunner().invoke(calibrate_app(), [command, "--help"], env={"COLUMNS": "300", "NO_COLOR": "1"})
     for field in fields.values():
-        assert field.flag in told.output
+        assert field.flag in output.output
     # What is required and the page does not fill in by itself is shown at once.
     needed = {field.name for field in fields.values() if field.required} - FILLED
     assert needed <= set(wizard.first)

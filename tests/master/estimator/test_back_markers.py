@@ -30,10 +30,10 @@ def palm_errors_deg(side: str, names: tuple[str, ...], *, imu: bool = False) -> 
         noise, orientation = rng.normal(0.0, NOISE_M, (len(EIGHT), 3)), rng.normal(0.0, IMU_RAD, 3)
         points = model.marker_points(joints, EIGHT) + noise
         seen = points[[EIGHT.index(name) for name in names]]
-        told = orientation_of(
+        orientation = orientation_of(
             Rotation.from_rotvec(orientation).as_matrix() @ T[:3, :3], IMU_RAD**2 * np.eye(3)
         )
-        errors.append(palm_deg(fit(seen, cov, by=machine, orientation=told if imu else None), T))
+        errors.append(palm_deg(fit(seen, cov, by=machine, orientation=orientation if imu else None), T))
     return np.array(errors)
 
 

@@ -49,7 +49,7 @@ class Extras:
         predict_extras_at(*boxes, dt_s, process_noise_rad2, boxed(self.belief), boxed(self.scratch))
         return self
 
-    def told(self, dt_s: float, information: Float, measured: Float, scale: float = 1.0) -> "Extras":
+    def measure(self, dt_s: float, information: Float, measured: Float, scale: float = 1.0) -> "Extras":
         """An epoch that measures them with so much information (K, K), in place."""
         whole = np.asarray(np.linalg.inv(self.belief.z_info + information), np.float64)
         mean = whole @ (self.belief.z_info @ self.belief.z + information @ measured)
@@ -140,7 +140,7 @@ def test_a_posture_that_is_kept_is_learnt() -> None:
     extras, information, measured = Extras(), np.zeros((EXTRAS, EXTRAS)), np.zeros(EXTRAS)
     information[WRIST_ANGLES, WRIST_ANGLES], measured[WRIST_ANGLES] = 1e4, -0.5
     for _ in range(60):
-        extras.after(1.0).told(1.0, information, measured)
+        extras.after(1.0).measure(1.0, information, measured)
     assert extras.state.habit[0] == pytest.approx(-0.5, abs=0.04)
     assert abs(extras.state.habit[1]) < 1e-9
 
@@ -160,13 +160,13 @@ def test_an_epoch_long_after_the_last_counts_as_a_whole_and_one_at_once_not_at_a
     long, again = (Extras().set(mean, cov).after(1e-3) for _ in range(2))
     kalman = np.linalg.inv(long.belief.z_info + information)
     expected = kalman @ (long.belief.z_info @ long.belief.z + information @ measured)
-    long.told(1e6, information, measured, scale)
+    long.measure(1e6, information, measured, scale)
     np.testing.assert_allclose(long.mean, expected, atol=0.01 * np.sqrt(np.diag(cov)).max())
     np.testing.assert_allclose(np.diag(long.cov), np.diag(kalman), rtol=0.01)
     before = again.cov
     alone = np.zeros((EXTRAS, EXTRAS))
     alone[LED_SCALE, LED_SCALE] = 1.0 / cov[LED_SCALE, LED_SCALE]
-    again.told(0.0, alone, measured, scale)
+    again.measure(0.0, alone, measured, scale)
     np.testing.assert_allclose(again.cov, before, rtol=1e-6, atol=1e-12)
 
 
@@ -177,7 +177,7 @@ def test_what_is_constant_is_learnt_by_the_second_and_not_by_the_frame() -> None
         extras, information = Extras(), np.zeros((EXTRAS, EXTRAS))
         information[0, 0] = information[1, 1] = 1.0 / np.radians(4.0) ** 2
         for _ in range(rate_hz):
-            extras.after(1.0 / rate_hz).told(1.0 / rate_hz, information, np.zeros(EXTRAS))
+            extras.after(1.0 / rate_hz).measure(1.0 / rate_hz, information, np.zeros(EXTRAS))
         left.append(float(np.sqrt(extras.cov[1, 1])))
     assert left[0] == pytest.approx(left[1], rel=0.02)
     seconds = 1.0 / DEFAULT.errs_s  # errors of that time are one
@@ -193,7 +193,7 @@ def test_it_stays_a_covariance_whatever_comes(seed: int) -> None:
         dt_s = float(rng.choice([0.0, 1e-4, 0.033, 1.0, 50.0]))
         extras.after(dt_s, float(rng.choice([0.0, 1e-6, 0.5])))
         root = rng.normal(size=(3, EXTRAS)) * 10.0 ** rng.uniform(-2.0, 3.0)
-        extras.told(dt_s, root.T @ root, rng.normal(size=EXTRAS), float(rng.uniform(1.0, 5.0)))
+        extras.measure(dt_s, root.T @ root, rng.normal(size=EXTRAS), float(rng.uniform(1.0, 5.0)))
         cov, size = extras.cov, np.sqrt(np.diag(extras.cov))
         assert np.isfinite(extras.mean).all()
         assert (size > 0.0).all()

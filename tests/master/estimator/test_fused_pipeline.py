@@ -164,7 +164,7 @@ def test_the_same_messages_make_the_same_poses(seen: Seen) -> None:
 
 
 def test_levels_are_told_with_the_poses(whole: Solved) -> None:
-    told = whole.poses.solver_mode[whole.t_s > 1.2]
-    assert (told[:, 1:] > 0).mean() > 0.8
-    assert (told[:, 1:] == SolverMode.IK).any()
+    levels = whole.poses.solver_mode[whole.t_s > 1.2]
+    assert (levels[:, 1:] > 0).mean() > 0.8
+    assert (levels[:, 1:] == SolverMode.IK).any()
     assert np.isfinite(whole.poses.laser_m[whole.t_s > 1.2]).mean() > 0.7

@@ -318,20 +318,20 @@ def test_a_leap_of_markers_that_are_no_hand_by_themselves_leaves_no_gap(shown: t
     assert np.isfinite(hand.solution.joints.position_m).all()
 
 
-@pytest.mark.parametrize(("heading_rad", "told"), [(0.03, True), (10.0, False)])
+@pytest.mark.parametrize(("heading_rad", "is_sure"), [(0.03, True), (10.0, False)])
 def test_an_orientation_without_heading_does_not_tell_the_palm_by_one_finger(
-    heading_rad: float, told: bool
+    heading_rad: float, is_sure: bool
 ) -> None:
     machine, up = estimator(), np.array([0.0, -1.0, 0.0])
     run(machine, range(5))
     cov = 0.03**2 * np.eye(3) + (heading_rad**2 - 0.03**2) * np.outer(up, up)
     points = bent_points(bent(5 / 60.0), tuple(m for m in range(6) if m != MARKER_INDEX))
-    output = orientation_of(palm()[:3, :3], cov, sure=told)
+    output = orientation_of(palm()[:3, :3], cov, sure=is_sure)
     hand = [push(machine, k * STEP_NS, points, orientation=output) for k in range(5, 10)][-1]
     assert region_m(hand)[TIPS[INDEX]] < DEFAULT.tracked_m
-    assert (hand.sources[5] > 0) == told
-    assert hand.source[PALM] == (Source.SOLVED if told else Source.HELD)
-    assert hand.tracked[PALM] == (told and sure(hand)[PALM])
+    assert (hand.sources[5] > 0) == is_sure
+    assert hand.source[PALM] == (Source.SOLVED if is_sure else Source.HELD)
+    assert hand.tracked[PALM] == (is_sure and sure(hand)[PALM])
 
 
 # -- tracked, as it is defined ----------------------------------------------------------------------------------

@@ -268,7 +268,7 @@ def light(line: Line) -> tuple[float, float]:
     return float(estimator.extras[LED_SCALE]), float(np.sqrt(estimator.extras_cov[LED_SCALE, LED_SCALE]))
 
 
-def tell_unit(line: Line, unit: float) -> None:
+def set_unit(line: Line, unit: float) -> None:
     """Poses whose PIP is sure without light, over three seconds."""
     for k in range(9):
         line.t_ns += 10 * CYCLE_NS
@@ -279,7 +279,7 @@ def test_the_unit_of_light_is_learnt(wrist_case: WristCase) -> None:
     for unit in (0.4, 7.0):
         line = Line(wrist_case)
         assert light(line)[1] > 1.0
-        tell_unit(line, unit)
+        set_unit(line, unit)
         log, sigma = light(line)
         assert abs(log - np.log(unit)) < 0.05
         assert sigma < 0.05
@@ -294,7 +294,7 @@ def test_light_resolves_what_laser_and_tip_leave_open(
 ) -> None:
     angles = bent(mcp, pip)
     dark, lit = Line(wrist_case, solver_mode), Line(wrist_case, solver_mode)
-    tell_unit(lit, 0.4)
+    set_unit(lit, 0.4)
     without, pose = dark.sees(angles), lit.sees(angles, unit=0.4)
     both = (pose.solver_mode == SolverMode.IK) & (without.solver_mode == SolverMode.IK)
     both[0] = False
@@ -309,7 +309,7 @@ def test_worthless_light_changes_nothing_much(wrist_case: WristCase, worthless: 
     laser, tip = pixels(wrist_case, bent(27.0, 60.0))
     lit, without = Line(wrist_case, "ik"), Line(wrist_case, "ik")
     for line in (lit, without):
-        tell_unit(line, 0.4)
+        set_unit(line, 0.4)
     pose = lit.takes(laser, tip, depth=np.full(5, worthless))
     expected = without.takes(laser, tip)
     np.testing.assert_allclose(pose.angles_rad, expected.angles_rad, atol=np.radians(3.0))

@@ -53,7 +53,7 @@ def poses_of(
     return out
 
 
-def told(hand: str, t_ns: int = BEGIN_NS) -> list[ResultMessage]:
+def results(hand: str, t_ns: int = BEGIN_NS) -> list[ResultMessage]:
     """An object, unknown at first, contact with it, and a pinch."""
     nowhere = np.full(3, np.nan)
     cup = ObjectPose(

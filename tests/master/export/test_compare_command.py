@@ -56,8 +56,8 @@ def exact(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_disturbed_truth_gives_the_errors_of_the_exact_one(
     source: Path, truth: Path, exact: Path, tmp_path: Path
 ) -> None:
-    told = run(str(source), "--compare", str(truth), "--json", str(tmp_path / "fitted.json"))
-    assert "this hides what is constant" in told
+    results = run(str(source), "--compare", str(truth), "--json", str(tmp_path / "fitted.json"))
+    assert "this hides what is constant" in results
     run(str(source), "--compare", str(exact), "--aligned", "--json", str(tmp_path / "exact.json"))
     fitted: dict[str, Any] = json.loads((tmp_path / "fitted.json").read_text())
     plain: dict[str, Any] = json.loads((tmp_path / "exact.json").read_text())
@@ -90,22 +90,22 @@ def test_a_recording_is_compared_like_a_run(source: Path, exact: Path, tmp_path:
 def test_seconds_from_the_beginning_are_aligned_too(source: Path, tmp_path: Path) -> None:
     joints = hand_at(T_S).position_m
     path = write_table(tmp_path / "seconds.csv", T_S - T_S[0], JOINTS, joints)
-    told = run(str(source), "--compare", str(path), "--aligned")
-    assert "600 poses compared" in told
-    assert "seconds from the beginning" in told
+    results = run(str(source), "--compare", str(path), "--aligned")
+    assert "600 poses compared" in results
+    assert "seconds from the beginning" in results
 
 
 def test_a_part_of_the_time(source: Path, exact: Path) -> None:
-    told = run(str(source), "--compare", str(exact), "--aligned", "--from", "2", "--until", "4")
-    assert "121 poses compared" in told
+    results = run(str(source), "--compare", str(exact), "--aligned", "--from", "2", "--until", "4")
+    assert "121 poses compared" in results
 
 
 def test_markers_of_a_rig_are_compared(source: Path, tmp_path: Path) -> None:
     points = RIGHT.marker_points(hand_at(TRUTH_S), MARKERS[:6])
     path = write_table(tmp_path / "markers.csv", TRUTH_S, MARKERS[:6], points)
-    told = run(str(source), "--compare", str(path))
-    assert "marker back" in told
-    assert "all joints" not in told
+    results = run(str(source), "--compare", str(path))
+    assert "marker back" in results
+    assert "all joints" not in results
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from tests.master.export.made import (
     hands_tree,
     poses_of,
     positions,
-    told,
+    results,
 )
 from tests.master.export.test_export_bvh import read_m
 from tests.master.export.test_export_tables import exported, places_of, rows_of, run_of
@@ -67,7 +67,7 @@ def tree_folder(tmp_path: Path) -> Path:
 
 def test_a_recording_carries_its_hand_and_is_exported_like_a_run(tmp_path: Path) -> None:
     poses = poses_of(3, 5)
-    source = recording_of(tmp_path / "wave.mcap", [*poses, *told("made-right")], tree_folder(tmp_path))
+    source = recording_of(tmp_path / "wave.mcap", [*poses, *results("made-right")], tree_folder(tmp_path))
     nowhere = tmp_path / "nowhere"
     assert exported(source, Wanted("bvh", calibration=nowhere, axes=Axes("m", "rig"))) == ["wave.bvh"]
     assert np.abs(read_m(tmp_path / "wave.bvh", "m")[0] - positions(poses)).max() < NEAR_M
@@ -94,7 +94,7 @@ def test_a_part_of_time_is_cut_out_and_both_ends_belong_to_it(tmp_path: Path) ->
     poses = poses_of(3, 10)
     step = STEP_NS * 1e-9
     wanted = Wanted("csv", window=Window(2 * step, 5 * step))
-    exported(run_of(tmp_path, poses, with_told=True), wanted)
+    exported(run_of(tmp_path, poses, with_results=True), wanted)
     assert np.abs(places_of(rows_of(tmp_path / "poses.csv")) - positions(poses[2:6])).max() < NEAR_M
     assert rows_of(tmp_path / "poses-object_cup.csv") == []
     source = recording_of(tmp_path / "wave.mcap", list(poses), late_ns=0)
@@ -114,7 +114,7 @@ def test_a_cut_recording_is_exported_up_to_the_cut_and_it_is_said(tmp_path: Path
 
 def test_an_rrd_of_a_recording_knows_its_rig(tmp_path: Path) -> None:
     poses = poses_of(3, 3)
-    source = recording_of(tmp_path / "wave.mcap", [*poses, *told("made-right")], tree_folder(tmp_path))
+    source = recording_of(tmp_path / "wave.mcap", [*poses, *results("made-right")], tree_folder(tmp_path))
     assert exported(source, Wanted("rrd", calibration=tmp_path / "nowhere")) == ["wave.rrd"]
     times, joints = column(tmp_path / "wave.rrd", "/world/hand/made-right/joints", "positions")
     assert times == [BEGIN_NS + i * STEP_NS for i in range(3)]

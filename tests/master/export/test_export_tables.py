@@ -16,18 +16,18 @@ from master.export.run import Wanted, export
 from master.outputs.files import PosesFile, RunFiles
 from master.outputs.poses import Poses
 from master.outputs.told_files import ObjectPoses, load_contact
-from tests.master.export.made import BEGIN_NS, LEFT, NEAR_M, STEP_NS, poses_of, positions, told
+from tests.master.export.made import BEGIN_NS, LEFT, NEAR_M, STEP_NS, poses_of, positions, results
 
 
-def run_of(folder: Path, *hands: Sequence[HandPose], with_told: bool = False) -> Path:
+def run_of(folder: Path, *hands: Sequence[HandPose], with_results: bool = False) -> Path:
     """The files of a run."""
     path = folder / "poses.npz"
     names = [poses[0].hand for poses in hands]
-    files = RunFiles(path, dict.fromkeys(names, 6), ["cup"] if with_told else [])
+    files = RunFiles(path, dict.fromkeys(names, 6), ["cup"] if with_results else [])
     for poses in hands:
         for pose in poses:
             files.write(pose)
-    for message in told(names[0]) if with_told else ():
+    for message in results(names[0]) if with_results else ():
         files.write(message)
     files.close()
     return path
@@ -82,7 +82,7 @@ def test_a_row_says_what_the_pose_says_and_is_empty_where_nothing_was_observed(t
 
 
 def test_all_that_a_run_told_has_its_table(tmp_path: Path) -> None:
-    source = run_of(tmp_path, poses_of(1, 1), with_told=True)
+    source = run_of(tmp_path, poses_of(1, 1), with_results=True)
     names = exported(source, Wanted("csv", tmp_path / "tables" / "wave.csv"))
     assert names == [
         "wave.csv",
@@ -133,8 +133,8 @@ def test_parquet_says_unit_and_frame_of_its_columns(tmp_path: Path) -> None:
 
 
 def all_columns(tmp_path: Path) -> list[list[Column]]:
-    source = run_of(tmp_path, poses_of(1, 1), with_told=True)
-    cup, _, pinch = told("made-right")
+    source = run_of(tmp_path, poses_of(1, 1), with_results=True)
+    cup, _, pinch = results("made-right")
     assert isinstance(cup, ObjectPose)
     assert isinstance(pinch, Gesture)
     return [

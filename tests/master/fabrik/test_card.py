@@ -55,9 +55,9 @@ def test_every_pose_of_the_shipped_rig_goes_through_law_filter_and_fabrik(
     def spy(owner: type, name: str, what: str) -> None:
         real: Callable[..., Any] = getattr(owner, name)
 
-        def spied(*told: Any, **named: Any) -> Any:
+        def spied(*positional: Any, **named: Any) -> Any:
             calls[what] += 1
-            return real(*told, **named)
+            return real(*positional, **named)
 
         monkeypatch.setattr(owner, name, spied)
 
@@ -157,8 +157,8 @@ def test_what_was_shown_of_a_wrong_hand_does_not_linger(run: SyntheticRun, fitte
     pipeline, shift_px = build_pipeline(run.setup, StageTimes()), np.array([150.0, 60.0])
     for message in run.messages:
         uv = message.uv[::-1] - shift_px if 10 <= message.seq < 25 else message.uv
-        told = detections(message.camera, message.seq, message.t_ns, uv)
-        shown += [one.pose.position_m for one in pipeline.push(told)]
+        positional = detections(message.camera, message.seq, message.t_ns, uv)
+        shown += [one.pose.position_m for one in pipeline.push(positional)]
     solved = [hand.solution.joints.position_m for hand in fitted if hand.solution is not None]
     assert len(solved) == len(shown)
     assert fitted[10].reinitialised

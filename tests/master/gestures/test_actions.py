@@ -71,26 +71,26 @@ def _closing(model: HandModel, target: Float, there: int = 30) -> Iterator[HandP
 
 @pytest.mark.parametrize(("finger", "name"), [(1, "index"), (2, "middle"), (3, "ring"), (4, "little")])
 def test_a_pinch_of_each_finger_begins_goes_on_and_ends(model: HandModel, finger: int, name: str) -> None:
-    told = _actions(
+    gestures = _actions(
         GestureRecogniser(default_gestures(), model), _closing(model, pinch_posture(model, finger, STILL))
     )
-    assert [(one.kind, one.name, one.phase) for one in told if one.phase != "update"] == [
+    assert [(one.kind, one.name, one.phase) for one in gestures if one.phase != "update"] == [
         ("pinch", name, "begin"),
         ("pinch", name, "end"),
     ]
-    closed = told[len(told) // 2]
+    closed = gestures[len(gestures) // 2]
     assert closed.distance_m == pytest.approx(
         -0.0005, abs=2e-3
     )  # as the posture was made; the little reaches less
     assert closed.strength > 0.99
-    assert {one.began_t_ns for one in told} == {told[0].t_ns}
-    assert all(b.t_ns - a.t_ns == FRAME_NS for a, b in pairwise(told))
+    assert {one.began_t_ns for one in gestures} == {gestures[0].t_ns}
+    assert all(b.t_ns - a.t_ns == FRAME_NS for a, b in pairwise(gestures))
 
 
 @pytest.mark.parametrize("name", ["small_grasp", "open_palm", "counting_two"])
 def test_a_fist_and_open_hands_say_nothing(model: HandModel, name: str) -> None:
-    told = _actions(GestureRecogniser(default_gestures(), model), _closing(model, np.array(POSES[name])))
-    assert not told
+    gestures = _actions(GestureRecogniser(default_gestures(), model), _closing(model, np.array(POSES[name])))
+    assert not gestures
 
 
 def test_fingers_that_are_not_known_say_nothing(model: HandModel) -> None:
@@ -124,36 +124,36 @@ def test_a_dial_is_turned_by_the_palm_over_two_grips(model: HandModel) -> None:
     rotations = np.radians(palm)
     posture = knob.posture_deg + loose[:, None, None] * (opened - knob.posture_deg)
     poses = [_pose(model, k, _about(knob.centre_m, knob.axis, rotations[k]), posture[k]) for k in range(240)]
-    told = _actions(GestureRecogniser(default_gestures(), model), poses)
-    assert [one.phase for one in told if one.phase != "update"] == ["begin"]
-    angle = {one.t_ns // FRAME_NS: np.degrees(one.angle_rad) for one in told}
+    gestures = _actions(GestureRecogniser(default_gestures(), model), poses)
+    assert [one.phase for one in gestures if one.phase != "update"] == ["begin"]
+    angle = {one.t_ns // FRAME_NS: np.degrees(one.angle_rad) for one in gestures}
     assert angle[80] == pytest.approx(50.0, abs=0.1)
     assert angle[117] == pytest.approx(50.0, abs=1.5)  # the open hand has turned back by 70
     assert angle[235] == pytest.approx(50.0 + 60.0, abs=2.0)
-    assert float(told[-1].direction @ knob.axis) > 0.999
+    assert float(gestures[-1].direction @ knob.axis) > 0.999
 
 
 def test_a_wrist_device_alone_turns_a_dial_by_its_imu(model: HandModel) -> None:
     knob, recogniser = knob_grip(model, 0.022, STILL), GestureRecogniser(default_gestures(), model)
-    told: list[Gesture] = []
+    gestures: list[Gesture] = []
     for k in range(60):
         rotation = np.radians(max(k - 20, 0))
         dispatcher = axis_rotation(1, 0.7) @ _about(np.zeros(3), knob.axis, rotation)[:3, :3]
         pose = _pose(model, k, np.eye(4), knob.posture_deg, markers=0)
-        told += _actions(
+        gestures += _actions(
             recogniser, [msgspec.structs.replace(pose, palm_world_wxyz=matrix_to_quaternion(dispatcher))]
         )
-    assert told[0].phase == "begin"
-    assert np.degrees(told[-1].angle_rad) == pytest.approx(39.0, abs=0.1)
+    assert gestures[0].phase == "begin"
+    assert np.degrees(gestures[-1].angle_rad) == pytest.approx(39.0, abs=0.1)
 
 
 def test_a_ray_goes_from_the_tip_where_knuckle_and_tip_point(model: HandModel) -> None:
-    told = _actions(
+    gestures = _actions(
         GestureRecogniser(default_gestures(), model), _closing(model, np.array(POSES["pointing"]))
     )
-    assert {one.kind for one in told} == {"point"}
-    assert [one.phase for one in told if one.phase != "update"] == ["begin", "end"]
-    middle = told[len(told) // 2]
+    assert {one.kind for one in gestures} == {"point"}
+    assert [one.phase for one in gestures if one.phase != "update"] == ["begin", "end"]
+    middle = gestures[len(gestures) // 2]
     joints = model.forward(
         np.eye(4), angles_of(model, np.array(POSES["pointing"], dtype=np.float64), STILL)
     ).position_m

@@ -91,13 +91,13 @@ def test_a_dial_is_turned_by_the_sum_of_its_grips_without_a_step(
     rotations_deg: list[float], rest: int
 ) -> None:
     palm, loose, knob = _grips(rotations_deg, rest)
-    told = _dial([_pose(k, palm[k], loose[k]) for k in range(len(palm))])
-    assert [one.phase for one in told if one.phase != "update"] == ["begin"]
-    off = np.degrees([one.angle_rad - knob[one.t_ns // FRAME_NS] for one in told])
+    gestures = _dial([_pose(k, palm[k], loose[k]) for k in range(len(palm))])
+    assert [one.phase for one in gestures if one.phase != "update"] == ["begin"]
+    off = np.degrees([one.angle_rad - knob[one.t_ns // FRAME_NS] for one in gestures])
     assert np.abs(off).max() < 1.5 * len(
         rotations_deg
     )  # each time it is let go by less than a degree and a half
-    steps = np.diff([one.angle_rad for one in told])
+    steps = np.diff([one.angle_rad for one in gestures])
     assert np.degrees(np.abs(steps).max()) < np.degrees(np.abs(np.diff(knob)).max()) + 1.5
 
 
@@ -107,9 +107,9 @@ def test_one_bad_instant_in_a_quick_turn_is_led_over() -> None:
     bad = poses[45].position_m.copy()
     bad[TIPS[0]] += 0.02 * KNOB.axis + 0.01  # the thumb somewhere else
     poses[45] = msgspec.structs.replace(poses[45], position_m=bad)
-    told = {one.t_ns // FRAME_NS: np.degrees(one.angle_rad) for one in _dial(poses)}
-    assert abs(told[45] - 40.0) < 1.5
-    assert told[46] == pytest.approx(42.0, abs=0.1)
+    gestures = {one.t_ns // FRAME_NS: np.degrees(one.angle_rad) for one in _dial(poses)}
+    assert abs(gestures[45] - 40.0) < 1.5
+    assert gestures[46] == pytest.approx(42.0, abs=0.1)
 
 
 def test_a_palm_that_is_in_doubt_does_not_delay_a_grip_whose_tips_stand_still() -> None:
@@ -122,8 +122,8 @@ def test_a_palm_that_is_in_doubt_does_not_delay_a_grip_whose_tips_stand_still() 
         wxyz = matrix_to_quaternion(over @ MODEL.forward(np.eye(4), pose.angles_rad).rotation)
         return msgspec.structs.replace(pose, orientation_wxyz=wxyz)
 
-    told = _dial([doubted(k) for k in range(40)])
-    begun = [one.t_ns for one in told if one.phase == "begin"]
+    gestures = _dial([doubted(k) for k in range(40)])
+    begun = [one.t_ns for one in gestures if one.phase == "begin"]
     hold_ns = default_gestures().dial.hold_s * 1e9
     assert len(begun) == 1
     assert hold_ns <= begun[0] <= hold_ns + 3 * FRAME_NS
@@ -135,9 +135,9 @@ def test_a_hand_that_opens_and_closes_turns_no_dial_further_than_its_fingers() -
     cut = 25 + 30 + 6 + 12
     poses = [_pose(k, palm[k], loose[k]) for k in range(cut)]
     poses += [_pose(k, palm[cut], 1.0) for k in range(cut, cut + 90)]
-    told = _dial(poses)
-    assert told[-1].phase == "end"
-    assert np.degrees(told[-1].angle_rad) == pytest.approx(40.0, abs=1.5)
+    gestures = _dial(poses)
+    assert gestures[-1].phase == "end"
+    assert np.degrees(gestures[-1].angle_rad) == pytest.approx(40.0, abs=1.5)
 
 
 def test_a_grip_that_slowly_widens_goes_on_and_a_loose_one_does_not() -> None:

@@ -104,15 +104,15 @@ def test_kernels_are_compiled_once_whether_or_not_a_hand_may_be_written() -> Non
 
 
 def test_a_finger_that_is_lost_while_a_dial_turns_leaves_the_dial() -> None:
-    recogniser, told = GestureRecogniser(default_gestures(), RIGHT), list[float]()
+    recogniser, angles = GestureRecogniser(default_gestures(), RIGHT), list[float]()
     for k, pose in enumerate(gripping(60)):
         place, rotated = pose.position_m.copy(), pose.orientation_wxyz.copy()
         if k >= 45:
             place[CHAINS[4]], rotated[CHAINS[4]] = np.nan, np.nan
         lacking = msgspec.structs.replace(pose, position_m=place, orientation_wxyz=rotated)
-        told += [one.angle_rad for one in recogniser.push(lacking) if one.kind == "dial"]
-    assert np.isfinite(told).all()
-    assert np.degrees(np.abs(np.diff(told)).max()) < 4.5
+        angles += [one.angle_rad for one in recogniser.push(lacking) if one.kind == "dial"]
+    assert np.isfinite(angles).all()
+    assert np.degrees(np.abs(np.diff(angles)).max()) < 4.5
 
 
 def compiled() -> dict[str, int]:

@@ -13,7 +13,7 @@ from tests.master.gestures.shown_hands import FRAME_NS, PINCH, posture, shown
 PINCHES = default_gestures().pinch
 
 
-def told_of(
+def recognised_in(
     gap_mm: tuple[float, float, float, float],
     sigma_mm: float = 1.0,
     apart_deg: float = 60.0,
@@ -48,25 +48,25 @@ def changed(
 def test_it_is_of_the_finger_that_the_thumb_meets(
     name: str, gap_mm: tuple[float, float, float, float]
 ) -> None:
-    assert told_of(gap_mm) == [name]
+    assert recognised_in(gap_mm) == [name]
 
 
 def test_a_gap_that_is_not_known_is_no_pinch() -> None:
-    assert told_of((3.0, 80.0, 80.0, 80.0), 4.0) == ["index"]
-    assert not told_of((3.0, 80.0, 80.0, 80.0), 8.0)
+    assert recognised_in((3.0, 80.0, 80.0, 80.0), 4.0) == ["index"]
+    assert not recognised_in((3.0, 80.0, 80.0, 80.0), 8.0)
 
 
 def test_where_the_others_are_away_no_bend_is_asked_for() -> None:
-    assert told_of((3.0, 60.0, 70.0, 80.0), apart_deg=150.0, doubt_deg=60.0) == ["index"]
+    assert recognised_in((3.0, 60.0, 70.0, 80.0), apart_deg=150.0, doubt_deg=60.0) == ["index"]
 
 
 def test_a_closing_fist_whose_bends_are_doubtful_is_withheld() -> None:
     # The thumb comes over the index finger, the others follow at a finger's breadth each.
     fist = (6.0, 13.0, 32.0, 52.0)
-    assert told_of(fist, apart_deg=80.0, doubt_deg=5.0) == ["index"]
-    assert not told_of(fist, apart_deg=80.0, doubt_deg=30.0)
-    assert not told_of(fist, apart_deg=120.0, doubt_deg=1.0)
+    assert recognised_in(fist, apart_deg=80.0, doubt_deg=5.0) == ["index"]
+    assert not recognised_in(fist, apart_deg=80.0, doubt_deg=30.0)
+    assert not recognised_in(fist, apart_deg=120.0, doubt_deg=1.0)
 
 
 def test_fingers_in_a_bunch_are_nobodys_pinch() -> None:
-    assert not told_of((3.0, 5.0, 30.0, 40.0))
+    assert not recognised_in((3.0, 5.0, 30.0, 40.0))

@@ -52,7 +52,7 @@ def gap_at(k: int, down: int = 5, pace: int = 8) -> float:
     return float(np.interp(k, knots, [UP_M, DOWN_M, DOWN_M, UP_M]))
 
 
-def told_of(pose: Callable[[int], HandPose], frames: int = 80, settings: TapSettings = TAPS) -> list[Gesture]:
+def recognised_in(pose: Callable[[int], HandPose], frames: int = 80, settings: TapSettings = TAPS) -> list[Gesture]:
     watch, out = ThumbTapMonitor(settings), list[Gesture]()
     for k in range(frames):
         seen = FeatureExtractor(RIGHT).of(pose(k))
@@ -65,16 +65,16 @@ def told_of(pose: Callable[[int], HandPose], frames: int = 80, settings: TapSett
 @pytest.mark.parametrize("column", range(3))
 def test_each_of_twelve_keys_is_told_by_its_name_as_the_thumb_leaves(finger: int, column: int) -> None:
     place = [(finger, 2 - column)]
-    told = told_of(lambda k: over(k, place, gap_at(k)))
-    assert [(one.kind, one.name, one.phase) for one in told] == [
+    gestures = recognised_in(lambda k: over(k, place, gap_at(k)))
+    assert [(one.kind, one.name, one.phase) for one in gestures] == [
         ("tap", TELEPHONE[finger - 1][column], "end")
     ]
     left = next(k for k in range(33, 80) if gap_at(k) > default_gestures().tap.touch_gap_m)
-    assert 0 <= told[0].t_ns // FRAME_NS - left <= 1
-    assert told[0].confidence > 0.9
-    assert told[0].distance_m == pytest.approx(DOWN_M, abs=1e-3)
+    assert 0 <= gestures[0].t_ns // FRAME_NS - left <= 1
+    assert gestures[0].confidence > 0.9
+    assert gestures[0].distance_m == pytest.approx(DOWN_M, abs=1e-3)
     segment = RIGHT.forward(palm(), PAD).position_m[CHAINS[finger, 2 - column : 4 - column]].mean(axis=0)
-    assert float(np.linalg.norm(told[0].origin_m - segment)) < 0.02
+    assert float(np.linalg.norm(gestures[0].origin_m - segment)) < 0.02
 
 
 def test_taps_one_after_another_are_all_told() -> None:
@@ -82,7 +82,7 @@ def test_taps_one_after_another_are_all_told() -> None:
         which = [(1, 2), (2, 1), (4, 0)][min(k // 50, 2)]
         return over(k, [which], gap_at(k % 50))
 
-    assert [one.name for one in told_of(pose, 150)] == ["1", "5", "hash"]
+    assert [one.name for one in recognised_in(pose, 150)] == ["1", "5", "hash"]
 
 
 NO_TAPS: tuple[tuple[str, Callable[[int], HandPose]], ...] = (
@@ -97,14 +97,14 @@ NO_TAPS: tuple[tuple[str, Callable[[int], HandPose]], ...] = (
 
 @pytest.mark.parametrize(("why", "pose"), NO_TAPS)
 def test_a_thumb_taps_nothing_where(why: str, pose: Callable[[int], HandPose]) -> None:
-    assert not told_of(pose, 240), why
+    assert not recognised_in(pose, 240), why
 
 
 def test_two_fingers_that_are_too_alike_in_their_gaps_tell_nothing() -> None:
     # Fingers lie side by side, some 20 mm apart: no touch is nearer to one of them by three times that.
-    assert told_of(lambda k: over(k, [(2, 1)], gap_at(k)))
+    assert recognised_in(lambda k: over(k, [(2, 1)], gap_at(k)))
     unsure = msgspec.structs.replace(default_gestures().tap, nearer_m=0.06)
-    assert not told_of(lambda k: over(k, [(2, 1)], gap_at(k)), settings=unsure)
+    assert not recognised_in(lambda k: over(k, [(2, 1)], gap_at(k)), settings=unsure)
 
 
 def test_a_finger_whose_bones_may_be_anywhere_has_no_keys() -> None:
@@ -114,7 +114,7 @@ def test_a_finger_whose_bones_may_be_anywhere_has_no_keys() -> None:
         cov[CHAINS[2, :2]] = np.square(0.015) * np.eye(3)
         return msgspec.structs.replace(seen, cov_m2=cov)
 
-    assert not told_of(pose)
+    assert not recognised_in(pose)
 
 
 def test_a_thumb_that_is_known_worst_while_it_is_down_is_judged_as_it_leaves() -> None:
@@ -126,4 +126,4 @@ def test_a_thumb_that_is_known_worst_while_it_is_down_is_judged_as_it_leaves() -
         cov[CHAINS[0, 2:]] = np.square(5e-3 if down else 5e-4) * np.eye(3)
         return msgspec.structs.replace(seen, cov_m2=cov)
 
-    assert [one.name for one in told_of(pose)] == ["5"]
+    assert [one.name for one in recognised_in(pose)] == ["5"]

@@ -23,7 +23,7 @@ def object_at(t_s: float) -> Float:
     )
 
 
-def told(
+def carried_rows(
     seconds: float,
     palm_at: Callable[[float], Float] | None = None,
     distance_m: float = 0.03,
@@ -41,25 +41,25 @@ def told(
 
 
 def test_what_is_lifted_and_turned_is_carried_and_stays_so_at_rest() -> None:
-    output = told(5.0)
+    output = carried_rows(5.0)
     assert not any(output[:60])  # at rest beside a hand at rest: nobody knows
     assert all(output[60 + 30 :])  # half a second after it begins to move
 
 
 def test_a_hand_that_rests_next_to_what_others_move_carries_nothing() -> None:
-    assert not any(told(5.0, lambda t_s: transform(object_at(0.0), PALM_M)))
+    assert not any(carried_rows(5.0, lambda t_s: transform(object_at(0.0), PALM_M)))
 
 
 def test_a_hand_that_passes_an_object_at_rest_carries_nothing() -> None:
-    assert not any(told(1.0, lambda t_s: transform(object_at(0.0), PALM_M) + np.array([0.2 * t_s, 0.0, 0.0])))
+    assert not any(carried_rows(1.0, lambda t_s: transform(object_at(0.0), PALM_M) + np.array([0.2 * t_s, 0.0, 0.0])))
 
 
 def test_what_moves_alike_but_far_away_is_not_carried() -> None:
-    assert not any(told(5.0, distance_m=0.08))
+    assert not any(carried_rows(5.0, distance_m=0.08))
 
 
 def test_fingers_that_are_seen_to_be_away_let_go() -> None:
-    output = told(5.0, away_s=4.0)
+    output = carried_rows(5.0, away_s=4.0)
     assert output[239]
     assert not any(output[240:])
 
@@ -70,7 +70,7 @@ def test_a_palm_that_moves_on_has_left_it() -> None:
     def palm(t_s: float) -> Float:
         return transform(object_at(t_s), PALM_M) + np.array([0.0, 0.0, -0.1 * max(t_s - 4.0, 0.0)])
 
-    output = told(5.0, palm)
+    output = carried_rows(5.0, palm)
     assert output[240]
     assert not any(output[240 + 24 :])
 

@@ -35,14 +35,14 @@ QUARTER = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
 HERE = np.array([0.2, 0.3, 0.5])
 
 
-def told(
+def pose_at(
     t_ms: float, place: np.ndarray = HERE, quaternion: np.ndarray = QUARTER, session: int = 1
 ) -> TrackerPose:
     return TrackerPose("tracker", session, int(t_ms), ZERO_NS + round(t_ms * MS), place, quaternion)
 
 
 def lost(t_ms: float) -> TrackerPose:
-    return told(t_ms, np.full(3, np.nan), np.full(4, np.nan))
+    return pose_at(t_ms, np.full(3, np.nan), np.full(4, np.nan))
 
 
 def one(line: TrackerLine, message: TrackerPose) -> ObjectPose:
@@ -55,7 +55,7 @@ def test_a_pose_by_hand() -> None:
     # The device is a quarter turned about the system's z, the system a quarter about the rig's z and 1 m aside: half a
     # turn. Its place 0.2, 0.3, 0.5 becomes 1 - 0.3, 0.2, 0.5; the object's origin is 10 cm along the device's -x, which
     # points along the rig's +x now.
-    pose = one(TrackerLine(CUBE, RIG), told(100.0))
+    pose = one(TrackerLine(CUBE, RIG), pose_at(100.0))
     np.testing.assert_allclose(pose.position_m, [0.8, 0.2, 0.5], atol=1e-12)
     np.testing.assert_allclose(
         quaternion_to_matrix(pose.orientation_wxyz), np.diag([-1.0, -1.0, 1.0]), atol=1e-12
@@ -73,7 +73,7 @@ def test_a_pose_by_hand() -> None:
 def test_while_it_is_lost_the_pose_is_held_ever_less_sure_and_then_there_is_none() -> None:
     line = TrackerLine(CUBE, RIG)
     assert one(line, lost(0.0)).source == ObjectSource.NONE
-    known = one(line, told(10.0))
+    known = one(line, pose_at(10.0))
     held = [one(line, lost(t_ms)) for t_ms in (20.0, 200.0, 509.0)]
     for pose in held:
         assert (pose.source, pose.tracked, pose.occluded) == (ObjectSource.HELD, False, True)
@@ -84,40 +84,40 @@ def test_while_it_is_lost_the_pose_is_held_ever_less_sure_and_then_there_is_none
     gone = one(line, lost(520.0))
     assert (gone.source, gone.tracked) == (ObjectSource.NONE, False)
     assert np.isnan([*gone.position_m, *gone.orientation_wxyz, *gone.cov.ravel()]).all()
-    assert one(line, told(530.0)).tracked
+    assert one(line, pose_at(530.0)).tracked
     assert line.counts == {"lost": 5}
 
 
 def test_a_leap_is_doubted_and_then_believed() -> None:
     line, far = TrackerLine(CUBE, RIG), HERE + np.array([0.5, 0.0, 0.0])
-    one(line, told(0.0))
-    doubted = one(line, told(10.0, far))
+    one(line, pose_at(0.0))
+    doubted = one(line, pose_at(10.0, far))
     assert (doubted.source, doubted.tracked) == (ObjectSource.HELD, False)
-    assert one(line, told(20.0)).tracked
-    poses = [one(line, told(30.0 + 10.0 * k, far)) for k in range(17)]
+    assert one(line, pose_at(20.0)).tracked
+    poses = [one(line, pose_at(30.0 + 10.0 * k, far)) for k in range(17)]
     assert [pose.tracked for pose in poses] == [False] * 15 + [True] * 2
     assert line.counts["leap"] == 16
     quick = TrackerLine(CUBE, RIG)  # 4 m/s are none
-    assert all(one(quick, told(10.0 * k, HERE + np.array([0.04 * k, 0.0, 0.0]))).tracked for k in range(20))
+    assert all(one(quick, pose_at(10.0 * k, HERE + np.array([0.04 * k, 0.0, 0.0]))).tracked for k in range(20))
 
 
 def test_poses_come_once_and_rise_and_a_new_process_may_have_another_clock() -> None:
     line = TrackerLine(CUBE, RIG)
-    one(line, told(50.0))
-    assert line.push(told(50.0)) == []
-    assert line.push(told(40.0)) == []
-    assert one(line, told(20.0, session=2)).t_ns == ZERO_NS + 8 * MS
+    one(line, pose_at(50.0))
+    assert line.push(pose_at(50.0)) == []
+    assert line.push(pose_at(40.0)) == []
+    assert one(line, pose_at(20.0, session=2)).t_ns == ZERO_NS + 8 * MS
     assert line.counts["late"] == 2
     assert line.flush() == []
 
 
 def test_a_turn_that_is_none_is_counted_and_a_foreign_device_is_an_error() -> None:
     line = TrackerLine(CUBE, RIG)
-    assert not one(line, told(0.0, quaternion=np.array([0.955, 0.0, 0.0, 0.0]))).tracked
-    assert not one(line, told(10.0, quaternion=np.array([1.0, np.nan, 0.0, 0.0]))).tracked
+    assert not one(line, pose_at(0.0, quaternion=np.array([0.955, 0.0, 0.0, 0.0]))).tracked
+    assert not one(line, pose_at(10.0, quaternion=np.array([1.0, np.nan, 0.0, 0.0]))).tracked
     assert line.counts == {"broken": 1, "lost": 1}
     with pytest.raises(ValueError, match="'other'"):
-        line.push(replace(told(20.0), source="other"))
+        line.push(replace(pose_at(20.0), source="other"))
 
 
 @pytest.mark.parametrize(

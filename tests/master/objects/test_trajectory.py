@@ -45,9 +45,9 @@ def test_what_never_tells_all_of_the_pose_is_forgotten() -> None:
     trajectory = Trajectory()
     assert trajectory.push(0, fitted(0.0))
     last = round(HELD_S * 1e9 / FRAME_NS)
-    told = [trajectory.push(k * FRAME_NS, fitted(0.0, alone=False)) for k in range(1, last + 3)]
-    assert all(told[: last - 1])
-    assert not told[-1]
+    accepted = [trajectory.push(k * FRAME_NS, fitted(0.0, alone=False)) for k in range(1, last + 3)]
+    assert all(accepted[: last - 1])
+    assert not accepted[-1]
 
 
 def test_the_past_is_of_before_all_that_is_seen_and_its_speed_counts() -> None:

@@ -58,9 +58,9 @@ def recorded_run(
             writer.write("health", report(t_ns, 6), t_ns)
         writer.write("taken", message, t_ns)
         for solved in dispatcher.push(message):
-            told = solved if isinstance(solved, Contact | Gesture) else solved.pose
-            live.take(told)
-            writer.write("hand" if isinstance(told, HandPose) else "gesture", told, t_ns)
+            result = solved if isinstance(solved, Contact | Gesture) else solved.pose
+            live.take(result)
+            writer.write("hand" if isinstance(result, HandPose) else "gesture", result, t_ns)
     writer.close()
     return RecordedRun(path, live)
 

@@ -25,7 +25,7 @@ from master.recording.files import recorded_setups
 from master.recording.lines import events_of, table
 from master.recording.player import Player
 from tests.common.hostile_mcap import RECORD, HostileMcap, chunk, message, record
-from tests.master.export.made import poses_of, told
+from tests.master.export.made import poses_of, results
 from tests.master.recording.recorded_run import report, scene
 
 MOST_S = 5.0  # of processor time for some kB
@@ -54,7 +54,7 @@ def seldom(honest: Any, hostile: st.SearchStrategy[Any]) -> st.SearchStrategy[An
 def honest() -> list[tuple[str, Message]]:
     """One message or more of each stream that a recording keeps and a command reads."""
     kinds = {row.message: stream for stream, row in STREAMS.items()}
-    own: list[Message] = [report(10**9), *poses_of(1, 2), *told("made-right")]
+    own: list[Message] = [report(10**9), *poses_of(1, 2), *results("made-right")]
     taken: list[tuple[str, Message]] = [("taken", one) for one in scene()[:4]]
     return taken + [(kinds[type(one)], one) for one in own]
 

@@ -46,7 +46,7 @@ class FakeSlave:
 
 
 def asker(cameras: Sequence[str], output: list[str]) -> RawAsker:
-    return RawAsker("wave", cameras, output.append, lambda _told: None, period_s=0.01)
+    return RawAsker("wave", cameras, output.append, lambda _health: None, period_s=0.01)
 
 
 def test_slaves_keep_raw_frames_for_as_long_as_messages_are_recorded(

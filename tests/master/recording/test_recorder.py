@@ -106,12 +106,12 @@ def test_how_far_behind_the_master_is_comes_before_the_message_it_holds_for() ->
             probe.lease()  # of a second reader, who knows nothing yet
         source.get(0.0)
     probe.drain()
-    told = [
+    expected = [
         (one.reject, one.t_ns) if isinstance(one, Backlog) else cast(MarkerDetections, one).seq
         for one in iter(lambda: shown.get(0.01), None)
     ]
     at = [came_ns(one, 0) for one in frames(6)]
-    assert told == [0, (3, at[1]), 1, (3, at[2]), 2, 3, (0, at[4]), 4, 5]
+    assert expected == [0, (3, at[1]), 1, (3, at[2]), 2, 3, (0, at[4]), 4, 5]
     assert probe.counts == {"tap.shown": 9, "tap.dropped": 0}
     probe.close()
 
@@ -236,9 +236,9 @@ def test_a_recorder_keeps_what_a_master_takes_and_tells(
         asker.publish("preview", "left", Preview("left", 5, TINY))
         asker.publish("still", "left", Still("left", 1, 5, TINY))
         assert until(lambda: asker.ask(Command(NAME, "report"), 1.0).counts.get("taken") == 30)
-        told = asker.ask(Command(NAME, "report"), 1.0)
-        assert told.counts["dropped"] == told.counts["lost"] == 0
-        assert told.metrics.keys() >= {"recorder.seconds", "recorder.megabytes", "recorder.free_gb"}
+        expected = asker.ask(Command(NAME, "report"), 1.0)
+        assert expected.counts["dropped"] == expected.counts["lost"] == 0
+        assert expected.metrics.keys() >= {"recorder.seconds", "recorder.megabytes", "recorder.free_gb"}
         with pytest.raises(BusError, match="there are report, stop"):
             asker.ask(Command(NAME, "dance"), 1.0)
         asker.ask(Command(NAME, "stop"), 1.0)

@@ -43,12 +43,12 @@ def test_an_inlet_reads_names_units_values_and_the_time_of_the_pose(pylsl: Modul
     assert info.type() == "MoCap"
     assert info.desc().child_value("hand") == "my-right"
     rows = channels()
-    for told, part in (
+    for values, part in (
         (info.get_channel_labels(), 0),
         (info.get_channel_types(), 1),
         (info.get_channel_units(), 2),
     ):
-        assert told == [row[part] for row in rows]
+        assert values == [row[part] for row in rows]
     valid = pose.valid.copy()
     valid[9] = False
     sink.write(replace(pose, t_ns=pose.t_ns + 7_000_000, valid=valid))

@@ -86,13 +86,13 @@ def test_poses_read_back() -> None:
 
 def test_angles_flags_and_frames_read_back() -> None:
     pose = whole_pose()
-    told = by_topic(pose)
-    t_ns, names, positions = joint_state(told["/phalanx/default_right/joint_states"])
+    topics = by_topic(pose)
+    t_ns, names, positions = joint_state(topics["/phalanx/default_right/joint_states"])
     assert t_ns == WALL_NS
     assert names == [f"default_right/{name}" for name in ANGLES]
     np.testing.assert_array_equal(positions, pose.angles_rad.ravel())
-    assert flags(told["/phalanx/default_right/joint_flags"]) == [2, 1] * 13
-    frames = transforms(told["/tf"])
+    assert flags(topics["/phalanx/default_right/joint_flags"]) == [2, 1] * 13
+    frames = transforms(topics["/tf"])
     assert list(frames) == [f"default_right/{joint}" for joint in JOINTS]
     tip = frames["default_right/index-finger-tip"]
     assert tip[:2] == (WALL_NS, FRAME)
@@ -104,14 +104,14 @@ def test_what_is_not_known_is_left_out_and_never_nan() -> None:
     position, angles, valid = pose.position_m.copy(), pose.angles_rad.copy(), pose.valid.copy()
     position[7], angles[2, 1], valid[9] = np.nan, np.nan, False
     pose = msgspec.structs.replace(pose, position_m=position, angles_rad=angles, valid=valid)
-    told = by_topic(pose)
-    assert "/phalanx/default_right/joint_poses" not in told
-    _, names, positions = joint_state(told["/phalanx/default_right/joint_states"])
+    topics = by_topic(pose)
+    assert "/phalanx/default_right/joint_poses" not in topics
+    _, names, positions = joint_state(topics["/phalanx/default_right/joint_states"])
     assert "default_right/middle_flexion" not in names
     assert np.isfinite(positions).all()
-    states = flags(told["/phalanx/default_right/joint_flags"])
+    states = flags(topics["/phalanx/default_right/joint_flags"])
     assert (states[7], states[9]) == (0, 0)
-    assert len(transforms(told["/tf"])) == 24
+    assert len(transforms(topics["/tf"])) == 24
 
 
 def test_an_object_reads_back_with_its_covariance() -> None:
@@ -121,12 +121,12 @@ def test_an_object_reads_back_with_its_covariance() -> None:
         "my-cube.2", 5, np.array([0.1, 0.2, 0.3]), np.array([0.5, 0.5, 0.5, -0.5]), cov, 0.0,
         int(ObjectSource.TAGS), True, 3, 3, False,
     )  # fmt: skip
-    told = {topic.name: bytes(payload) for topic, payload in object_messages(pose, WALL_NS)}
-    frame, numbers, covariance = pose_with_covariance(told["/phalanx/object/my_cube_2/pose"])
+    topics = {topic.name: bytes(payload) for topic, payload in object_messages(pose, WALL_NS)}
+    frame, numbers, covariance = pose_with_covariance(topics["/phalanx/object/my_cube_2/pose"])
     assert frame == FRAME
     assert numbers == [0.1, 0.2, 0.3, 0.5, 0.5, -0.5, 0.5]
     np.testing.assert_array_equal(np.reshape(covariance, (6, 6)), cov)
-    assert transforms(told["/tf"])["object/my_cube_2"][2][:3] == [0.1, 0.2, 0.3]
+    assert transforms(topics["/tf"])["object/my_cube_2"][2][:3] == [0.1, 0.2, 0.3]
     lost = msgspec.structs.replace(pose, position_m=np.full(3, np.nan))
     assert object_messages(lost, WALL_NS) == []
 

@@ -231,9 +231,9 @@ def test_the_process_obeys_follows_its_file_and_reports(sinks: dict[str, Kept], 
         answer = asker.ask(Command(NAME, "on", '{"output": "osc"}'), 1.0)
         assert answer.metrics["on.osc"] == 1.0
         eventually(lambda: asker.ask(Command(NAME, "report"), 1.0).metrics["open.osc"] == 1.0)
-        told = BusSink(master)
+        sink = BusSink(master)
         for number in range(20):
-            told.write(hand_pose("right", t_ns=number))
+            sink.write(hand_pose("right", t_ns=number))
         eventually(lambda: len(sinks["osc"].messages) == 20)
         save(path, replace(default_outputs(), vmc=VmcOutput(on=True)))
         eventually(lambda: "vmc" in sinks)

@@ -73,7 +73,7 @@ def test_a_cell_is_mean_and_sd_of_absolute_errors() -> None:
     )
     assert [cell.pose for cell in found] == ["pinch"] * 5
     for cell in found:
-        assert (cell.trials, cell.reached, cell.told, cell.tip, cell.unseen) == (4, 3, 4, 0, 0)
+        assert (cell.trials, cell.reached, cell.laser_seen, cell.tip, cell.unseen) == (4, 3, 4, 0, 0)
         assert cell.is_reached
         assert cell.mean_deg == pytest.approx(3.0)
         assert cell.sd_deg == pytest.approx(2.0)  # of 3, 5, 1 about 3, n - 1

@@ -55,7 +55,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def told(out: Path) -> dict[str, Any]:
+def report(out: Path) -> dict[str, Any]:
     """study.json of two participants, one after the other."""
     steps: list[tuple[int, int, str]] = []
     study = Study(task(out), participants=2, jobs=1, judged=JUDGED)
@@ -66,8 +66,8 @@ def told(out: Path) -> dict[str, Any]:
     return json.loads((out / "study.json").read_text())
 
 
-def test_every_trial_went_through_the_line(told: dict[str, Any]) -> None:
-    trials = told["trials"]["calibrated, detected"]
+def test_every_trial_went_through_the_line(report: dict[str, Any]) -> None:
+    trials = report["trials"]["calibrated, detected"]
     assert len(trials) == 12
     for who in ("participant-01", "participant-02"):
         assert {one["pose"] for one in trials if one["participant"] == who} == set(POSES)
@@ -78,8 +78,8 @@ def test_every_trial_went_through_the_line(told: dict[str, Any]) -> None:
             assert off.max() < 35.0  # eight triples calibrate nothing: a device 5 degrees askew costs 20
 
 
-def test_every_cell_is_there_and_nothing_is_filled_in(told: dict[str, Any]) -> None:
-    cells = told["cells"]
+def test_every_cell_is_there_and_nothing_is_filled_in(report: dict[str, Any]) -> None:
+    cells = report["cells"]
     assert [(one["finger"], one["pose"]) for one in cells] == [(f, p) for f in FINGERS for p in POSES]
     for one in cells:
         assert one["is_reached"] is (2 * one["reached"] >= one["trials"])
@@ -87,7 +87,7 @@ def test_every_cell_is_there_and_nothing_is_filled_in(told: dict[str, Any]) -> N
     assert 0 < sum(one["is_reached"] for one in cells) < len(cells)
 
 
-def test_tables_and_picture_show_it(out: Path, told: dict[str, Any]) -> None:
+def test_tables_and_picture_show_it(out: Path, report: dict[str, Any]) -> None:
     text = (out / "study.md").read_text()
     assert "Open loop" in text
     assert "(closed loop)" in text
@@ -100,15 +100,15 @@ def test_tables_and_picture_show_it(out: Path, told: dict[str, Any]) -> None:
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
 
 
-def test_calibration_is_ours_and_what_it_refuses_is_said(told: dict[str, Any]) -> None:
-    for one in told["calibrated"].values():
+def test_calibration_is_ours_and_what_it_refuses_is_said(report: dict[str, Any]) -> None:
+    for one in report["calibrated"].values():
         assert one["said"]
         assert 0.0 < one["nominal_rotation_deg"] < 5.3
         if one["refused"]:  # then the rig file's pose is used
             assert one["rotation_deg"] == one["nominal_rotation_deg"]
 
 
-def test_a_study_goes_on_from_what_was_detected_and_solves_anew(out: Path, told: dict[str, Any]) -> None:
+def test_a_study_goes_on_from_what_was_detected_and_solves_anew(out: Path, report: dict[str, Any]) -> None:
     detections = out / "participant-01/calibrated-detected/detections_wrist.npz"
     before = detections.stat().st_mtime_ns
     found = run_participant(replace(task(out), solver_mode="auto", keep=False, conditions=(EXACT,)), 1)
@@ -122,7 +122,7 @@ def test_a_study_goes_on_from_what_was_detected_and_solves_anew(out: Path, told:
 
 
 def test_a_study_takes_frames_again_and_makes_all_else_anew(
-    out: Path, told: dict[str, Any], tmp_path: Path
+    out: Path, report: dict[str, Any], tmp_path: Path
 ) -> None:
     shutil.copytree(out / "participant-02", tmp_path / "participant-02")
     folder = tmp_path / "participant-02"
@@ -135,13 +135,13 @@ def test_a_study_takes_frames_again_and_makes_all_else_anew(
     assert not (folder / "calibrated-detected").exists()
 
 
-def test_a_recording_gives_the_same_trials(out: Path, told: dict[str, Any], tmp_path: Path) -> None:
+def test_a_recording_gives_the_same_trials(out: Path, report: dict[str, Any], tmp_path: Path) -> None:
     folder, hand = out / "participant-02/trials", out / "participant-02/calibrated/hand.json"
     rig = load(out / "participant-02/calibrated/rig.json", RigCalibration)
     assert rig.kind == "wrist"
     claim(folder, rig)
     result = recorded([folder], lambda name: (hand, load(hand, HandProfile)), "fk", tmp_path, quiet)
-    trials = told["trials"]
+    trials = report["trials"]
     own = [one for one in trials["calibrated, detected"] if one["participant"] == "participant-02"]
     found = result.trials[result.judged]
     assert [one.pose for one in found] == [one["pose"] for one in own]
@@ -173,7 +173,7 @@ def test_what_cannot_be_studied_is_named(tmp_path: Path, arguments: tuple[str, .
 
 
 def test_a_recording_without_truth_or_hand_is_refused_before_it_is_detected(
-    tmp_path: Path, out: Path, told: dict[str, Any]
+    tmp_path: Path, out: Path, report: dict[str, Any]
 ) -> None:
     folder = tmp_path / "anna"
     folder.mkdir()

@@ -26,7 +26,7 @@ ORDER = [
 ]
 
 
-def told(pose: HandPose, **options: Any) -> dict[str, Any]:
+def message_of(pose: HandPose, **options: Any) -> dict[str, Any]:
     """What the JSON says. Strict: NaN or Infinity, which JSON has not, fail."""
 
     def refuse(word: str) -> float:
@@ -52,7 +52,7 @@ def with_wrist(position_m: list[float], wxyz: list[float]) -> HandPose:
 
 
 def test_joints_are_those_of_webxr_in_its_order() -> None:
-    message = told(hand_pose("right"))
+    message = message_of(hand_pose("right"))
     assert [joint["name"] for joint in message["joints"]] == ORDER
     assert len(ORDER) == 25
     assert (message["type"], message["version"], message["frame"]) == ("hand", 1, "webxr")
@@ -72,7 +72,7 @@ def test_joints_are_those_of_webxr_in_its_order() -> None:
     ],
 )
 def test_golden_axes(wxyz: list[float], xyzw: list[float]) -> None:
-    wrist = told(with_wrist([0.03, 0.02, 0.5], wxyz))["joints"][0]
+    wrist = message_of(with_wrist([0.03, 0.02, 0.5], wxyz))["joints"][0]
     assert wrist["position"] == [0.03, -0.02, -0.5]
     assert wrist["orientation"] in (xyzw, [-x if x else 0.0 for x in xyzw])
 
@@ -80,7 +80,7 @@ def test_golden_axes(wxyz: list[float], xyzw: list[float]) -> None:
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_turned_axes_say_the_same_rotation_as_the_pose(side: str) -> None:
     pose = hand_pose(side, rotation_vector=np.array([0.4, -1.1, 2.0]))
-    message = told(pose)
+    message = message_of(pose)
     half_rotation = Rotation.from_euler("x", 180, degrees=True)
     expected = half_rotation * Rotation.from_quat(pose.orientation_wxyz[1:], scalar_first=True)
     output = Rotation.from_quat([joint["orientation"] for joint in message["joints"]])
@@ -93,7 +93,7 @@ def test_turned_axes_say_the_same_rotation_as_the_pose(side: str) -> None:
 def test_a_bone_lies_along_minus_z_of_its_joint_and_the_back_of_the_hand_along_y() -> None:
     # What WebXR demands of joint axes, of a flat hand that points up before the camera, its back to the camera.
     rotation_vector = Rotation.from_matrix([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]]).as_rotvec()
-    joints = told(hand_pose("right", rotation_vector=rotation_vector))["joints"]
+    joints = message_of(hand_pose("right", rotation_vector=rotation_vector))["joints"]
     for first, second in pairwise(joints[11:15]):
         axes = Rotation.from_quat(first["orientation"]).as_matrix()
         bone = np.subtract(second["position"], first["position"])
@@ -103,7 +103,7 @@ def test_a_bone_lies_along_minus_z_of_its_joint_and_the_back_of_the_hand_along_y
 
 
 def test_what_is_not_known_is_null_and_stays_alone() -> None:
-    message = told(with_wrist([0.0, 0.0, 0.4], [1.0, 0.0, 0.0, 0.0]))
+    message = message_of(with_wrist([0.0, 0.0, 0.4], [1.0, 0.0, 0.0, 0.0]))
     assert message["side"] is None
     wrist, *others = message["joints"]
     assert wrist["position"] is not None
@@ -120,7 +120,7 @@ def test_doubt_is_the_root_mean_square_of_the_three_axes() -> None:
     pose = pose_of("my-right", pose.position_m, np.tile(np.eye(3), (26, 1, 1)), pose.angles_rad, 7)
     changed = {field: getattr(pose, field) for field in pose.__struct_fields__}
     changed |= {"cov_m2": cov, "tracked": tracked, "source": np.full(26, Source.HELD, np.uint8)}
-    joints = told(HandPose(**changed))["joints"]
+    joints = message_of(HandPose(**changed))["joints"]
     assert joints[0]["sigma_mm"] == 1.732
     assert joints[1]["sigma_mm"] is None
     assert [joint["tracked"] for joint in joints] == [JOINTS[5] != joint["name"] for joint in joints]
@@ -130,7 +130,7 @@ def test_doubt_is_the_root_mean_square_of_the_three_axes() -> None:
 
 def test_the_rig_frame_is_left_as_it_is() -> None:
     pose = hand_pose("left")
-    message = told(pose, frame="rig")
+    message = message_of(pose, frame="rig")
     assert message["frame"] == "rig"
     assert message["joints"][0]["position"] == np.round(pose.position_m[1], 6).tolist()
     w, x, y, z = np.round(pose.orientation_wxyz[1], 6)

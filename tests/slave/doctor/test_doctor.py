@@ -159,8 +159,8 @@ def test_another_source_than_the_master_and_no_chrony_at_all(tmp_path: Path) -> 
     (found,) = check_clock(machine(tmp_path, {"chronyc": output}), "other.local")
     assert found.verdict is Verdict.WARN
     assert "not by other.local" in found.text
-    told = {"timedatectl": Ran(0, "NTP=yes\nNTPSynchronized=yes\n", "")}
-    (found,) = check_clock(machine(tmp_path, told), None)
+    answers = {"timedatectl": Ran(0, "NTP=yes\nNTPSynchronized=yes\n", "")}
+    (found,) = check_clock(machine(tmp_path, answers), None)
     assert found.verdict is Verdict.WARN
     (found,) = check_clock(machine(tmp_path), None)
     assert found.verdict is Verdict.UNSEEN
@@ -351,9 +351,9 @@ def test_the_report(capsys: pytest.CaptureFixture[str]) -> None:
     text = as_text(findings)
     assert text.splitlines()[-1] == "1 ok, 1 to look at, 0 wrong"
     assert "not looked at:\n     board" in text
-    told = json.loads(as_json(findings, Program("pi-left", "1.2")))
-    assert (told["host"], told["ok"]) == ("pi-left", True)
-    assert told["findings"][1] == {"check": "clock", "verdict": "warn", "text": "far", "fix": "wait"}
+    answers = json.loads(as_json(findings, Program("pi-left", "1.2")))
+    assert (answers["host"], answers["ok"]) == ("pi-left", True)
+    assert answers["findings"][1] == {"check": "clock", "verdict": "warn", "text": "far", "fix": "wait"}
 
 
 def test_it_runs_without_any_hardware(capsys: pytest.CaptureFixture[str]) -> None:

@@ -148,9 +148,9 @@ def test_samples_before_the_start_are_read_and_forgotten() -> None:
     assert len(source.samples) == 2
     assert orientation.pushed == 3, "but the filter has seen them"
     assert not wait_for_start(source, Barrier(9), threading.Event()), "the source has ended"
-    told = threading.Event()
-    told.set()
-    assert not wait_for_start(Source([sample(0)]), Barrier(9), told)
+    stop = threading.Event()
+    stop.set()
+    assert not wait_for_start(Source([sample(0)]), Barrier(9), stop)
 
 
 def test_it_reports_and_stops_on_the_bus() -> None:

@@ -117,8 +117,8 @@ def test_it_ends_when_closed_or_told_also_while_it_waits() -> None:
     source.close()
     source.close()
     assert source.read() is None
-    told = Stage(EPOCH_NS - 10**12, until=1)  # before a scene that begins in a quarter of an hour
-    assert imu(told).read() is None
+    begun = Stage(EPOCH_NS - 10**12, until=1)  # before a scene that begins in a quarter of an hour
+    assert imu(begun).read() is None
 
 
 def test_a_stop_in_the_middle_of_a_wait_ends_it_at_once() -> None:

@@ -180,12 +180,12 @@ def test_nothing_that_a_driver_raises_ends_the_watchdog(raised: Exception) -> No
 def test_the_watchdog_ends_a_pulse_by_itself() -> None:
     dark = threading.Event()
 
-    class Told(NotedLights):
+    class SignallingLights(NotedLights):
         def off(self) -> None:
             super().off()
             dark.set()
 
-    lights = Told(SetClock())
+    lights = SignallingLights(SetClock())
     interlock = Interlock(lights, LIMITS)  # on the clock of this machine
     assert interlock.begin(LASER, MS)
     assert dark.wait(30.0)

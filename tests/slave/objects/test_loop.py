@@ -117,11 +117,11 @@ def test_a_synthetic_tracker_is_where_the_object_is_in_a_frame_of_its_own(tmp_pa
     off: list[np.ndarray] = []
     lost = 0
     for t_s in np.arange(0.0, 40.0, 0.25):
-        told = tracker.pose(float(t_s))
-        if told is None:
+        matrix = tracker.pose(float(t_s))
+        if matrix is None:
             lost += 1
             continue
-        found = SET_UP_TRACKING @ told @ np.linalg.inv(SET_UP_TRACKER)
+        found = SET_UP_TRACKING @ matrix @ np.linalg.inv(SET_UP_TRACKER)
         truth = tracker.scene.truth(float(t_s)).objects["cube"]
         quaternion = matrix_to_rotation_vector(found[:3, :3] @ truth[:3, :3].T)
         off.append(np.array([np.linalg.norm(found[:3, 3] - truth[:3, 3]), np.linalg.norm(quaternion)]))

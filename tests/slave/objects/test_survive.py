@@ -34,7 +34,7 @@ def output(folder: Path, *parts: bytes) -> str:
 
 def test_it_is_told_to_write_poses_alone_and_they_come_at_once(tmp_path: Path) -> None:
     command = program(
-        tmp_path, f'echo "$@" > {tmp_path}/told; {output(tmp_path, HEAD, pose(8.0), pose(8.01))}; sleep 60'
+        tmp_path, f'echo "$@" > {tmp_path}/arguments; {output(tmp_path, HEAD, pose(8.0), pose(8.01))}; sleep 60'
     )
     source = opened(command)
     begin_ns = SystemClock().now_ns()
@@ -42,7 +42,7 @@ def test_it_is_told_to_write_poses_alone_and_they_come_at_once(tmp_path: Path) -
     source.close()
     source.close()
     assert source.read() is None
-    assert (tmp_path / "told").read_text().split() == list(OPTIONS)
+    assert (tmp_path / "arguments").read_text().split() == list(OPTIONS)
     assert [one.seq for one in poses] == [0, 1]
     assert poses[1].t_ns - poses[0].t_ns == 10_000_000
     assert 0 < poses[1].t_ns - begin_ns < 10_000_000_000
@@ -94,10 +94,10 @@ def test_a_slave_that_is_killed_leaves_no_program_behind(tmp_path: Path) -> None
         "time.sleep(300)\n"
     )
     slave = subprocess.Popen([sys.executable, "-c", script], cwd=Path(__file__).resolve().parents[3])
-    told = tmp_path / "number"
+    number_file = tmp_path / "number"
     try:
-        assert until(lambda: told.exists() and told.read_text().strip().isdecimal())
-        number = int(told.read_text())
+        assert until(lambda: number_file.exists() and number_file.read_text().strip().isdecimal())
+        number = int(number_file.read_text())
         assert alive(number)
     finally:
         slave.kill()

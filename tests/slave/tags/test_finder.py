@@ -37,7 +37,7 @@ def box(family: TagFamily = "aruco_5x5_100", numbers: range = range(8), name: st
     ],
 )
 def test_corners_are_where_they_are_and_as_sure_as_told(look: Look, within_px: float) -> None:
-    base, missed, miss, told = TagFinder(FILE, [box()]), 0, [], []
+    base, missed, miss, sigmas = TagFinder(FILE, [box()]), 0, [], []
     for seed in range(8):
         rng = np.random.default_rng(seed)
         number = int(rng.integers(8))
@@ -48,11 +48,11 @@ def test_corners_are_where_they_are_and_as_sure_as_told(look: Look, within_px: f
             missed += 1
             continue
         miss.append(found.uv[0] - corners)
-        told.append(found.sigma_px[0])
+        sigmas.append(found.sigma_px[0])
     assert missed <= 1
     square = np.square(miss)
     assert np.sqrt(square.mean()) < within_px
-    assert (square / np.square(told)[:, None, None]).mean() < 4.0
+    assert (square / np.square(sigmas)[:, None, None]).mean() < 4.0
 
 
 @pytest.mark.parametrize(

@@ -263,13 +263,13 @@ def test_recorded_tips_are_found(datasets: Path, name: str) -> None:
 
 
 def test_relative_depth_orders_the_tips_by_their_distance() -> None:
-    told: list[tuple[float, float]] = []
+    depths: list[tuple[float, float]] = []
     for start_s in np.arange(0.0, 60.0, 3.0):
         ambient, laser, led = strobed("standard", 1, 5, float(start_s))
         truth = scene("standard", 5).truth(float(start_s) + 2.0 / CAMERA.frame_rate_hz)
         tips = found(Shown(ambient.image, laser.image, led.image, truth.tip_uv, truth.tip_visible))
         near = np.linalg.norm(tips.uv - truth.tip_uv, axis=1) < ELSEWHERE_PX
-        told += zip(tips.depth[near].tolist(), truth.tip_xyz[near, 2].tolist(), strict=True)
-    pairs = [(a, b) for a in told for b in told if a[1] > 1.3 * b[1]]
+        depths += zip(tips.depth[near].tolist(), truth.tip_xyz[near, 2].tolist(), strict=True)
+    pairs = [(a, b) for a in depths for b in depths if a[1] > 1.3 * b[1]]
     assert len(pairs) > 50
     assert np.mean([a[0] > b[0] for a, b in pairs]) > 0.9

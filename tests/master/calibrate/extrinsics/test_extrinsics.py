@@ -148,7 +148,7 @@ def test_what_no_extrinsics_explain_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("quantity", "value", "told"),
+    ("quantity", "value", "message"),
     [
         ("imu_rotation_sigma_deg", 5.0, "turn the forearm about another axis"),
         ("shift_sigma_mm", 5.0, "bend every finger"),
@@ -156,7 +156,7 @@ def test_what_no_extrinsics_explain_is_refused() -> None:
     ],
 )
 def test_what_the_motion_does_not_tell_is_refused_with_what_to_do(
-    quantity: str, value: float, told: str
+    quantity: str, value: float, message: str
 ) -> None:
-    with pytest.raises(FitError, match=told):
+    with pytest.raises(FitError, match=message):
         refuse(fitted(1.0), CERTAIN | {quantity: value})

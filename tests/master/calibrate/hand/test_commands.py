@@ -24,8 +24,8 @@ def run(*options: str) -> str:
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_a_quick_start_from_the_length(tmp_path: Path, side: str) -> None:
-    told = run("--length-mm", "183", "--side", side, "--name", "anna", "--out", str(tmp_path))
-    assert "no bone is measured" in told
+    output = run("--length-mm", "183", "--side", side, "--name", "anna", "--out", str(tmp_path))
+    assert "no bone is measured" in output
     made = load(tmp_path / "hands" / "anna.json", HandProfile)
     assert made.rest_joints == generated_profile("anna", side, 0.183).rest_joints
     assert "no bone is measured" in made.provenance["rest_joints"].note
@@ -56,9 +56,9 @@ def test_a_routine_from_a_file_of_poses(tmp_path: Path, root: Path) -> None:
     calibration = ("--rig", "desk", "--calibration", str(root / "calib_json"))
     given = ("--poses", str(tmp_path / "poses.npz"), "--side", "left", "--name", "ben", *calibration)
     figures, picture = tmp_path / "hand.json", tmp_path / "hand.png"
-    told = run(*given, "--out", str(tmp_path), "--json", str(figures), "--picture", str(picture))
-    assert "measured" in told
-    assert "undetermined" in told
+    output = run(*given, "--out", str(tmp_path), "--json", str(figures), "--picture", str(picture))
+    assert "measured" in output
+    assert "undetermined" in output
     lengths = json.loads(figures.read_text())["lengths"]
     made = load(tmp_path / "hands" / "ben.json", HandProfile)
     for finger in ("index", "middle", "ring", "little"):
@@ -69,9 +69,9 @@ def test_a_routine_from_a_file_of_poses(tmp_path: Path, root: Path) -> None:
 
 
 def test_the_steps_are_told_without_anything_else() -> None:
-    told = run("--steps")
-    assert "lay the back of the hand" in told.lower()
-    assert "thumb alone" in told
+    output = run("--steps")
+    assert "lay the back of the hand" in output.lower()
+    assert "thumb alone" in output
 
 
 @pytest.mark.parametrize(

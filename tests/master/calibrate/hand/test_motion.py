@@ -45,8 +45,8 @@ def test_a_hand_comes_back_and_shows_its_side(side: Side, without: tuple[str, ..
     assert hand.length_m == pytest.approx(0.19, abs=5e-4)
     if not without:
         np.testing.assert_allclose(found.rest_position_m, truth.rest_position_m, atol=6e-3)
-    told = "\n".join(motion_lines(hand))
-    assert ("index-finger-metacarpal" in told) == bool(without)
+    output = "\n".join(motion_lines(hand))
+    assert ("index-finger-metacarpal" in output) == bool(without)
     assert "rest_joints" in hand.profile.provenance
 
 
@@ -84,11 +84,11 @@ def test_noise_of_joints_is_no_spread_of_a_person() -> None:
     joints = hand_at(T_S, RIGHT, np.radians(8.0)).position_m
     noise = np.random.default_rng(1).normal(0.0, 8e-4, joints.shape)
 
-    def told(joints: Float) -> Ratio | None:
+    def output(joints: Float) -> Ratio | None:
         chains = find_palm(joints, "right", "file").chains_m
         return motion_couplings(joint_angles(RIGHT, chains), chains, ns(T_S)).dip
 
-    clean, noisy = told(joints), told(joints + noise)
+    clean, noisy = output(joints), output(joints + noise)
     assert clean is not None
     assert noisy is not None
     assert noisy.noise_rad > np.radians(4.0)
@@ -143,10 +143,10 @@ def test_a_user_makes_a_hand_file(tmp_path: Path) -> None:
     joints = hand_at(T_S, LEFT).position_m
     names = tuple(f"L_{name}" for name in JOINTS)
     table = write_table(tmp_path / "mine.csv", T_S, names, joints)
-    told = run(
+    output = run(
         "--from", str(table), "--name", "mine", "--out", str(tmp_path), "--json", str(tmp_path / "mine.json")
     )
-    assert "left hand (as its names or --side say), 190 mm long" in told
+    assert "left hand (as its names or --side say), 190 mm long" in output
     made = load(tmp_path / "hands" / "mine.json", HandProfile)
     assert made.side == "left"
     assert made.provenance["rest_joints"].data == ("mine.csv",)

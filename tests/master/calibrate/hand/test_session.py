@@ -47,8 +47,8 @@ class Person:
 def test_all_steps_are_told_in_order_and_kept() -> None:
     person = Person()
     t_ns, points, cov = person.guide().arrays()
-    told = [line for line in person.output if f" of {len(STEPS)}: " in line]
-    assert [line.split(": ")[0] for line in told] == [
+    steps = [line for line in person.output if f" of {len(STEPS)}: " in line]
+    assert [line.split(": ")[0] for line in steps] == [
         f"{n} of {len(STEPS)}" for n in range(1, len(STEPS) + 1)
     ]
     assert (np.diff(t_ns) > 0).all()

@@ -34,8 +34,8 @@ def body(places_m: np.ndarray = PLACES_M, names: tuple[str, ...] = BEADS) -> Obj
 def messages(seed: int, seconds: float = 5.0, rotation_rad_s: float = 2.0) -> list[MarkerDetections]:
     """What the cameras say of the body on its way, by stamps."""
     where = wander(seed, MIDDLE_M, 0.25, rotation_rad_s)
-    told = detections(body(), RIG.markers, MODELS, where, seconds, seed, noise=NOISE)
-    return [message for message in told if isinstance(message, MarkerDetections)]
+    sent = detections(body(), RIG.markers, MODELS, where, seconds, seed, noise=NOISE)
+    return [message for message in sent if isinstance(message, MarkerDetections)]
 
 
 def seen(seed: int, seconds: float = 5.0, rotation_rad_s: float = 2.0) -> Seen:

@@ -77,7 +77,7 @@ def shown(recorded: Path, tree: Path) -> tuple[object, ...]:
 
 def test_rendered_beads_are_measured_and_the_file_tracks(run: Run, recorded: Path, tree: Path) -> None:
     beads = ("--markers", ",".join(BEADS), "--radius-mm", 9, "--add-to-rig")
-    outputs = ("--json", tree / "told.json", "--picture", tree / "wand.png")
+    outputs = ("--json", tree / "report.json", "--picture", tree / "wand.png")
     assert run(*shown(recorded, tree), *beads, *outputs) == 0
     profile = load(tree / "objects" / "wand.json", ObjectProfile)
     places = np.array([profile.markers[name].position_m for name in BEADS])
@@ -89,7 +89,7 @@ def test_rendered_beads_are_measured_and_the_file_tracks(run: Run, recorded: Pat
     assert profile.provenance["markers"].residual["wand1_rms_mm"] < 3.0
     assert load(tree / "rigs" / "desk-wand.json", RigCalibration).objects == ("wand",)
     assert (tree / "wand.png").stat().st_size > 10_000
-    assert json.loads((tree / "told.json").read_text())["beads"]["wand1"]["strays"] < 0.1
+    assert json.loads((tree / "report.json").read_text())["beads"]["wand1"]["strays"] < 0.1
 
     setup = load_setup(tree, "desk-wand")
     line = ObjectLine(profile, setup.rig, setup.models)
@@ -126,7 +126,7 @@ def test_the_frame_and_the_shape_of_a_file_are_kept(run: Run, recorded: Path, tr
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         (("--markers", "wand1,wand2"), "three different beads"),
         (("--markers", "wand1,wand2,knob"), "'knob' is not among them"),
@@ -138,11 +138,11 @@ def test_what_is_asked_wrongly_is_refused(
     recorded: Path,
     tree: Path,
     options: tuple[str, ...],
-    told: str,
+    message: str,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert run(*shown(recorded, tree), *options) != 0
-    assert told in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert not (tree / "objects").exists()
 
 

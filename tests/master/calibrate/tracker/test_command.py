@@ -64,7 +64,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Run:
 def test_from_a_kept_motion_to_files_that_the_line_takes(
     run: Run, tree: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    motion, path, told = Motion(12), tmp_path / "motion.npz", tmp_path / "told.json"
+    motion, path, report = Motion(12), tmp_path / "motion.npz", tmp_path / "report.json"
     write_motion(path, motion.objects(), motion.tracked())
     picture = tmp_path / "tracker.png"
     assert (
@@ -77,7 +77,7 @@ def test_from_a_kept_motion_to_files_that_the_line_takes(
             "--out",
             tree,
             "--json",
-            told,
+            report,
             "--picture",
             picture,
         )
@@ -97,7 +97,7 @@ def test_from_a_kept_motion_to_files_that_the_line_takes(
         assert {"position_mm", "rotation_deg", "position_sigma_mm", "rotation_sigma_deg"} <= set(
             file.residual
         )
-    numbers = json.loads(told.read_text())
+    numbers = json.loads(report.read_text())
     assert numbers["late_ms"] == pytest.approx(1e3 * motion.late_s, abs=2.0)
     [solved] = TrackerLine(cube, rig).push(motion.tracked()[300])
     _, place = motion.truth(np.array([1e-9 * (solved.pose.t_ns - ZERO_NS)]))

@@ -35,9 +35,9 @@ def samples(seed: int = 0, noise: float = 0.02, where: Float = EVERYWHERE, views
     return WhiteSamples(xy, where, light, rng.integers(0, views, len(xy)).astype(np.int64))
 
 
-def worst_percent(told: Float, true: Float) -> float:
+def worst_percent(fitted: Float, true: Float) -> float:
     """Largest relative error, of whatever gain fits best."""
-    ratio = told / true
+    ratio = fitted / true
     return float(100.0 * np.abs(ratio / np.median(ratio) - 1.0).max())
 
 

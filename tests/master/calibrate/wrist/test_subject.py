@@ -83,14 +83,14 @@ def test_what_the_laser_cannot_tell_keeps_its_belief_and_says_so(
     people: dict[int, Person], motions: dict[int, list[WristDetections]], subjects: dict[int, Subject]
 ) -> None:
     person, cycles, found = people[40], motions[40], subjects[40]
-    told = Unknown.of(np.sqrt(np.diag(found.fit.covariance)) / found.fit.prior_sigma)
-    assert told.knuckle_m[:, 0].max() < 0.7  # across
-    assert told.thick.min() > 0.8  # a thicker finger looks like a knuckle farther away
+    shrunk = Unknown.of(np.sqrt(np.diag(found.fit.covariance)) / found.fit.prior_sigma)
+    assert shrunk.knuckle_m[:, 0].max() < 0.7  # across
+    assert shrunk.thick.min() > 0.8  # a thicker finger looks like a knuckle farther away
     # With a palm that a board has placed, knuckles are known better.
     rig = replace(person.true_rig, provenance={"T_camera_palm": provenance("calibrate palm", (), {})})
     placed = calibrate_subject(cycles, rig, person.camera, person.hand)
     surer = Unknown.of(np.sqrt(np.diag(placed.fit.covariance)) / placed.fit.prior_sigma)
-    assert (surer.knuckle_m[:, :2] < told.knuckle_m[:, :2]).all()  # across and up
+    assert (surer.knuckle_m[:, :2] < shrunk.knuckle_m[:, :2]).all()  # across and up
     assert np.sqrt(np.mean(person.errors(placed.rig, placed.hand)[1] ** 2)) < 3.0
 
 
@@ -247,7 +247,7 @@ def test_the_command_writes_rig_and_hand_and_draws(
         "--calibration",
         tmp_path / "tree",
     ]
-    options += ["--name", "me", "--out", out, "--picture", picture, "--json", tmp_path / "told.json"]
+    options += ["--name", "me", "--out", out, "--picture", picture, "--json", tmp_path / "report.json"]
     app = typer.main.get_command(calibrate_app())
     app.main(["subject", str(tmp_path / "guided"), *map(str, options)], standalone_mode=False)
     rig = load(out / "rigs" / f"{person.rig.name}.json", RigCalibration)
@@ -255,6 +255,6 @@ def test_the_command_writes_rig_and_hand_and_draws(
     assert rig.hand == hand.name == "me"
     assert hand.palmar_scale.keys() == {"index", "middle", "ring", "little"}
     assert cv2.imread(str(picture)) is not None
-    told = json.loads((tmp_path / "told.json").read_text())
-    assert told["fingers"]["ring"]["knuckle_sigma_mm"][0] < 3.0
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["fingers"]["ring"]["knuckle_sigma_mm"][0] < 3.0
     WristSetup.of(rig, person.camera, HandModel.of(hand))
