@@ -117,7 +117,7 @@ def test_a_tracked_bit_is_false_where_the_joint_is_far_off() -> None:
 @pytest.mark.parametrize(
     ("visible_area", "line", "false"), [(0.0, 0.02, 1.0), (100.0, 0.0, 0.0), (0.0, 0.0, 1.0)]
 )
-def test_a_tracked_bit_is_false_where_nothing_tells_of_the_joint(
+def test_a_tracked_bit_is_false_where_nothing_measures_the_joint(
     visible_area: float, line: float, false: float
 ) -> None:
     got = figures(solved(), shown(visible_area, line))  # without paint nothing tells where the palm is

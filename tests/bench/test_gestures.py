@@ -33,7 +33,7 @@ def truth(setup: RigSetup) -> GestureTruth:
     return GestureTruth.of(scene.motion, scene.model, SETTINGS, 14.0)
 
 
-def test_a_dial_is_told_in_time_and_as_far_as_it_was_turned(setup: RigSetup, truth: GestureTruth) -> None:
+def test_a_dial_is_reported_in_time_and_as_far_as_it_was_turned(setup: RigSetup, truth: GestureTruth) -> None:
     scene = scene_by_name("gestures", setup.rig, setup.cameras, setup.hand.profile, SEED)
     poses = seen_poses(setup, "gestures", SEED, SECONDS)
     recognised = recognised_in(poses, scene.model, SETTINGS)
@@ -58,7 +58,7 @@ def test_everything_that_is_said_is_in_the_truth_in_that_order(truth: GestureTru
     assert gap == pytest.approx(-0.0005, abs=2e-3)  # skin on skin
 
 
-def test_what_nobody_said_is_false_and_what_was_not_told_is_missed(truth: GestureTruth) -> None:
+def test_what_nobody_made_is_false_and_what_was_not_reported_is_missed(truth: GestureTruth) -> None:
     event = next(one for one in truth.events if one.kind == "pinch")
     nan = np.full(3, np.nan)
     right = Gesture(

@@ -137,7 +137,7 @@ def test_a_few_poses_run_in_every_way(name: str) -> None:
     assert all(np.isfinite(row.value) for row in lines)
 
 
-def test_rows_tell_of_violations_and_of_hands_that_were_not_found() -> None:
+def test_rows_report_violations_and_hands_that_were_not_found() -> None:
     T, angles = perfect(TRUTH)
     angles[0, 1, 2], angles[1, 0, 0] = 3.0, np.nan
     bad = score(MODEL, TRUTH, T, angles, TRUTH.caps_m)

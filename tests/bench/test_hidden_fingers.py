@@ -26,7 +26,7 @@ def test_a_hand_at_rest_hardly_strays() -> None:
         assert np.abs(at_rest[HIDDEN_S.index(after_s)] - at_rest[0]).max() < most_deg
 
 
-def test_neighbours_tell_of_a_fist_and_mislead_about_one_finger() -> None:
+def test_neighbours_predict_a_fist_and_mislead_about_one_finger() -> None:
     after = HIDDEN_S.index(0.3)
     fist = bending((1, 2, 3, 4))
     alone, together = (rms_deg(growth_deg(RIGHT, fist, alike=alike)[after]) for alike in (False, True))

@@ -82,7 +82,7 @@ def test_a_moving_hand_is_solved_in_every_way_and_a_fixed_palm_costs() -> None:
     assert value(lines, f"{hand.WARM}: times faster than scipy") > 1.0
 
 
-def test_scipy_finds_the_hand_when_habits_are_the_truth_and_caps_are_exact() -> None:
+def test_scipy_finds_the_hand_when_the_posture_prior_is_the_truth_and_markers_are_exact() -> None:
     way = peers_scipy.WholeHand.of(MODEL, hand.NOISE)
     angles = MODEL.clamp(way.parameters.angles(way.mean))
     T = np.eye(4)

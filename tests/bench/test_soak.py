@@ -51,7 +51,7 @@ def test_the_slope_is_that_of_the_line_whatever_outliers_say(per_h: float) -> No
     assert found.low <= per_h <= found.high
 
 
-def test_too_few_points_tell_nothing_and_gaps_are_left_out() -> None:
+def test_too_few_points_give_no_trend_and_gaps_are_left_out() -> None:
     assert np.isnan(slope([0.0, 1.0, 2.0], [1.0, 2.0, 3.0]).per_h)
     assert slope([0.0, 3600.0, 7200.0, 9000.0, 10800.0], [0.0, 1.0, 2.0, np.nan, 3.0]).per_h == pytest.approx(
         1.0
@@ -78,7 +78,7 @@ def test_a_run_of_minutes_says_that_it_is_too_short() -> None:
 
 
 @pytest.mark.parametrize("what", ["lost", "dropped", "refused", "blocked"])
-def test_one_message_that_is_gone_is_no_pass_and_one_never_sent_is_told_apart(what: str) -> None:
+def test_one_message_that_is_gone_is_no_pass_and_one_never_sent_is_distinguished(what: str) -> None:
     assert verdict(history(0.0, **{what: 1}))[what] is False
     assert "skipped" not in verdict(history(0.0, skipped=900))
 
@@ -109,7 +109,7 @@ def test_a_step_is_found_in_the_minute_in_which_it_came(at_s: float) -> None:
     assert abs(60.0 * found.minute - at_s) <= 60.0
 
 
-def test_a_step_after_the_start_is_no_pass_though_the_slope_leaves_it_out() -> None:
+def test_a_step_after_the_start_is_no_pass_though_the_trend_leaves_it_out() -> None:
     output = verdict(stepped(66.0, 34.0))
     assert output["memory of master"] is True
     assert output["steps of master"] is False
@@ -137,7 +137,7 @@ def fresh_pages(size: int) -> Generator[None]:
         yield
 
 
-def test_the_mapping_that_grew_is_told_by_the_kernel() -> None:
+def test_the_mapping_that_grew_is_reported_by_the_kernel() -> None:
     before = mapped(os.getpid())
     with fresh_pages(32_000_000):
         more = grown(before, mapped(os.getpid()))

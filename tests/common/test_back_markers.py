@@ -53,7 +53,7 @@ def test_finger_markers_and_bones_stay(root: Path) -> None:
 
 
 @pytest.mark.parametrize("camera", ["left", "right"])
-def test_a_detector_tells_all_eight_paints_where_they_are(camera: str, root: Path) -> None:
+def test_a_detector_distinguishes_all_eight_colours(camera: str, root: Path) -> None:
     files = root / "calib_json"
     rig = load(files / "rigs" / "desk-back3.json", RigCalibration)
     cameras = {name: load(files / "cameras" / f"{name}.json", CameraCalibration) for name in rig.cameras}

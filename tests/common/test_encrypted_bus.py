@@ -150,7 +150,7 @@ def test_a_camera_speaks_for_itself_alone(rig: Rig) -> None:
             asker.ask(Command("outputs", "report"), 0.3)
 
 
-def test_a_camera_tells_no_poses_and_nothing_in_the_name_of_another(rig: Rig) -> None:
+def test_a_camera_publishes_no_poses_and_nothing_in_the_name_of_another(rig: Rig) -> None:
     """Also not inside a message that travels under its own name, nor under a name that stands for several."""
     subscriptions = {stream: rig.viewer.subscribe(stream) for stream in ("health", "hand", "gesture", "taken")}
     assert until(lambda: arrives(rig.right, subscriptions["health"], "right"))
@@ -166,7 +166,7 @@ def test_a_camera_tells_no_poses_and_nothing_in_the_name_of_another(rig: Rig) ->
         rig.master.ask(Command("right", "report"), 5.0)
 
 
-def test_a_viewer_is_a_program_of_its_own_but_tells_no_poses_and_speaks_for_no_camera(rig: Rig) -> None:
+def test_a_viewer_is_a_program_of_its_own_but_publishes_no_poses_and_speaks_for_no_camera(rig: Rig) -> None:
     rig.viewer.announce("outputs")
     rig.viewer.serve("outputs", lambda command: health("outputs", 5))
     assert rig.master.ask(Command("outputs", "report"), 5.0).counts == {"frames": 5}

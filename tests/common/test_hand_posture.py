@@ -61,7 +61,7 @@ def test_a_long_motion_has_its_own_posture_and_a_short_one_that_of_others() -> N
         fit_posture(wandering(19))
 
 
-def test_fingers_that_move_together_are_believed_to() -> None:
+def test_fingers_that_move_together_are_coupled_by_the_prior() -> None:
     angles = wandering(60_000)
     angles[:, 3] = 0.7 * angles[:, 2] + 0.3 * angles[:, 3]  # the ring finger mostly as the middle finger
     cov = np.array(fit_posture(angles).cov_rad2)
@@ -70,7 +70,7 @@ def test_fingers_that_move_together_are_believed_to() -> None:
     assert abs(correlation[6, 10]) < 0.15  # index and middle finger go their own ways
 
 
-def test_a_profile_from_motion_believes_in_its_posture() -> None:
+def test_a_profile_from_motion_has_its_posture_as_prior() -> None:
     model = MODELS[0]
     angles = wandering(3000)
     profile = profile_from_joints("moved", "right", model.chains(angles).position_m)

@@ -117,7 +117,7 @@ def test_steps_are_taken_from_the_stamps() -> None:
     assert not fusion.counts
 
 
-def test_rest_tells_the_bias_and_the_heading_stays_after_it() -> None:
+def test_rest_measures_the_bias_and_the_heading_stays_after_it() -> None:
     bias = np.radians([4.0, -2.0, 2.0])  # beyond the three degrees per second of the library's own
     fusion = OrientationFilter(RATE_HZ)
     run(fusion, still(0, 1.4, bias))
@@ -136,7 +136,7 @@ def test_rest_tells_the_bias_and_the_heading_stays_after_it() -> None:
     assert drift < 1.0
 
 
-def test_without_rest_gravity_tells_the_bias_of_level_axes() -> None:
+def test_without_rest_gravity_measures_the_bias_of_level_axes() -> None:
     bias = np.radians([3.0, -3.0, 0.0])
     fusion = OrientationFilter(RATE_HZ)
     made = swayed(0, 25.0, bias)
@@ -145,7 +145,7 @@ def test_without_rest_gravity_tells_the_bias_of_level_axes() -> None:
     assert np.degrees(fusion.bias_rad_s) @ [1.0, -1.0, 0.0] > 3.0  # of 6
 
 
-def test_the_doubt_of_the_heading_is_that_of_the_bias_until_it_has_rested() -> None:
+def test_the_sigma_of_the_heading_is_that_of_the_bias_until_it_has_rested() -> None:
     fusion = OrientationFilter(RATE_HZ)
     run(fusion, [one for one, _ in swayed(0, 4.0, np.zeros(3))])
     assert (

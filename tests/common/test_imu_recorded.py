@@ -31,7 +31,7 @@ def test_the_inclination_is_right_and_its_sigma_holds(
     assert abs(errors.drift_deg_per_min) < drift_deg_per_min
 
 
-def test_who_cannot_tell_gravity_from_an_arm_is_seen(datasets: Path) -> None:
+def test_who_cannot_distinguish_gravity_from_an_arm_is_seen(datasets: Path) -> None:
     recording = Recording.of(datasets / "broad" / "11_undisturbed_slow_translation_B.npz", every=3)
     alone = Errors.of(played(forces_alone(recording.rate_hz), recording), recording)
     assert alone.inclination_rms_deg > 3.0

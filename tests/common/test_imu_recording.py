@@ -84,7 +84,7 @@ def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
         read_imu(tmp_path, "imu")
 
 
-def test_a_cut_last_line_is_left_out_and_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_cut_last_line_is_left_out_and_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "imu.csv").write_text(f"{FULL}\n{ROW}\n2000,0.1,0.")
     assert [one.t_ns for one in read_imu(tmp_path, "imu")] == [1000]
     assert "the last line is cut" in caplog.text

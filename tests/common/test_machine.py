@@ -43,7 +43,7 @@ def test_of_another_computer_the_zone_nearest_to_its_trip_point_counts(tmp_path:
     assert (metrics["temperature_c"], metrics["temperature_limit_c"]) == (91.0, 95.0)
 
 
-def test_what_is_not_there_is_not_told(tmp_path: Path) -> None:
+def test_what_is_not_there_is_not_reported(tmp_path: Path) -> None:
     metrics = Machine(tmp_path, {ROOT: str(tmp_path)}).metrics()
     assert set(metrics) == {"disk_free_mb"}
     assert metrics["disk_free_mb"] > 0.0  # of the disk that the folder really is on
@@ -59,7 +59,7 @@ def test_a_pi_5_has_the_flags_of_its_firmware_elsewhere(tmp_path: Path) -> None:
     assert Machine(tmp_path, {ROOT: str(tmp_path)}).metrics()["throttled"] == 8.0
 
 
-def test_a_kernel_without_these_flags_tells_of_a_weak_supply_alone(tmp_path: Path) -> None:
+def test_a_kernel_without_these_flags_reports_only_a_weak_supply(tmp_path: Path) -> None:
     for number, (name, alarm) in enumerate([("cpu_thermal", "0"), ("rpi_volt", "1")]):
         sensor = tmp_path / f"sys/class/hwmon/hwmon{number}"
         sensor.mkdir(parents=True)

@@ -96,7 +96,7 @@ def test_the_planted_failure_is_what_ends_it() -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_thread_that_was_told_to_stop_may_return() -> None:
+def test_a_stopped_thread_may_return() -> None:
     until(lambda: True, lambda: None)()
     with pytest.raises(ThreadEndedError):
         until(lambda: False, lambda: None)()

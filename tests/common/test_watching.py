@@ -7,7 +7,7 @@ from common.file_monitor import MonitoredFiles
 from common.replacing import replacing
 
 
-def test_the_first_look_tells_and_the_next_does_not(tmp_path: Path) -> None:
+def test_the_first_look_reports_and_the_next_does_not(tmp_path: Path) -> None:
     paths = [tmp_path / "a", tmp_path / "b"]
     paths[0].write_text("1")
     watched = MonitoredFiles()

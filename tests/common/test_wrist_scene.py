@@ -260,7 +260,7 @@ def test_the_guided_curl_keeps_the_natural_ratios() -> None:
     assert np.degrees(motion.at(5.0).angles_rad[1, 2]) == pytest.approx(110.0)
 
 
-def test_scenes_are_found_by_name_and_a_name_of_the_other_kind_is_told() -> None:
+def test_scenes_are_found_by_name_and_a_name_of_the_other_kind_is_reported() -> None:
     for motion in MOTIONS:
         shown = view_by_name(motion, RIGS["right"], CAMERAS, HANDS["right"], 7)
         assert isinstance(shown, WristScene)

@@ -244,7 +244,7 @@ def test_a_tracker_on_an_object_is_a_slave_of_its_own(tmp_path: Path) -> None:
     assert (slave.command, slave.device, slave.scene) == ("tracker", "synthetic", "object")
 
 
-def test_the_summary_says_what_was_told_of_objects_and_gestures() -> None:
+def test_the_summary_lists_the_results_of_objects_and_gestures() -> None:
     lines = summary_lines(
         {
             "poses_per_s": 60.0,

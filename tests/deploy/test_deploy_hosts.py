@@ -191,7 +191,7 @@ def test_a_link_that_hangs_ends_by_the_deadline_with_all_that_it_started(
         ("ssh: connect to host pi port 22: Connection timed out", "pi does not answer: switched on"),
     ],
 )
-def test_a_host_that_is_not_reached_is_told_in_one_line_with_what_to_do(
+def test_a_host_that_is_not_reached_is_reported_in_one_line_with_what_to_do(
     fake_ssh: Callable[[str], None],
     output: str,
     expected: str,
@@ -381,7 +381,7 @@ def _file(path: Path, content: bytes) -> Path:
         (["--identity", "nokey"], "--identity nokey: no such file"),
     ],
 )
-def test_what_is_mistyped_is_told_before_a_machine_is_asked(
+def test_what_is_mistyped_is_reported_before_a_machine_is_asked(
     words: list[str], output: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tree = str(ROOT / "calib_json")
@@ -390,7 +390,7 @@ def test_what_is_mistyped_is_told_before_a_machine_is_asked(
     assert output in capsys.readouterr().err
 
 
-def test_a_fleet_with_a_keys_folder_that_is_not_there_is_told_so(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_fleet_with_a_missing_keys_folder_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["fleet", "--keys", "nokeys"]) == 1
     assert "--keys nokeys: no such folder" in capsys.readouterr().err
 
@@ -423,7 +423,7 @@ def test_an_interruption_ends_what_waits_for_a_machine(fake_ssh: Callable[[str],
     assert time.monotonic() - began < 60.0
 
 
-def test_a_link_that_breaks_within_the_last_line_is_told(fake_ssh: Callable[[str], None]) -> None:
+def test_a_link_that_breaks_within_the_last_line_is_reported(fake_ssh: Callable[[str], None]) -> None:
     fake_ssh(
         """cat > /dev/null; printf '{"result": {"mach'; echo 'client_loop: send disconnect' >&2; exit 255"""
     )
@@ -432,7 +432,7 @@ def test_a_link_that_breaks_within_the_last_line_is_told(fake_ssh: Callable[[str
         host.look()
 
 
-def test_wheels_that_cannot_be_kept_are_told_in_one_line(
+def test_wheels_that_cannot_be_kept_are_reported_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "cache").write_text("no folder")

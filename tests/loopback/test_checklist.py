@@ -112,7 +112,7 @@ def rehearsed(rig: Rig, code: str, lag: Lag) -> Shown:
     raise AssertionError("unreachable")
 
 
-def test_nothing_is_told_while_nothing_is_wrong(rig: Rig, lag: Lag) -> None:
+def test_nothing_is_reported_while_nothing_is_wrong(rig: Rig, lag: Lag) -> None:
     for last in (False, False, True):
         lag.begin()
         conditions = {code for code, _ in clean(rig, 4.0)} - BEHIND
@@ -123,7 +123,7 @@ def test_nothing_is_told_while_nothing_is_wrong(rig: Rig, lag: Lag) -> None:
 
 
 @pytest.mark.parametrize("code", LIVE)
-def test_a_fault_is_told_alone_and_goes(code: str, rig: Rig, lag: Lag) -> None:
+def test_a_fault_is_reported_alone_and_goes(code: str, rig: Rig, lag: Lag) -> None:
     rehearsed(rig, code, lag)
     for key, (sentence, fix) in rig.lists.sentences.items():
         if key[0] == code:
@@ -131,11 +131,11 @@ def test_a_fault_is_told_alone_and_goes(code: str, rig: Rig, lag: Lag) -> None:
             assert fix
 
 
-def test_a_killed_slave_is_told_alone_until_it_is_there_again(rig: Rig, lag: Lag) -> None:
+def test_a_killed_slave_is_the_only_report_until_it_is_there_again(rig: Rig, lag: Lag) -> None:
     assert rehearsed(rig, "camera_absent", lag).subjects == {"right"}
 
 
-def test_a_camera_that_is_unplugged_is_told_by_its_slave_and_is_back_with_the_plug(
+def test_a_camera_that_is_unplugged_is_reported_by_its_slave_and_is_back_with_the_plug(
     rig: Rig, lag: Lag
 ) -> None:
     """The slave lives on, with the session it had; from the plug to frames of it: the longest wait of its retries."""

@@ -412,7 +412,7 @@ def test_duplicates_and_late_frames_are_dropped_and_counted() -> None:
     assert master.refused == {Refusal.DUPLICATE: 2}
 
 
-def test_lost_on_the_way_and_never_sent_are_told_apart() -> None:
+def test_lost_on_the_way_and_never_sent_are_distinguished() -> None:
     wires = Wires()
     master, left, _ = started_pair(wires)
     process = left.process

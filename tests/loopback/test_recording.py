@@ -66,7 +66,7 @@ def recorded_run(folder: Path, file: Path) -> str:
     return log.read_text()
 
 
-def test_a_replay_is_what_was_told_live(tmp_path: Path) -> None:
+def test_a_replay_equals_what_was_published_live(tmp_path: Path) -> None:
     file = tmp_path / "wave.mcap"
     output = recorded_run(tmp_path, file)
     assert "recorder: recorded" in output

@@ -27,7 +27,7 @@ def started(wires: Wires, clock: SkewedClock | None = None) -> tuple[MasterLink,
     return master, left, wrist
 
 
-def test_its_triples_come_on_the_masters_clock_with_the_doubt_of_the_conversion() -> None:
+def test_its_triples_come_on_the_masters_clock_with_the_uncertainty_of_the_conversion() -> None:
     wires = Wires()
     clock = SkewedClock(7 * S, 40.0, wires.clock)
     master, _, wrist = started(wires, clock)
@@ -80,7 +80,7 @@ def test_nothing_is_lost_where_nothing_was_though_numbers_rise_by_three() -> Non
     assert (counts.received, counts.lost, counts.skipped, counts.late) == (50, 0, 0, 0)
 
 
-def test_triples_lost_on_the_way_and_never_sent_are_told_apart() -> None:
+def test_triples_lost_on_the_way_and_never_sent_are_distinguished() -> None:
     wires = Wires()
     master, _, wrist = started(wires)
     for k in range(60):

@@ -122,7 +122,7 @@ def test_samples_of_an_imu_that_has_no_place_are_counted(short_run: SyntheticRun
     assert hands.counts == {"orientation.unplaced": 1}
 
 
-def test_a_loop_told_to_stop_does_nothing(short_run: SyntheticRun) -> None:
+def test_a_stopped_loop_does_nothing(short_run: SyntheticRun) -> None:
     stop = threading.Event()
     stop.set()
     sink = Collector()

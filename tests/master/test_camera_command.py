@@ -37,7 +37,7 @@ def test_options_become_a_body_that_the_slave_understands() -> None:
     assert msgspec.json.decode(extra.body, type=CameraSettings).analogue_gain is None
 
 
-def test_rate_margin_and_a_pick_are_told_in_turn() -> None:
+def test_rate_margin_and_a_pick_are_sent_in_turn() -> None:
     extra, pick, save = asked(rate_hz=30.0, roi_margin=0.1, pick="index@310,204.5", save=True)
     assert msgspec.json.decode(extra.body) == {"frame_rate_hz": 30.0, "roi_margin": 0.1}
     assert (pick.verb, save.verb) == ("pick", "save")
@@ -68,7 +68,7 @@ def test_a_file_is_loaded_then_changed_then_saved() -> None:
         ({"load_file": LEFT.with_name("none.json")}, "none.json: cannot read"),
     ],
 )
-def test_what_makes_no_sense_is_refused_before_anything_is_told(
+def test_what_makes_no_sense_is_refused_before_anything_is_sent(
     options: dict[str, Any], expected: str
 ) -> None:
     with pytest.raises(PhalanxError, match=expected):

@@ -155,7 +155,7 @@ def test_a_thing_elsewhere_is_the_one_that_is_left_out_or_none(names: tuple[str,
         assert outlying[c].mean() > (0.8 if len(names) == 3 else 0.95)
 
 
-def test_two_wrong_of_four_and_a_marker_of_two_cameras_are_not_told() -> None:
+def test_two_wrong_of_four_and_a_marker_of_two_cameras_are_not_found() -> None:
     uv = images(FOUR, 5, 40)
     uv[1, :, 1] += 60.0
     uv[3, :, 1] -= 60.0
@@ -166,7 +166,7 @@ def test_two_wrong_of_four_and_a_marker_of_two_cameras_are_not_told() -> None:
     assert not odd(rig(FOUR), uv).any()
 
 
-def test_of_three_side_by_side_one_that_is_off_sideways_is_not_told() -> None:
+def test_of_three_side_by_side_one_that_is_off_sideways_is_not_found() -> None:
     """Each pair meets, at another distance."""
     row = rig_file(THREE)
     uv = np.stack([camera.project(TRUTH) for camera in camera_models(row).values()])

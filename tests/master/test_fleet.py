@@ -30,7 +30,7 @@ def of_slave(name: str, throttled: float = 0.0) -> Health:
     return Health(name, 3, 1, {}, {"temperature_c": 51.0, "throttled": throttled}, f"pi-{name}", "0.2.0")
 
 
-def test_a_row_tells_machine_version_rate_and_clock() -> None:
+def test_a_row_shows_machine_version_rate_and_clock() -> None:
     roll = Roll(["left", "right"])
     roll.push(of_master(1, left=100, right=0), 1.0)
     roll.push(of_slave("left", throttled=4.0), 1.5)

@@ -129,7 +129,7 @@ def test_renewed_everything_is_another_and_other_files_stay(keys: Path) -> None:
     assert not [name for name in after if after[name] == before[name]]
 
 
-def test_a_device_that_is_taken_out_has_nothing_that_is_still_worth_anything(keys: Path) -> None:
+def test_a_removed_device_keeps_no_valid_secret(keys: Path) -> None:
     before = files(keys)
     assert renew(keys, NOW, ["left"]) == ["pi.right-2_x"]
     assert devices_of(keys) == ["pi.right-2_x"]

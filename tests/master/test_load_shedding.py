@@ -150,7 +150,7 @@ def test_a_pause_of_a_few_ms_leaves_nothing_out() -> None:
 
 @OFFSETS
 @pytest.mark.parametrize("load", [1.2, 1.7, 3.3])
-def test_at_overload_what_is_told_is_new(load: float, offset_ns: int) -> None:
+def test_at_overload_what_is_published_is_new(load: float, offset_ns: int) -> None:
     solve_ns = round(load * PERIOD_NS)
     out = lived(arrivals(5.0, offset_ns, 1 * MS), lambda _t: solve_ns)
     assert len(out.result_ns) == pytest.approx(5e9 / solve_ns, rel=0.1), "the solver never waits for long"
@@ -201,7 +201,7 @@ def test_what_is_no_frame_and_who_is_not_known_change_nothing() -> None:
     assert load_shedding.reject == MOST
 
 
-def test_a_master_that_has_no_time_but_for_messages_tells_some_instants() -> None:
+def test_a_master_that_has_time_only_for_messages_solves_some_epochs() -> None:
     load_shedding = LoadShedding()
     load_shedding.reject, shedding = MOST, Shedding(load_shedding)
     assert [shedding() for _ in range(2 * MOST + 2)] == 2 * [*[True] * MOST, False]

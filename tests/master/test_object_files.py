@@ -70,7 +70,7 @@ def written(folder: Path) -> list[ResultMessage]:
     return results
 
 
-def test_what_is_told_is_read_back_exactly(tmp_path: Path) -> None:
+def test_results_are_read_back_exactly(tmp_path: Path) -> None:
     results = written(tmp_path)
     poses, near = (
         load_object(object_path(tmp_path, "cube")),

@@ -130,7 +130,7 @@ def test_an_unknown_heading_is_that_of_the_hand_and_its_tilt_stays(wrong_rad: fl
     assert np.sqrt(UP @ covariance(found) @ UP) > 2.0 * np.pi
 
 
-def test_doubt_grows_away_from_samples() -> None:
+def test_uncertainty_grows_away_from_samples() -> None:
     track = filled(KNOWN, 2)
     sure, between, beyond, far = (np.trace(covariance(at(track, t * MS))) for t in (1008, 1004, 1018, 1057))
     assert sure < between < beyond < far

@@ -126,7 +126,7 @@ def test_a_disk_that_fills_while_tracking_is_reported_by_write(tmp_path: Path) -
     assert list(tmp_path.iterdir()) == []
 
 
-def test_missing_folder_is_told_at_the_start(tmp_path: Path) -> None:
+def test_missing_folder_is_reported_at_the_start(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="nowhere"):
         PosesFile(tmp_path / "nowhere" / "poses.npz", "default-right", 6)
 

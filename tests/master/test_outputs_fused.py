@@ -88,7 +88,7 @@ def test_what_the_device_sees_stands_in_the_rig_where_the_hand_is(
     assert np.linalg.norm(moved[:, :3, 3] - cameras[:, :3, 3], axis=1).max() > 1e-3  # unknown counts as none
 
 
-def test_the_forearm_is_as_long_as_asked_and_its_doubt_as_wide_as_the_bend(
+def test_the_forearm_is_as_long_as_asked_and_its_uncertainty_as_wide_as_that_of_the_wrist(
     setup: RigSetup, poses: Poses
 ) -> None:
     place = DevicePlace.of(poses, setup.hand)

@@ -303,7 +303,7 @@ def test_the_cameras_are_asked_and_show_themselves_in_the_recording(tmp_path: Pa
     bus.close()
 
 
-def test_without_a_pose_the_master_tells_the_time_and_without_a_master_nothing_is_shown(
+def test_without_a_pose_the_master_gives_the_time_and_without_a_master_nothing_is_shown(
     tmp_path: Path,
 ) -> None:
     bus = LoopbackBus()

@@ -184,7 +184,7 @@ def test_gestures_stand_at_the_hand_and_go_when_they_end(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("axis", [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.6, 0.0, -0.8]])
-def test_an_arc_is_a_turn_about_its_axis(axis: list[float]) -> None:
+def test_an_arc_is_a_rotation_about_its_axis(axis: list[float]) -> None:
     points = arc(np.array(axis), 1.0)
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1.0)
     np.testing.assert_allclose(points @ axis, 0.0, atol=1e-12)

@@ -86,7 +86,7 @@ def test_an_offset_of_the_rig_file_is_taken_into_account_and_followed() -> None:
     assert abs(watch.metrics(lambda _name: None)["right.residual_offset_us"]) < 500.0
 
 
-def test_gauges_tell_of_clocks_phases_and_residuals_and_fit_a_report() -> None:
+def test_gauges_report_clocks_phases_and_residuals_and_fit_a_report() -> None:
     long = "camera-" + "x" * 57
     watch = ClockMonitor([setup_of(cameras=("left", "right", long))])
     estimate = ClockEstimate(t_ns=S, offset_ns=-7 * S, drift_ppm=12.3456, sigma_ns=3_000.0, bound_ns=100_000)
@@ -106,7 +106,7 @@ def test_gauges_tell_of_clocks_phases_and_residuals_and_fit_a_report() -> None:
     assert all(len(name) <= 64 for name in metrics)
 
 
-def test_cameras_in_step_and_out_of_it_are_told_on_change_only() -> None:
+def test_cameras_in_step_and_out_of_it_are_reported_on_change_only() -> None:
     lines = watched(ClockMonitor([setup_of()]), stepping(0.04, 30.0))
     assert len(lines) == 1
     assert "camera right: in step with left, +0.04 ms" in lines[0]

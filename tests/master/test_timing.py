@@ -228,7 +228,7 @@ def track(camera: CameraModel, motion: Motion, t_s: Float) -> Track:
     return Track(stamps, camera.undistort(scenes.seen(camera, motion, t_s)))
 
 
-def test_rigid_motion_changes_no_distance_and_no_misfit_but_a_wrong_time_does() -> None:
+def test_rigid_motion_changes_no_distance_and_no_residual_but_a_wrong_time_does() -> None:
     models = cameras(row_time_us=0.0)
     left, right = models["left"], models["right"]
     pair, motion = CameraPair.of(left, right), scenes.circling(0)

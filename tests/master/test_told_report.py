@@ -42,7 +42,7 @@ def test_the_script_is_one() -> None:
     assert isinstance(Script(), Annotated)
 
 
-def test_what_was_made_and_told_is_right_and_what_was_not_made_is_false() -> None:
+def test_what_was_made_and_reported_is_right_and_what_was_not_made_is_false() -> None:
     received = [
         recognised("pinch", "index", 1.2),
         recognised("dial", "dial", 3.5, angle_rad=0.0),
@@ -115,5 +115,5 @@ def test_the_files_of_a_run_are_its_messages_again(tmp_path: Path) -> None:
     }  # 0.05, rounded up
 
 
-def test_a_run_that_told_nothing_has_no_figures(tmp_path: Path) -> None:
+def test_a_run_without_results_has_no_figures(tmp_path: Path) -> None:
     assert RunResults.load(tmp_path, WATCHED, 0).figures(None, 0, 0, 10**9) == {}

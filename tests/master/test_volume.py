@@ -54,7 +54,7 @@ def test_a_hand_within_is_inside_with_every_joint(volume: Volume | None) -> None
     assert outside == 0
 
 
-def test_a_hand_that_reaches_out_is_told_joint_by_joint_and_stays_valid() -> None:
+def test_a_hand_that_reaches_out_is_reported_joint_by_joint_and_stays_valid() -> None:
     everything, _ = _poses(None)
     border = float(np.mean([pose.position_m[:, 1].mean() for pose in everything]))
     poses, outside = _poses(

@@ -101,7 +101,7 @@ def off(run: ObjectRun, pose: ObjectPose) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("which", ["wand", "cube"])
-def test_objects_of_markers_and_of_tags_are_told_where_they_are(
+def test_objects_of_markers_and_of_tags_are_found_where_they_are(
     which: str, request: pytest.FixtureRequest
 ) -> None:
     shown: ObjectRun = request.getfixturevalue(which)
@@ -205,7 +205,7 @@ def test_tags_and_poses_of_trackers_are_no_frames(cube: ObjectRun) -> None:
     assert figures.rates.camera_hz == pytest.approx({"left": 60.0, "right": 60.0}, rel=1e-3)
 
 
-def test_a_tracker_tells_where_cameras_see_nothing_and_is_silent_where_they_do(wand: ObjectRun) -> None:
+def test_a_tracker_is_used_where_cameras_see_nothing_and_not_where_they_do(wand: ObjectRun) -> None:
     setup = with_tracker(wand.setup)
     middle = wand.messages[len(wand.messages) // 2].t_ns
     frames: list[Sent] = [one if one.t_ns < middle else blind(one) for one in wand.messages]
@@ -319,7 +319,7 @@ def test_single_pictures_have_no_gestures(wand: ObjectRun) -> None:
     assert not [one for one in results_of(dispatcher, wand.messages) if isinstance(one, Gesture)]
 
 
-def test_the_same_messages_tell_the_same(cube: ObjectRun) -> None:
+def test_the_same_messages_give_the_same_results(cube: ObjectRun) -> None:
     first, second = (results_of(world_of(cube.setup), cube.messages) for _ in range(2))
     assert [type(one) for one in first] == [type(one) for one in second]
     for one, other in zip(first, second, strict=True):
@@ -328,7 +328,7 @@ def test_the_same_messages_tell_the_same(cube: ObjectRun) -> None:
             np.testing.assert_array_equal(one.cov, other.cov)
 
 
-def test_an_object_whose_time_would_go_back_is_not_told(wand: ObjectRun) -> None:
+def test_an_object_whose_time_would_go_back_is_not_published(wand: ObjectRun) -> None:
     counts: Counter[str] = Counter()
     one = TrackedObject(with_tracker(wand.setup, only=True), "wand", counts)
     T = wand.pose("wand", START_NS)

@@ -114,7 +114,7 @@ def test_the_palm_is_turned_better_with_it_and_an_unknown_heading_spoils_nothing
     assert np.mean([np.abs(e @ UP).mean() for e in trusted]) > heading_without + 3.0
 
 
-def test_a_heading_is_not_believed_of_a_sensor_that_measured_none(
+def test_a_heading_is_not_accepted_of_a_sensor_that_measured_none(
     recorded: list[Recorded], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     used = recorded[0].solved(tmp_path / "used", IMU)
@@ -157,7 +157,7 @@ def test_replay_by_command_uses_the_imu_of_the_recording(
     np.testing.assert_allclose(one.errors(tmp_path / "a"), direct, atol=1e-9)
 
 
-def test_one_of_which_nothing_is_known_is_not_used_and_that_is_told(
+def test_one_of_which_nothing_is_known_is_not_used_and_that_is_reported(
     recorded: list[Recorded], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     without = recorded[0].solved(tmp_path / "none", None)

@@ -115,7 +115,7 @@ def by_laser_alone(replay: Replay, root: Path, out: Path) -> Replay:
     return replace(replay, out=out)
 
 
-def test_natural_flexion_is_told_by_the_laser_alone_up_to_85_degrees(
+def test_natural_flexion_is_measured_by_the_laser_alone_up_to_85_degrees(
     replays: dict[str, Replay], root: Path, tmp_path: Path
 ) -> None:
     summary = by_laser_alone(replays["curl"], root, tmp_path).summary
@@ -126,7 +126,7 @@ def test_natural_flexion_is_told_by_the_laser_alone_up_to_85_degrees(
     assert summary["pip_untracked"] <= 0.1 * (truth <= np.radians(85.0)).sum()
 
 
-def test_fingers_that_laser_and_tip_reach_are_told_whatever_way_they_bend(
+def test_fingers_that_laser_and_tip_reach_are_solved_whatever_way_they_bend(
     replays: dict[str, Replay],
 ) -> None:
     summaries = [replay.summary for replay in replays.values()]
@@ -136,7 +136,7 @@ def test_fingers_that_laser_and_tip_reach_are_told_whatever_way_they_bend(
         assert np.average(error, weights=reached) < bar, finger
 
 
-def test_straight_fingers_are_told_by_their_tips(
+def test_straight_fingers_are_measured_by_their_tips(
     replays: dict[str, Replay], root: Path, tmp_path: Path
 ) -> None:
     both = replays["mcp"]

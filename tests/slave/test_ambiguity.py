@@ -99,5 +99,5 @@ def test_a_simulated_camera_is_spoiled_as_its_file_says_and_well_without(tmp_pat
         FaultyCamera(drawn, camera, path)
 
 
-def test_nothing_is_told_of_a_detector_that_is_not_there() -> None:
+def test_nothing_is_reported_of_a_detector_that_is_not_there() -> None:
     assert ambiguity_counts(None) == ambiguity_gauges(None) == {}

@@ -84,7 +84,7 @@ def test_every_frame_is_sent_with_its_times_the_empty_ones_too() -> None:
     assert (counts["frames"], counts["dropped"], counts["empty"], counts["seen.back"]) == (3, 2, 1, 2)
 
 
-def test_the_loop_ends_when_told_and_passes_a_lost_camera_on() -> None:
+def test_the_loop_ends_when_stopped_and_passes_a_lost_camera_on() -> None:
     wire, stop = Wire(), threading.Event()
     stop.set()
     run(Source([frame(0, HAND)]), DETECTOR.fresh(), wire, "left", Counters(NAMES), stop)

@@ -156,7 +156,7 @@ def stopped(frames: Moving) -> Moving:
         (mirrored, "mirror image of 'default-right'"),
     ],
 )
-def test_what_cannot_be_told_is_refused(change: Change, message: str) -> None:
+def test_what_cannot_be_distinguished_is_refused(change: Change, message: str) -> None:
     with pytest.raises(FitError, match=message):
         calibrate_moving(change(opening()).images, NAMES, BY_HAND)
 

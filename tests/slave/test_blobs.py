@@ -53,7 +53,7 @@ def test_nothing_gives_nothing_and_specks_are_capped_to_the_largest() -> None:
     assert blobs[0].area == 32.0
 
 
-def test_scattered_points_are_told_apart_and_compact_ones_are_one_blob() -> None:
+def test_scattered_points_are_distinguished_and_compact_ones_are_one_blob() -> None:
     codes = np.zeros((60, 80), np.uint8)
     codes[10:13, 10:13] = 1
     codes[10:13, 40:43] = 1

@@ -96,7 +96,7 @@ def test_a_single_marker_without_a_hand_is_found_from_30_to_23000_px() -> None:
         assert np.isnan(found.uv[[0, 2, 3, 4, 5]]).all()
 
 
-def test_what_passes_in_front_of_a_marker_moves_it_little_and_is_told() -> None:
+def test_what_passes_in_front_of_a_marker_moves_it_little_and_is_reported() -> None:
     image = render(hand())
     whole = push_all([image, image])[1]
     hidden = image.copy()
@@ -139,7 +139,7 @@ def test_a_thing_near_a_marker_never_seen_before_is_an_alternative_not_a_part_of
         assert np.hypot(*(found.alt_uv[1] - thing)) < 0.3 or np.hypot(*(found.uv[1] - thing)) < 0.3
 
 
-def test_a_piece_split_off_is_joined_in_doubt_where_the_whole_is_not_known() -> None:
+def test_a_piece_split_off_is_joined_with_more_uncertainty_where_the_whole_is_not_known() -> None:
     whole, empty = render([Disc(marker_hsv(1), 300.0, 240.0, 30.0)]), render([])
     split = whole.copy()
     split[242:258] = empty[242:258]  # something in front, across the cap

@@ -93,7 +93,7 @@ def test_a_lone_marker_of_another_shade_does_not_carry_the_light_away(single: in
     assert np.abs(against_green(drift.log_gains)).max() < 0.2
 
 
-def test_a_clipped_channel_tells_no_gain() -> None:
+def test_a_clipped_channel_measures_no_gain() -> None:
     seen = np.minimum(COLOURS * [3.0, 1.0, 1.0], 1.0)
     assert (seen[:, 0] > 0.9).sum() >= 2
     fit = fit_gains(seen, COLOURS, ONES, CALIBRATED)

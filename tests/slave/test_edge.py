@@ -57,7 +57,7 @@ def test_the_centre_of_a_covered_ellipse_is_found_from_its_own_edge(
     st.floats(0.06, 0.45),
     st.floats(0.0, 2.0 * math.pi),
 )
-def test_a_straight_edge_explains_the_way_that_it_makes_and_not_twice_as_far(
+def test_a_straight_edge_is_followed_as_far_as_its_shift_and_not_twice_as_far(
     a: float, aspect: float, rotation: float, share: float, side: float
 ) -> None:
     _, seen_u, seen_v = covered_ellipse(a, a * aspect, rotation, 24.3, 23.6, share, side)

@@ -129,7 +129,7 @@ def test_what_is_put_down_becomes_what_stands_still() -> None:
 
 
 @pytest.mark.parametrize("level", [0, 255])
-def test_a_black_or_white_picture_tells_nothing(level: int) -> None:
+def test_a_black_or_white_picture_determines_nothing(level: int) -> None:
     meter = LightMeter(*SIZE)
     meter.push(seen(desk(), np.ones(3), 0), 0)
     change = forced(meter, np.full((240, 320, 3), level, np.uint8), FRAME_NS)

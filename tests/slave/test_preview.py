@@ -229,7 +229,7 @@ def test_a_still_of_any_size_fits_into_a_message() -> None:
         assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) is not None
 
 
-def test_a_still_too_large_for_a_message_is_told_and_the_next_one_goes_out(
+def test_a_still_too_large_for_a_message_is_reported_and_the_next_one_goes_out(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     noise = np.random.default_rng(4).integers(0, 256, (3000, 4000, 3), np.uint8)

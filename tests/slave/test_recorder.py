@@ -181,7 +181,7 @@ def test_a_disk_that_stands_still_costs_frames_and_no_time(tmp_path: Path) -> No
     assert check_whole(tmp_path) == 16
 
 
-def test_what_the_camera_lost_is_told_apart_from_what_was_dropped(tmp_path: Path) -> None:
+def test_what_the_camera_lost_is_distinguished_from_what_was_dropped(tmp_path: Path) -> None:
     given = frames(10)
     done = run(tmp_path, ListCamera([*given[:3], *given[5:7], given[9]])).progress()
     assert (done.frames, done.dropped, done.lost) == (6, 0, 4)

@@ -147,7 +147,7 @@ def test_the_watchdog_of_another_process_is_not_fed(manager: Manager) -> None:
 
 
 @pytest.mark.parametrize("environment", [{}, {"NOTIFY_SOCKET": ""}, {"NOTIFY_SOCKET": "vsock:2:1"}])
-def test_on_a_terminal_nothing_is_told(environment: dict[str, str]) -> None:
+def test_on_a_terminal_nothing_is_reported(environment: dict[str, str]) -> None:
     time = Time()
     service = Service(environment | {"WATCHDOG_USEC": "1000"}, time)
     service.ready(lambda: True)

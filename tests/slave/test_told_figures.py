@@ -41,7 +41,7 @@ class Alone(Wire):
     zenoh_endpoint = None
 
 
-def test_a_slave_tells_what_the_checklist_judges(tmp_path: Path) -> None:
+def test_a_slave_reports_what_the_checklist_judges(tmp_path: Path) -> None:
     files, clock, stop = tree(tmp_path), SystemClock(), threading.Event()
     nothing = cast(Any, None)  # neither frames nor datagrams are needed to be asked
     with ThreadPoolExecutor(1) as workers:

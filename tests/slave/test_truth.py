@@ -36,7 +36,7 @@ def test_a_camera_of_which_nothing_is_known_shows_the_true_world() -> None:
     assert brighter.mean() > 1.2 * true.mean(), "the file that is believed says how it is set"
 
 
-def test_a_board_from_an_empty_tree_and_the_recording_says_what_was_believed(tmp_path: Path) -> None:
+def test_a_board_from_an_empty_tree_and_the_recording_keeps_the_assumed_calibration(tmp_path: Path) -> None:
     for part in ("cameras", "rigs"):
         (tmp_path / part).mkdir()
     save(tmp_path / "cameras/left.json", BARE)

@@ -394,7 +394,7 @@ def test_no_frame_is_lost_for_a_detector_that_takes_over() -> None:
     assert min(counts[1:]) == 6, counts
 
 
-def test_rate_margin_and_ranges_are_set_by_name_and_told(tuning: CameraTuning, knobs: Knobs) -> None:
+def test_rate_margin_and_ranges_are_set_by_name_and_reported(tuning: CameraTuning, knobs: Knobs) -> None:
     ring = '{"hsv_low": [120, 1, 2], "hsv_high": [150, 4, 5]}'
     body = f'{{"frame_rate_hz": 30, "roi_margin": 0.1, "markers": {{"ring": {ring}}}}}'
     answer = tuning.commands()["set"](body)

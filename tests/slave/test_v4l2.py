@@ -150,7 +150,7 @@ def test_a_setting_that_was_not_taken_is_named_with_wanted_and_got(name: str, to
     assert camera.closed == 1
 
 
-def test_a_camera_that_falls_back_when_the_stream_starts_is_told_again() -> None:
+def test_a_camera_that_falls_back_when_the_stream_starts_is_reported_again() -> None:
     camera = Camera(resets={"Exposure Time": 333, "Gain": 1})
     opened(camera).close()
     assert (camera.knob("Exposure Time").value, camera.knob("Gain").value) == (50, 32)

@@ -122,7 +122,7 @@ def fake(folder: Path, name: str, text: str) -> None:
     (folder / name).chmod(0o755)
 
 
-def test_a_program_is_asked_and_told_and_something_clicks(
+def test_a_program_is_asked_and_set_and_something_clicks(
     app: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "volume").write_text("37\n")

@@ -87,7 +87,7 @@ def _put(path: Path, text: str) -> None:
 
 
 @pytest.mark.parametrize(("code", "subject", "expected", "change"), CHANGES)
-def test_a_file_that_is_wrong_is_told_and_mended_it_is_not(
+def test_a_file_that_is_wrong_is_reported_and_mended_it_is_not(
     code: str, subject: str, expected: str, change: Callable[[Path], None], tree: Path, tmp_path: Path
 ) -> None:
     plan, watch = _plan(tree), FileMonitor(tree, ("desk",))

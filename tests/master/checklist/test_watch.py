@@ -303,7 +303,7 @@ def test_a_fault_shows_alone_within_two_seconds_and_is_gone_within_two(case: Cas
     assert not any(items for s, items in shown if s > WITHIN_S)
 
 
-def test_who_never_came_is_told_after_a_grace() -> None:
+def test_who_never_came_is_reported_after_a_grace() -> None:
     bench = Bench(away={"right", "imu"})
     shown = bench.seconds(8.0)
     assert not any(items for s, items in shown if s < 5.0)
@@ -320,7 +320,7 @@ def test_a_camera_that_gives_no_frames_is_absent_though_its_slave_is_there() -> 
     assert "no frame comes" in items[0].sentence
 
 
-def test_what_a_camera_that_is_away_would_also_be_is_not_told_nor_when_it_comes_back() -> None:
+def test_what_follows_from_a_missing_camera_is_not_reported_nor_when_it_comes_back() -> None:
     bench = Bench()
     bench.seconds(8.0)
     bench.away.add("left")

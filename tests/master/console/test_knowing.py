@@ -221,7 +221,7 @@ def test_pages_of_other_servers_may_link_here_and_no_more(site: str, mode: str, 
     assert (refusal("127.0.0.1:8080", None, names_of("127.0.0.1"), site, mode) is None) == passes
 
 
-def test_a_hand_is_told_in_words() -> None:
+def test_a_hand_is_described_in_words() -> None:
     assert hand_line(pose(1)) == "22 of 26 joints seen now: 4 measured, 18 solved, 4 held"
 
 

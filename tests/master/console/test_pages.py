@@ -144,7 +144,7 @@ def test_a_page_fits_laptop_and_tablet_and_follows_the_systems_colours(
         expect(page.locator(".chart canvas").first).to_be_visible(timeout=WAIT_MS)
 
 
-def test_gestures_are_told_in_words(desk: Desk, page: Page) -> None:
+def test_gestures_are_described_in_words(desk: Desk, page: Page) -> None:
     show(desk, page, "gestures")
     expect(page.get_by_text("small grasp").first).to_be_visible(timeout=WAIT_MS)
     expect(page.get_by_text("index, 12 mm")).to_be_visible(timeout=WAIT_MS)
@@ -247,7 +247,7 @@ def test_the_filter_is_tried_on_the_master_and_saved_with_its_source(desk: Desk,
     assert load(path, RigCalibration).provenance["filter"].tool == "console"
 
 
-def test_the_checklist_is_told_with_its_fix_and_counted_in_the_header(desk: Desk, page: Page) -> None:
+def test_the_checklist_is_shown_with_its_fix_and_counted_in_the_header(desk: Desk, page: Page) -> None:
     show(desk, page, "checklist")
     expect(page.get_by_text("All is well")).to_be_visible(timeout=WAIT_MS)
     desk.master.items = (CheckItem("marker_unseen", "left.index", "left has not seen index.", "Turn it."),)

@@ -179,7 +179,7 @@ def test_a_click_on_half_a_picture_is_a_pixel_of_the_whole() -> None:
     assert pixel_of(camera, (320, 240), (319.6, -2.0)) == (639.0, 0.0)
 
 
-def test_colours_that_a_camera_tells() -> None:
+def test_colours_that_a_camera_reports() -> None:
     metrics = {f"marker.index.{letter}_{end}": float(value) for letter, end, value in _PICKED_RANGES}
     health = Health("left", 1, 0, {}, {**metrics, "rate_hz": 60.0})
     assert ranges_of(health) == {"index": HsvRange(hsv_low=(170, 60, 61), hsv_high=(9, 255, 254))}

@@ -75,7 +75,7 @@ def test_values_become_the_command_line() -> None:
         arguments_of(views, {"out": "x", "views": 3})
 
 
-def test_lines_tell_how_far_it_is() -> None:
+def test_lines_show_the_progress() -> None:
     assert share_of("view 7 of 25: left and right; for left, tilt it") == 7 / 25
     assert share_of("fitting  40 %") == 0.4
     assert share_of("left: hold it still") is None

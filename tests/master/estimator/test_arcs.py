@@ -106,7 +106,7 @@ def about_the_back(hand: FittedHand) -> Float:
     return follow @ cov @ follow.T
 
 
-def test_a_palm_turns_on_arcs_about_the_marker_on_its_back() -> None:
+def test_an_uncertain_palm_rotation_widens_joints_around_the_marker_on_its_back() -> None:
     hand = solution()
     cov = about_the_back(hand)
     step = np.random.default_rng(1).multivariate_normal(np.zeros(len(cov)), cov, DRAWS)
@@ -137,6 +137,6 @@ def test_tips_that_are_seen_stay_where_they_are() -> None:
     assert (far > 9.0 * seen).all()
 
 
-def test_a_hand_that_is_sure_has_no_arcs() -> None:
+def test_a_sure_hand_has_no_second_order_covariance() -> None:
     hand = solution()
     assert not arcs(hand, unsure(hand, 0.01, 0.01), np.ones(6, bool)).any()

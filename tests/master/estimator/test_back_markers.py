@@ -51,6 +51,6 @@ def test_order_and_number_of_those_on_the_back_do_not_matter() -> None:
     assert three.mean() < palm_errors_deg("right", (*MARKERS, "back3")).mean()
 
 
-def test_an_imu_tells_it_with_one_marker_and_adds_to_three() -> None:
+def test_an_imu_determines_it_with_one_marker_and_adds_to_three() -> None:
     assert palm_errors_deg("right", MARKERS, imu=True).mean() < 0.6 * palm_errors_deg("right", MARKERS).mean()
     assert palm_errors_deg("right", EIGHT, imu=True).mean() < palm_errors_deg("right", EIGHT).mean()

@@ -43,13 +43,13 @@ def test_a_pose_that_is_held_makes_its_directions_no_surer(dt_s: float) -> None:
     np.testing.assert_allclose(tilt_deg(hand), tilt_deg(first), rtol=0.15)
 
 
-def test_a_hand_against_habits_is_less_sure_than_a_relaxed_one() -> None:
+def test_a_hand_against_the_posture_prior_is_less_sure_than_a_relaxed_one() -> None:
     relaxed, odd = tilt_deg(solved(NATURAL)), tilt_deg(solved(UNNATURAL))
     assert (relaxed < 17.0).all()
     assert np.median(odd / relaxed) > 1.5
 
 
-def test_beliefs_that_contradict_each_other_are_no_news_of_the_instant() -> None:
+def test_priors_that_contradict_each_other_are_no_information_about_the_epoch() -> None:
     """A finger out of sight is believed curled, and its neighbours alike: counted as misfit, that gives 3 and more."""
     all_seen, ratio = tilt_deg(solved(NATURAL)), list[Float]()
     for gone in range(5):

@@ -121,7 +121,7 @@ def test_covariances_are_positive_definite_whatever_is_seen() -> None:
             assert value.max() < 1.0
 
 
-def test_what_moves_on_an_arc_is_as_wide_as_drawn_hands_are() -> None:
+def test_second_order_covariance_is_as_wide_as_drawn_hands_are() -> None:
     """A hidden finger's tip, its angles drawn from what is claimed of them, strays as its covariance says."""
     machine, hidden = estimator(), np.zeros((6, 1), bool)
     points = places(palm(), natural_angles(np.random.default_rng(3)))

@@ -102,7 +102,7 @@ def test_two_steps_are_one(first_s: float, second_s: float, seed: int) -> None:
     np.testing.assert_allclose(twice.cov, once.cov, atol=1e-9)
 
 
-def test_doubt_ends_at_what_is_usual_and_the_heading_walks_on() -> None:
+def test_covariance_ends_at_the_stationary_one_and_the_heading_keeps_drifting() -> None:
     mean, cov = drawn(1)
     far = Extras().set(mean, cov)
     for _ in range(100):
@@ -145,7 +145,7 @@ def test_a_posture_that_is_kept_is_learnt() -> None:
     assert abs(extras.state.habit[1]) < 1e-9
 
 
-def test_what_is_believed_is_the_inverse_of_the_covariance() -> None:
+def test_the_prior_information_is_the_inverse_of_the_covariance() -> None:
     mean, cov = drawn(3)
     extras = Extras().set(mean, cov).after(0.1, 1e-4)
     np.testing.assert_allclose(extras.belief.z, extras.mean, rtol=1e-12)

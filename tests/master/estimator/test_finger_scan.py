@@ -58,7 +58,7 @@ def on_valley(wrist_case: WristCase, scan: Scan, f: int, pip: float) -> Float:
 @pytest.mark.parametrize(
     ("mcp", "pip"), [(10.0, 5.0), (20.0, 40.0), (45.0, 30.0), (30.0, 75.0), (45.0, 62.0)]
 )
-def test_the_valley_leads_through_the_pose_that_is_shown(
+def test_the_profile_passes_through_the_true_pose(
     wrist_case: WristCase, mcp: float, pip: float
 ) -> None:
     angles = bent(mcp, pip)
@@ -70,7 +70,7 @@ def test_the_valley_leads_through_the_pose_that_is_shown(
         np.testing.assert_allclose(off[[0, DIP]], 0.0, atol=3.0)
 
 
-def test_of_random_poses_every_one_is_on_its_valley(wrist_case: WristCase) -> None:
+def test_of_random_poses_every_one_is_on_its_profile(wrist_case: WristCase) -> None:
     rng, asked, lost = np.random.default_rng(23), 0, 0
     for _ in range(15):
         angles = wrist_case.setup.model.clamp(bent(*rng.uniform([0.0, 0.0], [60.0, 80.0])))
@@ -90,7 +90,7 @@ def test_a_sharper_tip_makes_a_narrower_density(wrist_case: WristCase) -> None:
     assert (narrow.pip2[1:] < wide.pip2[1:]).all()
 
 
-def test_all_fingers_tell_which_hand_it_is(wrist_case: WristCase) -> None:
+def test_all_fingers_decide_which_hand_it_is(wrist_case: WristCase) -> None:
     assert scanned(wrist_case, natural(60.0)).share[NATURAL] > 0.85
     assert scanned(wrist_case, bent(60.0, 3.0)).share[STRAIGHT] > 0.5
     assert scanned(wrist_case, bent(70.0, 45.0)).share[FREE] > 0.5
@@ -99,13 +99,13 @@ def test_all_fingers_tell_which_hand_it_is(wrist_case: WristCase) -> None:
         np.testing.assert_array_equal(scanned(wrist_case, angles, "fk").share, [1.0, 0.0, 0.0])
 
 
-def test_a_finger_of_which_the_laser_alone_tells_has_no_say(wrist_case: WristCase) -> None:
+def test_a_finger_measured_only_by_the_laser_has_no_weight(wrist_case: WristCase) -> None:
     line = pipeline(wrist_case, "auto")
     pushed(line, wrist_case.message(natural(60.0), tips=False))
     np.testing.assert_allclose(scan_of(line).share, [0.8, 0.1, 0.1], atol=1e-9)
 
 
-def test_what_is_chosen_lies_on_the_valley_and_its_spread_is_that_of_the_density(
+def test_the_estimate_lies_on_the_profile_and_its_spread_is_that_of_the_density(
     wrist_case: WristCase,
 ) -> None:
     for angles in (natural(50.0), bent(30.0, 60.0), bent(60.0, 5.0)):

@@ -158,7 +158,7 @@ def test_heading_and_bend_are_learnt_from_palms(root: Path) -> None:
         assert wrist_case.wrist_sigma_deg.max() < 5.0
 
 
-def test_one_palm_tells_the_sum_of_heading_and_a_bend_whose_axis_is_upright_and_neither_alone(
+def test_one_palm_determines_the_sum_of_heading_and_a_wrist_angle_about_the_vertical_and_neither_alone(
     root: Path,
 ) -> None:
     """Deviation, about the palm's y, is upright."""
@@ -198,7 +198,7 @@ def test_a_heading_that_the_file_knows_is_there_at_once(root: Path) -> None:
     assert degrees(orientation.rotation, arm.forearm(48)) < 4.0
 
 
-def test_a_palm_that_is_hidden_is_turned_as_the_forearm_is_and_doubted_more_and_more(root: Path) -> None:
+def test_an_unobserved_palm_rotates_with_the_forearm_and_its_covariance_grows(root: Path) -> None:
     arm, wrist_case = Arm(), WristCase.of(root)
     wrist_case.played(arm, range(0, 6_000))
     spread: list[float] = []
@@ -215,7 +215,7 @@ def test_a_palm_that_is_hidden_is_turned_as_the_forearm_is_and_doubted_more_and_
     assert off_deg < 50.0
 
 
-def test_without_markers_the_bend_is_believed_less_and_less_and_the_heading_stays(root: Path) -> None:
+def test_without_markers_the_wrist_angles_lose_certainty_and_the_heading_stays(root: Path) -> None:
     arm, wrist_case = Arm(), WristCase.of(root)
     wrist_case.played(arm, range(0, 8_000))
     learnt = wrist_case.heading_rad

@@ -81,14 +81,14 @@ def test_nothing_leaps_when_the_cameras_go_or_come_back(cut: Solved) -> None:
     assert cut.poses.tracked[cut.t_s > SECONDS - 0.15].mean() > 0.6
 
 
-def test_a_palm_that_nobody_sees_is_doubted_more_and_more(cut: Solved) -> None:
+def test_the_covariance_of_an_unobserved_palm_grows(cut: Solved) -> None:
     at = away(cut)
     spread = np.sqrt(np.trace(cut.poses.cov_m2[at][:, 1], axis1=1, axis2=2))
     assert (np.diff(spread) > 0.0).all()
     assert (np.linalg.eigvalsh(cut.poses.cov_m2[at][:, 1]) > 0.0).all()
 
 
-def test_bend_and_turn_of_the_palm_are_told_with_their_doubt(seen: Seen, whole: Solved) -> None:
+def test_wrist_angles_and_rotation_of_the_palm_are_published_with_their_uncertainty(seen: Seen, whole: Solved) -> None:
     truth = np.array([seen[0].scene.motion.at(t).wrist_angles_rad for t in whole.t_s.tolist()])
     off = np.abs(whole.poses.wrist_angles_rad - truth)
     assert np.isfinite(whole.poses.wrist_angles_sigma_rad).all()
@@ -163,7 +163,7 @@ def test_the_same_messages_make_the_same_poses(seen: Seen) -> None:
         np.testing.assert_array_equal(a.cov_m2, b.cov_m2)
 
 
-def test_levels_are_told_with_the_poses(whole: Solved) -> None:
+def test_levels_are_published_with_the_poses(whole: Solved) -> None:
     levels = whole.poses.solver_mode[whole.t_s > 1.2]
     assert (levels[:, 1:] > 0).mean() > 0.8
     assert (levels[:, 1:] == SolverMode.IK).any()

@@ -62,7 +62,7 @@ def near(point: Float, spread_m: float = 0.02) -> Spot:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_the_other_camera_tells_a_thing_from_the_marker(seed: int) -> None:
+def test_the_other_camera_distinguishes_a_thing_from_the_marker(seed: int) -> None:
     """The left slave takes the mug, the right one is sure: the mug is not on the marker's epipolar line."""
     first, second = seen(PAIR, MUG, MARKER, seed=seed), seen(PAIR, MARKER, None, seed=seed + 100)
     chosen = choose(PAIR, first, second)
@@ -73,7 +73,7 @@ def test_the_other_camera_tells_a_thing_from_the_marker(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_the_slaves_are_believed_where_their_choice_fits(seed: int) -> None:
+def test_the_slaves_are_followed_where_their_association_fits(seed: int) -> None:
     first, second = seen(PAIR, MARKER, MARKER, seed=seed), seen(PAIR, MUG, MUG, seed=seed + 100)
     for alternatives in (second, seen(PAIR, None, MUG), seen(PAIR, IN_ROW, None), seen(PAIR, IN_ROW, IN_ROW)):
         chosen = choose(PAIR, first, alternatives)
@@ -158,7 +158,7 @@ def test_other_markers_are_passed_on_untouched() -> None:
     assert chosen.taken.tolist() == [True, False, False]
 
 
-def test_many_cameras_in_doubt_are_chosen_from_the_first_five_and_the_rest() -> None:
+def test_many_cameras_with_alternatives_are_associated_from_the_first_five_and_the_rest() -> None:
     names = tuple(f"c{k}" for k in range(9))
     cameras = tuple(camera_models(rig_file(names)).values())
     first = seen(cameras, *[MUG] * 7, MARKER, MARKER)

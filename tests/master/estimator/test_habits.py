@@ -63,7 +63,7 @@ def solved(
 # -- natural or free --------------------------------------------------------------------------------------------
 
 
-def test_markers_tell_a_free_hand_from_a_natural_one() -> None:
+def test_markers_distinguish_a_free_hand_from_a_natural_one() -> None:
     rng = np.random.default_rng(5)
     free, natural = list[float](), list[float]()
     for _ in range(40):
@@ -99,7 +99,7 @@ def test_without_the_free_hypothesis_every_hand_is_natural() -> None:
 
 @given(seeds)
 @settings(max_examples=30)
-def test_a_mean_of_two_hands_explains_the_markers_as_well_as_each(seed: int) -> None:
+def test_a_mean_of_two_hands_fits_the_markers_as_well_as_each(seed: int) -> None:
     """Fingers move on arcs: what lies between two hands that fit would be off by millimetres."""
     rng = np.random.default_rng(seed)
     T, angles, noise = palm(rng.uniform(-45, 45, 3)), natural_angles(rng), rng.normal(0.0, SIGMA_M, (6, 3))
@@ -122,7 +122,7 @@ def test_the_evidence_of_frames_is_joined_in_time() -> None:
     assert np.mean(joined[20:]) > 0.8
 
 
-def test_a_hand_that_leaves_its_habits_is_believed_free_within_a_second() -> None:
+def test_a_hand_that_leaves_the_posture_prior_gets_the_free_component_within_a_second() -> None:
     """A relaxed hand, then one that points with two fingers apart; and back."""
     rng, machine, natural = np.random.default_rng(9), estimator(), list[float]()
     odd = np.zeros((5, 4))

@@ -68,7 +68,7 @@ def expecting(model: HandModel) -> tuple[Float, Estimator]:
 @pytest.mark.parametrize("model", [RIGHT, LEFT], ids=["right", "left"])
 @given(seeds)
 @settings(max_examples=30)
-def test_a_hand_that_obeys_habits_is_found_exactly_in_any_orientation(model: HandModel, seed: int) -> None:
+def test_a_hand_at_the_posture_prior_is_found_exactly_in_any_orientation(model: HandModel, seed: int) -> None:
     angles, machine = expecting(model)
     rng = np.random.default_rng(seed)
     T = rigid(any_rotation(rng), rng.normal(0.0, 0.5, 3))
@@ -114,7 +114,7 @@ def test_a_missing_marker_costs_its_own_finger_only(gone: int) -> None:
     assert tips[np.arange(5) != gone].max() < 6.0
 
 
-def test_an_unseen_finger_is_believed_curled_and_not_flat() -> None:
+def test_an_unseen_finger_is_estimated_curled_and_not_flat() -> None:
     points = places(palm(), np.zeros((5, 4)))
     points[2] = np.nan
     assert np.degrees(found(fit(points, small_cov())).angles_rad[2, 2]) > 60.0
@@ -320,7 +320,7 @@ def test_covariances_of_joints_and_directions_are_those_of_numpy() -> None:
 @pytest.mark.parametrize("rotated_deg", [0.0, 20.0, 120.0, 180.0])
 @given(seeds)
 @settings(max_examples=8)
-def test_where_a_search_begins_does_not_tell_where_it_ends(rotated_deg: float, seed: int) -> None:
+def test_where_a_search_begins_does_not_decide_where_it_ends(rotated_deg: float, seed: int) -> None:
     """Nothing of a hand that may be near is believed: one that is not near leads to the same markers."""
     rng = np.random.default_rng(seed)
     T, cov = palm(), small_cov()
@@ -350,7 +350,7 @@ def test_a_first_frame_is_found_from_several_starts_open_to_closed(posture_deg: 
         assert not hand.reinitialised
 
 
-def test_a_first_frame_begins_from_the_line_s_hand_where_that_explains_it() -> None:
+def test_a_first_frame_begins_from_the_pipelines_hand_where_that_fits() -> None:
     points = places(palm(), natural_angles(np.random.default_rng(7)))
     reinitialise = found(fit(points, small_cov()))
     begun = found(fit(points, small_cov(), start=reinitialise))

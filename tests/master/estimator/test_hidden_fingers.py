@@ -98,7 +98,7 @@ def test_one_at_the_side_follows_less_and_the_thumb_not_at_all() -> None:
     np.testing.assert_array_equal(last.angles_rad[0], np.zeros(4))
 
 
-def test_a_hand_that_defies_habits_moves_its_fingers_one_by_one() -> None:
+def test_a_hand_against_the_posture_prior_moves_its_fingers_one_by_one() -> None:
     closing = [np.array([p, p, 40.0, p]) for p in np.linspace(40.0, 80.0, 30)]
     natural, free = (after(frozenset({RING}), closing, natural=p)[-1] for p in (1.0, 0.0))
     assert pip_deg(free) == pytest.approx(40.0)
@@ -155,7 +155,7 @@ def test_an_epoch_that_is_fitted_twice_still_knows_when_a_finger_was_seen_last()
     assert memory.state.hidden_ns[RING] == 0
 
 
-def test_nothing_that_is_believed_leaves_the_limits() -> None:
+def test_no_estimate_leaves_the_limits() -> None:
     closing = [np.array([p, p, 40.0, p]) for p in np.linspace(40.0, 110.0, 40)]
     for hidden in after(frozenset({RING, 0}), closing, (30.0, 40.0)):
         assert within(RIGHT, hidden.angles_rad)

@@ -208,7 +208,7 @@ def test_the_gradient_of_each_kind_of_row_is_the_derivative_of_its_cost(
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_the_gradient_of_habits_is_the_derivative_of_their_cost(name: str) -> None:
+def test_the_gradient_of_the_posture_prior_is_the_derivative_of_its_cost(name: str) -> None:
     for seed in range(6):
         Whole(MODELS[name], seed).check(1e-5)
 

@@ -101,7 +101,7 @@ def test_a_hand_that_is_lost_goes_on_a_little_and_stays_inside_its_limits(speed:
     assert history[-1] - history[0] < 0.12 * speed + 12.0
 
 
-def test_doubt_grows_while_a_finger_is_lost() -> None:
+def test_covariance_grows_while_a_finger_is_lost() -> None:
     machine = estimator()
     seen = run(machine, range(15))[-1]
     lost = run(machine, range(15, 45), gone=(MARKER_INDEX,), speed_deg_s=60.0)
@@ -111,7 +111,7 @@ def test_doubt_grows_while_a_finger_is_lost() -> None:
 
 
 @pytest.mark.parametrize("gap", [3, 10, 25])
-def test_a_returning_marker_is_believed_at_once(gap: int) -> None:
+def test_a_returning_marker_is_accepted_at_once(gap: int) -> None:
     machine = estimator()
     run(machine, range(10), speed_deg_s=60.0)
     held = run(machine, range(10, 10 + gap), gone=(MARKER_INDEX,), speed_deg_s=60.0)[-1]
@@ -163,7 +163,7 @@ def test_a_hand_that_nobody_sees_is_held_half_a_second_and_then_not_valid() -> N
 @pytest.mark.parametrize(
     ("seen", "palm"), [((5,), False), ((1,), False), ((1, 2), False), ((1, 5), True), ((0, 2, 4), True)]
 )
-def test_a_palm_is_tracked_only_where_markers_tell_its_turn_as_well(
+def test_a_palm_is_tracked_only_where_markers_constrain_its_rotation_as_well(
     seen: tuple[int, ...], palm: bool
 ) -> None:
     machine = estimator()
@@ -203,7 +203,7 @@ def test_what_was_measured_of_another_hand_tracks_no_finger(continuous: bool) ->
     np.testing.assert_array_equal(hand.tracked, alone.tracked)
 
 
-def test_a_finger_that_was_never_seen_is_held_by_habits_and_not_tracked() -> None:
+def test_a_finger_never_seen_is_held_by_the_posture_prior_and_not_tracked() -> None:
     hand = push(estimator(continuous=False), 0, bent_points(bent(0.1), (2,)))
     assert hand.valid.all()
     assert (hand.source[CHAINS[2]] == Source.HELD).all()
@@ -319,7 +319,7 @@ def test_a_leap_of_markers_that_are_no_hand_by_themselves_leaves_no_gap(shown: t
 
 
 @pytest.mark.parametrize(("heading_rad", "is_sure"), [(0.03, True), (10.0, False)])
-def test_an_orientation_without_heading_does_not_tell_the_palm_by_one_finger(
+def test_an_orientation_without_heading_does_not_determine_the_palm_by_one_finger(
     heading_rad: float, is_sure: bool
 ) -> None:
     machine, up = estimator(), np.array([0.0, -1.0, 0.0])
@@ -411,7 +411,7 @@ def test_a_hand_that_moves_on_is_not_begun_anew() -> None:
         assert not push(machine, k * STEP_NS, points, start=line).reinitialised
 
 
-def test_a_hand_of_habits_begins_anew_by_itself_where_the_last_does_not_explain_a_leap() -> None:
+def test_a_hand_by_the_posture_prior_is_reinitialised_where_the_last_does_not_fit_a_leap() -> None:
     machine, angles = estimator(natural=True), natural_angles(np.random.default_rng(4))
     push(machine, 0, places(palm(), angles))
     there = palm(np.array([5.0, 5.0, 120.0]), np.array([0.1, 0.0, 0.65]))

@@ -120,7 +120,7 @@ THING = np.array([0.05, -0.05, 0.6])  # about 10 cm from the finger
 OUT_OF_REACH = np.array([0.25, -0.12, 0.6])
 
 
-def test_a_thing_that_one_slave_takes_for_a_marker_is_told_by_the_other_camera(
+def test_a_thing_that_one_slave_takes_for_a_marker_is_rejected_by_the_other_camera(
     exact_run: SyntheticRun,
 ) -> None:
     clear = solve_all(build_pipeline(exact_run.setup, StageTimes()), exact_run.messages)
@@ -137,7 +137,7 @@ def test_a_thing_that_one_slave_takes_for_a_marker_is_told_by_the_other_camera(
     assert sure.counts["apart.index"] >= 18
 
 
-def test_a_law_of_disparity_tells_a_thing_by_the_difference_of_rows() -> None:
+def test_a_law_of_disparity_rejects_a_thing_by_the_difference_of_rows() -> None:
     run = synthetic_run(30, depth_model="power_law", power_law=PowerLawCalibration(k_m=37.5, z=-1.0))
     pipeline = build_pipeline(run.setup, StageTimes())
     poses = solve_all(pipeline, mistaken(run, OUT_OF_REACH, ("right",), doubt=True))
@@ -148,7 +148,7 @@ def test_a_law_of_disparity_tells_a_thing_by_the_difference_of_rows() -> None:
     assert sure.counts["apart.index"] >= 8
 
 
-def test_a_thing_that_both_slaves_take_for_a_marker_is_told_by_where_the_hand_is(
+def test_a_thing_that_both_slaves_take_for_a_marker_is_rejected_by_where_the_hand_is(
     exact_run: SyntheticRun,
 ) -> None:
     pipeline = build_pipeline(exact_run.setup, StageTimes())

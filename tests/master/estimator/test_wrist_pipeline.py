@@ -207,7 +207,7 @@ def test_a_tip_that_contradicts_the_laser_is_refused_and_counted(wrist_case: Wri
     assert abs(np.degrees(pose.angles_rad[2, PIP]) - 60.0) < 25.0  # by the laser alone
 
 
-def test_a_laser_point_that_no_finger_explains_is_off_and_counted(wrist_case: WristCase) -> None:
+def test_a_laser_point_that_fits_no_finger_is_rejected_and_counted(wrist_case: WristCase) -> None:
     """As of a neighbour's, or of a thing in the hand."""
     laser, tip = pixels(wrist_case, natural(5.0))
     laser[1] += [150.0, 0.0]
@@ -220,7 +220,7 @@ def test_a_laser_point_that_no_finger_explains_is_off_and_counted(wrist_case: Wr
     np.testing.assert_allclose(np.degrees(pose.angles_rad[2:, PIP]), 5.0, atol=2.0)
 
 
-def test_of_twins_the_doubt_holds_both(wrist_case: WristCase) -> None:
+def test_of_two_equal_solutions_the_covariance_holds_both(wrist_case: WristCase) -> None:
     """Poses of which a little finger's tip lies elsewhere as well, found by search, not by hand."""
     found = 0
     for mcp in (24.0, 27.0, 30.0, 35.0):
@@ -238,7 +238,7 @@ def test_of_twins_the_doubt_holds_both(wrist_case: WristCase) -> None:
     assert found > 0
 
 
-def test_one_hand_that_defies_habit_takes_fk_its_belief(wrist_case: WristCase) -> None:
+def test_one_hand_against_the_posture_prior_shifts_the_learnt_coupling_of_fk(wrist_case: WristCase) -> None:
     """Knuckles alone are bent: the finger whose tip is not seen is told by neither curve nor tip."""
     angles = bent(80.0, 2.0)
     pose, by_habit = (
@@ -361,7 +361,7 @@ def test_a_palm_that_the_laser_passes_by_is_refused(wrist_case: WristCase) -> No
 # -- memory ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_finger_that_is_lost_is_held_for_half_a_second_with_growing_doubt(wrist_case: WristCase) -> None:
+def test_a_lost_finger_is_held_for_half_a_second_with_growing_covariance(wrist_case: WristCase) -> None:
     line = Line(wrist_case, "fk", continuous=True)
     laser, _ = pixels(wrist_case, natural(5.0))
     first = line.takes(laser)

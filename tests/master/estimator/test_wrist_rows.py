@@ -144,7 +144,7 @@ def test_rows_that_are_not_seen_say_nothing(wrist_case: WristCase) -> None:
 
 
 @pytest.mark.parametrize("teaches", [True, False])
-def test_a_finger_tells_its_own_angles_and_twist_and_the_bend(wrist_case: WristCase, teaches: bool) -> None:
+def test_a_finger_constrains_its_own_angles_and_twist_and_the_wrist_angles(wrist_case: WristCase, teaches: bool) -> None:
     """One that is in doubt teaches nothing of its hinges."""
     whole, seen = hand(wrist_case, 2)
     tip_depth(whole, seen, 0.3)
@@ -161,7 +161,7 @@ def test_a_finger_tells_its_own_angles_and_twist_and_the_bend(wrist_case: WristC
     assert (extras + 2 in moved) == teaches
 
 
-def test_tilt_and_heading_away_from_the_believed_turn_the_palm(wrist_case: WristCase) -> None:
+def test_tilt_and_heading_away_from_the_prior_rotate_the_palm(wrist_case: WristCase) -> None:
     """To second order: of a few degrees the cost's slope is right to a few percent."""
     for seed in range(4):
         whole, seen = hand(wrist_case, seed)

@@ -81,7 +81,7 @@ def test_a_row_says_what_the_pose_says_and_is_empty_where_nothing_was_observed(t
     assert first["wrist_flexion_rad"] == ""
 
 
-def test_all_that_a_run_told_has_its_table(tmp_path: Path) -> None:
+def test_every_result_of_a_run_has_its_table(tmp_path: Path) -> None:
     source = run_of(tmp_path, poses_of(1, 1), with_results=True)
     names = exported(source, Wanted("csv", tmp_path / "tables" / "wave.csv"))
     assert names == [
@@ -166,7 +166,7 @@ def test_the_page_names_every_column(tmp_path: Path, root: Path) -> None:
         assert {one.name for one in columns} <= words
 
 
-def test_every_field_of_what_is_told_has_a_column(tmp_path: Path) -> None:
+def test_every_field_of_a_result_has_a_column(tmp_path: Path) -> None:
     _, cup, touch, pinch = (" ".join(one.name for one in columns) for columns in all_columns(tmp_path))
     for kind, shown, other in (
         (ObjectPose, cup, {"object", "position_m", "orientation_wxyz", "cov"}),

@@ -206,14 +206,14 @@ def test_noise_gives_the_distribution_the_limit_is_made_of(rig: Rig, degrees: in
     assert not found.outliers.any()
 
 
-def test_a_camera_that_sees_something_else_is_told_from_noise() -> None:
+def test_a_camera_that_sees_something_else_is_distinguished_from_noise() -> None:
     uv = _project(LEVEL, np.tile([0.02, 0.01, 0.5], (3, 1)))
     uv[1, :, 1] += [0.0, 5.0, 7.0]  # limit: 4.9 sqrt(2 (0.1^2 + 0.85^2)) = 5.9 px
     assert LEVEL.triangulate(uv).outliers.tolist() == [False, False, True]
     assert not LEVEL.triangulate(uv, 2.0).outliers.any()
 
 
-def test_a_marker_of_one_camera_has_neither_point_nor_misfit_and_is_not_apart() -> None:
+def test_a_marker_of_one_camera_has_neither_point_nor_residual_and_is_no_outlier() -> None:
     uv = np.full((2, 1, 2), np.nan)
     uv[0, 0] = 320.0, 240.0
     found = LEVEL.triangulate(uv, np.where(np.isnan(uv[..., 0]), np.nan, 0.1))

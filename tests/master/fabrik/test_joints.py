@@ -158,7 +158,7 @@ def test_rotor_and_hand_model_narrow_by_one_law(flexion: float, left: float) -> 
 
 
 @given(flexion=st.floats(0.01, 1.5), left=st.floats(0.0, 1.0))
-def test_the_slope_of_the_narrowing(flexion: float, left: float) -> None:
+def test_the_derivative_of_the_narrowing(flexion: float, left: float) -> None:
     rotor = Rotor((-0.3, 0.3), (0.0, 1.6), spread_at_full_flexion=left)
     step = 1e-6
     above, below = rotor.narrowing(flexion + step)[0], rotor.narrowing(flexion - step)[0]

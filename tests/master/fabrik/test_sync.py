@@ -302,7 +302,7 @@ def test_what_waited_for_a_partner_while_nothing_came_is_left_out(pause: int, ke
     assert machine.stale == (not kept)
 
 
-def test_a_whole_pair_before_a_pause_is_told_whenever_it_is_complete() -> None:
+def test_a_whole_pair_before_a_pause_is_solved_whenever_it_is_complete() -> None:
     machine = sync()
     times = [0, 1, 400, 401, 800]
     found = push_all(

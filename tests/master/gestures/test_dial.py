@@ -112,7 +112,7 @@ def test_one_bad_instant_in_a_quick_turn_is_led_over() -> None:
     assert gestures[46] == pytest.approx(42.0, abs=0.1)
 
 
-def test_a_palm_that_is_in_doubt_does_not_delay_a_grip_whose_tips_stand_still() -> None:
+def test_an_uncertain_palm_does_not_delay_a_grip_whose_tips_stand_still() -> None:
     def doubted(k: int) -> HandPose:
         pose = _pose(k, 0.0, 0.0)
         if k % 3:

@@ -36,7 +36,7 @@ def test_a_finger_bent_back_has_a_negative_bend() -> None:
 
 
 @pytest.mark.parametrize("name", [POINT, PINCH])
-def test_nothing_that_is_told_depends_on_where_the_hand_is(name: str) -> None:
+def test_no_feature_depends_on_where_the_hand_is(name: str) -> None:
     rng = np.random.default_rng(3)
     here = of(shown(posture(name)))
     for _ in range(5):
@@ -46,7 +46,7 @@ def test_nothing_that_is_told_depends_on_where_the_hand_is(name: str) -> None:
         np.testing.assert_allclose(there.T_rig_palm, T, atol=1e-9)
 
 
-def test_left_hands_tell_what_right_hands_tell() -> None:
+def test_left_hands_make_the_gestures_of_right_hands() -> None:
     right, left = of(shown(posture(PINCH))), of(shown(posture(PINCH, model=LEFT), model=LEFT), LEFT)
     np.testing.assert_allclose(Quantities.of(left).value, Quantities.of(right).value, atol=1e-6)
 
@@ -56,7 +56,7 @@ def test_a_pad_is_on_the_palmar_side_as_far_from_the_bone_as_the_surface() -> No
     assert (features.pads_m[1:, 1] < features.tips_m[1:, 1] - 0.8 * features.radius_m[1:]).all()
 
 
-def test_doubt_and_hiding_are_told_per_finger() -> None:
+def test_uncertainty_and_occlusion_are_reported_per_finger() -> None:
     sigma = np.array([1e-3, 0.5 * KNOWN_SIGMA_M, 2.0 * KNOWN_SIGMA_M, np.nan, 1e-3])
     seen = np.array([True, True, False, False, True])
     features = of(shown(posture(POINT), sigma_m=sigma, tracked=seen))

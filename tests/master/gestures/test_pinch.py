@@ -60,7 +60,7 @@ def test_where_the_others_are_away_no_bend_is_asked_for() -> None:
     assert recognised_in((3.0, 60.0, 70.0, 80.0), apart_deg=150.0, doubt_deg=60.0) == ["index"]
 
 
-def test_a_closing_fist_whose_bends_are_doubtful_is_withheld() -> None:
+def test_a_closing_fist_whose_bends_are_uncertain_is_withheld() -> None:
     # The thumb comes over the index finger, the others follow at a finger's breadth each.
     fist = (6.0, 13.0, 32.0, 52.0)
     assert recognised_in(fist, apart_deg=80.0, doubt_deg=5.0) == ["index"]

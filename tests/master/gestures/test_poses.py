@@ -43,7 +43,7 @@ def play(
 
 @pytest.mark.parametrize("model", [RIGHT, LEFT])
 @pytest.mark.parametrize("name", POSES)
-def test_each_study_pose_is_told_from_the_third_frame_on(name: str, model: HandModel) -> None:
+def test_each_study_pose_is_recognised_from_the_third_frame_on(name: str, model: HandModel) -> None:
     held, said = play([posture(name, model=model)] * 6, model)
     assert held == [None, None, name, name, name, name]
     assert [one.phase for one in said] == ["begin", "update", "update", "update"]
@@ -90,7 +90,7 @@ def test_an_end_is_said_once_and_before_the_next_begin() -> None:
     assert phases == [(OPEN, "begin"), (OPEN, "end"), (POINT, "begin")]
 
 
-def test_doubt_at_the_border_flickers_neither_on_nor_off() -> None:
+def test_uncertainty_at_the_border_flickers_neither_on_nor_off() -> None:
     rng = np.random.default_rng(7)
     border = np.zeros((5, 3))
     border[1:, 1:] = [4.0, 4.5]  # all fingers a little bent: between open palm and none
@@ -124,13 +124,13 @@ def test_a_pose_of_known_fingers_begins_where_no_sensor_sees_a_tip_just_now() ->
         assert [one.name for one in begun if one.phase == "begin"] == said
 
 
-def test_pointing_is_told_with_the_three_bent_fingers_hidden() -> None:
+def test_pointing_is_recognised_with_the_three_bent_fingers_hidden() -> None:
     # What cameras see from behind a pointing hand: thumb and index.
     doubt = np.array([1e-3, 1e-3, 0.05, 0.05, 0.05])
     assert play([posture(POINT)] * 30, sigma_m=doubt, tracked=np.arange(5) < 2)[0][-1] == POINT
 
 
-def test_an_open_palm_is_told_without_its_thumb() -> None:
+def test_an_open_palm_is_recognised_without_its_thumb() -> None:
     # A device at the wrist does not see it.
     doubt = np.array([0.05, 2e-3, 2e-3, 2e-3, 2e-3])
     assert play([posture(OPEN)] * 4, sigma_m=doubt, tracked=np.arange(5) > 0)[0][-1] == OPEN

@@ -63,7 +63,7 @@ def recognised_in(pose: Callable[[int], HandPose], frames: int = 80, settings: T
 
 @pytest.mark.parametrize("finger", range(1, 5))
 @pytest.mark.parametrize("column", range(3))
-def test_each_of_twelve_keys_is_told_by_its_name_as_the_thumb_leaves(finger: int, column: int) -> None:
+def test_each_of_twelve_keys_is_reported_by_its_name_as_the_thumb_leaves(finger: int, column: int) -> None:
     place = [(finger, 2 - column)]
     gestures = recognised_in(lambda k: over(k, place, gap_at(k)))
     assert [(one.kind, one.name, one.phase) for one in gestures] == [
@@ -77,7 +77,7 @@ def test_each_of_twelve_keys_is_told_by_its_name_as_the_thumb_leaves(finger: int
     assert float(np.linalg.norm(gestures[0].origin_m - segment)) < 0.02
 
 
-def test_taps_one_after_another_are_all_told() -> None:
+def test_taps_one_after_another_are_all_reported() -> None:
     def pose(k: int) -> HandPose:
         which = [(1, 2), (2, 1), (4, 0)][min(k // 50, 2)]
         return over(k, [which], gap_at(k % 50))
@@ -100,7 +100,7 @@ def test_a_thumb_taps_nothing_where(why: str, pose: Callable[[int], HandPose]) -
     assert not recognised_in(pose, 240), why
 
 
-def test_two_fingers_that_are_too_alike_in_their_gaps_tell_nothing() -> None:
+def test_two_fingers_too_alike_in_their_gaps_determine_nothing() -> None:
     # Fingers lie side by side, some 20 mm apart: no touch is nearer to one of them by three times that.
     assert recognised_in(lambda k: over(k, [(2, 1)], gap_at(k)))
     unsure = msgspec.structs.replace(default_gestures().tap, nearer_m=0.06)

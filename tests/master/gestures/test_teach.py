@@ -66,7 +66,7 @@ def test_a_taught_pose_is_known_again_and_changes_no_other(count: int) -> None:
         assert recogniser.held == name
 
 
-def test_what_tells_it_apart_is_said() -> None:
+def test_what_distinguishes_it_is_printed() -> None:
     stated = learn("horns", examples(4), SETTINGS).stated
     pointing = next(line for line in stated if line.startswith("from pointing"))
     assert "little_bend_deg" in pointing

@@ -20,7 +20,7 @@ def touch(cov_thumb_m2: Float, cov_index_m2: Float) -> ThumbTouch:
     return thumb_touch(seen, RIGHT.radius_m)
 
 
-def test_the_doubt_of_a_gap_is_that_of_both_skins() -> None:
+def test_the_sigma_of_a_gap_is_that_of_both_surfaces() -> None:
     found = touch(9e-6 * np.eye(3), 16e-6 * np.eye(3))
     np.testing.assert_allclose(found.sigma_m[0], 5e-3, rtol=1e-9)
     np.testing.assert_allclose(found.key_sigma_m[0], 5e-3, rtol=1e-9)
@@ -35,7 +35,7 @@ def test_what_is_not_known_across_the_way_does_not_matter() -> None:
     np.testing.assert_allclose(sum(squares), 4e-4, rtol=1e-9)
 
 
-def test_the_doubt_of_how_pads_face_is_that_of_the_ends_over_the_length() -> None:
+def test_the_sigma_of_how_pads_face_is_that_of_the_ends_over_the_length() -> None:
     found = touch(1e-6 * np.eye(3), 4e-6 * np.eye(3))
     seen = FeatureExtractor(RIGHT).of(shown(posture(PINCH)))
     assert seen is not None

@@ -73,7 +73,7 @@ def test_another_movement_is_refused() -> None:
         align(track_of(hand_at(OURS_S).position_m, OURS_S), theirs(other))
 
 
-def test_points_on_a_line_tell_no_turn() -> None:
+def test_points_on_a_line_determine_no_rotation() -> None:
     one = hand_at(OURS_S).position_m[:, :1] * [1.0, 0.0, 0.0]
     other = hand_at(THEIRS_S).position_m[:, :1] * [1.0, 0.0, 0.0]
     with pytest.raises(FitError, match="on a line"):

@@ -137,7 +137,7 @@ def test_what_is_wrong_with_a_table_is_said(tmp_path: Path, text: str, output: s
 @pytest.mark.parametrize(
     ("scale", "unit"), [(1.0, "m"), (10.0, "dm"), (100.0, "cm"), (1e3, "mm"), (1 / 0.0254, "in")]
 )
-def test_the_size_of_a_hand_tells_the_unit(tmp_path: Path, scale: float, unit: str) -> None:
+def test_the_size_of_a_hand_determines_the_unit(tmp_path: Path, scale: float, unit: str) -> None:
     t_s = np.arange(4) / 50.0
     exact = hand_at(t_s).position_m
     path = write_table(tmp_path / "plain.csv", t_s, JOINTS, 1e-3 * scale * exact)

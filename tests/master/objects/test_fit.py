@@ -82,7 +82,7 @@ def test_a_moving_object_is_found_from_unsynchronised_rolling_shutters(seed: int
     assert found.used.all()
 
 
-def test_two_beads_do_not_tell_the_turn_about_their_line() -> None:
+def test_two_beads_do_not_determine_the_rotation_about_their_line() -> None:
     where = wander(4, np.array([0.04, 0.0, 0.5]), 0.5, np.pi)
     observations = seen(where, points=(0, 1))
     found = PoseFit(cameras(), POINTS, BEADS, NO_FLOOR)(

@@ -132,7 +132,7 @@ def test_its_covariance_covers_its_errors() -> None:
     assert 0.05 < np.mean(squares) < 2.0
 
 
-def test_one_bead_that_is_hidden_is_told_and_the_pose_goes_on_for_a_while() -> None:
+def test_one_occluded_bead_is_reported_and_the_pose_goes_on_for_a_while() -> None:
     where = about(FLAT, 3, 0.2, 0.6)
 
     def hides(camera: str, feature: int, t_s: float) -> bool:
@@ -151,7 +151,7 @@ def test_one_bead_that_is_hidden_is_told_and_the_pose_goes_on_for_a_while() -> N
     assert all(np.isnan(pose.position_m).all() and pose.occluded for pose in long_after)
 
 
-def test_a_bead_hidden_from_one_camera_alone_is_told() -> None:
+def test_a_bead_hidden_from_one_camera_alone_is_reported() -> None:
     def hides(camera: str, feature: int, t_s: float) -> bool:
         return camera == "right" and feature == 1 and t_s > 0.3
 
@@ -270,7 +270,7 @@ def test_one_tag_has_two_poses_and_both_are_named() -> None:
     assert np.degrees(np.linalg.norm(other)) > 20.0
 
 
-def test_far_away_the_doubt_of_a_single_tag_reaches_its_other_pose() -> None:
+def test_far_away_the_covariance_of_a_single_tag_reaches_its_other_pose() -> None:
     """One small face in one camera at 0.7 m with poor corners: either tilt explains it."""
     tags = CUBE.profile.tags
     assert tags is not None

@@ -88,7 +88,7 @@ def test_while_it_is_lost_the_pose_is_held_ever_less_sure_and_then_there_is_none
     assert line.counts == {"lost": 5}
 
 
-def test_a_leap_is_doubted_and_then_believed() -> None:
+def test_a_leap_is_first_rejected_and_then_accepted() -> None:
     line, far = TrackerLine(CUBE, RIG), HERE + np.array([0.5, 0.0, 0.0])
     one(line, pose_at(0.0))
     doubted = one(line, pose_at(10.0, far))

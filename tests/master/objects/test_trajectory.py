@@ -28,7 +28,7 @@ def test_its_speed_dies_away() -> None:
     np.testing.assert_allclose(far.T[0, 3], 0.12, rtol=0.03)  # speed times the time in which it dies
 
 
-def test_its_doubt_grows_and_after_a_while_there_is_none() -> None:
+def test_its_uncertainty_grows_and_after_a_while_there_is_none() -> None:
     trajectory = Trajectory()
     trajectory.push(0, fitted(0.2))
     first, later = (trajectory.held_cov(round(t * 1e9)) for t in (0.02, 0.4))
@@ -41,7 +41,7 @@ def test_its_doubt_grows_and_after_a_while_there_is_none() -> None:
     assert not trajectory
 
 
-def test_what_never_tells_all_of_the_pose_is_forgotten() -> None:
+def test_a_never_complete_pose_is_forgotten() -> None:
     trajectory = Trajectory()
     assert trajectory.push(0, fitted(0.0))
     last = round(HELD_S * 1e9 / FRAME_NS)

@@ -211,7 +211,7 @@ def seqs_of(path: Path) -> list[int]:
     return [cast(MarkerDetections, one.message).seq for one in open_messages(path).read(["taken"])]
 
 
-def test_a_recorder_keeps_what_a_master_takes_and_tells(
+def test_a_recorder_keeps_what_a_master_receives_and_publishes(
     tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(process, "_PERIOD_NS", 20_000_000)
@@ -257,7 +257,7 @@ def test_a_recorder_keeps_what_a_master_takes_and_tells(
     assert kept.senders["health"].keys() == {"master", "recorder"}
 
 
-def test_a_recorder_outlives_its_master_and_tells_what_a_replay_cannot_repeat(
+def test_a_recorder_outlives_its_master_and_reports_what_a_replay_cannot_repeat(
     tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(process, "_PERIOD_NS", 20_000_000)

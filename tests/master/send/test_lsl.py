@@ -112,13 +112,13 @@ def test_nobody_on_the_network_is_asked_or_heard(pylsl: ModuleType) -> None:
         LslSink(LslOutput(scope="network"), MasterTimes())
 
 
-def test_a_machine_without_the_library_is_told_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_machine_without_the_library_is_shown_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pylsl", None)
     with pytest.raises(PhalanxError, match=r"pip install 'phalanx-hand\[lsl\]'.*PYLSL_LIB"):
         LslSink(LslOutput(), MasterTimes())
 
 
-def test_a_machine_whose_pylsl_has_no_liblsl_is_told_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_machine_whose_pylsl_has_no_liblsl_is_shown_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(name: str) -> ModuleType:
         raise RuntimeError(f"{name}: LSL binary library file was not found")  # as pylsl says it
 

@@ -27,6 +27,6 @@ def test_it_sends_to_nobody_and_loses_nothing_when_somebody_comes() -> None:
     sender.close()
 
 
-def test_an_unknown_host_is_told_with_the_key_of_the_file() -> None:
+def test_an_unknown_host_is_reported_with_the_key_of_the_file() -> None:
     with pytest.raises(PhalanxError, match=r"vmc\.host"):
         UdpSender("no-such-host.invalid", 9, "vmc")

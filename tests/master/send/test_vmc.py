@@ -241,7 +241,7 @@ def test_what_is_not_known_is_left_out(ear: socket.socket) -> None:
 
 
 @pytest.mark.parametrize("side", SIDES)
-def test_the_side_is_told_by_the_shape_however_the_hand_lies(side: Side) -> None:
+def test_the_side_is_determined_by_the_shape_however_the_hand_lies(side: Side) -> None:
     rng = np.random.default_rng(5)
     for rotation_vector in rng.normal(size=(20, 3)) * 2.0:
         assert side_of(hand_pose(side, rng.uniform(-0.2, 1.2, (5, 4)), rotation_vector)) == side

@@ -89,7 +89,7 @@ def test_a_finger_tracked_in_fewer_than_half_of_the_trials_is_not_filled_in(
     assert (cell.reached, cell.trials) == (tracked, 4)
 
 
-def test_a_finger_that_was_told_by_something_else_is_counted_and_its_error_kept() -> None:
+def test_a_finger_measured_by_something_else_is_counted_and_its_error_kept() -> None:
     cell = cells_of([trial(1, off=2.0), trial(2, off=30.0, seen=False)])[0]
     assert (cell.reached, cell.unseen) == (2, 1)
     assert cell.mean_deg == pytest.approx(16.0)

@@ -120,7 +120,7 @@ def test_labels_of_the_truth_serve_as_well_by_name_and_by_letter(
     ]
 
 
-def test_a_recording_that_does_not_tell_its_poses_says_what_it_needs(
+def test_a_recording_without_true_poses_says_what_it_needs(
     tmp_path: Path, setup: RigSetup, truths: list[WristTruth]
 ) -> None:
     opened, poses = recorded(tmp_path, setup, truths), true_poses(setup, truths)

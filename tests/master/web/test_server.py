@@ -210,7 +210,7 @@ def test_three_js_has_what_the_hand_imports() -> None:
         assert re.search(rf"\b{name}\b", exported)
 
 
-def test_an_address_that_is_taken_is_told_with_the_key_to_change(server: WebServer) -> None:
+def test_an_address_that_is_taken_is_reported_with_the_key_to_change(server: WebServer) -> None:
     with pytest.raises(PhalanxError, match=r"web\.port"):
         WebServer("127.0.0.1", server.port)
 

@@ -110,7 +110,7 @@ def test_what_is_not_known_is_null_and_stays_alone() -> None:
     assert all(joint["position"] is None and joint["orientation"] is None for joint in others)
 
 
-def test_doubt_is_the_root_mean_square_of_the_three_axes() -> None:
+def test_uncertainty_is_the_root_mean_square_of_the_three_axes() -> None:
     pose = hand_pose("right")
     known = np.ones(26, dtype=bool)
     tracked = known.copy()

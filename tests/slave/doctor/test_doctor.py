@@ -148,7 +148,7 @@ TRACKING = "C0A80005,pc.local,9,1763800000.1,{},0.000002,0.000031,-3.1,0.0,0.05,
         (Ran(0, "", ""), Verdict.WARN, "no answer"),
     ],
 )
-def test_the_clock_as_chrony_tells_it(tmp_path: Path, output: Ran, verdict: Verdict, text: str) -> None:
+def test_the_clock_as_chrony_reports_it(tmp_path: Path, output: Ran, verdict: Verdict, text: str) -> None:
     (found,) = check_clock(machine(tmp_path, {"chronyc": output}), None)
     assert found.verdict is verdict
     assert text in found.text
@@ -318,7 +318,7 @@ UNIT = (
         ("LoadState=not-found\nActiveState=inactive\n", Verdict.WARN, False, "not installed"),
     ],
 )
-def test_the_service_as_systemd_tells_it(
+def test_the_service_as_systemd_reports_it(
     tmp_path: Path, output: str, verdict: Verdict, runs: bool, text: str
 ) -> None:
     unit = check_unit(machine(tmp_path, {"systemctl": Ran(0, output, "")}), "left")

@@ -68,7 +68,7 @@ def test_a_pause_of_the_machine_moves_nothing() -> None:
     assert np.abs(got - np.array(true))[500:].max() < 0.4e6
 
 
-def test_one_impossible_stamp_is_left_out_and_a_set_clock_is_told() -> None:
+def test_one_impossible_stamp_is_left_out_and_a_set_clock_is_reported() -> None:
     clock = DeviceClock(200e-6)
     for k in range(1, 10):
         assert clock.observe(k * PERIOD_NS, BEGAN_NS + k * PERIOD_NS)

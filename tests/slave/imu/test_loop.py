@@ -70,7 +70,7 @@ def test_every_sample_is_sent_in_the_name_of_this_process_and_gaps_are_counted()
     assert set(counters.metrics()) == {"rate_hz"}
 
 
-def test_the_loop_ends_when_told_and_when_the_device_is_gone() -> None:
+def test_the_loop_ends_when_stopped_and_when_the_device_is_gone() -> None:
     wire, stop = Wire(), threading.Event()
     with pytest.raises(ImuError, match="unplugged"):
         run(Source([sample(0), ImuError("unplugged"), sample(1)]), wire, SampleCounters(), stop)
@@ -104,7 +104,7 @@ class Reporting(Source):
         return {"temperature_c": 30.5, "away_s": 0.0, "battery_percent": np.inf}
 
 
-def test_the_filters_orientation_is_sent_and_what_it_and_the_imu_tell_is_told() -> None:
+def test_the_filters_orientation_is_sent_and_its_counts_and_those_of_the_imu_are_reported() -> None:
     wire, source, orientation = Wire(), Reporting([sample(0), sample(1)]), Filter()
     counters = SampleCounters(source, orientation)
     run(source, wire, counters, threading.Event(), orientation)

@@ -127,7 +127,7 @@ def test_the_rate_is_the_next_above(rate_hz: float, expected: int) -> None:
     assert rate_of(rate_hz).code == expected
 
 
-def test_what_cannot_be_is_told() -> None:
+def test_the_impossible_is_reported() -> None:
     with pytest.raises(ImuError, match=r"imu.rate_hz: 800 Hz: .* at most 417 Hz"):
         rate_of(800.0)
     with pytest.raises(

@@ -100,7 +100,7 @@ def test_rows_begin_with_the_recording_and_are_whole_at_any_time(tmp_path: Path)
         assert {len(line) for line in csv.reader(file)} == {15}
 
 
-def test_what_nobody_keeps_is_taken_away_and_what_broke_is_told(tmp_path: Path) -> None:
+def test_what_nobody_keeps_is_removed_and_what_broke_is_reported(tmp_path: Path) -> None:
     source = Source(breaks_after=4)
     recorder = ImuRecorder(source, None, source.stop)
     (tmp_path / "out").mkdir()

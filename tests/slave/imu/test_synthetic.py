@@ -111,7 +111,7 @@ def test_a_little_lateness_costs_no_sample() -> None:
     assert seen + numbers(source, 3) == [0, 1, 2, 3, 4]
 
 
-def test_it_ends_when_closed_or_told_also_while_it_waits() -> None:
+def test_it_ends_when_closed_or_stopped_also_while_it_waits() -> None:
     stage = Stage(EPOCH_NS)
     source = imu(stage)
     source.close()

@@ -153,7 +153,7 @@ def test_behind_a_uart_the_wire_takes_its_time(link: Path) -> None:
         ),
     ],
 )
-def test_who_does_not_answer_or_refuses_is_told(
+def test_who_does_not_answer_or_refuses_is_reported(
     behaviour: dict[str, object], expected: str, link: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if "mute" in behaviour:
@@ -164,14 +164,14 @@ def test_who_does_not_answer_or_refuses_is_told(
     device.unplug()
 
 
-def test_a_setting_that_older_devices_lack_is_only_told(link: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_setting_that_older_devices_lack_is_only_reported(link: Path, caplog: pytest.LogCaptureFixture) -> None:
     device = FakeXimu3(link, refuses="gyroscope_offset_correction_enabled")
     opened(link).close()
     assert "refused gyroscope_offset_correction_enabled=False: Unknown key" in caplog.text
     device.unplug()
 
 
-def test_ports_that_cannot_be_opened_are_told(tmp_path: Path) -> None:
+def test_ports_that_cannot_be_opened_are_reported(tmp_path: Path) -> None:
     with pytest.raises(ImuError, match=r"nowhere cannot be opened: there is no such port; .* --list"):
         opened(tmp_path / "nowhere")
     locked = FakeXimu3(tmp_path / "locked")

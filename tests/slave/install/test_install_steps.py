@@ -239,7 +239,7 @@ def test_uninstalling_leaves_nothing_of_ours(board: Board, site: Path) -> None:
     assert uninstall(board.machine) == [], "a second time there is nothing"
 
 
-def test_a_full_disk_is_told_and_leaves_what_runs(
+def test_a_full_disk_is_reported_and_leaves_what_runs(
     board: Board, site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     needs("mount")

@@ -146,7 +146,7 @@ def test_a_driver_that_is_unplugged_is_tried_again_and_comes_back() -> None:
     assert stage.kind(60 + rest + 10) is CYCLE[(60 + rest + 10) % 3]
 
 
-def test_the_thread_lights_what_it_is_told_of_and_ends_dark() -> None:
+def test_the_thread_lights_the_scheduled_frames_and_ends_dark() -> None:
     clock = SystemClock()
     begun = threading.Event()
 

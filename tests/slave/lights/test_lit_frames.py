@@ -111,7 +111,7 @@ def test_a_light_that_smears_into_the_next_frame_is_seen_there(scene: WristScene
     assert 0.3 < smear[line > 100].mean() / line[line > 100].mean() < 0.9
 
 
-def test_the_timeline_tells_shares_of_an_exposure() -> None:
+def test_the_timeline_gives_shares_of_an_exposure() -> None:
     clock, timeline = SetClock(1000), Timeline()
     lights = SyntheticLights(timeline, clock)
     assert timeline.during(0, 100).mostly is AMBIENT

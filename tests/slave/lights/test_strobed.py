@@ -62,7 +62,7 @@ class Controller:
             raise LightsError("unplugged")
 
 
-def test_frames_are_told_and_a_lost_camera_is_dark() -> None:
+def test_frames_are_reported_and_a_lost_camera_is_dark() -> None:
     output: list[object] = []
     camera = StrobedCamera(Source(output), CAMERA, RIG, Controller(output))
     assert camera.read() is not None

@@ -155,12 +155,12 @@ def test_when_steamvr_ends_it_is_acknowledged_and_looked_for_again() -> None:
         (OpenVRError(110), "install SteamVR from Steam"),
     ],
 )
-def test_why_steamvr_does_not_answer_is_told(error: Exception, text: str) -> None:
+def test_why_steamvr_does_not_answer_is_reported(error: Exception, text: str) -> None:
     with pytest.raises(TrackerError, match=text):
         connect(FakeVr([], error))
 
 
-def test_a_library_that_is_missing_or_does_not_run_here_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_library_that_is_missing_or_does_not_run_here_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> None:
         raise ModuleNotFoundError(f"No module named {name!r}")
 

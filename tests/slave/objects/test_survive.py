@@ -32,7 +32,7 @@ def output(folder: Path, *parts: bytes) -> str:
     return f"cat {folder / 'lines'}"
 
 
-def test_it_is_told_to_write_poses_alone_and_they_come_at_once(tmp_path: Path) -> None:
+def test_it_is_asked_to_write_poses_alone_and_they_come_at_once(tmp_path: Path) -> None:
     command = program(
         tmp_path, f'echo "$@" > {tmp_path}/arguments; {output(tmp_path, HEAD, pose(8.0), pose(8.01))}; sleep 60'
     )
@@ -121,7 +121,7 @@ def test_two_devices_and_no_choice_end_it_though_it_would_be_reopened(tmp_path: 
     again.close()
 
 
-def test_a_missing_program_is_told_with_what_to_do(tmp_path: Path) -> None:
+def test_a_missing_program_is_refused_with_what_to_do(tmp_path: Path) -> None:
     with pytest.raises(TrackerError, match=r"cannot start .*survive-cli.*build libsurvive"):
         opened(str(tmp_path / "survive-cli"))
 

@@ -49,7 +49,7 @@ def test_lines_are_the_same_however_the_bytes_come(steps: list[int]) -> None:
 
 
 @pytest.mark.parametrize("cut", range(1, len(pose(8.0).split(b"\r\n")[0])))
-def test_a_pose_that_was_cut_and_run_into_by_the_next_line_is_never_believed(cut: int) -> None:
+def test_a_pose_cut_and_run_into_by_the_next_line_is_never_accepted(cut: int) -> None:
     line = pose(8.042091).split(b"\r\n")[0]
     [*before, last] = [one for one in found(line[:cut] + b"\n" + pose(9.0)) if not isinstance(one, Serial)]
     assert isinstance(last, Pose)
@@ -75,7 +75,7 @@ def test_a_pose_that_was_cut_and_run_into_by_the_next_line_is_never_believed(cut
         (b"8.0 WM0 POSE 1e9 0.2 0.3 1.0 0.0 0.0 0.0", Fault.PLACE),
     ],
 )
-def test_what_is_wrong_with_a_pose_is_told(line: bytes, why: Fault) -> None:
+def test_what_is_wrong_with_a_pose_is_reported(line: bytes, why: Fault) -> None:
     assert read_line(line) is why
 
 

@@ -35,7 +35,7 @@ def test_a_turned_square_is_found_from_a_pixel_away(degrees: float, side: float)
     assert abs(found.width_px[0] - read) < 0.03
 
 
-def test_noise_is_told_as_it_is() -> None:
+def test_noise_is_reported_as_it_is() -> None:
     true = np.array([[40.2, 41.1], [79.4, 44.0], [77.0, 80.3], [38.0, 78.9]])
     clear, rng = square(true, 0.8).astype(np.float64), np.random.default_rng(2)
     ratio = []

@@ -36,7 +36,7 @@ def box(family: TagFamily = "aruco_5x5_100", numbers: range = range(8), name: st
         (Look(0.45, light=0.1, noise=3.0), 0.06),
     ],
 )
-def test_corners_are_where_they_are_and_as_sure_as_told(look: Look, within_px: float) -> None:
+def test_corners_are_where_they_are_and_as_sure_as_stated(look: Look, within_px: float) -> None:
     base, missed, miss, sigmas = TagFinder(FILE, [box()]), 0, [], []
     for seed in range(8):
         rng = np.random.default_rng(seed)
@@ -124,7 +124,7 @@ def test_a_grey_image_does_and_one_of_another_size_is_refused() -> None:
         finder.push(image[:100], 1)
 
 
-def test_tags_that_nobody_could_tell_apart_are_refused() -> None:
+def test_tags_that_nobody_could_distinguish_are_refused() -> None:
     with pytest.raises(CalibrationError, match="3 is on object 'box', too"):
         TagFinder(FILE, [box(), box("apriltag_36h11", range(3, 4), "other")])
     with pytest.raises(CalibrationError, match="apriltag_16h5 has 0 to 29"):

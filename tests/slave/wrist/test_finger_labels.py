@@ -32,7 +32,7 @@ def rotated_view(degrees: tuple[float, float, float]) -> WristView:
 
 @pytest.mark.parametrize("name", ["spread@indoor", "poses@indoor"])
 @pytest.mark.parametrize("degrees", [(0.0, 2.0, 0.0), (0.0, -2.0, 0.0), (2.0, 0.0, 0.0), (0.0, 0.0, -3.0)])
-def test_fingers_are_told_apart_though_the_palm_is_not_quite_where_it_should_be(
+def test_fingers_are_distinguished_though_the_palm_is_not_quite_where_it_should_be(
     name: str, degrees: tuple[float, float, float]
 ) -> None:
     one, view = scene(name, 61), rotated_view(degrees)

@@ -62,7 +62,7 @@ def test_an_image_without_a_hand_has_the_seams_of_geometry(image: Image) -> None
     np.testing.assert_array_equal(fingers.finger_of(knuckles), [1, 2, 3, 4])
 
 
-def test_a_black_image_is_told() -> None:
+def test_a_black_image_is_reported() -> None:
     assert not separate(BLACK, VIEW).shown
 
 

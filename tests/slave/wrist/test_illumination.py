@@ -111,7 +111,7 @@ def test_a_line_that_no_led_lights_is_no_laser() -> None:
 
 
 @pytest.mark.parametrize("level", [0, 2, 128, 255])
-def test_even_pictures_tell_nothing(level: int) -> None:
+def test_even_pictures_determine_nothing(level: int) -> None:
     even = coarse(np.full((480, 640), level, np.uint8))
     assert unlit([even, even, even]) is (level < 255)
     assert evidence(even, even, even).margin == -np.inf

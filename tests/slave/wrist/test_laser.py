@@ -74,7 +74,7 @@ def test_the_centroid_weighs_length_and_not_columns() -> None:
     assert found.length_px[INDEX] == pytest.approx(flat + steep, rel=0.15)
 
 
-def test_a_line_in_parts_is_doubted_by_what_its_parts_would_move_it() -> None:
+def test_a_line_in_parts_has_more_uncertainty_by_what_its_parts_would_move_it() -> None:
     truth = scene("curl@dark").truth(0.0)
     u0, v0 = truth.laser_uv[1 + INDEX]
     renderer = WristRenderer(scene("curl@dark"), "wrist")
@@ -129,7 +129,7 @@ def test_rendered_fingers_are_met_within_six_tenths_of_a_millimetre(name: str) -
     assert owned >= 0.95
 
 
-def test_a_thumb_whose_line_runs_on_over_its_ball_is_met_within_half_a_finger_and_doubted() -> None:
+def test_a_thumb_whose_line_runs_on_over_its_ball_is_met_within_half_a_finger_with_more_uncertainty() -> None:
     one = scene("poses@indoor", 31)
     renderer = WristRenderer(one, "wrist")
     off: list[float] = []
@@ -163,7 +163,7 @@ def laser_errors(name: str, count: int, seed: int) -> tuple[Float, float]:
     return out, float((out[seen] < 6e-3).mean())
 
 
-def test_doubt_is_that_of_the_errors_and_more_where_the_leds_show_nothing() -> None:
+def test_uncertainty_is_that_of_the_errors_and_more_where_the_leds_show_nothing() -> None:
     one = scene("curl@indoor", 41)
     renderer = WristRenderer(one, "wrist")
     off: list[Float] = []

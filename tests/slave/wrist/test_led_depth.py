@@ -14,7 +14,7 @@ BARE = WristView.of(replace(RIG, flat_field=None), CAMERA, HAND)
 SHAPED = WristView.of(replace(RIG, flat_field=VIGNETTE), CAMERA, HAND)
 
 
-def test_with_its_flat_field_a_vignetted_image_tells_the_same_nearness() -> None:
+def test_with_its_flat_field_a_vignetted_image_gives_the_same_nearness() -> None:
     optics = led_optics(SHAPED)
     even = np.full(optics.cosine.shape, 100.0, dtype=np.float32)
     vignetted = even / optics.level**2

@@ -119,7 +119,7 @@ def test_the_time_of_a_cycle_is_that_of_its_three_frames_however_long_there_was_
     assert (metrics["detect_us"], metrics["detect_worst_us"]) == (3000.0, 3000.0)
 
 
-def test_the_loop_ends_when_told() -> None:
+def test_the_loop_ends_when_stopped() -> None:
     wire, stop = Wire(), threading.Event()
     stop.set()
     run_wrist(Source(frames([0, 1, 2])), ByNumber(), wire, "wrist", Counters(NAMES), stop)

@@ -106,7 +106,7 @@ def test_the_palm_that_comes_into_the_plane_is_no_finger() -> None:
     assert np.isnan(laser_lines(one.laser, separate(one.led, VIEW), VIEW).uv).all()
 
 
-def test_no_tip_is_told_of_a_bent_wrist() -> None:
+def test_no_tip_is_reported_of_a_bent_wrist() -> None:
     one = seen((0.0, -12.0))
     assert not separate(one.led, VIEW).palm_pose.straight
     dark = np.zeros_like(one.led)

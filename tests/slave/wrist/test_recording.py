@@ -165,7 +165,7 @@ def test_hand_is_an_option_of_wrist_cameras_only(tmp_path: Path, capsys: pytest.
     assert HAND.name == RIG.hand
 
 
-def test_another_hand_than_that_of_the_recording_is_told(
+def test_another_hand_than_that_of_the_recording_is_reported(
     curl: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     detect_wrist_recording(curl, "wrist", hand_file=HAND_FILE)

@@ -43,7 +43,7 @@ def test_bands_side_by_side_are_as_each_alone() -> None:
         np.testing.assert_array_equal(path, minimum_cost_paths(energy, (width,))[0])
 
 
-def test_a_valley_is_followed_as_steeply_as_two_samples_a_station() -> None:
+def test_a_minimum_is_followed_as_steeply_as_two_samples_a_station() -> None:
     energy = np.full((12, 40), 5.0, dtype=np.float32)
     valley = 6 + 2 * np.arange(12)
     energy[np.arange(12), valley] = 0.0

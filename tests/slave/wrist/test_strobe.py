@@ -107,7 +107,7 @@ def test_a_lost_frame_costs_its_cycle_alone() -> None:
         assert strobe.counts["gaps"] == 1
 
 
-def test_after_a_slip_that_no_time_tells_of_the_cycle_is_believed_anew_within_two_triples() -> None:
+def test_after_a_slip_that_no_time_shows_the_cycle_is_found_again_within_two_cycles() -> None:
     for lost in range(12, 15):
         cycles, _ = pushed(pictures([k for k in range(36) if k != lost]))
         assert len(cycles) >= 12 - 3
@@ -163,7 +163,7 @@ def test_a_counter_that_skips_is_a_gap_as_well() -> None:
     assert len(cycles) == 11
 
 
-def test_without_a_hand_nothing_is_told_and_said_to_be_unlit() -> None:
+def test_without_a_hand_nothing_is_sent_and_marked_unlit() -> None:
     """The room alone, with the noise of every frame; then the hand comes back."""
     rng = np.random.default_rng(3)
     room = np.full((480, 640), 40.0)

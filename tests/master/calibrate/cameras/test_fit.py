@@ -253,7 +253,7 @@ def test_a_picture_upside_down_among_three_cameras_is_parted_however_far_it_driv
 
 
 @pytest.mark.parametrize(("shape_mm", "bent"), [(0.3, True), (0.0, False)])
-def test_a_bent_board_is_told_from_a_flat_one_by_views_held_out(shape_mm: float, bent: bool) -> None:
+def test_a_bent_board_is_distinguished_from_a_flat_one_by_views_held_out(shape_mm: float, bent: bool) -> None:
     truth = scene(21, 2, views=12, shape_mm=shape_mm)
     fit = fit_cameras(truth.views(NOISE_PX, 21))
     assert fit.board.bent == bent == bool(fit.solution.bundle.shape_m.any())

@@ -81,7 +81,7 @@ def test_leaving_one_out_judges_a_point_by_the_others_alone() -> None:
 
 
 @pytest.mark.parametrize("wrong", [[3], [0], [16], [2, 9, 15]])
-def test_wrong_points_are_told_and_no_others(wrong: list[int]) -> None:
+def test_wrong_points_are_reported_and_no_others(wrong: list[int]) -> None:
     rng = np.random.default_rng(11)
     x = RIG.disparity(SWEEP_M) + rng.normal(0.0, 0.08, 17)
     x[wrong] *= 1.03

@@ -92,7 +92,7 @@ def test_a_moving_target_is_refused_until_it_stands(way: str) -> None:
     assert reading.uv[0, 0] - reading.uv[1, 0] == pytest.approx(RIG.disparity(np.array(0.5)), abs=0.05)
 
 
-def test_a_target_outside_one_image_is_told_with_the_camera() -> None:
+def test_a_target_outside_one_image_is_reported_with_the_camera() -> None:
     uv = still(100)
     uv["right"][:] = np.nan
     meter = Meter(CAMERAS, INDEX, 30, 1.0)
@@ -118,7 +118,7 @@ class Queue:
         return self.messages.popleft() if self.messages else None
 
 
-def test_nobody_sends_and_the_reason_is_told() -> None:
+def test_nobody_sends_and_the_reason_is_reported() -> None:
     clock = ManualClock()
     with pytest.raises(FitError, match="no frames from left and right"):
         measure(Queue(clock, []), Meter(CAMERAS, INDEX, 8, 1.0), clock, lambda share: None)

@@ -155,7 +155,7 @@ def test_what_no_extrinsics_explain_is_refused() -> None:
         ("imu_clock_sigma_ms", 9.0, "move fingers and forearm faster"),
     ],
 )
-def test_what_the_motion_does_not_tell_is_refused_with_what_to_do(
+def test_what_the_motion_does_not_determine_is_refused_with_what_to_do(
     quantity: str, value: float, message: str
 ) -> None:
     with pytest.raises(FitError, match=message):

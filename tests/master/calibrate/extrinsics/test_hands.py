@@ -41,7 +41,7 @@ def slopes(at: HandProblem, hands: Hands) -> Float:
     return np.array(ways).T / (2.0 * LITTLE)
 
 
-def test_the_gradient_is_the_slope_of_the_cost() -> None:
+def test_the_gradient_is_the_derivative_of_the_cost() -> None:
     at, hands = problem()
     np.testing.assert_allclose(at.linearise(hands).gradient, slopes(at, hands), rtol=1e-5, atol=1e-2)
 

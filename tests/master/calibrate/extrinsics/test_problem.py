@@ -62,7 +62,7 @@ def slopes(at: Problem, unknown: Unknown, hands: Hands, steps: Float) -> Float:
     return 0.25 * np.array(out)
 
 
-def test_the_pull_of_what_all_instants_share_is_the_slope_of_the_cost() -> None:
+def test_the_gradient_of_what_all_epochs_share_is_the_derivative_of_the_cost() -> None:
     at, unknown, hands = problem()
     pull, little = at.normal(unknown, hands).shared_pull, 1e-4 * believed()
     slope = slopes(at, unknown, hands, np.diag(little)) / little
@@ -72,7 +72,7 @@ def test_the_pull_of_what_all_instants_share_is_the_slope_of_the_cost() -> None:
     assert np.count_nonzero(scale > 0.1) > UNKNOWN // 2  # most unknowns are told something
 
 
-def test_the_pull_of_each_hand_is_the_slope_of_the_cost() -> None:
+def test_the_gradient_of_each_hand_is_the_derivative_of_the_cost() -> None:
     at, unknown, hands = problem()
     pull, little = at.normal(unknown, hands).own_pull, 1e-4
     for k in range(6):

@@ -68,7 +68,7 @@ def test_a_routine_from_a_file_of_poses(tmp_path: Path, root: Path) -> None:
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_steps_are_told_without_anything_else() -> None:
+def test_the_steps_are_printed_without_anything_else() -> None:
     output = run("--steps")
     assert "lay the back of the hand" in output.lower()
     assert "thumb alone" in output
@@ -85,7 +85,7 @@ def test_the_steps_are_told_without_anything_else() -> None:
         (("--length-mm", "190", "--hand", "nowhere.json"), CalibrationError, "nowhere.json"),
     ],
 )
-def test_what_cannot_be_done_is_told(
+def test_what_cannot_be_done_is_reported(
     options: tuple[str, ...], kind: type[PhalanxError], message: str, root: Path
 ) -> None:
     with pytest.raises(kind, match=message):

@@ -125,7 +125,7 @@ def frozen(points: Float, t_s: Float) -> None:
         (frozen, "little: the marker 'little' moved by"),
     ],
 )
-def test_what_is_missing_is_told_by_name(spoil: Callable[[Float, Float], None], message: str) -> None:
+def test_what_is_missing_is_reported_by_name(spoil: Callable[[Float, Float], None], message: str) -> None:
     run = routine(25, "right")
     points = run.points_m.copy()
     spoil(points, np.asarray(1e-9 * run.t_ns, np.float64))

@@ -70,7 +70,7 @@ def test_frames_that_are_wrong_or_not_whole_are_left_out() -> None:
 
 
 @pytest.mark.parametrize("spread_deg", [4.0, 8.0])
-def test_the_posture_of_a_person_is_told(spread_deg: float) -> None:
+def test_the_posture_of_a_person_is_measured(spread_deg: float) -> None:
     joints = hand_at(T_S, RIGHT, np.radians(spread_deg)).position_m
     hand = hand_from_motion(motion_of(joints, T_S), "again")
     found = couplings_of(hand.profile)
@@ -101,7 +101,7 @@ def test_a_dip_that_a_tracker_made_is_not_a_person_s() -> None:
     assert "its tracker made it" in "\n".join(motion_lines(hand))
 
 
-def test_a_short_motion_tells_no_posture() -> None:
+def test_a_short_motion_measures_no_posture() -> None:
     t_s = T_S[:300]
     hand = hand_from_motion(motion_of(hand_at(t_s, RIGHT, 0.1).position_m, t_s), "again")
     assert hand.profile.couplings is None

@@ -44,7 +44,7 @@ class Person:
         return guide(self.receive, TIPS, NAMES, self, self.output.append)
 
 
-def test_all_steps_are_told_in_order_and_kept() -> None:
+def test_all_steps_are_reported_in_order_and_kept() -> None:
     person = Person()
     t_ns, points, cov = person.guide().arrays()
     steps = [line for line in person.output if f" of {len(STEPS)}: " in line]

@@ -99,7 +99,7 @@ def test_an_object_that_is_not_turned_is_refused() -> None:
         measure_object(at_rest)
 
 
-def test_markers_that_the_rig_does_not_have_are_told_what_to_write() -> None:
+def test_markers_that_the_rig_does_not_have_are_refused_with_what_to_write() -> None:
     with pytest.raises(CalibrationError, match=r'free_markers.*"wand1", "knob"'):
         rows_of(RIG, ("wand1", "knob"))
     with pytest.raises(CalibrationError, match="free_markers: 'thumb'"):

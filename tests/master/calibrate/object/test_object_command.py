@@ -159,7 +159,7 @@ class Clock:
         return self._now_ns
 
 
-def test_a_person_is_told_that_nothing_comes() -> None:
+def test_a_person_is_warned_that_nothing_comes() -> None:
     output: list[str] = []
     with pytest.raises(Exception, match="no pose came"):
         guide(lambda wait_s: None, RIG, BEADS, Clock(), output.append, 3.0)

@@ -167,7 +167,7 @@ def test_a_motion_comes_back_as_it_was_kept(tmp_path: Path) -> None:
     assert (objects[0].source, objects[0].tracked) == (ObjectSource.TAGS, True)
 
 
-def test_coverage_tells_which_axis_and_what_else_is_missing() -> None:
+def test_coverage_reports_which_axis_and_what_else_is_missing() -> None:
     def of(motion: Motion) -> tuple[str, ...]:
         seen, device = object_track(motion.objects(), ZERO_NS), tracker_track(motion.tracked(), ZERO_NS)
         found = coverage_of(seen, device, motion.late_s)

@@ -67,7 +67,7 @@ def test_the_lag_is_found_from_nothing_however_far_it_is() -> None:
         assert abs(found - late_s) < 0.01
 
 
-def test_what_was_held_or_told_by_a_tracker_does_not_count() -> None:
+def test_what_was_held_or_given_by_a_tracker_does_not_count() -> None:
     motion = Motion(4, seconds=10.0)
     objects = motion.objects()
     wrong = [
@@ -94,7 +94,7 @@ def test_what_was_held_or_told_by_a_tracker_does_not_count() -> None:
         (Motion(1, strays=1.0), "hardly saw|no registration explains"),
     ],
 )
-def test_what_does_not_tell_it_is_refused_with_what_to_do(motion: Motion, text: str) -> None:
+def test_what_does_not_determine_it_is_refused_with_what_to_do(motion: Motion, text: str) -> None:
     with pytest.raises(FitError, match=text):
         register(motion.objects(), motion.tracked())
 

@@ -114,7 +114,7 @@ def test_a_constant_speed_is_taken_out_by_the_mean_of_both_ends() -> None:
 
 
 @pytest.mark.parametrize("level", [0, 255])
-def test_no_board_is_told(level: int) -> None:
+def test_no_board_is_reported(level: int) -> None:
     blank = np.full((480, 640), level, np.uint8)
     with pytest.raises(FitError, match="no board found"):
         board_pose(view_of("0", {AMBIENT: blank, LED: blank}), BOARD, OPTICS)

@@ -3,7 +3,7 @@
 from master.calibrate.wrist.lit_views import grouped_by_reason
 
 
-def test_each_reason_is_told_once_with_its_views() -> None:
+def test_each_reason_is_reported_once_with_its_views() -> None:
     assert grouped_by_reason({}) == []
     assert grouped_by_reason({"3": "no board found", "6": "the hand moved", "9": "no board found"}) == [
         "views 3, 9: no board found",

@@ -75,7 +75,7 @@ def test_a_hand_that_moved_and_a_board_not_seen_are_refused() -> None:
         palm_from_board([], BOARD, OFFSET)
 
 
-def test_a_board_too_small_to_tell_its_tilt_is_refused() -> None:
+def test_a_board_too_small_to_measure_its_tilt_is_refused() -> None:
     tiny = Checkerboard(3, 3, 0.001)
     far = rigid(np.eye(3), np.array([0.0, 0.0, 0.3]))
     rng = np.random.default_rng(0)

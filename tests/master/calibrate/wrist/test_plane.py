@@ -110,7 +110,7 @@ def test_the_stated_sigma_is_that_of_many_repetitions() -> None:
 
 
 @pytest.mark.parametrize("wrong", [(0.0, 0.004, 0.0), (0.0, -0.02, 0.01)])
-def test_a_wrong_view_is_left_out_and_told(wrong: tuple[float, float, float]) -> None:
+def test_a_wrong_view_is_left_out_and_reported(wrong: tuple[float, float, float]) -> None:
     bad = shifted(view_line("wrong", (10.0, 0.0, 5.0), (0.0, 0.02, 0.25)), np.array(wrong))
     fit = fit_plane((*GOOD, bad))
     assert fit.used.tolist() == [True, True, True, True, False]

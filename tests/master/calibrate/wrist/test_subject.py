@@ -79,7 +79,7 @@ def test_knuckles_5_mm_off_and_a_palm_askew_are_found_within_stated_sigma(
     np.testing.assert_allclose(written, found.model.knuckles(found.unknown), atol=1e-7)
 
 
-def test_what_the_laser_cannot_tell_keeps_its_belief_and_says_so(
+def test_what_the_laser_does_not_constrain_keeps_its_prior_and_is_reported(
     people: dict[int, Person], motions: dict[int, list[WristDetections]], subjects: dict[int, Subject]
 ) -> None:
     person, cycles, found = people[40], motions[40], subjects[40]
@@ -181,7 +181,7 @@ def test_a_motion_without_its_parts_is_refused(seen: Float, match: str) -> None:
         ("plane", "no likely subject.*laser plane measured|never|bent at their knuckles"),
     ],
 )
-def test_what_tells_nothing_or_a_lie_is_refused(
+def test_what_determines_nothing_or_is_false_is_refused(
     people: dict[int, Person], motions: dict[int, list[WristDetections]], what: str, match: str
 ) -> None:
     person, cycles = people[40], motions[40]
