@@ -56,7 +56,7 @@ class FlexedWrist:
     def __init__(self, seed: int) -> None:
         """Postures about a habit of its own, each kept for a while."""
         rng = np.random.default_rng([seed, 6])
-        self._habit = np.radians(rng.normal(size=2) * [9.0, 6.0])
+        self._mean_posture = np.radians(rng.normal(size=2) * [9.0, 6.0])
         self._begin_s = np.cumsum(rng.uniform(0.4, 2.0, 200))
         self._move_s = rng.uniform(0.3, 0.6, 200)
         self._posture = np.radians(rng.normal(size=(201, 2)) * [9.0, 7.0])
@@ -69,7 +69,7 @@ class FlexedWrist:
         share = 1.0 if k == 0 else smooth_step((t_s - self._begin_s[k - 1]) / self._move_s[k])
         before = self._posture[max(k - 1, 0)]
         waver = radians(2.0) * np.sin(self._rate * t_s + self._phase).sum(axis=0)
-        return self._habit + before + share * (self._posture[k] - before) + waver
+        return self._mean_posture + before + share * (self._posture[k] - before) + waver
 
 
 class MeasuredMarkers:

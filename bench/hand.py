@@ -22,7 +22,7 @@ from common.arrays import Float
 from common.geometry import rigid, rotation_vector_to_matrix
 from common.hand_model import HandModel
 from master.estimator.parameters import HandParameters
-from master.estimator.priors import habits_of
+from master.estimator.priors import posture_prior_of
 from master.estimator.settings import DEFAULT
 
 FRAMES = 240
@@ -76,7 +76,7 @@ def motion(model: HandModel, frames: int) -> Draw:
 def ways(model: HandModel) -> dict[str, Way]:
     """Every solver that is there, by name; each begins afresh."""
     fingers = finger_solvers(model)
-    habits = _Habits.of(model)
+    posture_prior = _PosturePrior.of(model)
     out: dict[str, Way] = {
         WARM: ours(model, warm=True),
         "whole hand, afresh": ours(model, warm=False),
@@ -84,11 +84,11 @@ def ways(model: HandModel) -> dict[str, Way]:
         "closed form, fixed palm": _with_fixed_palm(model, lambda tips: closed_form(fingers, tips)),
     }
     scipy = peers_scipy.WholeHand.of(model, NOISE)
-    out["scipy"] = lambda points: scipy.solve(points, fixed_palm(model, points), habits.mean)
+    out["scipy"] = lambda points: scipy.solve(points, fixed_palm(model, points), posture_prior.mean)
     if peers_mink.installed():
         sigma = np.sqrt(np.square(NOISE.place_m) + DEFAULT.bones_m**2)
-        mink = peers_mink.MinkHand(model, weight=1.0 / sigma, posture=(habits.mean, habits.per_sigma))
-        mink.begin(rigid(FACING_ROTATION, np.array([0.0, 0.0, 0.5])), habits.mean)
+        mink = peers_mink.MinkHand(model, weight=1.0 / sigma, posture=(posture_prior.mean, posture_prior.per_sigma))
+        mink.begin(rigid(FACING_ROTATION, np.array([0.0, 0.0, 0.5])), posture_prior.mean)
         out["mink"] = mink.push
     return out
 
@@ -107,20 +107,20 @@ def ours(model: HandModel, *, warm: bool) -> Way:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Habits:
+class _PosturePrior:
     """Natural angles (5, 4) [rad], and one per sigma (5, 4) [1/rad] of each by itself; 0 for a coupled DIP."""
 
     mean: Float
     per_sigma: Float
 
     @classmethod
-    def of(cls, model: HandModel) -> "_Habits":
+    def of(cls, model: HandModel) -> "_PosturePrior":
         parameters = HandParameters.of(model)
-        habits = habits_of(model, parameters).natural()
-        cov: Float = np.asarray(np.linalg.inv(habits.normal[0]), np.float64)
+        posture_prior = posture_prior_of(model, parameters).natural_component()
+        cov: Float = np.asarray(np.linalg.inv(posture_prior.normal[0]), np.float64)
         per_sigma = np.zeros(20)
         per_sigma[parameters.free] = 1.0 / np.sqrt(np.diagonal(cov))
-        return cls(model.clamp(parameters.angles(cov @ habits.pull[0])), per_sigma.reshape(5, 4))
+        return cls(model.clamp(parameters.angles(cov @ posture_prior.pull[0])), per_sigma.reshape(5, 4))
 
 
 def _with_fixed_palm(model: HandModel, fingers: Fingers) -> Way:

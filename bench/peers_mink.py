@@ -118,13 +118,13 @@ class MinkHand:
                 if joint >= 0:
                     self._columns[f, k] = self._mujoco.jnt_qposadr[joint]
         if posture is not None:
-            self._tasks.append(self._belief(*posture))
+            self._tasks.append(self._prior(*posture))
         self._limits = [mink.ConfigurationLimit(self._mujoco, gain=1.0)]
         self._equal = [mink.EqualityConstraintTask(self._mujoco, 1.0)] if self._mujoco.neq else None
         self._low, self._high = model.limits_rad[..., 0], model.limits_rad[..., 1]
         self._free = free
 
-    def _belief(self, mean: Float, per_sigma: Float) -> Any:
+    def _prior(self, mean: Float, per_sigma: Float) -> Any:
         q, cost = self._hand.q.copy(), np.zeros(self._mujoco.nv)
         has = self._columns >= 0
         q[self._columns[has]] = mean[has]

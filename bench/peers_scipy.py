@@ -10,7 +10,7 @@ from common.arrays import Float
 from common.geometry import rigid, rotation_vector_to_matrix
 from common.hand_model import HandModel
 from master.estimator.parameters import HandParameters
-from master.estimator.priors import habits_of
+from master.estimator.priors import posture_prior_of
 from master.estimator.settings import DEFAULT
 from master.fabrik.finger import FingerSolver
 from master.fabrik.rotations import Vector
@@ -62,8 +62,8 @@ class WholeHand:
     def of(cls, model: HandModel, noise: Noise) -> "WholeHand":
         """For caps with this noise, and the default habits."""
         parameters = HandParameters.of(model)
-        habits = habits_of(model, parameters).natural()
-        normal, pull = habits.normal[0], habits.pull[0]
+        posture_prior = posture_prior_of(model, parameters).natural_component()
+        normal, pull = posture_prior.normal[0], posture_prior.pull[0]
         cov = noise.cov_m2 + DEFAULT.bones_m**2 * np.eye(3)
         return cls(
             model,

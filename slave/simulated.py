@@ -36,7 +36,7 @@ class FrameClock:
 
 
 def world_of(
-    believed: Path, rig: RigCalibration, truth: Path | None, name: str | None
+    assumed: Path, rig: RigCalibration, truth: Path | None, name: str | None
 ) -> tuple[Path, RigCalibration]:
     """Folder and rig that say how the simulated world is: those that the slave believes, unless it is told otherwise.
 
@@ -52,7 +52,7 @@ def world_of(
     if truth is None:
         if name is not None:
             raise CalibrationError(f"--truth-rig {name}: needs --truth DIR, the tree that it is in")
-        return believed, rig
+        return assumed, rig
     path = truth / "rigs" / f"{rig.name if name is None else name}.json"
     true = load(path, RigCalibration)
     if true.kind != rig.kind:

@@ -102,7 +102,7 @@ class FittedHand(SolvedHand):
     alone: Float
     x: Float
     scale: float
-    natural: float
+    natural_weight: float
     surprise: Float
     steps: int
     twist: Float = field(default_factory=lambda: np.zeros(5))

@@ -17,7 +17,7 @@ from master.estimator.hypotheses import Blank
 from master.estimator.kinematics import Scratch, pose
 from master.estimator.observation_sources import count_rows
 from master.estimator.parameters import HandParameters
-from master.estimator.priors import Habits
+from master.estimator.priors import PosturePrior
 from master.estimator.problem import Rig
 from master.estimator.residuals import Observations, observe_points, observe_rays
 from master.estimator.settings import Settings
@@ -56,11 +56,11 @@ class EpochSteps:
         parameters: HandParameters,
         markers: tuple[str, ...],
         hand_markers: tuple[str, ...],
-        habits: Habits,
+        posture_prior: PosturePrior,
         settings: Settings,
         wrist: WristModel | None,
     ) -> None:
-        """Lay out the tables, and compile. Arguments as of `Estimator`; `habits`: any of those to be fitted with."""
+        """Lay out the tables, and compile. Arguments as of `Estimator`; `posture_prior`: any of those used."""
         self._settings, mounts, count = settings, Mounts.of(model, hand_markers), len(hand_markers)
         self.on_hand = np.array([markers.index(name) for name in hand_markers], np.int64)
         self.finger = mounts.finger
@@ -75,11 +75,11 @@ class EpochSteps:
         space = Workspace.empty(n, extras, _capacity(count))
         self.now, self.at = fields(state), fields(space)
         self._state, self._space, self._work = boxed(state), boxed(space), boxed(Scratch.empty())
-        self._ground, self._lines_of_sight = self._space["ground"], self._space["belief"]["lines_of_sight"]
+        self._ground, self._lines_of_sight = self._space["ground"], self._space["epoch_prior"]["lines_of_sight"]
         hand, device = boxed(self._rig.hand), boxed(device)
         self._model = Model(hand, boxed(settings.record()), mounts, self._rig.cameras, device)
         self.at.scratch.search.wrist_share[0] = settings.wrist_share
-        self.at.belief.z_info[0, 0] = 1.0  # of a rig without wrist device: one extra that means nothing
+        self.at.epoch_prior.z_info[0, 0] = 1.0  # of a rig without wrist device: one extra that means nothing
         if wrist is not None:
             self._lay_out(wrist)
         nothing, own = np.full((len(cameras), len(markers), 2), np.nan), np.zeros((len(markers), 3, 3))
@@ -98,7 +98,7 @@ class EpochSteps:
         rig, state, space = self._model, self._state, self._space
         self._prepare = bound(prepare_epoch, rig, state, space)
         self._predict = bound(predict_epoch, rig, state, observed, space)
-        self._fit = bound(fit_epoch, rig, habits, observed, self._blank, space)
+        self._fit = bound(fit_epoch, rig, posture_prior, observed, self._blank, space)
         self._take_over = bound(take_over_epoch, rig, state, True, observed, space, Estimate.empty())
 
     def pose(self, T: Float, angles_rad: Float) -> tuple[HandJoints, Float]:
@@ -113,7 +113,7 @@ class EpochSteps:
 
     def observe(self, at: Epoch, *, continuous: bool) -> None:
         """Write the rows of an epoch, and count them."""
-        task, lines_of_sight = self.at.task, self.at.belief.lines_of_sight
+        task, lines_of_sight = self.at.task, self.at.epoch_prior.lines_of_sight
         task.t_ns[0], task.second_order[0], task.continuous[0] = at.t_ns, at.second_order, continuous
         task.process_noise_rad2[0] = 0.0 if at.orientation is None else at.orientation.process_noise_rad2
         if at.wrist is None:
@@ -157,34 +157,34 @@ class EpochSteps:
         """Step the extras, and search the valleys of the fingers that a wrist device sees."""
         self._prepare(self._model, self._state, self._space)
 
-    def believe(self, at: Epoch, *, known: bool) -> None:
+    def set_priors(self, at: Epoch, *, known: bool) -> None:
         """Write what is believed beside the past and habits; `known`: whether the past still says anything."""
-        belief, ground, orientation = self.at.belief, self.at.ground, at.orientation
-        belief.back_normal[:] = at.back_normal
-        belief.back_normal_w2[0] = self._settings.back_normal_rad**-2.0 if ground.back[0] else 0.0
-        belief.depth_w2[0] = 0.0
+        epoch_prior, ground, orientation = self.at.epoch_prior, self.at.ground, at.orientation
+        epoch_prior.back_normal[:] = at.back_normal
+        epoch_prior.back_normal_w2[0] = self._settings.back_normal_rad**-2.0 if ground.back[0] else 0.0
+        epoch_prior.depth_w2[0] = 0.0
         if known and ground.most[0] == 1:
             alone = self._rig.cameras.centre[(self.observed.weight > 0.0).sum(axis=1).argmax()]
             line_of_sight = self.now.palm[:3, 3] - alone
-            belief.line_of_sight[:] = line_of_sight / np.sqrt(line_of_sight @ line_of_sight)
-            belief.depth_w2[0] = self._settings.held_depth_m**-2.0
-        belief.oriented[0] = orientation is not None
+            epoch_prior.line_of_sight[:] = line_of_sight / np.sqrt(line_of_sight @ line_of_sight)
+            epoch_prior.depth_w2[0] = self._settings.held_depth_m**-2.0
+        epoch_prior.oriented[0] = orientation is not None
         if orientation is not None:
-            belief.forearm[:3, :3], belief.orientation_info[:] = orientation.rotation, orientation.information
-            belief.on_forearm[0] = orientation.axes is not None
-            belief.axes[:] = 0.0 if orientation.axes is None else orientation.axes
-        belief.place_w2[0] = 0.0
+            epoch_prior.forearm[:3, :3], epoch_prior.orientation_info[:] = orientation.rotation, orientation.information
+            epoch_prior.on_forearm[0] = orientation.axes is not None
+            epoch_prior.axes[:] = 0.0 if orientation.axes is None else orientation.axes
+        epoch_prior.place_w2[0] = 0.0
         if at.place is not None:
-            belief.place[:], belief.place_w2[0] = at.place, _STANDS_M**-2.0
+            epoch_prior.place[:], epoch_prior.place_w2[0] = at.place, _STANDS_M**-2.0
 
     def predict(self) -> float:
         """Write where the state has the hand; as `predict_epoch`."""
         return self._predict(self._model, self._state, self.observed, self._space)
 
-    def fit(self, habits: Habits, *, rough: bool = False) -> float:
+    def fit(self, posture_prior: PosturePrior, *, rough: bool = False) -> float:
         """Fit what is measured; return chi square, or the cost of a rough search."""
         self.at.task.rough[0] = rough
-        return self._fit(self._model, habits, self.observed, self._blank, self._space)
+        return self._fit(self._model, posture_prior, self.observed, self._blank, self._space)
 
     def take_over(self, *, goes_on: bool) -> Estimate:
         """Take what was found into the state; `goes_on`: the hand is that of the epoch before."""
@@ -233,11 +233,11 @@ class EpochSteps:
     def _lay_out(self, wrist: WristModel) -> None:
         """Write what is believed of fingers before a wrist device, and of what it leaves open."""
         prior, state, s = self.at.prior, self.now, self._settings
-        prior.natural[:], prior.slope[:], prior.frame[:] = wrist.natural, wrist.slope, wrist.frame
+        prior.base_rad[:], prior.per_pip[:], prior.frame[:] = wrist.base_rad, wrist.per_pip, wrist.frame
         prior.abduction[:], prior.flexion[:] = s.abduction_rad, s.coupled_rad
         prior.abduction[0] = prior.flexion[0] = 0.5 * s.thumb_rad
-        if wrist.only_natural:
-            prior.only_natural[0], prior.flexion[:] = 1.0, _STIFF_RAD
+        if wrist.natural_only:
+            prior.natural_only[0], prior.flexion[:] = 1.0, _STIFF_RAD
         state.stationary[:] = stationary_of(s, loose=wrist.loose, tilt_rad=wrist.tilt_rad)
         state.z_cov[:] = np.diag(state.stationary)
         if wrist.heading_rad is not None:

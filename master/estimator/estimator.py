@@ -12,7 +12,7 @@ from master.estimator.epoch import Epoch, Fitted, FittedHand
 from master.estimator.epoch_steps import EpochSteps
 from master.estimator.observation_sources import ON_OTHERS
 from master.estimator.parameters import HandParameters
-from master.estimator.reinitialise import NONE, HabitTables, Reinitialiser
+from master.estimator.reinitialise import NONE, PosturePriorTables, Reinitialiser
 from master.estimator.settings import DEFAULT, Settings
 from master.estimator.update import Estimate
 from master.estimator.wrist_device import HEADING, LED_SCALE, WRIST_ANGLES
@@ -54,15 +54,15 @@ class Estimator:
             CalibrationError: The profile mounts no marker of one of the names.
         """
         self.model, self.settings, self.wrist = model, settings, wrist is not None
-        self._continuous, self._only_natural = continuous, natural
+        self._continuous, self._natural_only = continuous, natural
         self.parameters = HandParameters.of(model)
-        habits = HabitTables(model, self.parameters, settings, natural=natural)
-        self._habits = habits.unlike(NONE)
-        self._natural_habits = self._habits.natural()
+        posture_prior = PosturePriorTables(model, self.parameters, settings, natural=natural)
+        self._posture_prior = posture_prior.unlike(NONE)
+        self._natural_prior = self._posture_prior.natural_component()
         self._steps = EpochSteps(
-            cameras, model, self.parameters, markers, hand_markers, self._habits, settings, wrist
+            cameras, model, self.parameters, markers, hand_markers, self._posture_prior, settings, wrist
         )
-        self._reinitialiser = Reinitialiser(self._steps, self.parameters, habits, settings)
+        self._reinitialiser = Reinitialiser(self._steps, self.parameters, posture_prior, settings)
         self.state, self._now, self._at = self._steps.state, self._steps.now, self._steps.at
 
     @property
@@ -121,7 +121,7 @@ class Estimator:
         palm_shown = bool(ground.by_markers[0]) or (sure and ground.seen[0] > 0) or at.place is not None
         task.palm_shown[0] = palm_shown
         known = self.has_previous(at.t_ns)
-        steps.believe(at, known=known)
+        steps.set_priors(at, known=known)
         doubtful = self.wrist and at.orientation is not None and bool(ground.by_markers[0])
         before, rejected = steps.kept() if doubtful else None, False
         out, reinitialised = self._solve(at, known=known)
@@ -129,7 +129,7 @@ class Estimator:
             # What the IMU says is left out: it began anew, or the wrist was flicked. But not where it alone tells.
             for orientation in (None, at.orientation):
                 steps.put_back(before)
-                steps.believe(replace(at, orientation=orientation), known=known)
+                steps.set_priors(replace(at, orientation=orientation), known=known)
                 out, reinitialised = self._solve(replace(at, orientation=orientation), known=known)
                 rejected = orientation is None
                 if rejected and np.trace(self._at.found.cov[:3, :3]) < _SURE_RAD2:
@@ -161,7 +161,7 @@ class Estimator:
             self._reinitialiser.begin(at)
         else:
             return None, False
-        reinitialised = known and not goes_on and not self._only_natural
+        reinitialised = known and not goes_on and not self._natural_only
         return self._steps.take_over(goes_on=goes_on), reinitialised
 
     def _go_on(self, at: Epoch, *, may_leave: bool) -> tuple[float, bool]:
@@ -179,8 +179,8 @@ class Estimator:
         if limit < 0.0:
             return np.inf, False
         # Whether a hand obeys habits, fingers before a wrist device say by themselves.
-        wrong = self._steps.fit(self._habits if self._at.ground.seen[0] > 0 else self._natural_habits)
-        if self._only_natural and may_leave:
+        wrong = self._steps.fit(self._posture_prior if self._at.ground.seen[0] > 0 else self._natural_prior)
+        if self._natural_only and may_leave:
             return wrong, not (self._steps.unexplained() and self._steps.enough(at))
         return wrong, not wrong > limit  # NaN: there is nothing to compare
 
@@ -224,7 +224,7 @@ class Estimator:
             alone=found.cov[:known, :known].copy(),
             x=found.x.copy(),
             scale=float(found.scale[0]),
-            natural=float(found.natural[0]),
+            natural_weight=float(found.natural_weight[0]),
             surprise=found.surprise[: len(self._steps.on_hand)].copy(),
             steps=int(found.steps[0]),
             twist=self._now.z[:5].copy() if self.wrist else np.zeros(5),

@@ -24,7 +24,7 @@ from common.arrays import Float
 from common.kernels import inlined, inner
 from common.records import record
 from master.estimator.matrices import cholesky, inverse
-from master.estimator.problem import Belief
+from master.estimator.problem import EpochPrior
 from master.estimator.settings import Settings
 from master.estimator.state import HandState
 from master.estimator.wrist_device import EXTRAS, HEADING, LED_SCALE, RATE, TILT, WRIST_ANGLES
@@ -80,10 +80,10 @@ def predict_extras(
     state: HandState,
     dt_s: float,
     process_noise_rad2: float,
-    belief: Belief,
+    epoch_prior: EpochPrior,
     scratch: ExtrasScratch,
 ) -> None:
-    """Step the extras to an epoch, in the state, and write `Belief.z` and `z_info`.
+    """Step the extras to an epoch, in the state, and write `EpochPrior.z` and `z_info`.
 
     Args:
         settings: Paces.
@@ -94,7 +94,7 @@ def predict_extras(
     """
     K, z, P, M = state.z.shape[0], state.z, state.z_cov, scratch.M
     if K < EXTRAS:
-        belief.z[0], belief.z_info[0, 0] = 0.0, 1.0
+        epoch_prior.z[0], epoch_prior.z_info[0, 0] = 0.0, 1.0
         return
     away = min(max(dt_s, 0.0), 1e3)
     for i in range(K):
@@ -107,7 +107,7 @@ def predict_extras(
         at, rate = WRIST_ANGLES + b, RATE + b
         M[at, at], M[at, rate] = (1.0 + paced) * decay, away * decay
         M[rate, at], M[rate, rate] = -(settings.pace_1_s**2) * away * decay, (1.0 - paced) * decay
-        z[at] -= state.habit[b]
+        z[at] -= state.wrist_mean_rad[b]
     for i in range(K):
         total = 0.0
         for j in range(K):
@@ -131,18 +131,18 @@ def predict_extras(
             P[i, i] += state.stationary[i]
     P[HEADING, HEADING] += process_noise_rad2
     for b in range(2):
-        z[WRIST_ANGLES + b] += state.habit[b]
+        z[WRIST_ANGLES + b] += state.wrist_mean_rad[b]
     for i in range(K):
-        belief.z[i] = z[i]
+        epoch_prior.z[i] = z[i]
         for j in range(i + 1):
             scratch.A[i, j] = 0.5 * (P[i, j] + P[j, i])
     if cholesky(scratch.A, K, scratch.L):
-        inverse(scratch.L, K, scratch.B, belief.z_info)
+        inverse(scratch.L, K, scratch.B, epoch_prior.z_info)
         return
     for i in range(K):  # by rounding: nothing is known
         for j in range(K):
             P[i, j] = state.stationary[i] if i == j else 0.0
-            belief.z_info[i, j] = 1.0 / state.stationary[i] if i == j else 0.0
+            epoch_prior.z_info[i, j] = 1.0 / state.stationary[i] if i == j else 0.0
 
 
 @inner
@@ -150,7 +150,7 @@ def keep_extras(
     settings: Settings,
     state: HandState,
     dt_s: float,
-    belief: Belief,
+    epoch_prior: EpochPrior,
     z: Float,
     cov: Float,
     scale: float,
@@ -158,7 +158,7 @@ def keep_extras(
 ) -> None:
     """Take over what an epoch leaves of the extras.
 
-    The epoch's own information is what its posterior has beyond `Belief.z_info`; so much of it counts as is new.
+    The epoch's own information is what its posterior has beyond `EpochPrior.z_info`; so much of it counts as is new.
 
     Args:
         settings: How much of it is new.
@@ -185,19 +185,19 @@ def keep_extras(
     for i in range(K):
         pull = 0.0
         for j in range(K):
-            pull += A[i, j] * (z[j] - belief.z[j])
+            pull += A[i, j] * (z[j] - epoch_prior.z[j])
         scratch.M[1, i] = new[i] * pull
     for i in range(K):
         for j in range(K):
-            gained = A[i, j] - belief.z_info[i, j]
-            B[i, j] = belief.z_info[i, j] + sqrt(new[i] * new[j]) * gained
+            gained = A[i, j] - epoch_prior.z_info[i, j]
+            B[i, j] = epoch_prior.z_info[i, j] + sqrt(new[i] * new[j]) * gained
     if not cholesky(B, K, scratch.L):
         return
     inverse(scratch.L, K, A, P)
     for i in range(K):
-        state.z[i] = belief.z[i]
+        state.z[i] = epoch_prior.z[i]
         for j in range(K):
             state.z[i] += P[i, j] * scratch.M[1, j]
-    share = 1.0 - exp(-min(dt_s, 10.0) / settings.habit_s)
+    share = 1.0 - exp(-min(dt_s, 10.0) / settings.wrist_mean_s)
     for b in range(2):
-        state.habit[b] += share * (state.z[WRIST_ANGLES + b] - state.habit[b])
+        state.wrist_mean_rad[b] += share * (state.z[WRIST_ANGLES + b] - state.wrist_mean_rad[b])

@@ -36,8 +36,8 @@ def expect_coupling(settings: Settings, state: HandState, dt_s: float, prior: Pr
 def learn_coupling(prior: Prior, f: int, scan: Scan, state: HandState) -> None:
     """Add a finger of which laser and tip tell without doubt."""
     pip, pip2, sums = scan.out[f, 2], scan.pip2[f], state.coupling
-    off = scan.out[f, 1] - prior.natural[f, 1] - prior.slope[f, 1] * pip
-    way = scan.way[f, 1] - prior.slope[f, 1]
+    off = scan.out[f, 1] - prior.base_rad[f, 1] - prior.per_pip[f, 1] * pip
+    way = scan.way[f, 1] - prior.per_pip[f, 1]
     sums[0] += pip * pip + pip2
     sums[1] += pip * off + way * pip2
     sums[2] += off * off + way * way * pip2

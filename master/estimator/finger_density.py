@@ -55,9 +55,9 @@ def _densities(hand: HandTables, settings: Settings, prior: Prior, f: int, unsee
         if unseen:
             shows = (1.0 - share) * scan.showing[f, node] + share * scan.showing[f, node + 1]
             base -= (settings.unseen_again if prior.had_previous[f] > 0.0 else settings.unseen) * shows
-        off = flexion - prior.natural[f, 1] - prior.slope[f, 1] * pip
+        off = flexion - prior.base_rad[f, 1] - prior.per_pip[f, 1] * pip
         variance = prior.flexion[f] ** 2 + flexion2
-        if f > 0 and prior.only_natural[0] == 0.0:
+        if f > 0 and prior.natural_only[0] == 0.0:
             off -= prior.coupled_share[0] * pip
             variance += (prior.coupled_spread[0] * max(pip, 0.0)) ** 2
         natural = _normal_log(off, variance)
@@ -79,8 +79,8 @@ def weigh_hands(
     others = 0
     for f in range(1, 5):
         others += 1 if lines_of_sight.shown[f] > 0.0 else 0
-    scan.share[_NATURAL] = log(settings.mostly_natural)
-    scan.share[_STRAIGHT] = scan.share[_FREE] = log(0.5 * (1.0 - settings.mostly_natural))
+    scan.share[_NATURAL] = log(settings.natural_finger_weight)
+    scan.share[_STRAIGHT] = scan.share[_FREE] = log(0.5 * (1.0 - settings.natural_finger_weight))
     for f in range(5):
         if scan.known[f] == 0.0:
             continue
@@ -95,7 +95,7 @@ def weigh_hands(
             scan.hand[f, h] = log(total) + top
             if f > 0 and lines_of_sight.shown[f] > 0.0:
                 scan.share[h] += scan.hand[f, h]
-    if prior.only_natural[0] > 0.0:
+    if prior.natural_only[0] > 0.0:
         scan.share[_STRAIGHT] = scan.share[_FREE] = -inf
     top = max(scan.share[0], max(scan.share[1], scan.share[2]))
     total = 0.0
@@ -186,7 +186,7 @@ def choose(
     scan.parts[f] = parts
     if isfinite(prior.law[f]):
         for k in range(1, 4):
-            scan.out[f, k] = scan.mode[f, k] = prior.natural[f, k] + prior.slope[f, k] * prior.law[f]
+            scan.out[f, k] = scan.mode[f, k] = prior.base_rad[f, k] + prior.per_pip[f, k] * prior.law[f]
     share = place / FINE - node
     for i in range(2):
         lines_of_sight.lack[f, i] = (1.0 - share) * scan.lack[f, node, i] + share * scan.lack[f, node + 1, i]

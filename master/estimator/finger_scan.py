@@ -54,7 +54,7 @@ class Prior:
         last: (5,) PIPs expected, `process_noise` (5,) how far from there they may be, `had_previous` (5,)
             whether they are expected anywhere.
         near_rad: (5,) how far from there a finger that is well known is searched; 0: everywhere.
-        only_natural: (1,) 1 where fingers are taken to bend naturally, whatever is seen (level "fk").
+        natural_only: (1,) 1 where fingers are taken to bend naturally, whatever is seen (level "fk").
         law: (5,) PIPs by another law; NaN: none.
         frame: (4,) least and most x and y of a fingertip that is clearly in the image.
     """
@@ -65,8 +65,8 @@ class Prior:
     twist2: Float
     light: Float
     light2: Float
-    natural: Float
-    slope: Float
+    base_rad: Float
+    per_pip: Float
     abduction: Float
     flexion: Float
     coupled_share: Float
@@ -75,7 +75,7 @@ class Prior:
     process_noise: Float
     had_previous: Float
     near_rad: Float
-    only_natural: Float
+    natural_only: Float
     law: Float
     frame: Float
 
@@ -90,8 +90,8 @@ class Prior:
             twist2=5,
             light=1,
             light2=1,
-            natural=(5, 4),
-            slope=(5, 4),
+            base_rad=(5, 4),
+            per_pip=(5, 4),
             abduction=5,
             flexion=5,
             coupled_share=1,
@@ -100,7 +100,7 @@ class Prior:
             process_noise=5,
             had_previous=5,
             near_rad=5,
-            only_natural=1,
+            natural_only=1,
             law=5,
             frame=4,
         )
@@ -246,10 +246,10 @@ def _rows(
             c = _column(u)
             J[2, u], J[3, u], J[4, u] = p * G[2, c], p * G[3, c], w * G[4, c]
     pip = a[4 * f + 2]
-    r[5] = (a[4 * f] - prior.natural[f, 0] - prior.slope[f, 0] * pip) / prior.abduction[f]
+    r[5] = (a[4 * f] - prior.base_rad[f, 0] - prior.per_pip[f, 0] * pip) / prior.abduction[f]
     J[5, 0] = 1.0 / prior.abduction[f]
     sigma = _dip_sigma(settings, f, pip)
-    r[6] = (a[4 * f + 3] - prior.natural[f, 3] - prior.slope[f, 3] * pip) / sigma
+    r[6] = (a[4 * f + 3] - prior.base_rad[f, 3] - prior.per_pip[f, 3] * pip) / sigma
     J[6, 2] = 1.0 / sigma
     r[7] = (scan.twist[f] - prior.twist[f]) / sqrt(prior.twist2[f])
     J[7, 3] = 1.0 / sqrt(prior.twist2[f])
@@ -311,8 +311,8 @@ def scan_finger(
         a[4 * f + 2] = pip
         lines_of_sight.lack[f, 0] = lines_of_sight.lack[f, 1] = 0.0
         dip, aside = (
-            prior.natural[f, 3] + prior.slope[f, 3] * pip,
-            prior.natural[f, 0] + prior.slope[f, 0] * pip,
+            prior.base_rad[f, 3] + prior.per_pip[f, 3] * pip,
+            prior.base_rad[f, 0] + prior.per_pip[f, 0] * pip,
         )
         best, at = inf, _COARSE
         if (node - scan.first[f]) % _RESTART == 0:

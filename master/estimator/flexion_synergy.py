@@ -28,7 +28,7 @@ class FlexionSynergy:
     """
 
     base_rad: Float
-    slope: Float
+    per_pip: Float
     range_rad: Float
 
     @classmethod
@@ -37,20 +37,20 @@ class FlexionSynergy:
         stated = model.profile.couplings is not None
         digits = preset_couplings("D")
         mcp, dip = (model.mcp_per_pip, model.dip_per_pip) if stated else (None, None)
-        base, slope, range_rad = np.zeros((5, 4)), np.zeros((5, 4)), np.empty((5, 2))
-        slope[1:, FLEXION] = digits.mcp_per_pip if mcp is None else mcp
-        slope[1:, DIP] = digits.dip_per_pip if dip is None else dip
-        slope[:, PIP] = 1.0
+        base, per_pip, range_rad = np.zeros((5, 4)), np.zeros((5, 4)), np.empty((5, 2))
+        per_pip[1:, FLEXION] = digits.mcp_per_pip if mcp is None else mcp
+        per_pip[1:, DIP] = digits.dip_per_pip if dip is None else dip
+        per_pip[:, PIP] = 1.0
         range_rad[1:] = 0.0, FULL_CURL_RAD
         low, high = model.limits_rad[0, 1:].T
         span = np.maximum(high - low, 1e-3)
-        slope[0, 1:] = span / span[1]
-        base[0, 1:] = low - low[1] * slope[0, 1:]
+        per_pip[0, 1:] = span / span[1]
+        base[0, 1:] = low - low[1] * per_pip[0, 1:]
         range_rad[0] = low[1], low[1] + span[1]
-        return cls(base, slope, range_rad)
+        return cls(base, per_pip, range_rad)
 
     def angles(self, curl_rad: Float, abduction_rad: Float) -> Float:
         """Angles (..., 5, 4) [rad] of closings and abductions (..., 5) [rad]."""
-        angles = self.base_rad + curl_rad[..., None] * self.slope
+        angles = self.base_rad + curl_rad[..., None] * self.per_pip
         angles[..., ABDUCTION] = abduction_rad
         return angles

@@ -8,8 +8,8 @@ import numpy as np
 from common.arrays import Float
 from common.kernels import inlined
 from common.records import boxed, record
-from master.estimator.priors import Habits
-from master.estimator.problem import Belief, Search
+from master.estimator.priors import PosturePrior
+from master.estimator.problem import EpochPrior, Search
 from master.estimator.residuals import Observations
 from master.estimator.truncated import Cut
 
@@ -33,7 +33,7 @@ class Posterior:
     cov: Float
     surprise: Float
     steps: Float
-    natural: Float
+    natural_weight: Float
     scale: Float
     contrary: Float
 
@@ -49,7 +49,7 @@ class Posterior:
             cov=(N, N),
             surprise=markers,
             steps=1,
-            natural=1,
+            natural_weight=1,
             scale=1,
             contrary=1,
         )
@@ -58,18 +58,18 @@ class Posterior:
 class Blank(NamedTuple):
     """Of which nothing is believed: what `_onto` needs for a fit to points alone.
 
-    `belief`: the array that a `Belief` lies in (`common.records.boxed`).
+    `epoch_prior`: the array that a `EpochPrior` lies in (`common.records.boxed`).
     """
 
-    habits: Habits
-    belief: Any
+    posture_prior: PosturePrior
+    epoch_prior: Any
     between: Observations
 
     @classmethod
     def of(cls, n: int, extras: int, cameras: int, markers: int) -> "Blank":
         """For a hand with n free angles."""
-        nothing = Habits(np.zeros((1, n, n)), np.zeros((1, n)), np.zeros(1), np.zeros(1))
-        return cls(nothing, boxed(Belief.none(n, extras)), Observations.empty(cameras, markers))
+        nothing = PosturePrior(np.zeros((1, n, n)), np.zeros((1, n)), np.zeros(1), np.zeros(1))
+        return cls(nothing, boxed(EpochPrior.none(n, extras)), Observations.empty(cameras, markers))
 
 
 class Hypothesis:

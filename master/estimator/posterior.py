@@ -29,8 +29,8 @@ from common.kernels import constant, inlined, inner
 from master.estimator.hypotheses import Blank, Hypothesis, Posterior, Scratch, likelier
 from master.estimator.kinematics import markers_of, rotate_by, rotation_between
 from master.estimator.matrices import cholesky, copy, half_log_determinant, inverse, substitute
-from master.estimator.priors import Habits
-from master.estimator.problem import Belief, Rig
+from master.estimator.priors import PosturePrior
+from master.estimator.problem import EpochPrior, Rig
 from master.estimator.residuals import Observations
 from master.estimator.settings import Settings
 from master.estimator.solve import descend, linearise, own_cost, past_cost
@@ -44,8 +44,8 @@ _ONLY = constant(0)  # hypothesis of `Blank`
 def _solve_each(
     rig: Rig,
     settings: Settings,
-    habits: Habits,
-    belief: Belief,
+    posture_prior: PosturePrior,
+    epoch_prior: EpochPrior,
     observed: Observations,
     T: Float,
     x: Float,
@@ -54,7 +54,7 @@ def _solve_each(
 ) -> int:
     """Search under each hypothesis from one start; return the steps of the first."""
     steps = 0
-    for h in range(habits.constant.shape[0]):
+    for h in range(posture_prior.constant.shape[0]):
         one = scratch.each[h]
         copy(T, one.palm)
         for i in range(x.shape[0]):
@@ -63,8 +63,8 @@ def _solve_each(
             one.z[i] = z[i]
         _, taken = descend(
             rig,
-            habits,
-            belief,
+            posture_prior,
+            epoch_prior,
             observed,
             h,
             settings.tolerance,
@@ -77,7 +77,7 @@ def _solve_each(
             scratch.search,
         )
         one.cost[0] = linearise(
-            rig, habits, belief, observed, h, one.palm, one.x, one.z, one.gradient, one.normal, scratch.search
+            rig, posture_prior, epoch_prior, observed, h, one.palm, one.x, one.z, one.gradient, one.normal, scratch.search
         )
         one.outliers[0] = scratch.search.outliers[0]
         for m in range(rig.mounts.finger.shape[0]):
@@ -90,71 +90,71 @@ def _solve_each(
 
 
 @inner
-def _weigh(habits: Habits, settings: Settings, natural: float, counts: float, scratch: Scratch) -> None:
+def _weigh(posture_prior: PosturePrior, settings: Settings, natural_weight: float, counts: float, scratch: Scratch) -> None:
     """Write the probability of each hypothesis, from its evidence and what it was before.
 
-    `natural` is the probability of a natural hand a moment ago, `counts` what that counts, 0 ... 1.
+    `natural_weight` is the probability of a natural hand a moment ago, `counts` what that counts, 0 ... 1.
     """
     N, share, other = scratch.middle.shape[0], scratch.each[0].share, scratch.each[1].share
     share[0], other[0] = 1.0, 0.0
-    if habits.constant.shape[0] < 2:
+    if posture_prior.constant.shape[0] < 2:
         return
     odds = 0.0
     for h in range(2):
         one = scratch.each[h]
         known = half_log_determinant(scratch.L, N) if cholesky(one.normal, N, scratch.L) else 0.0
-        odds += (1.0 - 2.0 * h) * (habits.log_density[h] - one.cost[0] - known)
+        odds += (1.0 - 2.0 * h) * (posture_prior.log_density[h] - one.cost[0] - known)
     odds = min(max(odds, -settings.certain), settings.certain)
-    then = log(max(natural, 1e-9)) - log(max(1.0 - natural, 1e-9))
+    then = log(max(natural_weight, 1e-9)) - log(max(1.0 - natural_weight, 1e-9))
     odds += counts * (min(max(then, -settings.certain), settings.certain) - odds)
     share[0] = 1.0 / (1.0 + exp(-odds))
     other[0] = 1.0 - share[0]
 
 
 @inner
-def _least(habits: Habits, belief: Belief, h: int, scratch: Scratch) -> float:
+def _least(posture_prior: PosturePrior, epoch_prior: EpochPrior, h: int, scratch: Scratch) -> float:
     """The least that habits and beliefs about single angles of this instant cost: what they contradict each other."""
-    n = belief.own.shape[0]
+    n = epoch_prior.own.shape[0]
     x = scratch.cut.weight
     for i in range(n):
         for j in range(n):
-            scratch.work[i, j] = habits.normal[h, i, j]
-        scratch.work[i, i] += belief.own_w2[i]
-        x[i] = habits.pull[h, i] + belief.own_w2[i] * belief.own[i]
+            scratch.work[i, j] = posture_prior.normal[h, i, j]
+        scratch.work[i, i] += epoch_prior.own_w2[i]
+        x[i] = posture_prior.pull[h, i] + epoch_prior.own_w2[i] * epoch_prior.own[i]
     if not cholesky(scratch.work, n, scratch.L):
         return 0.0
     substitute(scratch.L, n, x)
-    return own_cost(habits, belief, h, x)
+    return own_cost(posture_prior, epoch_prior, h, x)
 
 
 @inner
 def _covariance(
-    rig: Rig, settings: Settings, habits: Habits, belief: Belief, h: int, numbers: float, scratch: Scratch
+    rig: Rig, settings: Settings, posture_prior: PosturePrior, epoch_prior: EpochPrior, h: int, numbers: float, scratch: Scratch
 ) -> float:
     """Write the covariance (N, N) of one hypothesis by this instant alone; return its scale."""
     N, A, one = scratch.middle.shape[0], scratch.A, scratch.each[h]
     for i in range(N):
         for j in range(i + 1):
             A[i, j] = one.normal[i, j]
-        if i < 6 + belief.past_w2.shape[0]:
-            A[i, i] += rig.hand.anywhere[i] - (belief.palm_w2[i] if i < 6 else belief.past_w2[i - 6])
+        if i < 6 + epoch_prior.past_w2.shape[0]:
+            A[i, i] += rig.hand.anywhere[i] - (epoch_prior.palm_w2[i] if i < 6 else epoch_prior.past_w2[i - 6])
     for i in range(one.x.shape[0]):  # a limit keeps an angle, and measures none
         if one.x[i] > rig.hand.legal_high[i] or one.x[i] < rig.hand.legal_low[i]:
             A[6 + i, 6 + i] -= rig.hand.beyond_w2[i]
     for i in range(3):
         for j in range(i + 1):
-            A[3 + i, 3 + j] -= belief.depth_w2[0] * belief.line_of_sight[i] * belief.line_of_sight[j]
+            A[3 + i, 3 + j] -= epoch_prior.depth_w2[0] * epoch_prior.line_of_sight[i] * epoch_prior.line_of_sight[j]
     if not cholesky(A, N, scratch.L):  # by rounding: nothing is known but limits
         known = rig.hand.anywhere.shape[0]
         for i in range(N):
             for j in range(N):
                 scratch.cov[i, j] = 0.0
-            w2 = rig.hand.anywhere[i] if i < known else belief.z_info[i - known, i - known]
+            w2 = rig.hand.anywhere[i] if i < known else epoch_prior.z_info[i - known, i - known]
             scratch.cov[i, i] = 1.0 / w2
         return 1.0
     inverse(scratch.L, N, scratch.work, scratch.cov)
-    past = past_cost(belief, one.palm, one.x, scratch.search.off)
-    chi2 = 2.0 * (one.cost[0] - past - one.outliers[0] - _least(habits, belief, h, scratch))
+    past = past_cost(epoch_prior, one.palm, one.x, scratch.search.off)
+    chi2 = 2.0 * (one.cost[0] - past - one.outliers[0] - _least(posture_prior, epoch_prior, h, scratch))
     free = max(numbers - 6.0, 0.0)
     scale = max((settings.claimed + max(chi2, 0.0)) / (settings.claimed + free), 1.0)
     for i in range(N):
@@ -167,8 +167,8 @@ def _covariance(
 def _mix(
     rig: Rig,
     settings: Settings,
-    habits: Habits,
-    belief: Belief,
+    posture_prior: PosturePrior,
+    epoch_prior: EpochPrior,
     numbers: float,
     scratch: Scratch,
     out: Posterior,
@@ -183,7 +183,7 @@ def _mix(
         scratch.middle[i] = 0.0
         for j in range(N):
             out.cov[i, j] = 0.0
-    for h in range(habits.constant.shape[0]):
+    for h in range(posture_prior.constant.shape[0]):
         one, from_here = scratch.each[h], scratch.each[best]
         share = one.share[0]
         for i in range(N):
@@ -198,7 +198,7 @@ def _mix(
                 one.off[6 + i] = one.x[i] - from_here.x[i]
             for i in range(out.z.shape[0]):
                 one.off[6 + n + i] = one.z[i] - from_here.z[i]
-        out.scale[0] += share * _covariance(rig, settings, habits, belief, h, numbers, scratch)
+        out.scale[0] += share * _covariance(rig, settings, posture_prior, epoch_prior, h, numbers, scratch)
         for i in range(N):
             for j in range(N):
                 out.cov[i, j] += share * scratch.cov[i, j]
@@ -207,7 +207,7 @@ def _mix(
         for i in range(N):
             one.off[i] += one.step[i]
             scratch.middle[i] += share * one.off[i]
-    for h in range(habits.constant.shape[0]):
+    for h in range(posture_prior.constant.shape[0]):
         one = scratch.each[h]
         for i in range(N):
             for j in range(N):
@@ -274,8 +274,8 @@ def _onto(
         out.z[i] = likely.z[i] + scratch.middle[6 + n + i]
     linearise(
         rig,
-        blank.habits,
-        blank.belief[0],
+        blank.posture_prior,
+        blank.epoch_prior[0],
         between,
         _ONLY,
         out.palm,
@@ -305,13 +305,13 @@ def _onto(
 def posterior(
     rig: Rig,
     settings: Settings,
-    habits: Habits,
-    belief: Belief,
+    posture_prior: PosturePrior,
+    epoch_prior: EpochPrior,
     observed: Observations,
     T: Float,
     x: Float,
     z: Float,
-    natural: float,
+    natural_weight: float,
     counts: float,
     numbers: float,
     blank: Blank,
@@ -328,10 +328,10 @@ def posterior(
         blank, room: Scratch.
         out: Written.
     """
-    out.steps[0] = _solve_each(rig, settings, habits, belief, observed, T, x, z, scratch)
-    _weigh(habits, settings, natural, counts, scratch)
-    out.natural[0] = scratch.each[0].share[0]
-    best = _mix(rig, settings, habits, belief, numbers, scratch, out)
+    out.steps[0] = _solve_each(rig, settings, posture_prior, epoch_prior, observed, T, x, z, scratch)
+    _weigh(posture_prior, settings, natural_weight, counts, scratch)
+    out.natural_weight[0] = scratch.each[0].share[0]
+    best = _mix(rig, settings, posture_prior, epoch_prior, numbers, scratch, out)
     likely = scratch.each[best]
     moves = False
     for i in range(scratch.middle.shape[0]):

@@ -21,7 +21,7 @@ _NARROWEST_RAD = 1e-3  # limits that leave an angle no room
 Row = tuple[dict[int, float], float, float]
 
 
-class Habits(NamedTuple):
+class PosturePrior(NamedTuple):
     """Beliefs about the free angles x of H hypotheses: x normal x / 2 - pull x + constant, half a sum of squares.
 
     Attributes:
@@ -36,25 +36,25 @@ class Habits(NamedTuple):
     constant: Float
     log_density: Float
 
-    def without(self, columns: Int, mean: float, sigma: float) -> "Habits":
+    def without(self, columns: Int, mean: float, sigma: float) -> "PosturePrior":
         """The same, but the first hypothesis without its belief about each of these angles by itself."""
         normal, pull, constant = self.normal.copy(), self.pull.copy(), self.constant.copy()
         normal[0, columns, columns] -= 1.0 / sigma**2
         pull[0, columns] -= mean / sigma**2
         constant[0] -= 0.5 * len(columns) * (mean / sigma) ** 2
-        return Habits(normal, pull, constant, self.log_density)
+        return PosturePrior(normal, pull, constant, self.log_density)
 
-    def natural(self) -> "Habits":
+    def natural_component(self) -> "PosturePrior":
         """Those of the first hypothesis alone."""
-        return Habits(self.normal[:1], self.pull[:1], self.constant[:1], self.log_density[:1])
+        return PosturePrior(self.normal[:1], self.pull[:1], self.constant[:1], self.log_density[:1])
 
 
-def habits_of(
+def posture_prior_of(
     model: HandModel,
     parameters: HandParameters,
     settings: Settings = DEFAULT,
     unlike: frozenset[int] = frozenset(),
-) -> Habits:
+) -> PosturePrior:
     """Habits of a natural hand and of a free one.
 
     Args:
@@ -76,8 +76,8 @@ def habits_of(
         span = np.maximum(parameters.legal_high - parameters.legal_low, _NARROWEST_RAD)[flexion]
         # The highest density of a normal distribution of this width is that of any angle within the span.
         volume[1, flexion, flexion] += 2.0 * np.pi / span**2
-    share = np.log([settings.natural_share, 1.0 - settings.natural_share])
-    return Habits(normal, pull, constant, share + least + 0.5 * np.linalg.slogdet(volume)[1])
+    share = np.log([settings.natural_prior_weight, 1.0 - settings.natural_prior_weight])
+    return PosturePrior(normal, pull, constant, share + least + 0.5 * np.linalg.slogdet(volume)[1])
 
 
 def curled(parameters: HandParameters, settings: Settings, fingers: Bool) -> tuple[Float, Float]:

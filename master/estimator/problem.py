@@ -20,7 +20,7 @@ class Rig(NamedTuple):
     device: Device
 
 
-class Belief:
+class EpochPrior:
     """What is believed at one epoch beside habits; filled in place.
 
     Attributes:
@@ -61,7 +61,7 @@ class Belief:
     lines_of_sight: LinesOfSight
 
     @classmethod
-    def none(cls, n: int, extras: int) -> "Belief":
+    def none(cls, n: int, extras: int) -> "EpochPrior":
         """Nothing is believed of a hand with n free angles and so many extra unknowns."""
         return record(
             cls,

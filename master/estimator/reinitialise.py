@@ -13,7 +13,7 @@ from common.wrist_joint import forearm_palm
 from master.estimator.epoch import Epoch
 from master.estimator.epoch_steps import EpochSteps
 from master.estimator.parameters import HandParameters
-from master.estimator.priors import Habits, curled, habits_of
+from master.estimator.priors import PosturePrior, curled, posture_prior_of
 from master.estimator.settings import Settings
 from master.estimator.solve import MAX_ITERATIONS
 from master.estimator.wrist_device import WRIST_ANGLES
@@ -26,7 +26,7 @@ _AT_ORIGIN = np.eye(4)
 NONE = frozenset[int]()
 
 
-class HabitTables:
+class PosturePriorTables:
     """Habits of one hand while some fingers are bent unlike the others, each worked out once."""
 
     def __init__(
@@ -34,13 +34,13 @@ class HabitTables:
     ) -> None:
         """Of a hand; `natural`: it is taken to obey them."""
         self._model, self._parameters, self._settings, self._natural = model, parameters, settings, natural
-        self._tables: dict[frozenset[int], Habits] = {}
+        self._tables: dict[frozenset[int], PosturePrior] = {}
 
-    def unlike(self, fingers: frozenset[int]) -> Habits:
+    def unlike(self, fingers: frozenset[int]) -> PosturePrior:
         """Those while these fingers are bent unlike the others."""
         if fingers not in self._tables:
-            habits = habits_of(self._model, self._parameters, self._settings, fingers)
-            self._tables[fingers] = habits.natural() if self._natural else habits
+            posture_prior = posture_prior_of(self._model, self._parameters, self._settings, fingers)
+            self._tables[fingers] = posture_prior.natural_component() if self._natural else posture_prior
         return self._tables[fingers]
 
 
@@ -48,14 +48,14 @@ class Reinitialiser:
     """Fits without the state. What it holds was prepared by the constructor."""
 
     def __init__(
-        self, steps: EpochSteps, parameters: HandParameters, habits: HabitTables, settings: Settings
+        self, steps: EpochSteps, parameters: HandParameters, posture_prior: PosturePriorTables, settings: Settings
     ) -> None:
-        self._steps, self._parameters, self._habits, self._settings = steps, parameters, habits, settings
+        self._steps, self._parameters, self._posture_prior, self._settings = steps, parameters, posture_prior, settings
         postures = np.zeros((len(_BENDS_RAD), 5, 4))
         postures[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (_MCP_PER_PIP, 1.0))[:, None]
         self._postures = np.array([parameters.of_angles(angles) for angles in postures])
         self._finger_of_free = parameters.free // 4
-        any_finger = habits.unlike(NONE)
+        any_finger = posture_prior.unlike(NONE)
         likeliest = np.asarray(np.linalg.solve(any_finger.normal[0], any_finger.pull[0]), np.float64)
         self._natural = np.minimum(np.maximum(likeliest, parameters.low), parameters.high)
 
@@ -75,32 +75,32 @@ class Reinitialiser:
     def _begin_with(self, at: Epoch, shown: frozenset[int], like: frozenset[int]) -> float:
         """As `begin`, while the hidden fingers of `like` are bent as their neighbours."""
         steps, outliers, start = self._steps, frozenset(range(5)) - shown - like, at.start
-        task, belief, scratch = steps.at.task, steps.at.belief, steps.at.scratch
-        belief.past_w2[:], belief.past[:], belief.palm_w2[:], belief.depth_w2[:] = 0.0, 0.0, 0.0, 0.0
+        task, epoch_prior, scratch = steps.at.task, steps.at.epoch_prior, steps.at.scratch
+        epoch_prior.past_w2[:], epoch_prior.past[:], epoch_prior.palm_w2[:], epoch_prior.depth_w2[:] = 0.0, 0.0, 0.0, 0.0
         fingers = np.isin(np.arange(5), list(outliers))
-        belief.own_w2[:], belief.own[:] = curled(self._parameters, self._settings, fingers)
-        task.natural[0], task.counts[0] = _EVEN, 0.0
-        habits = self._habits.unlike(outliers)
+        epoch_prior.own_w2[:], epoch_prior.own[:] = curled(self._parameters, self._settings, fingers)
+        task.natural_weight[0], task.counts[0] = _EVEN, 0.0
+        posture_prior = self._posture_prior.unlike(outliers)
         try:
             if start is not None:
                 shows = steps.at.ground.shown[self._finger_of_free] > 0
                 x = np.where(shows, self._parameters.of_angles(start.angles_rad), self._natural)
                 scratch.start_T[:], scratch.start_x[:] = start.T_rig_palm, self._with_scanned(x)
-                chi2 = steps.fit(habits)
+                chi2 = steps.fit(posture_prior)
                 if steps.at.found.steps[0] < MAX_ITERATIONS and not steps.unexplained():
                     return chi2
             ends = list[tuple[float, Float, Float]]()
             starts = self._starts(at)
             if len(starts) == 1:
                 scratch.start_T[:], scratch.start_x[:] = starts[0]
-                return steps.fit(habits)
+                return steps.fit(posture_prior)
             for T, x in starts:
                 task.palm[:], task.x[:] = T, x
-                ends.append((steps.fit(habits, rough=True), task.palm.copy(), task.x.copy()))
+                ends.append((steps.fit(posture_prior, rough=True), task.palm.copy(), task.x.copy()))
             _, scratch.start_T[:], scratch.start_x[:] = min(ends, key=lambda end: end[0])
-            return steps.fit(habits)
+            return steps.fit(posture_prior)
         finally:
-            belief.own_w2[:] = 0.0
+            epoch_prior.own_w2[:] = 0.0
 
     def _starts(self, epoch: Epoch) -> list[tuple[Float, Float]]:
         """Three hands, open to closed, each laid on the markers as a rigid body; one where the palm is known."""
@@ -120,7 +120,7 @@ class Reinitialiser:
                 T = np.eye(4)
                 T[:3, :3] = measured
                 T[:3, 3] = np.average(observed - expected @ measured.T, axis=0, weights=weight)
-            elif steps.at.belief.back_normal_w2[0] > 0.0:
+            elif steps.at.epoch_prior.back_normal_w2[0] > 0.0:
                 # A point above the wrist stands for "the back of the hand faces the cameras".
                 above = expected.mean(axis=0) + np.array([0.0, _ABOVE_M, 0.0])
                 towards = observed.mean(axis=0) + _ABOVE_M * epoch.back_normal

@@ -54,7 +54,7 @@ class Settings(NamedTuple):
     # A free hand, which has none: flexions anywhere within limits, a PIP rather in the lower half of its range.
     free_pip_rad: Annotated[float, Range("rad", 0.1, 3.0, _HANDS)] = radians(40.0)
     free_pip_mean_rad: Annotated[float, Range("rad", 0.0, 1.5, _HANDS)] = radians(30.0)
-    natural_share: Annotated[
+    natural_prior_weight: Annotated[
         float, Range("1", 0.01, 0.99, "small: habits that fit win by their narrowness")
     ] = 1.0 / 3.0
     posture_widened: Annotated[
@@ -86,7 +86,7 @@ class Settings(NamedTuple):
     shortest_s: Annotated[
         float, Range("s", 1e-5, 1e-2, "a shorter step would weld the hand to its last pose")
     ] = 1e-3
-    habit_memory_s: Annotated[
+    component_memory_s: Annotated[
         float, Range("s", 0.0, 5.0, "how fast a hand may change from habits to none")
     ] = 0.3
     # Fingers that nobody sees.
@@ -178,7 +178,7 @@ class Settings(NamedTuple):
     thumb_coupled_rad: Annotated[
         float, Range("rad", 0.01, 1.0, "of a thumb's IP about what goes with its MCP")
     ] = radians(12.0)
-    mostly_natural: Annotated[float, Range("1", 0.01, 0.99, "hands before anything of them is seen")] = 0.8
+    natural_finger_weight: Annotated[float, Range("1", 0.01, 0.99, "hands before anything of them is seen")] = 0.8
     straight_pip_rad: Annotated[
         float, Range("rad", 0.02, 1.0, "by which fingers are bent that are stretched")
     ] = radians(10.0)
@@ -241,7 +241,7 @@ class Settings(NamedTuple):
         float, Range("rad", 0.001, 0.5, "of a palm by markers, and of how IMU and camera are mounted")
     ] = radians(1.5)
     pace_1_s: Annotated[float, Range("1/s", 0.1, 30.0, "of wrists; Hansson et al. 2009")] = 1.5
-    habit_s: Annotated[float, Range("s", 1.0, 600.0, "as long as a posture of the wrist is kept")] = 20.0
+    wrist_mean_s: Annotated[float, Range("s", 1.0, 600.0, "as long as a posture of the wrist is kept")] = 20.0
     tilt_s: Annotated[float, Range("s", 0.1, 600.0, "as long as an IMU has the vertical off")] = 5.0
     errs_s: Annotated[float, Range("s", 0.01, 60.0, "as long as errors of shape and skin stay")] = 0.5
     wrist_errs_s: Annotated[

@@ -128,7 +128,7 @@ class HandOneEuro:
             alone=solution.alone,
             x=solution.x,
             scale=solution.scale,
-            natural=solution.natural,
+            natural_weight=solution.natural_weight,
             surprise=solution.surprise,
             steps=solution.steps,
             twist=solution.twist,

@@ -25,8 +25,8 @@ from master.estimator.kinematics import (
     twist_hand,
 )
 from master.estimator.matrices import cholesky, copy, substitute
-from master.estimator.priors import Habits
-from master.estimator.problem import Belief, Rig, Search
+from master.estimator.priors import PosturePrior
+from master.estimator.problem import EpochPrior, Rig, Search
 from master.estimator.residuals import Observations, marker_rows
 from master.estimator.wrist_device import EXTRAS, WRIST_ANGLES, flexed_palm
 from master.estimator.wrist_rows import finger_rows, orientation_row
@@ -49,37 +49,37 @@ def palm_off(T: Float, palm: Float, out: Float) -> None:
 
 
 @inlined
-def past_cost(belief: Belief, T: Float, x: Float, off: Float) -> float:
+def past_cost(epoch_prior: EpochPrior, T: Float, x: Float, off: Float) -> float:
     """What the state before costs at a hand; `off`: (6,) scratch."""
-    palm_off(T, belief.palm, off)
+    palm_off(T, epoch_prior.palm, off)
     cost, depth = 0.0, 0.0
     for i in range(6):
-        cost += 0.5 * belief.palm_w2[i] * off[i] * off[i]
+        cost += 0.5 * epoch_prior.palm_w2[i] * off[i] * off[i]
     for i in range(3):
-        depth += belief.line_of_sight[i] * off[3 + i]
-    cost += 0.5 * belief.depth_w2[0] * depth * depth
+        depth += epoch_prior.line_of_sight[i] * off[3 + i]
+    cost += 0.5 * epoch_prior.depth_w2[0] * depth * depth
     for i in range(x.shape[0]):
-        cost += 0.5 * belief.past_w2[i] * (x[i] - belief.past[i]) ** 2
+        cost += 0.5 * epoch_prior.past_w2[i] * (x[i] - epoch_prior.past[i]) ** 2
     return cost
 
 
 @inlined
-def own_cost(habits: Habits, belief: Belief, h: int, x: Float) -> float:
+def own_cost(posture_prior: PosturePrior, epoch_prior: EpochPrior, h: int, x: Float) -> float:
     """What habits of hypothesis h and beliefs about single angles of this instant cost."""
-    cost = habits.constant[h]
+    cost = posture_prior.constant[h]
     for i in range(x.shape[0]):
         total = 0.0
         for j in range(x.shape[0]):
-            total += habits.normal[h, i, j] * x[j]
-        cost += (0.5 * total - habits.pull[h, i]) * x[i]
-        cost += 0.5 * belief.own_w2[i] * (x[i] - belief.own[i]) ** 2
+            total += posture_prior.normal[h, i, j] * x[j]
+        cost += (0.5 * total - posture_prior.pull[h, i]) * x[i]
+        cost += 0.5 * epoch_prior.own_w2[i] * (x[i] - epoch_prior.own[i]) ** 2
     return cost
 
 
 @inlined
-def _believed(
-    habits: Habits,
-    belief: Belief,
+def _add_priors(
+    posture_prior: PosturePrior,
+    epoch_prior: EpochPrior,
     h: int,
     T: Float,
     x: Float,
@@ -94,38 +94,38 @@ def _believed(
         gradient[i] = 0.0
         for j in range(6 + n + K):
             normal[i, j] = 0.0
-    cost = past_cost(belief, T, x, search.off) + own_cost(habits, belief, h, x)
+    cost = past_cost(epoch_prior, T, x, search.off) + own_cost(posture_prior, epoch_prior, h, x)
     depth = 0.0
     for i in range(3):
-        depth += belief.line_of_sight[i] * search.off[3 + i]
+        depth += epoch_prior.line_of_sight[i] * search.off[3 + i]
     for i in range(6):
-        gradient[i] = belief.palm_w2[i] * search.off[i]
-        normal[i, i] = belief.palm_w2[i]
+        gradient[i] = epoch_prior.palm_w2[i] * search.off[i]
+        normal[i, i] = epoch_prior.palm_w2[i]
     for i in range(3):
-        gradient[3 + i] += belief.depth_w2[0] * depth * belief.line_of_sight[i]
+        gradient[3 + i] += epoch_prior.depth_w2[0] * depth * epoch_prior.line_of_sight[i]
         for j in range(3):
-            normal[3 + i, 3 + j] += belief.depth_w2[0] * belief.line_of_sight[i] * belief.line_of_sight[j]
+            normal[3 + i, 3 + j] += epoch_prior.depth_w2[0] * epoch_prior.line_of_sight[i] * epoch_prior.line_of_sight[j]
     for i in range(n):
         total = 0.0
         for j in range(n):
-            normal[6 + i, 6 + j] = habits.normal[h, i, j]
-            total += habits.normal[h, i, j] * x[j]
-        gradient[6 + i] = total - habits.pull[h, i] + belief.own_w2[i] * (x[i] - belief.own[i])
-        gradient[6 + i] += belief.past_w2[i] * (x[i] - belief.past[i])
-        normal[6 + i, 6 + i] += belief.own_w2[i] + belief.past_w2[i]
+            normal[6 + i, 6 + j] = posture_prior.normal[h, i, j]
+            total += posture_prior.normal[h, i, j] * x[j]
+        gradient[6 + i] = total - posture_prior.pull[h, i] + epoch_prior.own_w2[i] * (x[i] - epoch_prior.own[i])
+        gradient[6 + i] += epoch_prior.past_w2[i] * (x[i] - epoch_prior.past[i])
+        normal[6 + i, 6 + i] += epoch_prior.own_w2[i] + epoch_prior.past_w2[i]
     for i in range(K):
         total = 0.0
         for j in range(K):
-            normal[6 + n + i, 6 + n + j] = belief.z_info[i, j]
-            total += belief.z_info[i, j] * (z[j] - belief.z[j])
+            normal[6 + n + i, 6 + n + j] = epoch_prior.z_info[i, j]
+            total += epoch_prior.z_info[i, j] * (z[j] - epoch_prior.z[j])
         gradient[6 + n + i] = total
-        cost += 0.5 * total * (z[i] - belief.z[i])
-    if belief.place_w2[0] > 0.0:
+        cost += 0.5 * total * (z[i] - epoch_prior.z[i])
+    if epoch_prior.place_w2[0] > 0.0:
         for i in range(3):
-            off = T[i, 3] - belief.place[i]
-            cost += 0.5 * belief.place_w2[0] * off * off
-            gradient[3 + i] += belief.place_w2[0] * off
-            normal[3 + i, 3 + i] += belief.place_w2[0]
+            off = T[i, 3] - epoch_prior.place[i]
+            cost += 0.5 * epoch_prior.place_w2[0] * off * off
+            gradient[3 + i] += epoch_prior.place_w2[0] * off
+            normal[3 + i, 3 + i] += epoch_prior.place_w2[0]
     return cost
 
 
@@ -143,15 +143,15 @@ def _beyond(hand: HandTables, x: Float, gradient: Float, normal: Float) -> float
 
 
 @inlined
-def _faced(belief: Belief, T: Float, gradient: Float, normal: Float) -> float:
+def _faced(epoch_prior: EpochPrior, T: Float, gradient: Float, normal: Float) -> float:
     """Add that the back (the palm's +y) looks along `back_normal`; return its cost."""
-    w2 = belief.back_normal_w2[0]
+    w2 = epoch_prior.back_normal_w2[0]
     cost = 0.0
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
-        off = T[i, 1] - belief.back_normal[i]
+        off = T[i, 1] - epoch_prior.back_normal[i]
         cost += 0.5 * w2 * off * off
-        off_j, off_k = T[j, 1] - belief.back_normal[j], T[k, 1] - belief.back_normal[k]
+        off_j, off_k = T[j, 1] - epoch_prior.back_normal[j], T[k, 1] - epoch_prior.back_normal[k]
         gradient[i] += w2 * (T[j, 1] * off_k - T[k, 1] * off_j)
         normal[i, i] += w2 * (T[j, 1] * T[j, 1] + T[k, 1] * T[k, 1])
         normal[i, j] -= w2 * T[i, 1] * T[j, 1]
@@ -162,8 +162,8 @@ def _faced(belief: Belief, T: Float, gradient: Float, normal: Float) -> float:
 @inner
 def linearise(
     rig: Rig,
-    habits: Habits,
-    belief: Belief,
+    posture_prior: PosturePrior,
+    epoch_prior: EpochPrior,
     observed: Observations,
     h: int,
     T: Float,
@@ -186,24 +186,24 @@ def linearise(
         search: Scratch.
     """
     work = search.rows
-    cost = _believed(habits, belief, h, T, x, z, gradient, normal, search)
+    cost = _add_priors(posture_prior, epoch_prior, h, T, x, z, gradient, normal, search)
     cost += _beyond(rig.hand, x, gradient, normal)
-    if belief.back_normal_w2[0] > 0.0:
-        cost += _faced(belief, T, gradient, normal)
-    if belief.oriented[0] > 0.0:
-        cost += orientation_row(belief, T, z, x.shape[0], gradient, normal, search)
+    if epoch_prior.back_normal_w2[0] > 0.0:
+        cost += _faced(epoch_prior, T, gradient, normal)
+    if epoch_prior.oriented[0] > 0.0:
+        cost += orientation_row(epoch_prior, T, z, x.shape[0], gradient, normal, search)
     hand, mounts = rig.hand, rig.mounts
     angles_of(hand, x, work.angles, work.by)
     if z.shape[0] == EXTRAS:
         for f in range(5):
             search.twist[f] = z[f]
         twist_hand(hand, search.twist)
-        if belief.lines_of_sight.rows[0] > 0.0:
+        if epoch_prior.lines_of_sight.rows[0] > 0.0:
             flexed_palm(
                 rig.device.palm, z[WRIST_ANGLES], z[WRIST_ANGLES + 1], search.palm_camera, search.wrist_axes
             )
             for f in range(5):
-                cost += finger_rows(rig, belief, f, z, x.shape[0], gradient, normal, search)
+                cost += finger_rows(rig, epoch_prior, f, z, x.shape[0], gradient, normal, search)
     chains(hand, T, work.angles, work.R, work.P)
     search.outliers[0] = 0.0
     for m in range(mounts.finger.shape[0]):
@@ -280,8 +280,8 @@ def _step(rig: Rig, x: Float, damping: float, gradient: Float, normal: Float, se
 @inner
 def descend(
     rig: Rig,
-    habits: Habits,
-    belief: Belief,
+    posture_prior: PosturePrior,
+    epoch_prior: EpochPrior,
     observed: Observations,
     h: int,
     tolerance: float,
@@ -307,7 +307,7 @@ def descend(
         search: Scratch.
     """
     n, K, hand = x.shape[0], z.shape[0], rig.hand
-    cost = linearise(rig, habits, belief, observed, h, T, x, z, gradient, normal, search)
+    cost = linearise(rig, posture_prior, epoch_prior, observed, h, T, x, z, gradient, normal, search)
     damping, growth, iterations = _FIRST_DAMPING, 2.0, 0
     while iterations < MAX_ITERATIONS and damping <= _MOST_DAMPING:
         iterations += 1
@@ -332,8 +332,8 @@ def descend(
             break
         there = linearise(
             rig,
-            habits,
-            belief,
+            posture_prior,
+            epoch_prior,
             observed,
             h,
             search.next_palm,

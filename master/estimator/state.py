@@ -24,7 +24,7 @@ from common.records import record
 from master.estimator.hand_tables import HandTables
 from master.estimator.kinematics import clamp, free_of
 from master.estimator.matrices import cholesky, copy, substitute
-from master.estimator.problem import Belief
+from master.estimator.problem import EpochPrior
 from master.estimator.settings import Settings
 
 NEVER_NS = -(2**61)
@@ -45,7 +45,7 @@ class HandState:
         rates: (20,) [rad/s].
         cov: (N, N) of turn [rad], shift [m], rig axes, free angles [rad] and extras.
         z, z_cov: (K,), (K, K) mean and covariance of the extras, which are filtered (`master.estimator.extras`).
-        z_ns: (1,) when they were stepped last, `stationary` (K,) variances that they grow to, and `habit` (2,) [rad]
+        z_ns: (1,) when they were stepped last, `stationary` (K,) variances to grow to, and `wrist_mean_rad` (2,) [rad]
             the bend of the wrist that is kept.
         solver_mode: (5,) `SolverMode` codes of what a wrist device told each finger from last; 0: markers since.
         searched: (5,) triples since the whole valley of a finger was searched.
@@ -73,12 +73,12 @@ class HandState:
     z_cov: Float
     z_ns: Int
     stationary: Float
-    habit: Float
+    wrist_mean_rad: Float
     solver_mode: Code
     searched: Int
     vague: Bool
     coupling: Float
-    natural: Float
+    natural_weight: Float
     speed: Float
     lost_s: Float
     hidden_ns: Int
@@ -108,12 +108,12 @@ class HandState:
             z_cov=(extras, extras),
             z_ns=("i8", 1),
             stationary=extras,
-            habit=2,
+            wrist_mean_rad=2,
             solver_mode=("u1", 5),
             searched=("i8", 5),
             vague=("u1", 5),
             coupling=3,
-            natural=1,
+            natural_weight=1,
             speed=1,
             lost_s=1,
             hidden_ns=("i8", 5),
@@ -215,7 +215,7 @@ def hide(
             continue
         if state.hidden_ns[f] == NEVER_NS:
             state.hidden_ns[f] = state.t_ns[0]
-            state.then_alike[f] = settings.alike * state.natural[0]
+            state.then_alike[f] = settings.alike * state.natural_weight[0]
             for a in range(20):
                 state.then[f, a], state.then_rates[f, a] = state.angles[a], state.rates[a]
         gone_s = (t_ns - state.hidden_ns[f]) * 1e-9
@@ -240,9 +240,9 @@ def predict(
     t_ns: int,
     shown: Bool,
     hidden: Hidden,
-    belief: Belief,
+    epoch_prior: EpochPrior,
 ) -> None:
-    """Write what the state says of an epoch: `Belief.past`, `palm` and their weights.
+    """Write what the state says of an epoch: `EpochPrior.past`, `palm` and their weights.
 
     A hand moved on since anything of it was seen, a hidden finger since that was. What comes back to a hand that was
     seen meanwhile is told by its marker, not by a hand that is let go for it.
@@ -260,13 +260,13 @@ def predict(
     for f in range(5):
         for c in range(hand.first[f], hand.first[f + 1]):
             held = 0.0 if shown[f] else 1.0 / hidden.sigma[4 * f + c - hand.first[f]] ** 2
-            belief.past_w2[c] = process_noise + held
-            belief.past[c] = (process_noise * state.x[c] + held * hidden.x[c]) / (process_noise + held)
+            epoch_prior.past_w2[c] = process_noise + held
+            epoch_prior.past[c] = (process_noise * state.x[c] + held * hidden.x[c]) / (process_noise + held)
     rotation_rad_s = settings.palm_process_noise_rad_s if shown[0] else settings.palm_held_rad_s
     for i in range(3):
-        belief.palm_w2[i] = 1.0 / (rotation_rad_s * age_s) ** 2
-        belief.palm_w2[3 + i] = 1.0 / (settings.palm_process_noise_m_s * age_s) ** 2
-    copy(state.palm, belief.palm)
+        epoch_prior.palm_w2[i] = 1.0 / (rotation_rad_s * age_s) ** 2
+        epoch_prior.palm_w2[3 + i] = 1.0 / (settings.palm_process_noise_m_s * age_s) ** 2
+    copy(state.palm, epoch_prior.palm)
 
 
 @inner

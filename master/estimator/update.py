@@ -16,8 +16,8 @@ from master.estimator.kinematics import angles_of, chains, clamp, free_of, joint
 from master.estimator.matrices import copy, inverse_3
 from master.estimator.observation_sources import Ground
 from master.estimator.posterior import posterior
-from master.estimator.priors import Habits
-from master.estimator.problem import Belief, Rig, Search
+from master.estimator.priors import PosturePrior
+from master.estimator.problem import EpochPrior, Rig, Search
 from master.estimator.residuals import Observations, marker_rows
 from master.estimator.settings import Settings
 from master.estimator.solve import descend
@@ -137,7 +137,7 @@ def _judge(
 
 @inner
 def _depth_noise(
-    settings: Settings, state: HandState, t_ns: int, ground: Ground, belief: Belief, out: Estimate
+    settings: Settings, state: HandState, t_ns: int, ground: Ground, epoch_prior: EpochPrior, out: Estimate
 ) -> None:
     """Add how far a hand may have drifted along the sight while one camera alone saw it.
 
@@ -155,7 +155,7 @@ def _depth_noise(
     for joint in range(26):
         for i in range(3):
             for j in range(3):
-                out.cov[joint, i, j] += sigma_m * sigma_m * belief.line_of_sight[i] * belief.line_of_sight[j]
+                out.cov[joint, i, j] += sigma_m * sigma_m * epoch_prior.line_of_sight[i] * epoch_prior.line_of_sight[j]
 
 
 @kernel
@@ -173,10 +173,10 @@ def predict_epoch(model: Model, boxed_state: Any, observed: Observations, boxed_
         no motion explains them, but it does.
     """
     state, space, settings = boxed_state[0], boxed_space[0], model.settings[0]
-    rig, task, belief, scratch = (
+    rig, task, epoch_prior, scratch = (
         Rig(model.hand[0], model.mounts, model.cameras, model.device[0]),
         space.task,
-        space.belief,
+        space.epoch_prior,
         space.scratch,
     )
     t_ns, limit = task.t_ns[0], np.inf
@@ -187,10 +187,10 @@ def predict_epoch(model: Model, boxed_state: Any, observed: Observations, boxed_
         process_noise_m = settings.palm_process_noise_m_s * dt_s
         if chi_square(rig, observed, state.palm, state.x, process_noise_m, scratch.search) > limit:
             return -1.0
-    predict(rig.hand, settings, state, t_ns, space.ground.shown, space.hidden, belief)
-    _rotate_on(state, belief, scratch.search)
-    task.natural[0], task.counts[0] = state.natural[0], exp(-dt_s / settings.habit_memory_s)
-    copy(belief.palm, scratch.start_T)
+    predict(rig.hand, settings, state, t_ns, space.ground.shown, space.hidden, epoch_prior)
+    _rotate_on(state, epoch_prior, scratch.search)
+    task.natural_weight[0], task.counts[0] = state.natural_weight[0], exp(-dt_s / settings.component_memory_s)
+    copy(epoch_prior.palm, scratch.start_T)
     for c in range(state.x.shape[0]):
         scratch.start_x[c] = state.x[c]
     start_scanned(rig.hand, space.scan, task.scanned, scratch.search.x, scratch.start_x)
@@ -198,14 +198,14 @@ def predict_epoch(model: Model, boxed_state: Any, observed: Observations, boxed_
 
 
 @inner
-def _rotate_on(state: HandState, belief: Belief, search: Search) -> None:
-    """Write the palm of the state, turned on as other sensors say, to `belief.palm`."""
+def _rotate_on(state: HandState, epoch_prior: EpochPrior, search: Search) -> None:
+    """Write the palm of the state, turned on as other sensors say, to `epoch_prior.palm`."""
     by = search.J
     for i in range(3):
         for j in range(3):
             by[i, j] = 1.0 if i == j else 0.0
-    if belief.oriented[0] > 0.0 and state.measured_rotation_known[0] > 0:
-        sensed_palm(belief, state.z, search)
+    if epoch_prior.oriented[0] > 0.0 and state.measured_rotation_known[0] > 0:
+        sensed_palm(epoch_prior, state.z, search)
         for i in range(3):
             for j in range(3):
                 by[i, j] = 0.0
@@ -213,13 +213,13 @@ def _rotate_on(state: HandState, belief: Belief, search: Search) -> None:
                     by[i, j] += search.palm[i, k] * state.measured_rotation[j, k]
     for i in range(3):
         for j in range(3):
-            belief.palm[i, j] = 0.0
+            epoch_prior.palm[i, j] = 0.0
             for k in range(3):
-                belief.palm[i, j] += by[i, k] * state.palm[k, j]
+                epoch_prior.palm[i, j] += by[i, k] * state.palm[k, j]
 
 
 @kernel
-def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank, boxed_space: Any) -> float:
+def fit_epoch(model: Model, posture_prior: PosturePrior, observed: Observations, blank: Blank, boxed_space: Any) -> float:
     """Fit an epoch: from where `predict_epoch` says, or roughly from the task's hand, in place.
 
     Args:
@@ -232,20 +232,20 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
         Chi square of the markers; of a rough search its cost.
     """
     space, settings = boxed_space[0], model.settings[0]
-    rig, task, belief, scratch = (
+    rig, task, epoch_prior, scratch = (
         Rig(model.hand[0], model.mounts, model.cameras, model.device[0]),
         space.task,
-        space.belief,
+        space.epoch_prior,
         space.scratch,
     )
     search, found = scratch.search, space.found
     if task.rough[0] > 0:
         cost, _ = descend(
             rig,
-            habits,
-            belief,
+            posture_prior,
+            epoch_prior,
             observed,
-            habits.constant.shape[0] - 1,
+            posture_prior.constant.shape[0] - 1,
             settings.rough,
             settings.tolerance_share,
             task.palm,
@@ -259,13 +259,13 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
     posterior(
         rig,
         settings,
-        habits,
-        belief,
+        posture_prior,
+        epoch_prior,
         observed,
         scratch.start_T,
         scratch.start_x,
         scratch.start_z,
-        task.natural[0],
+        task.natural_weight[0],
         task.counts[0],
         space.ground.numbers[0],
         blank,
@@ -273,10 +273,10 @@ def fit_epoch(model: Model, habits: Habits, observed: Observations, blank: Blank
         found,
     )
     if found.z.shape[0] == EXTRAS:
-        extras_alone(belief, found, search)
-    if belief.lines_of_sight.rows[0] > 0.0:
+        extras_alone(epoch_prior, found, search)
+    if epoch_prior.lines_of_sight.rows[0] > 0.0:
         take_scanned(rig, space.ground, space.scan, found, search.rows)
-    found.contrary[0] = contrary(belief, found.palm, found.z, search) if belief.oriented[0] > 0.0 else 0.0
+    found.contrary[0] = contrary(epoch_prior, found.palm, found.z, search) if epoch_prior.oriented[0] > 0.0 else 0.0
     return chi_square(rig, observed, found.palm, found.x, 0.0, search)
 
 
@@ -355,8 +355,8 @@ def take_over_epoch(
             scratch,
             out.cov,
         )
-    _depth_noise(settings, state, t_ns, space.ground, space.belief, out)
-    state.t_ns[0], state.known[0], state.natural[0] = t_ns, True, found.natural[0]
+    _depth_noise(settings, state, t_ns, space.ground, space.epoch_prior, out)
+    state.t_ns[0], state.known[0], state.natural_weight[0] = t_ns, True, found.natural_weight[0]
     for f in range(5):
         if shown[f]:
             state.measured_ns[f], state.hidden_ns[f] = t_ns, NEVER_NS
@@ -364,11 +364,11 @@ def take_over_epoch(
         state.measured_ns[PALM_PART] = t_ns
     copy(found.palm, state.palm)
     since_s = dt_s if goes_on else _LONG_S  # what begins owes nothing to an epoch before
-    keep_extras(settings, state, since_s, space.belief, found.z, found.cov, found.scale[0], space.extras)
+    keep_extras(settings, state, since_s, space.epoch_prior, found.z, found.cov, found.scale[0], space.extras)
     # With tilt and heading as this epoch leaves them, so that what is learnt of these is no motion.
-    state.measured_rotation_known[0] = space.belief.oriented[0] > 0.0
+    state.measured_rotation_known[0] = space.epoch_prior.oriented[0] > 0.0
     if state.measured_rotation_known[0] > 0:
-        sensed_palm(space.belief, state.z, space.scratch.search)
+        sensed_palm(space.epoch_prior, state.z, space.scratch.search)
         for i in range(3):
             for j in range(3):
                 state.measured_rotation[i, j] = space.scratch.search.palm[i, j]

@@ -11,7 +11,7 @@ from master.estimator.finger_scan import Prior, Scan
 from master.estimator.hand_tables import Mounts
 from master.estimator.hypotheses import Posterior, Scratch
 from master.estimator.observation_sources import Ground
-from master.estimator.problem import Belief
+from master.estimator.problem import EpochPrior
 from master.estimator.state import Hidden
 
 
@@ -42,7 +42,7 @@ class Task:
     x: Float
     may_leave: Bool
     rough: Bool
-    natural: Float
+    natural_weight: Float
     counts: Float
     second_order: Bool
     process_noise_rad2: Float
@@ -65,7 +65,7 @@ class Task:
             x=n,
             may_leave=("u1", 1),
             rough=("u1", 1),
-            natural=1,
+            natural_weight=1,
             counts=1,
             second_order=("u1", 1),
             process_noise_rad2=1,
@@ -83,7 +83,7 @@ class Workspace:
 
     task: Task
     ground: Ground
-    belief: Belief
+    epoch_prior: EpochPrior
     hidden: Hidden
     found: Posterior
     scratch: Scratch
@@ -99,7 +99,7 @@ class Workspace:
             cls,
             task=Task.empty(n),
             ground=Ground.empty(),
-            belief=Belief.none(n, extras),
+            epoch_prior=EpochPrior.none(n, extras),
             hidden=Hidden.none(n),
             found=Posterior.empty(n, extras, markers),
             scratch=Scratch.empty(n, extras, markers),

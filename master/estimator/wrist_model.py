@@ -34,19 +34,19 @@ class WristModel:
         loose: Whether the wrist may bend before the device.
         tilt_rad: By which the IMU may have the vertical off.
         heading_rad: By which its heading may be off in the beginning; None: it may be any.
-        only_natural: Whether fingers are taken to bend naturally, whatever is seen.
+        natural_only: Whether fingers are taken to bend naturally, whatever is seen.
         cubic: The paper's law; None: the hand's own bones count.
     """
 
     device: Device
-    natural: Float
-    slope: Float
+    base_rad: Float
+    per_pip: Float
     frame: Float
     frame_s: float
     loose: bool
     tilt_rad: float
     heading_rad: float | None
-    only_natural: bool
+    natural_only: bool
     cubic: CubicLaw | None
 
     @classmethod
@@ -57,12 +57,12 @@ class WristModel:
             CalibrationError: The laser passes by the hand.
         """
         synergy, optics = FlexionSynergy.of(setup.model), setup.optics
-        slope = synergy.slope.copy()
+        per_pip = synergy.per_pip.copy()
         if setup.model.profile.couplings is None and setup.solver_mode != "fk":
-            slope[1:, DIP] = _DIP_PER_PIP
-        slope[0, DIP] = _IP_PER_MCP
-        natural = synergy.base_rad.copy()
-        natural[0, DIP] = 0.0
+            per_pip[1:, DIP] = _DIP_PER_PIP
+        per_pip[0, DIP] = _IP_PER_MCP
+        base_rad = synergy.base_rad.copy()
+        base_rad[0, DIP] = 0.0
         if not lit(setup, synergy):
             raise CalibrationError(
                 "laser_plane, T_camera_palm: the laser meets no finger of this hand however it is bent: calibrate plane"
@@ -74,8 +74,8 @@ class WristModel:
         low, high = (_INSIDE_PX - centre) / focal, (size - _INSIDE_PX - centre) / focal
         return cls(
             Device.of(setup),
-            natural,
-            slope,
+            base_rad,
+            per_pip,
             np.array([low[0], high[0], low[1], high[1]]),
             setup.frame_s,
             loose,

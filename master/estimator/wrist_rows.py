@@ -17,7 +17,7 @@ from common.arrays import Float
 from common.kernels import inlined, inner
 from master.estimator.finger_surface import MOVES, look
 from master.estimator.kinematics import rotation_between
-from master.estimator.problem import Belief, Rig, Search
+from master.estimator.problem import EpochPrior, Rig, Search
 from master.estimator.wrist_device import LED_SCALE, TILT, WRIST_ANGLES, flexed_palm
 
 _SMALL_RAD = 1e-4  # below it a rotation vector counts as so long in the derivative
@@ -42,14 +42,14 @@ def rotation_vector_jacobian(rotation: Float, J: Float) -> None:
 
 
 @inner
-def sensed_palm(belief: Belief, z: Float, search: Search) -> None:
+def sensed_palm(epoch_prior: EpochPrior, z: Float, search: Search) -> None:
     """Write how other sensors have the palm turned, to `search.palm` (3, 3), and how extras turn that: `slope` (5, 3).
 
     By an IMU on the forearm it is  exp(axes . (tilt, heading less the believed)) forearm R_y(deviation) R_x(flexion),
     and extras are tilt 2, heading, flexion, deviation; by one on the palm itself it is `forearm`, which none turns.
     """
-    R, slope, F = search.palm_straight, search.slope, belief.forearm
-    if belief.on_forearm[0] == 0.0:
+    R, slope, F = search.palm_straight, search.slope, epoch_prior.forearm
+    if epoch_prior.on_forearm[0] == 0.0:
         for i in range(3):
             for j in range(3):
                 search.palm[i, j] = F[i, j]
@@ -57,41 +57,41 @@ def sensed_palm(belief: Belief, z: Float, search: Search) -> None:
     flexed_palm(F, z[WRIST_ANGLES], z[WRIST_ANGLES + 1], R, search.wrist_axes)
     for i in range(3):  # rig axes
         for a in range(3):
-            slope[a, i] = belief.axes[a, i]
+            slope[a, i] = epoch_prior.axes[a, i]
         slope[3, i], slope[4, i] = search.wrist_axes[0, i], search.wrist_axes[1, i]
     for i in range(3):
         search.off[i] = 0.0
         for a in range(3):
-            search.off[i] += belief.axes[a, i] * (z[TILT + a] - belief.z[TILT + a])
+            search.off[i] += epoch_prior.axes[a, i] * (z[TILT + a] - epoch_prior.z[TILT + a])
     rotate_by_vector(search.off, R, search.palm)
 
 
 @inner
-def contrary(belief: Belief, T: Float, z: Float, search: Search) -> float:
+def contrary(epoch_prior: EpochPrior, T: Float, z: Float, search: Search) -> float:
     """Chi square of a palm against how other sensors have it turned, and of what the extras gave in to it."""
-    sensed_palm(belief, z, search)
+    sensed_palm(epoch_prior, z, search)
     rotation_between(T, search.palm, search.J, search.q)
     total, q = 0.0, search.q
     for i in range(3):
         for j in range(3):
-            total += q[i] * belief.orientation_info[i, j] * q[j]
+            total += q[i] * epoch_prior.orientation_info[i, j] * q[j]
     for i in range(z.shape[0]):
         for j in range(z.shape[0]):
-            total += (z[i] - belief.z[i]) * belief.z_info[i, j] * (z[j] - belief.z[j])
+            total += (z[i] - epoch_prior.z[i]) * epoch_prior.z_info[i, j] * (z[j] - epoch_prior.z[j])
     return total
 
 
 @inner
 def orientation_row(
-    belief: Belief, T: Float, z: Float, n: int, gradient: Float, normal: Float, search: Search
+    epoch_prior: EpochPrior, T: Float, z: Float, n: int, gradient: Float, normal: Float, search: Search
 ) -> float:
     """Add the TURN row; return its cost."""
     J, q, slope = search.J, search.q, search.slope
-    K = 5 if belief.on_forearm[0] > 0.0 else 0
-    sensed_palm(belief, z, search)
+    K = 5 if epoch_prior.on_forearm[0] > 0.0 else 0
+    sensed_palm(epoch_prior, z, search)
     rotation_between(T, search.palm, J, q)
     rotation_vector_jacobian(q, J)
-    L, w = belief.orientation_info, search.off
+    L, w = epoch_prior.orientation_info, search.off
     cost = 0.0
     for i in range(3):
         w[i] = L[i, 0] * q[0] + L[i, 1] * q[1] + L[i, 2] * q[2]
@@ -137,13 +137,13 @@ def rotate_by_vector(rotation: Float, R: Float, out: Float) -> None:
 
 @inner
 def finger_rows(
-    rig: Rig, belief: Belief, f: int, z: Float, n: int, gradient: Float, normal: Float, search: Search
+    rig: Rig, epoch_prior: EpochPrior, f: int, z: Float, n: int, gradient: Float, normal: Float, search: Search
 ) -> float:
     """Add the rows of finger f, of angles `search.rows.angles`; return their cost.
 
     `search.palm_camera` and `search.wrist_axes` are those of the bend.
     """
-    hand, lines_of_sight, work, surface = rig.hand, belief.lines_of_sight, search.rows, search.surface
+    hand, lines_of_sight, work, surface = rig.hand, epoch_prior.lines_of_sight, search.rows, search.surface
     start = hand.first[f]
     count, base = hand.first[f + 1] - start, 6 + n
     J, r, w, at = search.local_J, search.local_r, search.local_w, search.at

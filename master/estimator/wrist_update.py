@@ -15,7 +15,7 @@ from master.estimator.hand_tables import HandTables
 from master.estimator.hypotheses import Posterior
 from master.estimator.kinematics import Scratch, angles_of, clamp, free_of
 from master.estimator.observation_sources import Ground
-from master.estimator.problem import Belief, Rig, Search
+from master.estimator.problem import EpochPrior, Rig, Search
 from master.estimator.settings import Settings
 from master.estimator.solve import palm_off
 from master.estimator.state import NEVER_NS, HandState
@@ -97,10 +97,10 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
         boxed_space: (1,) `Workspace`, with the task and what is seen.
     """
     state, space, settings = boxed_state[0], boxed_space[0], model.settings[0]
-    hand, device, task, belief = model.hand[0], model.device[0], space.task, space.belief
-    lines_of_sight, scan, prior = belief.lines_of_sight, space.scan, space.prior
+    hand, device, task, epoch_prior = model.hand[0], model.device[0], space.task, space.epoch_prior
+    lines_of_sight, scan, prior = epoch_prior.lines_of_sight, space.scan, space.prior
     dt_s = 0.0 if state.z_ns[0] == NEVER_NS else (task.t_ns[0] - state.z_ns[0]) * 1e-9
-    predict_extras(settings, state, dt_s, task.process_noise_rad2[0], belief, space.extras)
+    predict_extras(settings, state, dt_s, task.process_noise_rad2[0], epoch_prior, space.extras)
     state.z_ns[0] = task.t_ns[0]
     for i in range(state.z.shape[0]):
         space.scratch.start_z[i] = state.z[i]
@@ -190,22 +190,22 @@ def start_scanned(hand: HandTables, scan: Scan, scanned: Float, x: Float, out: F
 
 
 @inner
-def extras_alone(belief: Belief, found: Posterior, search: Search) -> None:
+def extras_alone(epoch_prior: EpochPrior, found: Posterior, search: Search) -> None:
     """Move the extras to where this instant alone has them, as its covariance has it.
 
     At the solution the pull of the past is that of the instant, reversed: a Newton step without it.
     """
     n, K, off = found.x.shape[0], found.z.shape[0], search.off
-    palm_off(found.palm, belief.palm, off)
+    palm_off(found.palm, epoch_prior.palm, off)
     depth = 0.0
     for i in range(3):
-        depth += belief.line_of_sight[i] * off[3 + i]
+        depth += epoch_prior.line_of_sight[i] * off[3 + i]
     for i in range(6):
-        search.step[i] = belief.palm_w2[i] * off[i]
+        search.step[i] = epoch_prior.palm_w2[i] * off[i]
         if i >= 3:
-            search.step[i] += belief.depth_w2[0] * depth * belief.line_of_sight[i - 3]
+            search.step[i] += epoch_prior.depth_w2[0] * depth * epoch_prior.line_of_sight[i - 3]
     for i in range(n):
-        search.step[6 + i] = belief.past_w2[i] * (found.x[i] - belief.past[i])
+        search.step[6 + i] = epoch_prior.past_w2[i] * (found.x[i] - epoch_prior.past[i])
     for k in range(K):
         total = 0.0
         for j in range(6 + n):

@@ -42,7 +42,7 @@ _METACARPAL, _LITTLE, _INDEX = (
 _EDGE_WEIGHT = 0.125
 # A bend is believed that shows so much of what it should, and is so much more probable than a straight wrist: fists
 # have gaps of their own. One that shows less of it must be more probable.
-_BELIEVED = ((0.6, 3.0), (0.45, 5.0))
+_ACCEPTED = ((0.6, 3.0), (0.45, 5.0))
 # So little changes no name, and webs of one hand lie that much beside those of the next.
 _NEAR_STRAIGHT_RAD = 1.01 * STEP_RAD * np.array([3.0, 1.0])
 _VIEW_STEPS = np.array([4, 1])  # steps between two views that corridors and reach are made for
@@ -132,7 +132,7 @@ def wrist_angles_seen(near: Float32, view: WristView) -> Float:
     score = np.float32(_EVIDENCE) * shown - marks.prior
     best = int(score.argmax())
     more = float(score[best] - score[marks.near_straight].max())
-    if not any(shown[best] >= least and more >= least_more for least, least_more in _BELIEVED):
+    if not any(shown[best] >= least and more >= least_more for least, least_more in _ACCEPTED):
         return STRAIGHT
     about = (np.abs(marks.candidates - marks.candidates[best]) < 1.5 * STEP_RAD).all(axis=1)
     weight = np.exp(score[about] - score[best])

@@ -13,7 +13,7 @@ from common.hand_posture import fit_posture, joint_angles, reached_limits
 from common.hand_presets import preset_limits
 from common.hand_profiles import generated_profile
 from master.estimator.parameters import HandParameters
-from master.estimator.priors import habits_of
+from master.estimator.priors import posture_prior_of
 
 MODELS = [HandModel.of(generated_profile("made", side)) for side in ("right", "left")]
 
@@ -76,12 +76,12 @@ def test_a_profile_from_motion_has_its_posture_as_prior() -> None:
     profile = profile_from_joints("moved", "right", model.chains(angles).position_m)
     found = HandModel.of(profile)
     parameters = HandParameters.of(found)
-    habits = habits_of(found, parameters)
-    believed = np.linalg.solve(habits.normal[0], habits.pull[0]).reshape(5, 4)
-    np.testing.assert_allclose(np.degrees(believed[1:, 1:]), [[25.0, 45.0, 30.0]] * 4, atol=6.0)
+    posture_prior = posture_prior_of(found, parameters)
+    prior_mean_rad = np.linalg.solve(posture_prior.normal[0], posture_prior.pull[0]).reshape(5, 4)
+    np.testing.assert_allclose(np.degrees(prior_mean_rad[1:, 1:]), [[25.0, 45.0, 30.0]] * 4, atol=6.0)
     # A hand that defies it is believed three times as widely, about the same mean.
     np.testing.assert_allclose(
-        np.linalg.inv(habits.normal[1]), 9.0 * np.linalg.inv(habits.normal[0]), rtol=1e-9
+        np.linalg.inv(posture_prior.normal[1]), 9.0 * np.linalg.inv(posture_prior.normal[0]), rtol=1e-9
     )
 
 

@@ -12,7 +12,7 @@ from common.arrays import Float
 from common.geometry import rotation_vector_to_matrix, skew
 from common.hand_model import Chains, HandModel
 from master.estimator.body_points import BodyPoints
-from master.estimator.priors import Habits
+from master.estimator.priors import PosturePrior
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +52,7 @@ class HandProblem:
 
     model: HandModel
     markers: BodyPoints
-    habits: Habits
+    posture_prior: PosturePrior
     points_m: Float
     whiten: Float
 
@@ -66,8 +66,8 @@ class HandProblem:
         arm = self._arm(hands, self.markers.place(self._chains(hands)))
         residual = self._residual(hands, arm)
         pushed = self._pushed(hands)
-        habit = np.vecdot(0.5 * pushed - self.habits.pull, hands.x) + self.habits.constant
-        return habit + 0.5 * np.vecdot(residual, residual)
+        prior_cost = np.vecdot(0.5 * pushed - self.posture_prior.pull, hands.x) + self.posture_prior.constant
+        return prior_cost + 0.5 * np.vecdot(residual, residual)
 
     def linearise(self, hands: Hands) -> Linear:
         """Gradient and normal matrix at these hands."""
@@ -81,8 +81,8 @@ class HandProblem:
         )
         J_t = np.swapaxes(J, 1, 2)
         gradient, normal = (J_t @ self._residual(hands, arm)[..., None])[..., 0], J_t @ J
-        gradient[:, 6:] += self._pushed(hands) - self.habits.pull
-        normal[:, 6:, 6:] += self.habits.normal
+        gradient[:, 6:] += self._pushed(hands) - self.posture_prior.pull
+        normal[:, 6:, 6:] += self.posture_prior.normal
         return Linear(gradient, normal)
 
     def _chains(self, hands: Hands) -> Chains:
@@ -99,4 +99,4 @@ class HandProblem:
 
     def _pushed(self, hands: Hands) -> Float:
         """The habits' information times the free angles (T, n)."""
-        return (hands.x[:, None] @ self.habits.normal)[:, 0]
+        return (hands.x[:, None] @ self.posture_prior.normal)[:, 0]

@@ -45,16 +45,16 @@ from master.calibrate.extrinsics.unknown import (
     UNKNOWN,
     ZERO,
     Unknown,
-    believed,
+    prior_sigma,
 )
 from master.calibrate.extrinsics.wrists import bends_by_rotation, wrist_rotation_angles
 from master.estimator.body_points import BodyPoints
 from master.estimator.parameters import HandParameters
-from master.estimator.priors import Habits, habits_of
+from master.estimator.priors import PosturePrior, posture_prior_of
 
 _SURFACE_M, _TIP_M = 8e-4, 1e-3  # skin of another shape than the cones; a tip is seen anywhere on its pulp
 _CAP_M = 5e-4  # where caps sit, beyond the noise of the cameras
-_HABITS = 1e-2  # of their information: what sensors tell is to count
+_PRIOR_SHARE = 1e-2  # of their information: what sensors tell is to count
 _TWIST_RAD = np.radians(1.0)
 _WRIST_RAD = np.radians(15.0)
 _PER_S = 4.0  # independent instants
@@ -100,7 +100,7 @@ class Problem:
         self._hands = HandProblem(
             model,
             BodyPoints.markers(model, self._parameters, names),
-            _loosest(habits_of(model, self._parameters)),
+            _loosest(posture_prior_of(model, self._parameters)),
             np.zeros((count, len(names), 3)),
             np.zeros((count, len(names), 3, 3)),
         )
@@ -110,7 +110,7 @@ class Problem:
         last_s, first_s = cycles.t_s[-1], cycles.t_s[0]
         self._share = min(_PER_S * (last_s - first_s) / count, 1.0)
         self._wrist_sigma = np.array([_WRIST_RAD, _WRIST_RAD, _TWIST_RAD])
-        self._believed = believed()
+        self._prior_sigma = prior_sigma()
 
     def followed(self, unknown: Unknown, rounds: Sequence[int]) -> tuple[Unknown, Hands, int]:
         """From a guess downhill, round by round; and the steps taken."""
@@ -272,8 +272,8 @@ class Problem:
         wrist = (STRAYS**2 * np.log1p(chi2 / STRAYS**2)).sum()
         markers = replace(self._hands, points_m=self._here(unknown).points_m)
         held = 2.0 * markers.cost(hands).sum()
-        believed_off = unknown.off(self._first) / self._believed
-        return float(self._share * (data + wrist + held) + (believed_off**2).sum())
+        prior_residual = unknown.off(self._first) / self._prior_sigma
+        return float(self._share * (data + wrist + held) + (prior_residual**2).sum())
 
     def normal(self, unknown: Unknown, hands: Hands) -> Normal:
         """Normal equations about a place."""
@@ -287,7 +287,7 @@ class Problem:
         )
         for residual, own, shared in rows:
             out = out.and_rows(residual, own, shared)
-        out = out.shared_out(self._share, unknown.off(self._first), self._believed)
+        out = out.shared_out(self._share, unknown.off(self._first), self._prior_sigma)
         return out.within(hands.x, self._parameters)
 
     def _line_of_sight_rows(
@@ -357,7 +357,7 @@ class Problem:
         shared[..., CAMERA_LATE], shared[..., IMU_LATE] = later, -later
 
 
-def _loosest(habits: Habits) -> Habits:
+def _loosest(posture_prior: PosturePrior) -> PosturePrior:
     """Those of the free hand, the last hypothesis, with a share of their information."""
-    normal, pull, constant = (_HABITS * part[-1:] for part in (habits.normal, habits.pull, habits.constant))
-    return Habits(normal, pull, constant, habits.log_density[-1:])
+    normal, pull, constant = (_PRIOR_SHARE * part[-1:] for part in (posture_prior.normal, posture_prior.pull, posture_prior.constant))
+    return PosturePrior(normal, pull, constant, posture_prior.log_density[-1:])

@@ -75,7 +75,7 @@ class Unknown:
         return out
 
 
-def believed() -> Float:
+def prior_sigma() -> Float:
     """(UNKNOWN,) standard deviations of what is believed before."""
     sigma = np.full(UNKNOWN, ANY_RAD)
     sigma[SHIFT], sigma[ZERO], sigma[[CAMERA_LATE, IMU_LATE]] = ANY_M, _ZERO_RAD_S, ANY_S

@@ -14,7 +14,7 @@ _ROUGHLY_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Beliefs:
+class Priors:
     """Standard deviations.
 
     Attributes:

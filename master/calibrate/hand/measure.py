@@ -16,7 +16,7 @@ from common.errors import FitError
 from common.hand_model import FINGERS, TIPS, WRIST, HandModel
 from common.hand_profiles import mirrored_profile, scaled_profile
 from master.calibrate.hand.align import GRID_S, Alignment, align, flat_scale, missing_steps
-from master.calibrate.hand.beliefs import Beliefs, RoutineTargets
+from master.calibrate.hand.priors import Priors, RoutineTargets
 from master.calibrate.hand.curves import Knots
 from master.calibrate.hand.fit import ShapeFit, fit_shape
 from master.calibrate.hand.observed import Observed
@@ -128,8 +128,8 @@ def measure_hand(
             "the routine is not complete: " + "; ".join(gaps[:6]) + ". Do these steps again, in full"
         )
     progress(0.1)
-    beliefs = Beliefs() if dip_per_pip is None else Beliefs(dip_ratio=dip_per_pip)
-    problem = problem_of(observed, model, alignment, beliefs)
+    priors = Priors() if dip_per_pip is None else Priors(dip_ratio=dip_per_pip)
+    problem = problem_of(observed, model, alignment, priors)
     fit = fit_shape(problem, lambda share: progress(0.1 + 0.9 * share))
     if not problem.palm_free:
         _check_palm(problem, fit)
@@ -137,7 +137,7 @@ def measure_hand(
 
 
 def problem_of(
-    observed: Observed, model: HandModel, alignment: Alignment, beliefs: Beliefs
+    observed: Observed, model: HandModel, alignment: Alignment, priors: Priors
 ) -> HandRoutineProblem:
     """The least-squares problem of an aligned routine."""
     knots = Knots.over(observed.t_s, GRID_S)
@@ -146,14 +146,14 @@ def problem_of(
     return HandRoutineProblem(
         model=model,
         cap_m=np.array([model.mount(name).offset_m for name in names[:5]]),
-        prior=Shape.of(model, names[5:], beliefs.dip_ratio[0], beliefs.thumb_ratio[0]),
+        prior=Shape.of(model, names[5:], priors.dip_ratio[0], priors.thumb_ratio[0]),
         points_m=observed.points_m,
-        whiten=whitening(observed.cov_m2, beliefs.model_m),
+        whiten=whitening(observed.cov_m2, priors.model_m),
         knots=knots,
         targets=RoutineTargets.of(alignment.at(knots.time_s)),
         start=alignment.T_rig_palm,
         palm_free=bool(np.quantile(seen_back, 0.1) >= _FREE_WITH),
-        beliefs=beliefs,
+        priors=priors,
     )
 
 
@@ -224,9 +224,9 @@ def _check_side(observed: Observed, template: HandProfile, alignment: Alignment)
 
 def _check_palm(problem: HandRoutineProblem, fit: ShapeFit) -> None:
     """Curves that are smoothed by a belief stay within it, unless the palm really moved more than that."""
-    beliefs, step_s = problem.beliefs, np.sqrt(problem.knots.spacing_s)
-    believed = np.repeat([beliefs.palm_rad_s, beliefs.palm_m_s], 3) * step_s
-    wander = np.sqrt((np.diff(fit.palm, axis=0) ** 2).mean(axis=0)) / believed
+    priors, step_s = problem.priors, np.sqrt(problem.knots.spacing_s)
+    expected_rms = np.repeat([priors.palm_rad_s, priors.palm_m_s], 3) * step_s
+    wander = np.sqrt((np.diff(fit.palm, axis=0) ** 2).mean(axis=0)) / expected_rms
     if wander.max() > _RESTLESS:
         rotation, shift = (float(np.ptp(part, axis=0).max()) for part in (fit.palm[:, :3], fit.palm[:, 3:]))
         raise FitError(

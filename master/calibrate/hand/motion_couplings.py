@@ -23,7 +23,7 @@ _STEP_S = 0.1  # longer, two frames are no step
 _BENT_RAD = np.radians(15.0)  # the PIP, where it tells a ratio
 _RANGE_RAD = np.radians(20.0)  # of the PIP from the 5th to the 95th hundredth, at least
 _MADE_RAD = np.radians(0.5)
-_NO_HABIT_RAD = np.radians(25.0)
+_NO_COUPLING_RAD = np.radians(25.0)
 _HUBER = 1.345
 _OUTLIER = 4.0
 _LEAST_SHARE = 0.25  # of a variance: less is noise
@@ -92,7 +92,7 @@ def motion_couplings(angles_rad: Float, chains_m: Float, t_ns: Int) -> MotionCou
         )
     else:
         couplings, taken = replace(couplings, dip_per_pip=dip.per_pip, dip_spread_rad=dip.spread_rad), True
-    if mcp.spread_rad > _NO_HABIT_RAD or mcp.per_pip <= 0.0:
+    if mcp.spread_rad > _NO_COUPLING_RAD or mcp.per_pip <= 0.0:
         remarks.append(
             f"MCP strays by {np.degrees(mcp.spread_rad):.0f}° from {mcp.per_pip:.2f} PIP: no habit is told; the default"
             " stays"

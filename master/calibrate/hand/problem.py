@@ -12,7 +12,7 @@ import numpy as np
 from common.arrays import Float
 from common.geometry import rotation_vector_to_matrix, skew, transform
 from common.hand_model import HandModel
-from master.calibrate.hand.beliefs import Beliefs, RoutineTargets
+from master.calibrate.hand.priors import Priors, RoutineTargets
 from master.calibrate.hand.curves import BorderedNormal, Knots
 from master.calibrate.hand.shape import BIAS, LENGTH, PER_FINGER, RATIO, ROOT, ROTATION, Shape, caps_of
 
@@ -57,7 +57,7 @@ class HandRoutineProblem:
     targets: RoutineTargets
     start: Float
     palm_free: bool
-    beliefs: Beliefs
+    priors: Priors
 
     def guess(self) -> State:
         """The routine as it is asked for, by the believed shape."""
@@ -91,7 +91,7 @@ class HandRoutineProblem:
         )
         links = self._links(state)
         out.add_links(*links)
-        weight, away = self._shape_belief(state.shape)
+        weight, away = self._shape_prior(state.shape)
         out.corner += np.diag(weight**2)
         out.pull_constants -= weight**2 * away
         cost = 0.5 * (float((off**2).sum() + (links[2] ** 2).sum()) + float(((weight * away) ** 2).sum()))
@@ -107,7 +107,7 @@ class HandRoutineProblem:
 
     def shape_sd(self) -> Float:
         """(size,) of the believed shape."""
-        return 1.0 / self._shape_belief(self.prior)[0]
+        return 1.0 / self._shape_prior(self.prior)[0]
 
     def _predicted(self, state: State) -> tuple[Float, Float, Float]:
         """Markers (T, M, 3), their Jacobians by the curves (T, M, 3, 26) and the shape (T, M, 3, size)."""
@@ -173,7 +173,7 @@ class HandRoutineProblem:
 
     def _widths(self) -> tuple[Float, Float, Float]:
         """Inverse sd of changes (K - 1, 26), means (K - 1, 26), and inverse sd of levels (K - 1, 26)."""
-        b, h = self.beliefs, self.knots.spacing_s
+        b, h = self.priors, self.knots.spacing_s
         count = len(self.knots.time_s) - 1
         moving = (self.targets.moving[1:] | self.targets.moving[:-1]).reshape(count, 5, 3)
         straight = self.targets.straight[:-1]
@@ -191,9 +191,9 @@ class HandRoutineProblem:
         angles[..., _DIP], sigmas[..., _DIP] = dip * np.sqrt(2.0 / b.slow_s), dip
         return 1.0 / (wander * np.sqrt(h)), mean, np.sqrt(h / (2.0 * b.slow_s)) / sigma
 
-    def _shape_belief(self, shape: Shape) -> tuple[Float, Float]:
+    def _shape_prior(self, shape: Shape) -> tuple[Float, Float]:
         """Inverse sd (size,) and how far a shape (size,) is from the believed one."""
-        b, prior = self.beliefs, self.prior
+        b, prior = self.priors, self.prior
         sd, away = np.empty(shape.size), np.empty(shape.size)
         own_sd, own = (a[: 5 * PER_FINGER].reshape(5, PER_FINGER) for a in (sd, away))
         own_sd[:, LENGTH], own[:, LENGTH] = b.bone * prior.length_m, shape.length_m - prior.length_m

@@ -195,11 +195,11 @@ def fit_flat_field(samples: WhiteSamples, optics: CameraModel) -> FlatFit:
 def _law(xy: Float, light: Float) -> Float:
     """Coefficients of the logarithm of k F by least squares; samples that stray are weighed down (Huber)."""
     terms, wanted = _law_terms(xy), np.log(light)
-    believed = np.diag(np.r_[0.0, 0.0, np.full(terms.shape[1] - 2, (_SAMPLE_SIGMA / _CORRECTION_SIGMA) ** 2)])
+    prior_information = np.diag(np.r_[0.0, 0.0, np.full(terms.shape[1] - 2, (_SAMPLE_SIGMA / _CORRECTION_SIGMA) ** 2)])
     weight = np.ones(len(light))
     found = np.zeros(terms.shape[1])
     for _ in range(8):
-        normal = terms.T @ (weight[:, None] * terms) + believed
+        normal = terms.T @ (weight[:, None] * terms) + prior_information
         found = np.asarray(np.linalg.solve(normal, terms.T @ (weight * wanted)), np.float64)
         off = np.abs(terms @ found - wanted)
         weight = 1.0 / np.maximum(off / (_HUBER * max(1.4826 * float(np.median(off)), 1e-6)), 1.0)

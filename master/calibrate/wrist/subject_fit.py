@@ -139,10 +139,10 @@ class _Problem:
 
     def guessed(self, x: Float) -> "_Guess":
         """Angles by habit alone; a bend is that of a fist if it suits a fist better."""
-        habits = np.zeros((2, len(_GRID_RAD), 4, LOCAL))
-        habits[_KNUCKLES, ..., MCP] = habits[_FIST, ..., PIP] = _GRID_RAD[:, None]
-        habits[_FIST, ..., MCP] = self._model.mcp_per_pip * _GRID_RAD[:, None]
-        shown = np.stack([self._model(x, poses) for poses in habits])  # (2, G, 4, 4)
+        grid = np.zeros((2, len(_GRID_RAD), 4, LOCAL))
+        grid[_KNUCKLES, ..., MCP] = grid[_FIST, ..., PIP] = _GRID_RAD[:, None]
+        grid[_FIST, ..., MCP] = self._model.mcp_per_pip * _GRID_RAD[:, None]
+        shown = np.stack([self._model(x, poses) for poses in grid])  # (2, G, 4, 4)
         # Abductions, of which nothing is known yet, move points and tips across.
         along = (self._data[:, None, None, :, 1::2] - shown[..., 1::2]) / _ROUGH
         unseen = np.isnan(self._data[:, None, None, :, 1::2])
@@ -154,7 +154,7 @@ class _Problem:
         fist = np.isin(self._bend, fists)
         own_cost = cost[np.arange(len(fist)), fist.astype(np.int64)]  # (T, G, 4); a fist is number _FIST
         node: Int = own_cost.argmin(axis=1)
-        angles = habits[fist.astype(np.int64)[:, None], node, np.arange(4)]
+        angles = grid[fist.astype(np.int64)[:, None], node, np.arange(4)]
         used: Bool = (own_cost.min(axis=1) < _ROUGHEST**2) & ~(angles[..., PIP] > _PAST_RAD)
         flat = self._bend == FLAT
         angles[flat], used[flat] = 0.0, True
@@ -189,7 +189,7 @@ class _Problem:
         laser, tip = (
             np.sqrt((part**2).sum(axis=-1)) for part in (off[..., :2], (off * self._sigma)[..., 2:])
         )
-        unlike = float(np.sqrt(np.mean(self._habits(guess)[0][guess.used] ** 2)))
+        unlike = float(np.sqrt(np.mean(self._prior_rows(guess)[0][guess.used] ** 2)))
         return Fit(
             x, covariance, self.prior_sigma, guess.angles, guess.fist, off, rms, unlike,
             _LASER_SIGMA_M * float(np.sqrt(np.nanmedian(laser**2))), float(np.sqrt(np.nanmedian(tip**2))),
@@ -201,7 +201,7 @@ class _Problem:
         off = (self._data - shown) / self._sigma
         return np.where(np.isnan(shown) & np.isfinite(self._data), _FARTHEST, off)
 
-    def _habits(self, guess: _Guess) -> tuple[Float, Float]:
+    def _prior_rows(self, guess: _Guess) -> tuple[Float, Float]:
         """Residuals (T, 4, 3) of what fingers do, and their derivatives by the angles (T, 4, 3, 3)."""
         angles, fist, flat = guess.angles, guess.fist, self._bend == FLAT
         ratio = np.broadcast_to(self._model.mcp_per_pip, angles.shape[:2])
@@ -218,8 +218,8 @@ class _Problem:
         off = np.nan_to_num(self._off(x, guess.angles)) * guess.used[..., None]
         pairs = np.stack([(off[..., :2] ** 2).sum(axis=-1), (off[..., 2:] ** 2).sum(axis=-1)])
         data = (_STRAYS**2 * np.log1p(pairs / _STRAYS**2)).sum(axis=(0, 2))
-        habits = (self._habits(guess)[0] ** 2).sum(axis=(1, 2))
-        return float((self._share * (data + habits)).sum() + ((x / self.prior_sigma) ** 2).sum())
+        grid = (self._prior_rows(guess)[0] ** 2).sum(axis=(1, 2))
+        return float((self._share * (data + grid)).sum() + ((x / self.prior_sigma) ** 2).sum())
 
     def _normal(self, x: Float, guess: _Guess) -> "_Normal":
         """Normal equations about a place, strays weighed down."""
@@ -228,12 +228,12 @@ class _Problem:
         root = np.repeat((1.0 + pairs / _STRAYS**2) ** -0.5, 2, axis=-1) * guess.used[..., None]
         root = np.where(np.isfinite(self._data), root, 0.0)
         by_x, by_angles = self._model.derivatives(x, guess.angles)
-        habit, by_habit = self._habits(guess)
+        prior_residual, prior_jacobian = self._prior_rows(guess)
         share = np.sqrt(self._share)[:, None, None]
         scale = (share * root / self._sigma)[..., None]
-        residual = np.concatenate([share * root * off, share * habit], axis=-1)
-        local = np.concatenate([-scale * by_angles, share[..., None] * by_habit], axis=-2)
-        shared = np.concatenate([-scale * by_x, np.zeros((*habit.shape, UNKNOWN))], axis=-2)
+        residual = np.concatenate([share * root * off, share * prior_residual], axis=-1)
+        local = np.concatenate([-scale * by_angles, share[..., None] * prior_jacobian], axis=-2)
+        shared = np.concatenate([-scale * by_x, np.zeros((*prior_residual.shape, UNKNOWN))], axis=-2)
         back = np.swapaxes(local, -1, -2)
         return _Normal(
             back @ local,

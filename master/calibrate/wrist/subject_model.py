@@ -62,7 +62,7 @@ class SubjectModel:
         synergy = FlexionSynergy.of(setup.model)
         distance = np.linalg.norm(transform(setup.T_camera_palm, self._root[FINGERS].mean(axis=0)))
         self.px_per_m = float(setup.optics.matrix[0, 0] / distance)  # at the knuckles
-        self.mcp_per_pip, self.dip_per_pip = synergy.slope[FINGERS, 1], synergy.slope[FINGERS, DIP]
+        self.mcp_per_pip, self.dip_per_pip = synergy.per_pip[FINGERS, 1], synergy.per_pip[FINGERS, DIP]
 
     @property
     def none(self) -> Unknown:
@@ -114,15 +114,15 @@ class SubjectModel:
             surfaces += [self._surface_of(Unknown.of(x), angles + sign * change) for sign in (1.0, -1.0)]
         seen = self._seen(surfaces)
         half = np.r_[steps, np.full(LOCAL, _ROTATION_STEP)]
-        slope = np.nan_to_num((seen[0::2] - seen[1::2]) / (2.0 * half[:, None, None, None]))
+        per_pip = np.nan_to_num((seen[0::2] - seen[1::2]) / (2.0 * half[:, None, None, None]))
         out = np.zeros((*angles.shape[:2], 4, UNKNOWN))
-        out[..., :6] = np.moveaxis(slope[:6], 0, -1)
+        out[..., :6] = np.moveaxis(per_pip[:6], 0, -1)
         # A knuckle that moves in the palm moves its finger as a palm does that moves: only turned.
-        by_knuckle = np.moveaxis(slope[3:6], 0, -1) @ self.palm(Unknown.of(x))[:3, :3]
+        by_knuckle = np.moveaxis(per_pip[3:6], 0, -1) @ self.palm(Unknown.of(x))[:3, :3]
         for f in range(4):
             out[:, f, :, 6 + 3 * f : 9 + 3 * f] = by_knuckle[:, f]
-            out[:, f, :, 18 + f], out[:, f, :, 22 + f] = slope[6, :, f], slope[7, :, f]
-        return out, np.moveaxis(slope[8:], 0, -1)
+            out[:, f, :, 18 + f], out[:, f, :, 22 + f] = per_pip[6, :, f], per_pip[7, :, f]
+        return out, np.moveaxis(per_pip[8:], 0, -1)
 
     def _surface_of(self, unknown: Unknown, angles: Float) -> tuple[Float, Float, Float]:
         """Spheres (T, 4, K, 3) [m], their radii (4, K), and the tips (T, 4, 3) [m], camera frame."""

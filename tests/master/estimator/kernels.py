@@ -12,7 +12,7 @@ from master.estimator.certainty import Certainty, linear, surer
 from master.estimator.extras import keep_extras, predict_extras
 from master.estimator.finger_surface import MOVES, laser_centroid, look
 from master.estimator.kinematics import Scratch, angles_of, chains, twist_hand
-from master.estimator.priors import Habits
+from master.estimator.priors import PosturePrior
 from master.estimator.problem import Rig
 from master.estimator.residuals import Observations, marker_rows
 from master.estimator.solve import linearise
@@ -42,8 +42,8 @@ def marker_rows_at(
 @kernel
 def linearise_at(
     model: Model,
-    habits: Habits,
-    boxed_belief: Any,
+    posture_prior: PosturePrior,
+    boxed_prior: Any,
     observed: Observations,
     h: int,
     T: Float,
@@ -55,7 +55,7 @@ def linearise_at(
 ) -> float:
     """`master.estimator.solve.linearise`; records in their arrays."""
     rig = Rig(model.hand[0], model.mounts, model.cameras, model.device[0])
-    return linearise(rig, habits, boxed_belief[0], observed, h, T, x, z, gradient, normal, boxed_search[0])
+    return linearise(rig, posture_prior, boxed_prior[0], observed, h, T, x, z, gradient, normal, boxed_search[0])
 
 
 @kernel
@@ -152,12 +152,12 @@ def predict_extras_at(
     boxed_state: Any,
     dt_s: float,
     process_noise_rad2: float,
-    boxed_belief: Any,
+    boxed_prior: Any,
     boxed_scratch: Any,
 ) -> None:
     """`master.estimator.extras.predict_extras`; records in their arrays."""
     predict_extras(
-        boxed_settings[0], boxed_state[0], dt_s, process_noise_rad2, boxed_belief[0], boxed_scratch[0]
+        boxed_settings[0], boxed_state[0], dt_s, process_noise_rad2, boxed_prior[0], boxed_scratch[0]
     )
 
 
@@ -166,11 +166,11 @@ def keep_extras_at(
     boxed_settings: Any,
     boxed_state: Any,
     dt_s: float,
-    boxed_belief: Any,
+    boxed_prior: Any,
     z: Float,
     cov: Float,
     scale: float,
     boxed_scratch: Any,
 ) -> None:
     """`master.estimator.extras.keep_extras`; records in their arrays."""
-    keep_extras(boxed_settings[0], boxed_state[0], dt_s, boxed_belief[0], z, cov, scale, boxed_scratch[0])
+    keep_extras(boxed_settings[0], boxed_state[0], dt_s, boxed_prior[0], z, cov, scale, boxed_scratch[0])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from common.arrays import Float
 from common.records import boxed
 from master.estimator.extras import ExtrasScratch, stationary_of
-from master.estimator.problem import Belief
+from master.estimator.problem import EpochPrior
 from master.estimator.settings import DEFAULT
 from master.estimator.state import HandState
 from master.estimator.wrist_device import EXTRAS, HEADING, LED_SCALE, RATE, TILT, WRIST_ANGLES
@@ -29,7 +29,7 @@ class Extras:
         self.state = HandState.unknown(N, EXTRAS)
         self.state.stationary[:] = stationary_of(DEFAULT, loose=loose, tilt_rad=TILT_RAD)
         self.state.z_cov[:] = np.diag(self.state.stationary)
-        self.belief, self.scratch = Belief.none(N, EXTRAS), ExtrasScratch.empty(EXTRAS)
+        self.epoch_prior, self.scratch = EpochPrior.none(N, EXTRAS), ExtrasScratch.empty(EXTRAS)
 
     @property
     def mean(self) -> Float:
@@ -46,17 +46,17 @@ class Extras:
     def after(self, dt_s: float, process_noise_rad2: float = 0.0) -> "Extras":
         """Step them, in place."""
         boxes = boxed(SETTINGS), boxed(self.state)
-        predict_extras_at(*boxes, dt_s, process_noise_rad2, boxed(self.belief), boxed(self.scratch))
+        predict_extras_at(*boxes, dt_s, process_noise_rad2, boxed(self.epoch_prior), boxed(self.scratch))
         return self
 
     def measure(self, dt_s: float, information: Float, measured: Float, scale: float = 1.0) -> "Extras":
         """An epoch that measures them with so much information (K, K), in place."""
-        whole = np.asarray(np.linalg.inv(self.belief.z_info + information), np.float64)
-        mean = whole @ (self.belief.z_info @ self.belief.z + information @ measured)
+        whole = np.asarray(np.linalg.inv(self.epoch_prior.z_info + information), np.float64)
+        mean = whole @ (self.epoch_prior.z_info @ self.epoch_prior.z + information @ measured)
         cov = np.eye(6 + N + EXTRAS)
         cov[-EXTRAS:, -EXTRAS:] = scale * whole
         boxes = boxed(SETTINGS), boxed(self.state)
-        keep_extras_at(*boxes, dt_s, boxed(self.belief), mean, cov, scale, boxed(self.scratch))
+        keep_extras_at(*boxes, dt_s, boxed(self.epoch_prior), mean, cov, scale, boxed(self.scratch))
         return self
 
 
@@ -126,7 +126,7 @@ def test_what_is_constant_is_so_for_a_session() -> None:
 
 def test_a_bend_goes_back_to_the_posture_that_is_kept() -> None:
     extras = Extras()
-    extras.state.habit[:] = -0.4, 0.1
+    extras.state.wrist_mean_rad[:] = -0.4, 0.1
     mean = np.zeros(EXTRAS)
     mean[WRIST_ANGLES : WRIST_ANGLES + 2] = 0.2, 0.2
     extras.set(mean, 1e-6 * np.eye(EXTRAS))
@@ -141,15 +141,15 @@ def test_a_posture_that_is_kept_is_learnt() -> None:
     information[WRIST_ANGLES, WRIST_ANGLES], measured[WRIST_ANGLES] = 1e4, -0.5
     for _ in range(60):
         extras.after(1.0).measure(1.0, information, measured)
-    assert extras.state.habit[0] == pytest.approx(-0.5, abs=0.04)
-    assert abs(extras.state.habit[1]) < 1e-9
+    assert extras.state.wrist_mean_rad[0] == pytest.approx(-0.5, abs=0.04)
+    assert abs(extras.state.wrist_mean_rad[1]) < 1e-9
 
 
 def test_the_prior_information_is_the_inverse_of_the_covariance() -> None:
     mean, cov = drawn(3)
     extras = Extras().set(mean, cov).after(0.1, 1e-4)
-    np.testing.assert_allclose(extras.belief.z, extras.mean, rtol=1e-12)
-    np.testing.assert_allclose(extras.belief.z_info @ extras.cov, np.eye(EXTRAS), atol=1e-6)
+    np.testing.assert_allclose(extras.epoch_prior.z, extras.mean, rtol=1e-12)
+    np.testing.assert_allclose(extras.epoch_prior.z_info @ extras.cov, np.eye(EXTRAS), atol=1e-6)
 
 
 @pytest.mark.parametrize("scale", [1.0, 3.0])
@@ -158,8 +158,8 @@ def test_an_epoch_long_after_the_last_counts_as_a_whole_and_one_at_once_not_at_a
     root = rng.normal(size=(EXTRAS, EXTRAS)) / np.sqrt(np.diag(cov))
     information, measured = root.T @ root, rng.normal(size=EXTRAS) * np.sqrt(np.diag(cov))
     long, again = (Extras().set(mean, cov).after(1e-3) for _ in range(2))
-    kalman = np.linalg.inv(long.belief.z_info + information)
-    expected = kalman @ (long.belief.z_info @ long.belief.z + information @ measured)
+    kalman = np.linalg.inv(long.epoch_prior.z_info + information)
+    expected = kalman @ (long.epoch_prior.z_info @ long.epoch_prior.z + information @ measured)
     long.measure(1e6, information, measured, scale)
     np.testing.assert_allclose(long.mean, expected, atol=0.01 * np.sqrt(np.diag(cov)).max())
     np.testing.assert_allclose(np.diag(long.cov), np.diag(kalman), rtol=0.01)

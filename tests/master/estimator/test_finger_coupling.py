@@ -33,7 +33,7 @@ def learnt(wrist_case: WristCase, share: float, spread_deg: float = 0.0) -> Wris
 def coupled(line: WristPipeline) -> tuple[float, float]:
     """MCP as a share of the PIP, and within how much of the PIP."""
     prior = line._estimator._at.prior
-    return float(prior.slope[1, 1] + prior.coupled_share[0]), float(prior.coupled_spread[0])
+    return float(prior.per_pip[1, 1] + prior.coupled_share[0]), float(prior.coupled_spread[0])
 
 
 def laser_alone(wrist_case: WristCase, line: WristPipeline) -> tuple[HandPose, Float]:

@@ -69,8 +69,8 @@ def test_markers_distinguish_a_free_hand_from_a_natural_one() -> None:
     for _ in range(40):
         T = palm(rng.uniform(-45, 45, 3))
         noise = rng.normal(0.0, SIGMA_M, (6, 3))
-        free.append(solved(SOLVER, T, independent_angles(rng), noise).natural)
-        natural.append(solved(SOLVER, T, natural_angles(rng), noise).natural)
+        free.append(solved(SOLVER, T, independent_angles(rng), noise).natural_weight)
+        natural.append(solved(SOLVER, T, natural_angles(rng), noise).natural_weight)
     assert np.mean(free) < 0.35
     assert np.mean(natural) > 0.8
 
@@ -94,7 +94,7 @@ def test_free_hands_are_solved_better_and_natural_ones_no_worse() -> None:
 
 def test_without_the_free_hypothesis_every_hand_is_natural() -> None:
     rng = np.random.default_rng(7)
-    assert solved(NATURAL_ONLY, palm(), independent_angles(rng), np.zeros((6, 3))).natural == 1.0
+    assert solved(NATURAL_ONLY, palm(), independent_angles(rng), np.zeros((6, 3))).natural_weight == 1.0
 
 
 @given(seeds)
@@ -110,14 +110,14 @@ def test_a_mean_of_two_hands_fits_the_markers_as_well_as_each(seed: int) -> None
 def test_the_evidence_of_frames_is_joined_in_time() -> None:
     """Whether a hand obeys habits does not change from frame to frame: of noisy frames it is less sure one by one."""
     rng, one_by_one, joined = np.random.default_rng(8), list[float](), list[float]()
-    slow, machine = DEFAULT.changed("habit_memory_s", 0.3), estimator()
-    assert slow.habit_memory_s == 0.3
+    slow, machine = DEFAULT.changed("component_memory_s", 0.3), estimator()
+    assert slow.component_memory_s == 0.3
     truth = natural_angles(rng)
     for k in range(60):
         points = places(palm(), truth) + rng.normal(0.0, 2.0 * SIGMA_M, (6, 3))
         hand, alone = found(push(machine, k * STEP_NS, points, COV).solution), found(fit(points, COV))
-        joined.append(hand.natural)
-        one_by_one.append(alone.natural)
+        joined.append(hand.natural_weight)
+        one_by_one.append(alone.natural_weight)
     assert np.std(joined[20:]) < 0.5 * np.std(one_by_one[20:])
     assert np.mean(joined[20:]) > 0.8
 
@@ -133,7 +133,7 @@ def test_a_hand_that_leaves_the_posture_prior_gets_the_free_component_within_a_s
     for k in range(240):
         truth = odd if 60 <= k < 150 else natural_angles(np.random.default_rng(3))
         points = places(palm(), truth) + rng.normal(0.0, 0.5 * SIGMA_M, (6, 3))
-        natural.append(found(push(machine, k * STEP_NS, points, COV).solution).natural)
+        natural.append(found(push(machine, k * STEP_NS, points, COV).solution).natural_weight)
     assert natural[59] > 0.8
     assert natural[120] < 0.2
     assert natural[239] > 0.8
@@ -147,8 +147,8 @@ def test_what_both_hypotheses_have_between_them_is_uncertainty_as_well() -> None
         T, truth = palm(rng.uniform(-30, 30, 3)), independent_angles(rng)
         noise = rng.normal(0.0, SIGMA_M, (6, 3))
         both, natural = solved(SOLVER, T, truth, noise), solved(NATURAL_ONLY, T, truth, noise)
-        shares.append(both.natural)
-        if not 0.2 < both.natural < 0.8:
+        shares.append(both.natural_weight)
+        if not 0.2 < both.natural_weight < 0.8:
             continue
         off = natural.x - both.x
         spread = np.sqrt(np.diag(both.alone)[6:])

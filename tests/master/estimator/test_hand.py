@@ -44,7 +44,7 @@ seeds = st.integers(0, 2**32 - 1)
 # -- finding the hand -------------------------------------------------------------------------------------------
 
 
-def believed(model: HandModel) -> tuple[Float, Settings]:
+def prior_hand(model: HandModel) -> tuple[Float, Settings]:
     """A pose that every habit expects, and the settings with a thumb that can be like that."""
     thumb = np.radians([8.0, 8.0, 12.0, 12.0]).tolist()
     angles = np.zeros((5, 4))
@@ -61,7 +61,7 @@ def believed(model: HandModel) -> tuple[Float, Settings]:
 
 def expecting(model: HandModel) -> tuple[Float, Estimator]:
     """A pose, and an estimator whose habits expect it."""
-    angles, settings = believed(model)
+    angles, settings = prior_hand(model)
     return angles, forgetful(model, settings=settings)
 
 
@@ -250,7 +250,7 @@ def test_covariance_is_one_and_grows_with_that_of_the_markers(seed: int, factor:
 
 
 def test_an_unseen_tip_is_less_sure_than_a_seen_one() -> None:
-    points = places(palm(), believed(RIGHT)[0])
+    points = places(palm(), prior_hand(RIGHT)[0])
     both = found(fit(points, small_cov()))
     points[3] = np.nan
     without = found(fit(points, small_cov()))

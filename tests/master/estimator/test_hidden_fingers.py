@@ -35,7 +35,7 @@ class Memory:
 
     def __init__(self, natural: float = 1.0) -> None:
         self.state = HandState.unknown(FREE, NO_EXTRAS)
-        self.state.natural[0] = natural
+        self.state.natural_weight[0] = natural
 
     def moved(self, before_rad: Float, after_rad: Float, dt_s: float) -> None:
         """Let the rates be those of a step, as the end of an epoch leaves them."""
@@ -43,7 +43,7 @@ class Memory:
         share = 1.0 - np.exp(-dt_s / DEFAULT.rate_memory_s)
         self.state.rates[:] += share * (rate - self.state.rates)
 
-    def belief(self, t_ns: int, last_ns: int, last_rad: Float, shown: frozenset[int]) -> HiddenFingers:
+    def epoch_prior(self, t_ns: int, last_ns: int, last_rad: Float, shown: frozenset[int]) -> HiddenFingers:
         """Where fingers that are not shown are now, if the hand was like that a moment ago."""
         hidden = Hidden.none(FREE)
         self.state.angles[:], self.state.t_ns[0] = last_rad.reshape(20), last_ns
@@ -76,7 +76,7 @@ def after(
         memory.moved(bent(before_deg[0]), bent(before_deg[1]), STEP_NS * 1e-9)
     seen = ALL - gone
     return [
-        memory.belief((k + 1) * STEP_NS, k * STEP_NS, bent(pip), seen) for k, pip in enumerate(history_deg)
+        memory.epoch_prior((k + 1) * STEP_NS, k * STEP_NS, bent(pip), seen) for k, pip in enumerate(history_deg)
     ]
 
 
@@ -133,16 +133,16 @@ def test_uncertainty_grows_with_time_and_less_between_neighbours_that_show() -> 
 def test_a_marker_that_returns_begins_a_new_time() -> None:
     memory = Memory()
     seen = ALL - {RING}
-    gone = [memory.belief((k + 1) * STEP_NS, k * STEP_NS, bent(40.0), seen) for k in range(20)]
+    gone = [memory.epoch_prior((k + 1) * STEP_NS, k * STEP_NS, bent(40.0), seen) for k in range(20)]
     assert gone[-1].gone_s[RING] == pytest.approx(20 * STEP_NS * 1e-9)
-    assert memory.belief(21 * STEP_NS, 20 * STEP_NS, bent(40.0), ALL).gone_s[RING] == 0.0
-    hidden = memory.belief(22 * STEP_NS, 21 * STEP_NS, bent(40.0), seen)
+    assert memory.epoch_prior(21 * STEP_NS, 20 * STEP_NS, bent(40.0), ALL).gone_s[RING] == 0.0
+    hidden = memory.epoch_prior(22 * STEP_NS, 21 * STEP_NS, bent(40.0), seen)
     assert hidden.gone_s[RING] == pytest.approx(STEP_NS * 1e-9)
 
 
 def test_an_epoch_that_is_fitted_twice_still_knows_when_a_finger_was_seen_last() -> None:
     memory = Memory()
-    memory.belief(STEP_NS, 0, bent(40.0), ALL - {RING})
+    memory.epoch_prior(STEP_NS, 0, bent(40.0), ALL - {RING})
     assert memory.state.hidden_ns[RING] == 0
     hide_at(
         boxed(TABLES),
@@ -167,5 +167,5 @@ def test_a_step_of_a_millisecond_throws_no_finger() -> None:
     for _ in range(10):
         memory.moved(bent(40.0), bent(40.0), STEP_NS * 1e-9)
     memory.moved(bent(40.0), bent(41.5), 1e-3)
-    history = [memory.belief((k + 1) * STEP_NS, k * STEP_NS, bent(41.5), frozenset()) for k in range(60)]
+    history = [memory.epoch_prior((k + 1) * STEP_NS, k * STEP_NS, bent(41.5), frozenset()) for k in range(60)]
     assert max(abs(pip_deg(hidden) - 41.5) for hidden in history) < 10.0

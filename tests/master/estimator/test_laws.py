@@ -137,35 +137,35 @@ def test_points_move_with_the_angles_as_the_jacobian_says(name: str, seed: int) 
 
 
 def past(whole: Whole) -> None:
-    rng, belief = whole.rng, whole.belief
-    belief.own_w2[:], belief.own[:] = rng.uniform(0.0, 9.0, whole.n), rng.normal(size=whole.n)
-    belief.past_w2[:], belief.past[:] = rng.uniform(0.0, 9.0, whole.n), rng.normal(size=whole.n)
+    rng, epoch_prior = whole.rng, whole.epoch_prior
+    epoch_prior.own_w2[:], epoch_prior.own[:] = rng.uniform(0.0, 9.0, whole.n), rng.normal(size=whole.n)
+    epoch_prior.past_w2[:], epoch_prior.past[:] = rng.uniform(0.0, 9.0, whole.n), rng.normal(size=whole.n)
     # Near the last pose the sine stands for the angle.
     near = rotation_vector_to_matrix(rng.normal(0.0, 1e-3, 3)) @ whole.T[:3, :3]
-    belief.palm[:] = rigid(near, whole.T[:3, 3] + rng.normal(0.0, 0.01, 3))
-    belief.palm_w2[:] = np.repeat([20.0, 3e3], 3)
-    belief.line_of_sight[:], belief.depth_w2[0] = any_rotation(rng)[:, 0], 5e4
+    epoch_prior.palm[:] = rigid(near, whole.T[:3, 3] + rng.normal(0.0, 0.01, 3))
+    epoch_prior.palm_w2[:] = np.repeat([20.0, 3e3], 3)
+    epoch_prior.line_of_sight[:], epoch_prior.depth_w2[0] = any_rotation(rng)[:, 0], 5e4
 
 
 def back_normal(whole: Whole) -> None:
-    whole.belief.back_normal[:], whole.belief.back_normal_w2[0] = BACK_NORMAL, 7.0
+    whole.epoch_prior.back_normal[:], whole.epoch_prior.back_normal_w2[0] = BACK_NORMAL, 7.0
 
 
 def orientation(whole: Whole) -> None:
     """Of an IMU on the palm."""
-    rng, belief = whole.rng, whole.belief
-    belief.forearm[:3, :3] = rotation_vector_to_matrix(rng.normal(0.0, 0.8, 3)) @ whole.T[:3, :3]
+    rng, epoch_prior = whole.rng, whole.epoch_prior
+    epoch_prior.forearm[:3, :3] = rotation_vector_to_matrix(rng.normal(0.0, 0.8, 3)) @ whole.T[:3, :3]
     root = rng.normal(size=(3, 3))
-    belief.orientation_info[:], belief.oriented[0] = root @ root.T, 1.0
+    epoch_prior.orientation_info[:], epoch_prior.oriented[0] = root @ root.T, 1.0
 
 
 def place(whole: Whole) -> None:
-    whole.belief.place[:], whole.belief.place_w2[0] = whole.rng.normal(0.0, 0.1, 3), 9.0
+    whole.epoch_prior.place[:], whole.epoch_prior.place_w2[0] = whole.rng.normal(0.0, 0.1, 3), 9.0
 
 
 def extras(whole: Whole) -> None:
     root = whole.rng.normal(size=(len(whole.z), len(whole.z)))
-    whole.belief.z_info[:], whole.belief.z[:] = root @ root.T, whole.rng.normal(size=len(whole.z))
+    whole.epoch_prior.z_info[:], whole.epoch_prior.z[:] = root @ root.T, whole.rng.normal(size=len(whole.z))
 
 
 def points(whole: Whole) -> None:
@@ -217,7 +217,7 @@ def test_the_gradient_of_the_posture_prior_is_the_derivative_of_its_cost(name: s
 def test_all_kinds_of_rows_add_up(name: str) -> None:
     """Each by itself, with numbers drawn anew, and then all of them on one hand."""
     whole, kinds = Whole(MODELS[name], 3), (past, back_normal, orientation, place, extras, points)
-    habits = whole.habits
+    posture_prior = whole.posture_prior
     _, total, _ = whole.cost()
     for kind in kinds:
         one = Whole(MODELS[name], 3)
@@ -227,6 +227,6 @@ def test_all_kinds_of_rows_add_up(name: str) -> None:
         total = total + one.cost()[1]
         whole.rng = np.random.default_rng(7)
         kind(whole)
-    assert whole.habits is habits
+    assert whole.posture_prior is posture_prior
     _, gradient, _ = whole.cost()
     np.testing.assert_allclose(gradient, total, atol=1e-9 * np.abs(total).max())

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from common.arrays import Float
 from common.geometry import rigid, rotation_vector_to_matrix
 from master.estimator.epoch import Epoch, FittedHand
-from master.estimator.priors import habits_of
+from master.estimator.priors import posture_prior_of
 from master.estimator.settings import DEFAULT
 from tests.hand_helpers import BACK_NORMAL, MARKERS, RIGHT, natural_angles, palm, small_cov
 from tests.master.estimator.fitted import FREE, PAIR, PARAMETERS, fit, forgetful, found, places, seen
@@ -20,22 +20,22 @@ from tests.master.estimator.fitted import FREE, PAIR, PARAMETERS, fit, forgetful
 SIGMA_PX = 0.5
 FINE = DEFAULT.changed("tolerance", 1e-12).changed("tolerance_share", 0.0)
 MACHINE = forgetful(natural=True, settings=FINE)
-HABITS = habits_of(RIGHT, PARAMETERS, FINE)
+POSTURE_PRIOR = posture_prior_of(RIGHT, PARAMETERS, FINE)
 
 
 class Residuals:
     """Of a natural hand whose back faces the cameras: square roots of what the estimator sums up."""
 
     def __init__(self, near: Float) -> None:
-        self.near, self.root = near, np.linalg.cholesky(HABITS.normal[0])
-        self.mean = np.linalg.solve(HABITS.normal[0], HABITS.pull[0])
+        self.near, self.root = near, np.linalg.cholesky(POSTURE_PRIOR.normal[0])
+        self.mean = np.linalg.solve(POSTURE_PRIOR.normal[0], POSTURE_PRIOR.pull[0])
 
     def hand(self, at: Float) -> tuple[Float, Float]:
         """Palm (4, 4) and free angles (n,) of a step from the palm where it begins, and angles."""
         R = rotation_vector_to_matrix(at[:3]) @ self.near[:3, :3]
         return rigid(R, self.near[:3, 3] + at[3:6]), at[6 : 6 + FREE]
 
-    def believed(self, T: Float, x: Float) -> Float:
+    def prior_rows(self, T: Float, x: Float) -> Float:
         return np.append(self.root.T @ (x - self.mean), (T[:3, 1] - BACK_NORMAL) / FINE.back_normal_rad)
 
     def solve(self, start: Float, spare: int = 0) -> tuple[Float, Float, float]:
@@ -65,7 +65,7 @@ class OfPoints(Residuals):
     def __call__(self, at: Float) -> Float:
         T, x = self.hand(at)
         off = places(T, PARAMETERS.angles(x)) - self.points
-        return np.append(np.einsum("mij,mi->mj", self.white, off).ravel(), self.believed(T, x))
+        return np.append(np.einsum("mij,mi->mj", self.white, off).ravel(), self.prior_rows(T, x))
 
 
 class OfPixels(Residuals):
@@ -84,7 +84,7 @@ class OfPixels(Residuals):
             [(camera.project(points) - uv) / self.sigma_px for camera, uv in zip(PAIR, self.uv, strict=True)]
         )
         own = moved / FINE.bones_m
-        return np.concatenate([off[np.isfinite(off)], own.ravel(), self.believed(T, x)])
+        return np.concatenate([off[np.isfinite(off)], own.ravel(), self.prior_rows(T, x)])
 
 
 def compare(hand: FittedHand, T: Float, x: Float, share: float) -> None:
@@ -178,7 +178,7 @@ for k in range(5):
     T = palm(np.array([3.0 * k, -2.0 * k, k]))
     epoch = seen(T, bent(k / 60.0)).epoch(k * STEP_NS, gone=(2,) if k == 3 else (), cameras=(0,) if k == 4 else None)
     for hand in (rays.push(epoch).solution, push(points, k * STEP_NS, places(T, bent(k / 60.0))).solution):
-        out += [hand.T_rig_palm.ravel(), hand.angles_rad.ravel(), hand.cov_m2.ravel() * 1e3, [hand.natural]]
+        out += [hand.T_rig_palm.ravel(), hand.angles_rad.ravel(), hand.cov_m2.ravel() * 1e3, [hand.natural_weight]]
 np.save(sys.argv[1], np.concatenate(out))
 """
 

@@ -241,11 +241,11 @@ def test_of_two_equal_solutions_the_covariance_holds_both(wrist_case: WristCase)
 def test_one_hand_against_the_posture_prior_shifts_the_learnt_coupling_of_fk(wrist_case: WristCase) -> None:
     """Knuckles alone are bent: the finger whose tip is not seen is told by neither curve nor tip."""
     angles = bent(80.0, 2.0)
-    pose, by_habit = (
+    pose, by_prior = (
         Line(wrist_case, solver_mode).sees(angles, tips=np.arange(5) != 2) for solver_mode in ("auto", "fk")
     )
     assert (pose.solver_mode[[1, 3, 4]] == SolverMode.IK).all()
-    off, without = (np.abs(one.angles_rad[2, PIP] - angles[2, PIP]) for one in (pose, by_habit))
+    off, without = (np.abs(one.angles_rad[2, PIP] - angles[2, PIP]) for one in (pose, by_prior))
     assert off < 0.6 * without
 
 

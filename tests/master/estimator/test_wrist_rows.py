@@ -42,7 +42,7 @@ def spd(rng: np.random.Generator, n: int) -> Float:
 
 
 def laser(whole: Whole, seen: Seen, off: float) -> None:
-    lines_of_sight = whole.belief.lines_of_sight
+    lines_of_sight = whole.epoch_prior.lines_of_sight
     lines_of_sight.rows[0], lines_of_sight.lit[:], lines_of_sight.teaches[:] = 1.0, 1.0, 1.0
     lines_of_sight.lack[:] = whole.rng.normal(0.0, 0.02, (5, 2))
     lines_of_sight.laser[:] = seen.predicted_laser + lines_of_sight.lack + off * whole.rng.normal(size=(5, 2))
@@ -50,7 +50,7 @@ def laser(whole: Whole, seen: Seen, off: float) -> None:
 
 
 def tip(whole: Whole, seen: Seen, off: float) -> None:
-    lines_of_sight = whole.belief.lines_of_sight
+    lines_of_sight = whole.epoch_prior.lines_of_sight
     lines_of_sight.rows[0], lines_of_sight.shown[:], lines_of_sight.teaches[:] = 1.0, 1.0, 1.0
     lines_of_sight.tip[:] = seen.tip + off * whole.rng.normal(size=(5, 2))
     lines_of_sight.tip_W[:] = [spd(whole.rng, 2) for _ in range(5)]
@@ -58,19 +58,19 @@ def tip(whole: Whole, seen: Seen, off: float) -> None:
 
 def tip_depth(whole: Whole, seen: Seen, off: float) -> None:
     tip(whole, seen, off)
-    lines_of_sight = whole.belief.lines_of_sight
+    lines_of_sight = whole.epoch_prior.lines_of_sight
     lines_of_sight.depth[:] = np.log(seen.depth_m) + whole.z[LED_SCALE] + off * whole.rng.normal(size=5)
     lines_of_sight.depth_w2[:] = whole.rng.uniform(1.0, 9.0, 5)
 
 
 def orientation(whole: Whole, seen: Seen, off: float) -> None:
     """Of a forearm that is turned `off` from where it would put the palm; tilt and heading are as they were."""
-    belief, rng = whole.belief, whole.rng
+    epoch_prior, rng = whole.epoch_prior, whole.rng
     palm = rotation_vector_to_matrix(off * rng.normal(size=3)) @ whole.T[:3, :3]
-    belief.forearm[:3, :3] = palm @ forearm_palm(FLEXED).T
-    belief.orientation_info[:], belief.oriented[0], belief.on_forearm[0] = spd(rng, 3), 1.0, 1.0
-    belief.axes[:] = any_rotation(rng)
-    whole.z[TILT : HEADING + 1] = belief.z[TILT : HEADING + 1] = rng.normal(0.0, 0.2, 3)
+    epoch_prior.forearm[:3, :3] = palm @ forearm_palm(FLEXED).T
+    epoch_prior.orientation_info[:], epoch_prior.oriented[0], epoch_prior.on_forearm[0] = spd(rng, 3), 1.0, 1.0
+    epoch_prior.axes[:] = any_rotation(rng)
+    whole.z[TILT : HEADING + 1] = epoch_prior.z[TILT : HEADING + 1] = rng.normal(0.0, 0.2, 3)
 
 
 def largest(whole: Whole, numeric: Float) -> Float:
@@ -103,7 +103,7 @@ def test_the_laser_row_is_that_of_closed_form_and_lack(wrist_case: WristCase) ->
     for seed in range(4):
         whole, seen = hand(wrist_case, seed)
         laser(whole, seen, 0.3)
-        lines_of_sight, n = whole.belief.lines_of_sight, whole.n
+        lines_of_sight, n = whole.epoch_prior.lines_of_sight, whole.n
         by_free = whole.parameters.by_angles(whole.x).reshape(5, 4, n)
         expected, cost = np.zeros(6 + n + len(whole.z)), 0.0
         for f in range(5):
@@ -136,7 +136,7 @@ def test_rows_that_are_not_seen_say_nothing(wrist_case: WristCase) -> None:
     whole, seen = hand(wrist_case, 1)
     tip_depth(whole, seen, 0.3)
     laser(whole, seen, 0.3)
-    whole.belief.lines_of_sight.lit[:] = whole.belief.lines_of_sight.shown[:] = 0.0
+    whole.epoch_prior.lines_of_sight.lit[:] = whole.epoch_prior.lines_of_sight.shown[:] = 0.0
     cost, gradient, normal = whole.cost()
     assert cost == 0.0
     assert not gradient.any()
@@ -149,7 +149,7 @@ def test_a_finger_constrains_its_own_angles_and_twist_and_the_wrist_angles(wrist
     whole, seen = hand(wrist_case, 2)
     tip_depth(whole, seen, 0.3)
     laser(whole, seen, 0.3)
-    lines_of_sight = whole.belief.lines_of_sight
+    lines_of_sight = whole.epoch_prior.lines_of_sight
     lines_of_sight.lit[:] = lines_of_sight.shown[:] = np.arange(5) == 2
     lines_of_sight.teaches[:] = teaches
     _, gradient, _ = whole.cost()

@@ -16,8 +16,8 @@ from common.records import boxed
 from master.estimator.cameras import CameraArrays
 from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.parameters import HandParameters
-from master.estimator.priors import habits_of
-from master.estimator.problem import Belief, Search
+from master.estimator.priors import posture_prior_of
+from master.estimator.problem import EpochPrior, Search
 from master.estimator.residuals import Observations
 from master.estimator.settings import DEFAULT
 from master.estimator.workspace import Model
@@ -58,8 +58,8 @@ class Whole:
         self.x = np.clip(self.parameters.of_angles(angles), low + 0.02, high - 0.02)
         self.z = np.zeros(K)
         self.points = model.marker_points(model.forward(self.T, self.parameters.angles(self.x)), MARKERS)
-        self.habits = habits_of(model, self.parameters)
-        self.belief, self.search = Belief.none(n, K), Search.empty(n, K, 16)
+        self.posture_prior = posture_prior_of(model, self.parameters)
+        self.epoch_prior, self.search = EpochPrior.none(n, K), Search.empty(n, K, 16)
         self.observed = Observations.empty(2, 6)
         self.rig = Model(
             boxed(HandTables.of(model, self.parameters)),
@@ -76,7 +76,7 @@ class Whole:
         T = rigid(rotation_vector_to_matrix(by[:3]) @ self.T[:3, :3], self.T[:3, 3] + by[3:6])
         gradient, normal = np.empty(N), np.empty((N, N))
         cost = linearise_at(
-            self.rig, self.habits, boxed(self.belief), self.observed, self.h, T,
+            self.rig, self.posture_prior, boxed(self.epoch_prior), self.observed, self.h, T,
             self.x + by[6 : 6 + self.n], self.z + by[6 + self.n :], gradient, normal, boxed(self.search),
         )  # fmt: skip
         return float(cost), gradient, normal
@@ -107,5 +107,5 @@ class Whole:
 
 def silent(whole: Whole) -> None:
     """Let habits say nothing."""
-    for table in whole.habits:
+    for table in whole.posture_prior:
         table[:] = 0.0

@@ -84,20 +84,20 @@ def test_a_known_hand_gives_its_caps_back() -> None:
 
 def test_the_covariance_is_the_spread_of_the_errors_that_unsure_tilts_make() -> None:
     rng = np.random.default_rng(5)
-    sd, believed = 0.1, hand(0.1)
+    sd, estimated = 0.1, hand(0.1)
     tilts = rng.normal(0.0, sd, (1500, 5, 2))
-    _, uv = seen(believed.joints)
-    truth = RIGHT.marker_points(believed.joints, MARKERS)
+    _, uv = seen(estimated.joints)
+    truth = RIGHT.marker_points(estimated.joints, MARKERS)
     errors: list[Float] = []
     for tilt in tilts:
-        rotation = believed.joints.rotation.copy()
+        rotation = estimated.joints.rotation.copy()
         R = rotation[TIPS]
         ahead = -R[:, :, 2] + np.einsum("kij,kj->ki", R[:, :, :2], tilt)
         rotation[TIPS, :, 2] = -ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
-        _, uv = seen(replace(believed.joints, rotation=rotation))
-        errors.append(correct_centres(believed, uv + centroid_errors(rng)).points_m - truth)
+        _, uv = seen(replace(estimated.joints, rotation=rotation))
+        errors.append(correct_centres(estimated, uv + centroid_errors(rng)).points_m - truth)
     spread = np.array(errors)
-    cov = correct_centres(believed, seen(believed.joints)[1]).cov_m2
+    cov = correct_centres(estimated, seen(estimated.joints)[1]).cov_m2
     for m in range(5):
         nees = np.einsum("ni,ij,nj->n", spread[:, m], np.linalg.inv(cov[m]), spread[:, m])
         assert 0.90 < (nees < 7.815).mean() <= 1.0, MARKERS[m]

@@ -10,7 +10,7 @@ from common.geometry import rotation_vector_to_matrix
 from master.calibrate.extrinsics.hands import HandProblem, Hands
 from master.estimator.body_points import BodyPoints
 from master.estimator.parameters import HandParameters
-from master.estimator.priors import Habits, habits_of
+from master.estimator.priors import PosturePrior, posture_prior_of
 from tests.master.calibrate.extrinsics.moved import moved
 
 COUNT, LITTLE = 4, 1e-5
@@ -27,9 +27,9 @@ def problem(seed: int = 5) -> tuple[HandProblem, Hands]:
     hands = Hands(T, parameters.low + share * (parameters.high - parameters.low))
     markers = BodyPoints.markers(seen.hand, parameters, seen.markers)
     shape = (COUNT, len(seen.markers), 3)
-    free = habits_of(seen.hand, parameters)
+    free = posture_prior_of(seen.hand, parameters)
     whiten = 1e3 * np.eye(3) + rng.normal(0.0, 50.0, (*shape, 3))
-    out = HandProblem(seen.hand, markers, Habits(*(part[1:] for part in free)), np.zeros(shape), whiten)
+    out = HandProblem(seen.hand, markers, PosturePrior(*(part[1:] for part in free)), np.zeros(shape), whiten)
     return replace(out, points_m=out.place(hands) + rng.normal(0.0, 3e-3, shape)), hands
 
 

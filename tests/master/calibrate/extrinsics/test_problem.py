@@ -13,7 +13,7 @@ from master.calibrate.extrinsics.hands import Hands
 from master.calibrate.extrinsics.lines_of_sight import LinesOfSight
 from master.calibrate.extrinsics.problem import Problem
 from master.calibrate.extrinsics.tracks import HandTrack, ImuTrack
-from master.calibrate.extrinsics.unknown import UNKNOWN, Unknown, believed
+from master.calibrate.extrinsics.unknown import UNKNOWN, Unknown, prior_sigma
 from master.calibrate.extrinsics.wrists import bends_by_rotation, wrist_rotation_angles
 from master.wrist_setup import WristSetup
 from tests.master.calibrate.extrinsics.moved import CAMERA_LATE_NS, IMU_LATE_NS, ZERO_NS, moved
@@ -64,11 +64,11 @@ def slopes(at: Problem, unknown: Unknown, hands: Hands, steps: Float) -> Float:
 
 def test_the_gradient_of_what_all_epochs_share_is_the_derivative_of_the_cost() -> None:
     at, unknown, hands = problem()
-    pull, little = at.normal(unknown, hands).shared_pull, 1e-4 * believed()
+    pull, little = at.normal(unknown, hands).shared_pull, 1e-4 * prior_sigma()
     slope = slopes(at, unknown, hands, np.diag(little)) / little
-    scale = np.abs(pull * believed())
+    scale = np.abs(pull * prior_sigma())
     most = float(scale.max())  # small pulls are differences of large ones
-    np.testing.assert_allclose(slope * believed(), pull * believed(), rtol=0.01, atol=2e-3 * most)
+    np.testing.assert_allclose(slope * prior_sigma(), pull * prior_sigma(), rtol=0.01, atol=2e-3 * most)
     assert np.count_nonzero(scale > 0.1) > UNKNOWN // 2  # most unknowns are told something
 
 
