@@ -23,7 +23,7 @@ def floor_px(kind: Kind, count: int, seed: int = 1) -> Float:
     for k in range(count):
         scene = make_scene(kind, generator(kind, k, seed))
         inverse = 1.0 / variance(scene.light(scene.caps), kind.noise)
-        slopes = [
+        sensitivities = [
             (
                 scene.light(tuple(c.moved(du, dv) for c in scene.caps))
                 - scene.light(tuple(c.moved(-du, -dv) for c in scene.caps))
@@ -37,7 +37,7 @@ def floor_px(kind: Kind, count: int, seed: int = 1) -> Float:
                 max(round(cap.v - reach), 0) : round(cap.v + reach) + 1,
                 max(round(cap.u - reach), 0) : round(cap.u + reach) + 1,
             ]
-            su, sv, weight = slopes[0][window], slopes[1][window], inverse[window]
+            su, sv, weight = sensitivities[0][window], sensitivities[1][window], inverse[window]
             uu, uv, vv = ((a * b * weight).sum() for a, b in ((su, su), (su, sv), (sv, sv)))
             covariance = cast(Float, np.linalg.inv(np.array([[uu, uv], [uv, vv]], np.float64)))
             floors.append(float(np.sqrt(np.trace(covariance) / 2.0)))

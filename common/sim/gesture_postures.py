@@ -221,10 +221,10 @@ def _solved(
     here = residuals(x + steps)
     best_x, best, damping = x, float(here[0] @ here[0]), _DAMPING
     for _ in range(_STEPS):
-        slope = (here[1:] - here[0]) / _NUDGE_DEG
-        square = slope @ slope.T
+        jacobian = (here[1:] - here[0]) / _NUDGE_DEG
+        square = jacobian @ jacobian.T
         move: Float = np.asarray(
-            np.linalg.solve(square + damping * np.diag(np.diag(square)), slope @ here[0]), np.float64
+            np.linalg.solve(square + damping * np.diag(np.diag(square)), jacobian @ here[0]), np.float64
         )
         x = best_x - np.clip(move, -15.0, 15.0)
         found = residuals(x + steps)

@@ -231,14 +231,14 @@ class View:
         h = max(0.5 * readout_s, 0.5 * self.exposure_s, 1e-4)
         states = tuple(self.scene.motion.at(t) for t in (t_middle - h, t_middle, t_middle + h))
         before, now, after = transform(self.T_camera_rig, self._key_points(states))
-        slope, curvature = (after - before) / (2.0 * h), (after - 2.0 * now + before) / (h * h)
+        velocity, curvature = (after - before) / (2.0 * h), (after - 2.0 * now + before) / (h * h)
         when = np.full(len(now), t_middle)
         points = now
         for _ in range(2):
             when = t_s + (self._together @ self.project(points)[:, 1]) * self.row_s
             ahead = (when - t_middle)[:, None]
-            points = now + ahead * slope + 0.5 * ahead * ahead * curvature
-        speed = slope + (when - t_middle)[:, None] * curvature
+            points = now + ahead * velocity + 0.5 * ahead * ahead * curvature
+        speed = velocity + (when - t_middle)[:, None] * curvature
         z = np.maximum(points[:, 2:], NEAREST_M)
         speed_uv = self.focal_px * (speed[:, :2] / z - points[:, :2] * speed[:, 2:] / z**2)
         return points, self.project(points), speed_uv, when, self.scene.untracked(states[1])

@@ -23,9 +23,9 @@ from math import sqrt
 
 from common.arrays import Bool, Float
 from common.kernels import constant, inlined, inner
-from master.estimator.certainty import MOST_ROTATIONS, Certainty, joint_slopes
+from master.estimator.certainty import MOST_ROTATIONS, Certainty, joint_jacobian
 from master.estimator.hand_tables import HandTables
-from master.estimator.kinematics import PLACE, Scratch, finger_slopes, marker_point, palm_slopes
+from master.estimator.kinematics import PLACE, Scratch, finger_jacobian, marker_point, palm_jacobian
 from master.estimator.matrices import cholesky, eigen
 from master.estimator.problem import Rig
 from master.estimator.settings import Settings
@@ -206,11 +206,11 @@ def _gain(
         marker_point(mounts, m, T, work.R, work.P, work.point)
         for i in range(3):
             work.arm[i] = work.point[i] - T[i, 3]
-        palm_slopes(work.arm, scratch.J)
+        palm_jacobian(work.arm, scratch.J)
         size, start = 6, 0
         if f >= 0:
             start, size = hand.first[f], 6 + hand.first[f + 1] - hand.first[f]
-            finger_slopes(hand, work.by, T, work.R, work.P, f, mounts.level[m], work.point, PLACE, scratch.J)
+            finger_jacobian(hand, work.by, T, work.R, work.P, f, mounts.level[m], work.point, PLACE, scratch.J)
         _whiten(information[m], scratch.white)
         for i in range(3):
             for c in range(N):
@@ -300,7 +300,7 @@ def add_arcs(
     K = _gain(rig, T, cov, seen, information, pairs, work, scratch)
     _at_most_one(N, K, scratch)
     for joint in range(26):
-        size = joint_slopes(rig.hand, joint, T, work, scratch)
+        size = joint_jacobian(rig.hand, joint, T, work, scratch)
         mx = my = mz = 0.0
         out = joint_cov[joint]
         for i in range(3):

@@ -84,13 +84,13 @@ def project(cameras: CameraArrays, c: int, point: Float, uv: Float, J: Float) ->
     )
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))  # of radial, by r^2, twice
+    radial_derivative = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))  # of radial, by r^2, twice
     fx, fy = cameras.focal[c, 0], cameras.focal[c, 1]
     uv[0] = fx * (x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)) + cameras.principal[c, 0]
     uv[1] = fy * (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y) + cameras.principal[c, 1]
-    a = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
-    b = slope * x * y + 2.0 * (p1 * x + p2 * y)
-    d = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+    a = radial + radial_derivative * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+    b = radial_derivative * x * y + 2.0 * (p1 * x + p2 * y)
+    d = radial + radial_derivative * y * y + 6.0 * p1 * y + 2.0 * p2 * x
     for i in range(3):
         by_x = (cameras.R[c, 0, i] - x * cameras.R[c, 2, i]) / z
         by_y = (cameras.R[c, 1, i] - y * cameras.R[c, 2, i]) / z
@@ -124,12 +124,12 @@ def undistort(cameras: CameraArrays, c: int, u: float, v: float, out: Float) -> 
     for _ in range(_NEWTON_STEPS):
         r2 = x * x + y * y
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))
+        radial_derivative = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))
         off_x = seen_x - (x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x))
         off_y = seen_y - (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y)
-        a = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
-        b = slope * x * y + 2.0 * (p1 * x + p2 * y)
-        d = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+        a = radial + radial_derivative * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+        b = radial_derivative * x * y + 2.0 * (p1 * x + p2 * y)
+        d = radial + radial_derivative * y * y + 6.0 * p1 * y + 2.0 * p2 * x
         determinant = a * d - b * b
         step_x = (d * off_x - b * off_y) / determinant
         step_y = (a * off_y - b * off_x) / determinant

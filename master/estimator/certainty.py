@@ -14,7 +14,7 @@ from common.hand_model import CHAINS
 from common.kernels import constant, inlined, inner
 from common.records import record
 from master.estimator.hand_tables import HandTables
-from master.estimator.kinematics import DIRECTION, PLACE, Scratch, finger_slopes, palm_slopes
+from master.estimator.kinematics import DIRECTION, PLACE, Scratch, finger_jacobian, palm_jacobian
 from master.estimator.matrices import cholesky, eigen
 from master.estimator.settings import Settings
 from master.estimator.state import Hidden
@@ -137,7 +137,7 @@ def only_limits(hand: HandTables, x: Float, hidden: Hidden, cov: Float) -> None:
 
 
 @inner
-def joint_slopes(hand: HandTables, joint: int, T: Float, work: Scratch, scratch: Certainty) -> int:
+def joint_jacobian(hand: HandTables, joint: int, T: Float, work: Scratch, scratch: Certainty) -> int:
     """Write derivatives of a joint (10, 3) and which unknowns they belong to; return how many."""
     f, level = hand.finger[joint], hand.level[joint]
     for i in range(3):
@@ -145,13 +145,13 @@ def joint_slopes(hand: HandTables, joint: int, T: Float, work: Scratch, scratch:
         for j in range(3):
             work.point[i] += 0.0 if f >= 0 else T[i, j] * hand.rest_m[joint, j]
         work.arm[i] = work.point[i] - T[i, 3]
-    palm_slopes(work.arm, scratch.J)
+    palm_jacobian(work.arm, scratch.J)
     for a in range(6):
         scratch.at[a] = a
     if f < 0:
         return 6
     count = int(hand.first[f + 1] - hand.first[f])
-    finger_slopes(hand, work.by, T, work.R, work.P, f, level, work.point, PLACE, scratch.J)
+    finger_jacobian(hand, work.by, T, work.R, work.P, f, level, work.point, PLACE, scratch.J)
     for c in range(count):
         scratch.at[6 + c] = 6 + hand.first[f] + c
     return 6 + count
@@ -180,7 +180,7 @@ def linear(
 ) -> None:
     """Write the covariances of the joints (26, 3, 3) [m^2], by their derivatives; `work` as `chains` left it."""
     for joint in range(26):
-        count = joint_slopes(hand, joint, T, work, scratch)
+        count = joint_jacobian(hand, joint, T, work, scratch)
         _project(cov, count, scratch, joint_cov[joint])
 
 
@@ -206,8 +206,8 @@ def tilts(
             squared += work.ahead[i] ** 2
         for i in range(3):
             work.ahead[i] /= sqrt(squared)
-        palm_slopes(work.ahead, scratch.J)
-        finger_slopes(hand, work.by, T, work.R, work.P, f, _LAST, work.ahead, DIRECTION, scratch.J)
+        palm_jacobian(work.ahead, scratch.J)
+        finger_jacobian(hand, work.by, T, work.R, work.P, f, _LAST, work.ahead, DIRECTION, scratch.J)
         count = hand.first[f + 1] - hand.first[f]
         for a in range(6 + count):
             scratch.at[a] = a if a < 6 else hand.first[f] + a

@@ -266,7 +266,7 @@ def joints(tables: HandTables, T: Float, R: Float, P: Float, position: Float, ro
 
 
 @inlined
-def palm_slopes(arm: Float, J: Float) -> None:
+def palm_jacobian(arm: Float, J: Float) -> None:
     """Write derivatives by the palm of a point `arm` (3,) from its origin.
 
     `J`: (10, 3), the first six rows.
@@ -281,7 +281,7 @@ def palm_slopes(arm: Float, J: Float) -> None:
 
 
 @inlined
-def finger_slopes(
+def finger_jacobian(
     tables: HandTables,
     by: Float,
     T: Float,

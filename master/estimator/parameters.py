@@ -108,9 +108,9 @@ class HandParameters:
         """Derivatives (..., P, 3, n) by the free angles as they are -> by the parameters at x (..., n); in place."""
         if len(self.most):
             flexed = self._flexed(x)
-            slope = -2.0 * (1.0 - self.left) * flexed / self.most * x[..., self.abduction]
+            spread_derivative = -2.0 * (1.0 - self.left) * flexed / self.most * x[..., self.abduction]
             spread = J[..., self.abduction]
-            J[..., self.flexion] += spread * slope[..., None, None, :]
+            J[..., self.flexion] += spread * spread_derivative[..., None, None, :]
             J[..., self.abduction] = spread * self._share(flexed)[..., None, None, :]
         return J
 

@@ -105,7 +105,7 @@ class Search:
     q: Float  # (3,)
     J: Float  # (3, 3)
     palm_straight: Float  # (4, 4)
-    slope: Float  # (5, 3)
+    extras_jacobian: Float  # (5, 3)
     by_rotation: Float  # (8, 3)
     palm_camera: Float  # (4, 4)
     wrist_axes: Float  # (2, 3)
@@ -142,7 +142,7 @@ class Search:
             q=3,
             J=(3, 3),
             palm_straight=(4, 4),
-            slope=(5, 3),
+            extras_jacobian=(5, 3),
             by_rotation=(8, 3),
             palm_camera=(4, 4),
             wrist_axes=(2, 3),

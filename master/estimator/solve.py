@@ -18,9 +18,9 @@ from master.estimator.kinematics import (
     PLACE,
     angles_of,
     chains,
-    finger_slopes,
+    finger_jacobian,
     marker_point,
-    palm_slopes,
+    palm_jacobian,
     rotate_by,
     twist_hand,
 )
@@ -229,11 +229,11 @@ def _marker(
         for j in range(3):
             search.information[m, i, j] = work.H[i, j]
     size, start, D = 6, 0, work.by_place
-    palm_slopes(work.arm, D)
+    palm_jacobian(work.arm, D)
     if f >= 0:
         start = hand.first[f]
         size += hand.first[f + 1] - start
-        finger_slopes(hand, work.by, T, work.R, work.P, f, mounts.level[m], work.point, PLACE, D)
+        finger_jacobian(hand, work.by, T, work.R, work.P, f, mounts.level[m], work.point, PLACE, D)
     for a in range(size):
         ia = a if a < 6 else start + a
         gradient[ia] += D[a, 0] * work.g[0] + D[a, 1] * work.g[1] + D[a, 2] * work.g[2]

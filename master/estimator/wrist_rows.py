@@ -43,12 +43,12 @@ def rotation_vector_jacobian(rotation: Float, J: Float) -> None:
 
 @inner
 def sensed_palm(epoch_prior: EpochPrior, z: Float, search: Search) -> None:
-    """Write how other sensors have the palm turned, to `search.palm` (3, 3), and how extras turn that: `slope` (5, 3).
+    """Write the palm's rotation by other sensors to `search.palm` (3, 3), its derivative to `extras_jacobian` (5, 3).
 
     By an IMU on the forearm it is  exp(axes . (tilt, heading less the believed)) forearm R_y(deviation) R_x(flexion),
     and extras are tilt 2, heading, flexion, deviation; by one on the palm itself it is `forearm`, which none turns.
     """
-    R, slope, F = search.palm_straight, search.slope, epoch_prior.forearm
+    R, extras_jacobian, F = search.palm_straight, search.extras_jacobian, epoch_prior.forearm
     if epoch_prior.on_forearm[0] == 0.0:
         for i in range(3):
             for j in range(3):
@@ -57,8 +57,8 @@ def sensed_palm(epoch_prior: EpochPrior, z: Float, search: Search) -> None:
     flexed_palm(F, z[WRIST_ANGLES], z[WRIST_ANGLES + 1], R, search.wrist_axes)
     for i in range(3):  # rig axes
         for a in range(3):
-            slope[a, i] = epoch_prior.axes[a, i]
-        slope[3, i], slope[4, i] = search.wrist_axes[0, i], search.wrist_axes[1, i]
+            extras_jacobian[a, i] = epoch_prior.axes[a, i]
+        extras_jacobian[3, i], extras_jacobian[4, i] = search.wrist_axes[0, i], search.wrist_axes[1, i]
     for i in range(3):
         search.off[i] = 0.0
         for a in range(3):
@@ -86,7 +86,7 @@ def orientation_row(
     epoch_prior: EpochPrior, T: Float, z: Float, n: int, gradient: Float, normal: Float, search: Search
 ) -> float:
     """Add the TURN row; return its cost."""
-    J, q, slope = search.J, search.q, search.slope
+    J, q, extras_jacobian = search.J, search.q, search.extras_jacobian
     K = 5 if epoch_prior.on_forearm[0] > 0.0 else 0
     sensed_palm(epoch_prior, z, search)
     rotation_between(T, search.palm, J, q)
@@ -103,7 +103,7 @@ def orientation_row(
             D[i, c] = J[c, i]
     for a in range(K):
         for c in range(3):
-            D[3 + a, c] = -(J[0, c] * slope[a, 0] + J[1, c] * slope[a, 1] + J[2, c] * slope[a, 2])
+            D[3 + a, c] = -(J[0, c] * extras_jacobian[a, 0] + J[1, c] * extras_jacobian[a, 1] + J[2, c] * extras_jacobian[a, 2])
     for a in range(3 + K):
         ia = a if a < 3 else _column(n, a - 3)
         gradient[ia] += D[a, 0] * w[0] + D[a, 1] * w[1] + D[a, 2] * w[2]

@@ -38,7 +38,7 @@ class Views(NamedTuple):
     aim: Float
     bias: Float
     whole: Float
-    moved: Float
+    correction_jacobian_m: Float
     back: Float
     shift: Float
     gain: Float

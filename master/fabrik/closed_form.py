@@ -109,9 +109,9 @@ def distance2_of(chain: ChainArrays, ratio: float, pip: float) -> tuple[float, f
     """Squared distance |w|^2 [m^2] at a PIP [rad], and its derivative [m^2/rad]."""
     led = ratio * pip
     dip = min(max(led, chain.spans[3, 0]), chain.spans[3, 1])
-    slope, link_rotation = ratio if dip == led else 0.0, matrix_at(chain.links, DIP, ROTATION)
+    dip_per_pip, link_rotation = ratio if dip == led else 0.0, matrix_at(chain.links, DIP, ROTATION)
     tip = _flexed(dip, vector_at(chain.links, DIP, BONE))
-    rotating = rotate(link_rotation, (0.0, slope * tip[2], -slope * tip[1]))
+    rotating = rotate(link_rotation, (0.0, dip_per_pip * tip[2], -dip_per_pip * tip[1]))
     end = plus(rotate(link_rotation, tip), vector_at(chain.links, PIP, BONE))
     end, rotating, link_rotation = (
         _flexed(pip, end),
@@ -161,12 +161,12 @@ def _invert(
         return far if distance2 >= far2 else bent, off
     pip = far + sqrt((far2 - distance2) / (far2 - near2)) * (bent - far)
     for _ in range(_ROOT_STEPS):
-        value, slope = distance2_of(chain, ratio, pip)
+        value, dip_per_pip = distance2_of(chain, ratio, pip)
         if value > distance2:
             far = pip
         else:
             bent = pip
-        new = pip + (distance2 - value) / slope if slope != 0.0 else inf
+        new = pip + (distance2 - value) / dip_per_pip if dip_per_pip != 0.0 else inf
         if not min(far, bent) <= new <= max(far, bent):
             new = 0.5 * (far + bent)
         if new == pip or abs(value - distance2) <= _ROUNDING * far2:

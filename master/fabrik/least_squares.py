@@ -80,7 +80,7 @@ def _evaluate(chain: ChainArrays, goal: Vector, unknowns: Float, angles: Float, 
     limits = limits_of(chain, ROOT)
     unknowns[0] = min(max(unknowns[0], limits.low), limits.high)
     unknowns[1] = min(max(unknowns[1], limits.flexion_low), limits.flexion_high)
-    share, slope = narrowing(limits, unknowns[1])
+    share, narrowing_derivative = narrowing(limits, unknowns[1])
     angles[0] = share * unknowns[0]
     for i in range(1, 4):
         angles[i] = unknowns[i]
@@ -101,7 +101,7 @@ def _evaluate(chain: ChainArrays, goal: Vector, unknowns: Float, angles: Float, 
         axis = (-orientations[k, 0], -orientations[k, 3], -orientations[k, 6])
         put_vector(columns, k + 1, cross(axis, minus(end, vector_at(positions, k, START))))
     follows = chain.follower >= 0 and abs(angles[3] - chain.ratio * angles[2]) < _COUPLED_RAD
-    ratio, narrows = chain.ratio if follows else 0.0, unknowns[0] * slope
+    ratio, narrows = chain.ratio if follows else 0.0, unknowns[0] * narrowing_derivative
     for j in range(3):
         if chain.follower >= 0:
             columns[2, j] += ratio * columns[3, j]

@@ -92,14 +92,14 @@ def _covariance(
 
     `process_noise`: as of `_Hand`.
     """
-    moved, gain = views.moved, views.gain
+    correction_jacobian_m, gain = views.correction_jacobian_m, views.gain
     step, both = views.step, views.both  # of the point by a common step; gain gain'
     for i in range(3):
         for j in range(3):
             step[i, j] = both[i, j] = 0.0
     for t in range(count):
         for i in range(3):
-            moved[t, i] = 0.0
+            correction_jacobian_m[t, i] = 0.0
     for c in range(rays.weight.shape[0]):
         if rays.weight[c] == 0.0 or not project(cameras, c, rays.point, rays.seen, rays.J):
             continue
@@ -110,18 +110,18 @@ def _covariance(
                     gain[i, axis] += rays.weight[c] * rays.cov[i, k] * rays.J[axis, k]
         for i in range(3):
             for t in range(count):
-                moved[t, i] += gain[i, 0] * views.bias[t, c, 0] + gain[i, 1] * views.bias[t, c, 1]
+                correction_jacobian_m[t, i] += gain[i, 0] * views.bias[t, c, 0] + gain[i, 1] * views.bias[t, c, 1]
             for j in range(3):
                 step[i, j] += gain[i, 0] * cameras.R[c, 0, j] + gain[i, 1] * cameras.R[c, 1, j]
                 both[i, j] += gain[i, 0] * gain[j, 0] + gain[i, 1] * gain[j, 1]
     for i in range(3):
         for j in range(3):
             common = step[i, 0] * step[j, 0] + step[i, 1] * step[j, 1] + step[i, 2] * step[j, 2] - both[i, j]
-            shape = CAPS.radius_share**2 * moved[0, i] * moved[0, j]
+            shape = CAPS.radius_share**2 * correction_jacobian_m[0, i] * correction_jacobian_m[0, j]
             shape += CAPS.relief_m**2 if row < 0 and i == j else 0.0
             tilt = 0.0
             for t in range(1, count):
-                tilt += (moved[t, i] - moved[0, i]) * (moved[t, j] - moved[0, j]) / (count - 1)
+                tilt += (correction_jacobian_m[t, i] - correction_jacobian_m[0, i]) * (correction_jacobian_m[t, j] - correction_jacobian_m[0, j]) / (count - 1)
             cov[i, j] = rays.cov[i, j] + shared * common + shape + tilt
             own[i, j] = shape + (1.0 + process_noise) * tilt
 

@@ -48,7 +48,7 @@ class Views:
         xx, yy = x * x, y * y
         r2 = xx + yy
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2.0 * k1 + r2 * (4.0 * k2 + r2 * (6.0 * k3))
+        radial_derivative = 2.0 * k1 + r2 * (4.0 * k2 + r2 * (6.0 * k3))
         two_xy = 2.0 * x * y
         uv = np.empty_like(xy)
         uv[:, 0] = x * radial + p1 * two_xy + p2 * (r2 + 2.0 * xx)
@@ -56,9 +56,9 @@ class Views:
         # The tangential part turns the derivative by less than 1 % and is left out of it.
         by_own = np.empty((len(xy), 2, 3))
         scale = self.focal / z[:, None]
-        by_own[:, 0, 0] = slope * xx + radial
-        by_own[:, 1, 1] = slope * yy + radial
-        by_own[:, 0, 1] = by_own[:, 1, 0] = 0.5 * slope * two_xy
+        by_own[:, 0, 0] = radial_derivative * xx + radial
+        by_own[:, 1, 1] = radial_derivative * yy + radial
+        by_own[:, 0, 1] = by_own[:, 1, 0] = 0.5 * radial_derivative * two_xy
         by_own[..., :2] *= scale[..., None]
         by_own[..., 2] = -by_own[..., 0] * x[:, None] - by_own[..., 1] * y[:, None]
         return uv * self.focal + self.centre, by_own @ self.R, z

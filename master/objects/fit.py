@@ -123,7 +123,7 @@ class PoseFit:
             most = float(np.abs(step[:6]).max())
             if not np.isfinite(step).all() or most > 1.0:
                 return None
-            motion = motion.moved(step)
+            motion = motion.retracted(step)
             if most < _SETTLED:
                 break
         problem = task.linear(motion)
@@ -147,7 +147,7 @@ class PoseFit:
         off = x[:, :12] - mean[:12]
         spread = (share @ cov.reshape(-1, 144)).reshape(12, 12) + (share[:, None] * off).T @ off
         return Fitted(
-            motion.moved(mean - problem.rates),
+            motion.retracted(mean - problem.rates),
             0.5 * (spread + spread.T),
             problem.cost,
             problem.weight,

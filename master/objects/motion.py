@@ -46,7 +46,7 @@ class Motion:
         rates[orders:] = 0.0
         return Motion(_stepped(self.T, way), rates)
 
-    def moved(self, step: Float) -> "Motion":
+    def retracted(self, step: Float) -> "Motion":
         """The motion after a step (6 ORDERS,): of each order place, then turn."""
         change = step.reshape(ORDERS, 2, 3)
         rates = self.rates + change

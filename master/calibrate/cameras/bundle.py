@@ -131,7 +131,7 @@ def solve(
     cost, normal = _normal_equations(observations, now, prior, cauchy_px)
     for _ in range(_MOST_STEPS):
         step = _step(normal, mask, damping)
-        tried = now if step is None else _moved(now, *step)
+        tried = now if step is None else _retracted(now, *step)
         new_cost, new_normal = _normal_equations(observations, tried, prior, cauchy_px)
         if step is not None and new_cost <= cost:  # False where it is NaN: a board went through a camera
             gain = cost - new_cost
@@ -278,7 +278,7 @@ def _step(normal: Normal, mask: Bool, damping: float) -> tuple[Float, Float] | N
     return step, by_right - by_shared @ step[mask]
 
 
-def _moved(bundle: Bundle, shared: Float, own: Float) -> Bundle:
+def _retracted(bundle: Bundle, shared: Float, own: Float) -> Bundle:
     cameras = len(bundle.lenses)
     places = shared[9 * cameras : 15 * cameras].reshape(cameras, 6)
     return replace(

@@ -22,7 +22,7 @@ class Hands:
     T_rig_palm: Float
     x: Float
 
-    def moved(self, step: Float) -> "Hands":
+    def retracted(self, step: Float) -> "Hands":
         """The hands after steps (T, 6 + n) of turn [rad], shift [m], both in rig axes, and angles [rad]."""
         T = self.T_rig_palm.copy()
         T[:, :3, :3] = rotation_vector_to_matrix(step[:, :3]) @ T[:, :3, :3]

@@ -51,7 +51,7 @@ class LinesOfSight:
             reach_m: (4,) how far tips are seen beyond where the hand file has them, along the last bone.
         """
         local = self._local(angles, thick, reach_m)
-        return self._seen([self._moved(R, shift_m, *local)])[0]
+        return self._seen([self._placed_at(R, shift_m, *local)])[0]
 
     def derivatives(
         self, R: Float, shift_m: Float, angles: Float, thick: Float, reach_m: Float
@@ -63,20 +63,20 @@ class LinesOfSight:
             joint), its shift (3), the finger's own four angles, its thickness and reach; 0 where not known.
         """
         surface, radius, _ = local = self._local(angles, thick, reach_m)
-        all_of = [self._moved(R, shift_m, *local)]
+        all_of = [self._placed_at(R, shift_m, *local)]
         for k in range(3):
             rotation = rotation_vector_to_matrix(_ROTATION_STEP * np.eye(3)[k])
-            all_of.append(self._moved(rotation @ R, shift_m, *local))
+            all_of.append(self._placed_at(rotation @ R, shift_m, *local))
         for k in range(3):
-            all_of.append(self._moved(R, shift_m + _SHIFT_M * np.eye(3)[k], *local))
+            all_of.append(self._placed_at(R, shift_m + _SHIFT_M * np.eye(3)[k], *local))
         for k in range(4):
             stepped = self._local(angles + _ROTATION_STEP * np.eye(4)[k], thick, reach_m)
-            all_of.append(self._moved(R, shift_m, *stepped))
-        all_of.append(self._moved(R, shift_m, *self._local(angles, thick + _THICK, reach_m)))
+            all_of.append(self._placed_at(R, shift_m, *stepped))
+        all_of.append(self._placed_at(R, shift_m, *self._local(angles, thick + _THICK, reach_m)))
         seen = self._seen(all_of)
         out = np.zeros((*seen.shape[1:], len(_STEPS) + 1))
         out[..., :-1] = np.moveaxis(seen[1:] - seen[0], 0, -1) / _STEPS
-        farther = self._moved(R, shift_m, surface, radius, self._local(angles, thick, reach_m + _SHIFT_M)[2])
+        farther = self._placed_at(R, shift_m, surface, radius, self._local(angles, thick, reach_m + _SHIFT_M)[2])
         out[..., 2:, -1] = (self._setup.optics.project(farther[2]) - seen[0][..., 2:]) / _SHIFT_M
         return seen[0], np.nan_to_num(out)
 
@@ -95,7 +95,7 @@ class LinesOfSight:
         )
 
     @staticmethod
-    def _moved(R: Float, shift_m: Float, spheres: Float, radius: Float, tips: Float) -> tuple[Float, ...]:
+    def _placed_at(R: Float, shift_m: Float, spheres: Float, radius: Float, tips: Float) -> tuple[Float, ...]:
         """The same in the camera's frame."""
         transposed = np.swapaxes(R, 1, 2)
         return spheres @ transposed[:, None] + shift_m, radius, tips @ transposed + shift_m

@@ -215,9 +215,9 @@ class Problem:
         )
 
     def _stepped(self, unknown: Unknown, hands: Hands, step: Float, own: Float) -> tuple[Unknown, Hands]:
-        after = hands.moved(own)
+        after = hands.retracted(own)
         x = np.minimum(np.maximum(after.x, self._parameters.low), self._parameters.high)
-        return unknown.moved(step), replace(after, x=x)
+        return unknown.retracted(step), replace(after, x=x)
 
     def _here(self, unknown: Unknown) -> Markers:
         """The markers when the frames were taken."""

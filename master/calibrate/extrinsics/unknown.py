@@ -51,7 +51,7 @@ class Unknown:
         """(4, 4) with a straight wrist."""
         return rigid(self.R_camera_imu @ self.R_forearm_imu.T, self.shift_m)
 
-    def moved(self, step: Float) -> Self:
+    def retracted(self, step: Float) -> Self:
         """After a step (UNKNOWN,); turns in front: by axes of camera, forearm and rig."""
         return type(self)(
             rotation_vector_to_matrix(step[CAMERA_IMU]) @ self.R_camera_imu,

@@ -71,7 +71,7 @@ class _Lines:
     R: Float
     p_m: Float
     off: Float
-    slope: Float
+    jacobian: Float
 
 
 class _Problem:
@@ -94,18 +94,18 @@ class _Problem:
         v = (after[1] - before[1]) / (2.0 * _DT_S)
         w = matrix_to_rotation_vector(after[0] @ before[0].swapaxes(1, 2)) / (2.0 * _DT_S)
         off = np.concatenate([self.p_m - p, matrix_to_rotation_vector(self.R @ R.swapaxes(1, 2))], axis=1)
-        slope = np.zeros((len(at), 6, _UNKNOWNS))
-        slope[:, :3, 0:3] = -skew(p - self.middle_m)
-        slope[:, :3, 3:6] = slope[:, 3:, 0:3] = np.eye(3)
-        slope[:, 3:, 6:9] = slope[:, :3, 9:12] = R
-        slope[:, :3, 12], slope[:, 3:, 12] = -v, -w
-        return _Lines(R, p, off, slope)
+        jacobian = np.zeros((len(at), 6, _UNKNOWNS))
+        jacobian[:, :3, 0:3] = -skew(p - self.middle_m)
+        jacobian[:, :3, 3:6] = jacobian[:, 3:, 0:3] = np.eye(3)
+        jacobian[:, 3:, 6:9] = jacobian[:, :3, 9:12] = R
+        jacobian[:, :3, 12], jacobian[:, 3:, 12] = -v, -w
+        return _Lines(R, p, off, jacobian)
 
     def _predicted(self, placed: Placed, at_s: Float) -> tuple[Float, Float]:
         rotation, place, _ = self._tracker.at(at_s)
         return predicted(placed.T_rig_tracking, placed.T_object_tracker, rotation, place)
 
-    def moved(self, placed: Placed, by: Float) -> Placed:
+    def retracted(self, placed: Placed, by: Float) -> Placed:
         rotation = rotation_vector_to_matrix(by[:3])
         X = rigid(rotation, self.middle_m - rotation @ self.middle_m + by[3:6]) @ placed.T_rig_tracking
         Z = invert(placed.T_object_tracker) @ rigid(rotation_vector_to_matrix(by[6:9]), by[9:12])
@@ -149,13 +149,13 @@ def sigma_at(fit: Fit, R: Float, p_m: Float) -> tuple[float, float]:
 
     Root of the mean square over the poses, all axes together.
     """
-    slope = np.zeros((len(R), 6, _UNKNOWNS))
-    slope[:, :3, 0:3] = -skew(p_m - fit.middle_m)
-    slope[:, :3, 3:6] = slope[:, 3:, 0:3] = np.eye(3)
-    slope[:, 3:, 6:9] = slope[:, :3, 9:12] = R
-    formal = np.einsum("tij,jk,tik->ti", slope, fit.cov, slope)
+    jacobian = np.zeros((len(R), 6, _UNKNOWNS))
+    jacobian[:, :3, 0:3] = -skew(p_m - fit.middle_m)
+    jacobian[:, :3, 3:6] = jacobian[:, 3:, 0:3] = np.eye(3)
+    jacobian[:, 3:, 6:9] = jacobian[:, :3, 9:12] = R
+    formal = np.einsum("tij,jk,tik->ti", jacobian, fit.cov, jacobian)
     count = len(fit.rejected)
-    change = np.einsum("tij,bj->tbi", slope, fit.rejected - fit.rejected.mean(axis=0))
+    change = np.einsum("tij,bj->tbi", jacobian, fit.rejected - fit.rejected.mean(axis=0))
     left = (count - 1) / count * (change**2).sum(axis=1) if count > 1 else np.zeros_like(formal)
     both = np.maximum(formal, left)
     place, rotation = both[:, :3].sum(axis=1).mean(), both[:, 3:].sum(axis=1).mean()
@@ -181,7 +181,7 @@ def _refined(problem: _Problem, placed: Placed) -> tuple[Placed, float]:
             normal = _normal(problem.weight, lines, counts) / scale**2 + np.diag(_PRIOR)
             pull = _pull(problem.weight, lines, counts) / scale**2
             by = np.asarray(np.linalg.solve(normal, pull), np.float64)
-            placed = problem.moved(placed, by)
+            placed = problem.retracted(placed, by)
             if np.abs(by).max() < 1e-7:
                 break
     return placed, scale
@@ -198,11 +198,11 @@ def _counts(sizes: Float) -> Float:
 
 
 def _normal(weight: Float, lines: _Lines, counts: Float) -> Float:
-    return np.einsum("n,nia,nij,njb->ab", counts, lines.slope, weight, lines.slope, optimize=True)
+    return np.einsum("n,nia,nij,njb->ab", counts, lines.jacobian, weight, lines.jacobian, optimize=True)
 
 
 def _pull(weight: Float, lines: _Lines, counts: Float) -> Float:
-    return np.einsum("n,nia,nij,nj->a", counts, lines.slope, weight, lines.off, optimize=True)
+    return np.einsum("n,nia,nij,nj->a", counts, lines.jacobian, weight, lines.off, optimize=True)
 
 
 def _blocks(t_s: Float) -> list[Bool]:

@@ -66,7 +66,7 @@ def drawn(hand: FittedHand, step: Float, model: HandModel = RIGHT) -> Float:
     return local @ np.swapaxes(R, 1, 2) + (hand.T_rig_palm[:3, 3] + step[:, 3:6])[:, None]
 
 
-def slopes(hand: FittedHand, model: HandModel = RIGHT) -> Float:
+def jacobians(hand: FittedHand, model: HandModel = RIGHT) -> Float:
     """How the joints move (26, 3, 6 + n), by finite differences."""
     step = 1e-6 * np.eye(6 + len(hand.x))
     return np.moveaxis(drawn(hand, step, model) - drawn(hand, -step, model), 0, 2) / 2e-6
@@ -84,7 +84,7 @@ def test_what_is_left_of_the_tangent_is_that_of_drawn_hands() -> None:
         hand = solution(model)
         cov = unsure(hand, 0.3, 0.1)
         step = np.random.default_rng(1).multivariate_normal(np.zeros(len(cov)), cov, DRAWS)
-        tangent = hand.joints.position_m + np.einsum("pin,tn->tpi", slopes(hand, model), step)
+        tangent = hand.joints.position_m + np.einsum("pin,tn->tpi", jacobians(hand, model), step)
         off = drawn(hand, step, model) - tangent
         expected = np.einsum("tpi,tpj->pij", off, off) / DRAWS
         for joint in (*CHAINS[:, 0], *TIPS):
@@ -119,7 +119,7 @@ def test_an_uncertain_palm_rotation_widens_joints_around_the_marker_on_its_back(
     straight, whole = covariances(hand, cov, np.arange(6) == BACK)
     linear, claimed = straight[WRIST], whole[WRIST]
     np.testing.assert_allclose(
-        linear, slopes(hand)[WRIST] @ cov @ slopes(hand)[WRIST].T, rtol=1e-5, atol=1e-12
+        linear, jacobians(hand)[WRIST] @ cov @ jacobians(hand)[WRIST].T, rtol=1e-5, atol=1e-12
     )
 
     def inside(region: Float) -> float:

@@ -91,7 +91,7 @@ def test_the_gradient_of_each_kind_of_row_is_the_derivative_of_its_cost(
         whole, seen = hand(wrist_case, seed)
         kind(whole, seen, 0.3)
         _, gradient, normal = whole.cost()
-        numeric = whole.slope()
+        numeric = whole.numeric_gradient()
         assert np.abs(numeric).max() > 0.01
         np.testing.assert_array_less(np.abs(gradient - numeric), share * largest(whole, numeric))
         np.testing.assert_allclose(normal, normal.T, atol=1e-9 * np.abs(normal).max())
@@ -168,7 +168,7 @@ def test_tilt_and_heading_away_from_the_prior_rotate_the_palm(wrist_case: WristC
         orientation(whole, seen, 0.1)
         whole.z[TILT : HEADING + 1] += whole.rng.normal(0.0, 0.05, 3)
         _, gradient, _ = whole.cost()
-        numeric = whole.slope()
+        numeric = whole.numeric_gradient()
         np.testing.assert_array_less(np.abs(gradient - numeric), 0.1 * largest(whole, numeric))
 
 

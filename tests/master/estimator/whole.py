@@ -81,7 +81,7 @@ class Whole:
         )  # fmt: skip
         return float(cost), gradient, normal
 
-    def slope(self, step_size: float = H) -> Float:
+    def numeric_gradient(self, step_size: float = H) -> Float:
         """The gradient (N,) by central differences."""
         N = 6 + self.n + len(self.z)
         steps = step_size * np.eye(N)
@@ -96,7 +96,7 @@ class Whole:
     def check(self, share: float) -> None:
         """The gradient against finite differences, to a share of its largest component."""
         _, gradient, normal = self.cost()
-        numeric = self.slope()
+        numeric = self.numeric_gradient()
         size = np.array([3, 3, self.n, len(self.z)])  # turn, shift, angles and extras have units of their own
         largest = np.repeat([max(float(np.abs(part).max()), 1e-3) for part in
                              np.split(numeric, np.cumsum(size)[:-1])], size)  # fmt: skip

@@ -105,9 +105,9 @@ def test_the_covariance_is_that_of_the_points_derivative_by_the_pixels(rig: Rig)
             high, low = uv.copy(), uv.copy()
             high[c, :, axis] += 1e-3
             low[c, :, axis] -= 1e-3
-            slope = (rig.triangulate(high, sigma).points_m - rig.triangulate(low, sigma).points_m) / 2e-3
+            derivative = (rig.triangulate(high, sigma).points_m - rig.triangulate(low, sigma).points_m) / 2e-3
             cov += np.where(np.isnan(uv[c, :, 0]), 0.0, sigma[c] ** 2)[:, None, None] * (
-                slope[:, :, None] * slope[:, None, :]
+                derivative[:, :, None] * derivative[:, None, :]
             )
     np.testing.assert_allclose(out.cov_m2, cov, rtol=1e-4, atol=1e-12)
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from common.arrays import Float
 from master.calibrate.cameras.boards import board_corners
-from master.calibrate.cameras.bundle import Bundle, Free, Observation, _jacobian, _moved, predict, rms, solve
+from master.calibrate.cameras.bundle import Bundle, Free, Observation, _jacobian, _retracted, predict, rms, solve
 from tests.master.calibrate.cameras.board_scenes import SIZE, Scene, scene
 
 
@@ -37,7 +37,7 @@ def _problem(truth: Scene, noise_px: float, seed: int) -> tuple[list[Observation
         ]
     )
     shared[9 * cameras : 9 * cameras + 6] = 0.0
-    start = _moved(replace(exact, shape_m=0 * drawn), shared, rng.normal(0.0, 2e-3, (views, 6)))
+    start = _retracted(replace(exact, shape_m=0 * drawn), shared, rng.normal(0.0, 2e-3, (views, 6)))
     return observations, start
 
 
@@ -58,17 +58,17 @@ def test_derivatives_are_those_of_the_prediction() -> None:
     for at, expected, step in cases:
         shared = np.zeros(30 + 3 * corners)
         shared[at] = step
-        up, down = (predict(_moved(bundle, sign * shared, np.zeros((2, 6))), seen) for sign in (1, -1))
+        up, down = (predict(_retracted(bundle, sign * shared, np.zeros((2, 6))), seen) for sign in (1, -1))
         np.testing.assert_allclose((up - down) / (2 * step), expected, rtol=1e-4, atol=1e-3)
     for i in range(6):
         own = np.zeros((2, 6))
         own[1, i] = 1e-6
-        up, down = (predict(_moved(bundle, np.zeros(30 + 3 * corners), s * own), seen) for s in (1, -1))
+        up, down = (predict(_retracted(bundle, np.zeros(30 + 3 * corners), s * own), seen) for s in (1, -1))
         np.testing.assert_allclose((up - down) / 2e-6, by_view[:, :, i], rtol=1e-4, atol=1e-3)
     for i in range(3):
         shared = np.zeros(30 + 3 * corners)
         shared[30 + 3 * 7 + i] = 1e-6
-        up, down = (predict(_moved(bundle, s * shared, np.zeros((2, 6))), seen) for s in (1, -1))
+        up, down = (predict(_retracted(bundle, s * shared, np.zeros((2, 6))), seen) for s in (1, -1))
         change = (up - down) / 2e-6
         np.testing.assert_allclose(change[7], by_shape[7, :, i], rtol=1e-4, atol=1e-3)
         assert not np.delete(change, 7, axis=0).any()  # a corner's own place moves nothing else

@@ -33,17 +33,17 @@ def problem(seed: int = 5) -> tuple[HandProblem, Hands]:
     return replace(out, points_m=out.place(hands) + rng.normal(0.0, 3e-3, shape)), hands
 
 
-def slopes(at: HandProblem, hands: Hands) -> Float:
+def derivatives(at: HandProblem, hands: Hands) -> Float:
     """Of the cost (T, 6 + n) by turn, shift and angles, by central differences."""
     size = 6 + hands.x.shape[1]
     steps = LITTLE * np.eye(size)[:, None] * np.ones((COUNT, 1))
-    ways = [at.cost(hands.moved(step)) - at.cost(hands.moved(-step)) for step in steps]
+    ways = [at.cost(hands.retracted(step)) - at.cost(hands.retracted(-step)) for step in steps]
     return np.array(ways).T / (2.0 * LITTLE)
 
 
 def test_the_gradient_is_the_derivative_of_the_cost() -> None:
     at, hands = problem()
-    np.testing.assert_allclose(at.linearise(hands).gradient, slopes(at, hands), rtol=1e-5, atol=1e-2)
+    np.testing.assert_allclose(at.linearise(hands).gradient, derivatives(at, hands), rtol=1e-5, atol=1e-2)
 
 
 def test_the_normal_matrix_is_the_curvature_where_markers_fit() -> None:
@@ -53,7 +53,7 @@ def test_the_normal_matrix_is_the_curvature_where_markers_fit() -> None:
     step = 1e-5 * rng.normal(size=(COUNT, 6 + hands.x.shape[1]))
     here = at.linearise(hands)
     curved = np.einsum("ti,tij,tj->t", step, here.normal, step)
-    found = at.cost(hands.moved(step)) + at.cost(hands.moved(-step)) - 2.0 * at.cost(hands)
+    found = at.cost(hands.retracted(step)) + at.cost(hands.retracted(-step)) - 2.0 * at.cost(hands)
     np.testing.assert_allclose(found, curved, rtol=1e-4)
 
 

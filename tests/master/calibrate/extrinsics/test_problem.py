@@ -53,22 +53,22 @@ def problem() -> tuple[Problem, Unknown, Hands]:
     )
     hands = out.guessed(first)
     out.update_observations(first, hands)
-    return out, first.moved(1e-3 * rng.normal(size=UNKNOWN)), hands
+    return out, first.retracted(1e-3 * rng.normal(size=UNKNOWN)), hands
 
 
-def slopes(at: Problem, unknown: Unknown, hands: Hands, steps: Float) -> Float:
+def derivatives(at: Problem, unknown: Unknown, hands: Hands, steps: Float) -> Float:
     """Of half of the cost by each of these steps (N, UNKNOWN), by central differences."""
-    out = [at.cost(unknown.moved(step), hands) - at.cost(unknown.moved(-step), hands) for step in steps]
+    out = [at.cost(unknown.retracted(step), hands) - at.cost(unknown.retracted(-step), hands) for step in steps]
     return 0.25 * np.array(out)
 
 
 def test_the_gradient_of_what_all_epochs_share_is_the_derivative_of_the_cost() -> None:
     at, unknown, hands = problem()
     pull, little = at.normal(unknown, hands).shared_pull, 1e-4 * prior_sigma()
-    slope = slopes(at, unknown, hands, np.diag(little)) / little
+    derivative = derivatives(at, unknown, hands, np.diag(little)) / little
     scale = np.abs(pull * prior_sigma())
     most = float(scale.max())  # small pulls are differences of large ones
-    np.testing.assert_allclose(slope * prior_sigma(), pull * prior_sigma(), rtol=0.01, atol=2e-3 * most)
+    np.testing.assert_allclose(derivative * prior_sigma(), pull * prior_sigma(), rtol=0.01, atol=2e-3 * most)
     assert np.count_nonzero(scale > 0.1) > UNKNOWN // 2  # most unknowns are told something
 
 
@@ -78,7 +78,7 @@ def test_the_gradient_of_each_hand_is_the_derivative_of_the_cost() -> None:
     for k in range(6):
         step = np.zeros_like(pull)
         step[:, k] = little
-        costs = [at.cost(unknown, hands.moved(way * step)) for way in (1.0, -1.0)]
+        costs = [at.cost(unknown, hands.retracted(way * step)) for way in (1.0, -1.0)]
         assert 0.25 * (costs[0] - costs[1]) / little == pytest.approx(pull[:, k].sum(), rel=0.01)
 
 
