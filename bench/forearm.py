@@ -212,7 +212,7 @@ def _moment(
     surprise = (
         heading**2 / cov[HEADING, HEADING],
         bent @ np.linalg.solve(cov[WRIST_ANGLES : WRIST_ANGLES + 2, WRIST_ANGLES : WRIST_ANGLES + 2], bent),
-        palm @ np.linalg.solve(hand.solution.alone[:3, :3], palm),
+        palm @ np.linalg.solve(hand.solution.measurement_cov[:3, :3], palm),
     )
     off = [float(np.linalg.norm(one)) for one in (heading, bent, palm, last - truth, truth)]
     return Moment(after_s, np.degrees(off), np.array(surprise))

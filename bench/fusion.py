@@ -61,12 +61,12 @@ def _scene(name: str, found: Outcome) -> Iterator[Row]:
     yield Row("  thumb's MCP", ours.pip_deg[0], "deg", alone(markers.pip_deg[0], wrist.pip_deg[0]))
     yield Row("  joints valid", 100 * ours.valid, "%", alone(100 * markers.valid, 100 * wrist.valid))
     yield Row("  joints tracked", 100 * ours.tracked, "%", alone(100 * markers.tracked, 100 * wrist.tracked))
-    yield from _doubt(ours, alone(100 * markers.inside, 100 * wrist.inside))
+    yield from _coverage(ours, alone(100 * markers.inside, 100 * wrist.inside))
     yield from _steps(ours, alone(markers.step_mm, wrist.step_mm))
     yield from _bits(ours, alone(100 * markers.false_tracked, 100 * wrist.false_tracked))
 
 
-def _doubt(ours: Figures, note: str) -> Iterator[Row]:
+def _coverage(ours: Figures, note: str) -> Iterator[Row]:
     yield Row("  inside 95 %", 100 * ours.inside, "%", note)
     yield Row(
         "  inside 95 %, half a second about hand-overs", 100 * ours.inside_hand_over, "%", "goal 90 to 98"
@@ -105,7 +105,7 @@ def _cut(name: str, ours: Figures) -> Iterator[Row]:
     )
     yield Row("  PIP", ours.four_deg, "deg", "")
     yield Row("  joints valid", 100 * ours.valid, "%", f"tracked {100 * ours.tracked:.0f}")
-    yield from _doubt(ours, "")
+    yield from _coverage(ours, "")
     yield from _steps(ours, "goal 5")
     yield from _bits(ours, "goal 0")
 

@@ -160,7 +160,7 @@ def grasped(path: Path, backs: int, half: bool) -> Grasped:
         off = at - truth[k]
         pip.append(pip_deg(at.reshape(1, 20, 3))[0] - pip_deg(truth[k].reshape(1, 20, 3))[0])
         column = 6 + np.searchsorted(solver.estimator.parameters.free, 4 * np.arange(1, 5) + 2)
-        variance: Float = hand.solution.alone.diagonal()[column]
+        variance: Float = hand.solution.measurement_cov.diagonal()[column]
         sigma.append(np.degrees(np.sqrt(variance)))
         joint.append(np.linalg.norm(off, axis=2).ravel())
         inverse = np.linalg.inv(hand.solution.cov_m2[CHAINS] + 1e-12 * np.eye(3))

@@ -130,7 +130,7 @@ class OffsetEstimator:
             self.refused += 1
             return
         echo = _Echo((t1_ns + t4_ns) // 2, t2_ns - t1_ns, t4_ns - t3_ns)
-        if self._doubted(echo):
+        if self._uncertain(echo):
             return
         self._echoes.append(echo)
         while echo.t_ns - self._echoes[0].t_ns > self._window_ns:
@@ -149,7 +149,7 @@ class OffsetEstimator:
         """Return the estimate, which may be a few echoes old, or None before the first."""
         return self._estimate
 
-    def _doubted(self, echo: _Echo) -> bool:
+    def _uncertain(self, echo: _Echo) -> bool:
         """Whether this echo is not to be used yet; starts afresh where too many contradict."""
         wrong = self._contradicts(echo)
         if wrong or self._suspects:

@@ -58,7 +58,7 @@ class PoseShape(Part, frozen=True):
 class HoldSettings(Part, frozen=True):
     """When a pose begins and ends.
 
-    It begins at a confidence of `begin` that has lasted `begin_s` (`doubt_s` where fewer than three of the four fingers
+    It begins at a confidence of `begin` that has lasted `begin_s` (`uncertain_s` where fewer than three fingers
     are known), while the fingers turn by no more than `still_deg_s`
     (a hand on its way through a pose does not hold it), or, at any speed, that has lasted `slow_s`. It ends below `end`
     that has lasted `end_s`, when another begins, `lost_s` after the hand was last known, or, where nothing that is seen
@@ -69,7 +69,7 @@ class HoldSettings(Part, frozen=True):
     begin: Score = 0.45
     end: Score = 0.22
     begin_s: Duration = 0.012
-    doubt_s: Duration = 0.1
+    uncertain_s: Duration = 0.1
     end_s: Duration = 0.04
     still_deg_s: Annotated[float, Meta(ge=1e-3, le=1e6)] = 60.0
     slow_s: Duration = 0.25

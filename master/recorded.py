@@ -12,7 +12,7 @@ from common.npz import read_npz
 from master.sequence import CYCLE_FRAMES
 
 # Sigma of detections that state none: of full quality, and added where it is 0.
-_CLEAR_PX, _DOUBT_PX = 0.1, 0.6
+_CLEAR_PX, _POOR_PX = 0.1, 0.6
 _LASER_PX, _TIP_PX = 0.5, 3.0  # of a wrist device: some tenths of the line's width, and of a fingertip's
 
 
@@ -128,5 +128,5 @@ def _sigma_of(uv: Float, quality: Float) -> Float:
     A whole, clear marker is known to a tenth of a pixel; one of no quality, to as much as the part of a cap that
     may be hidden moves its centroid at half a metre. Without a quality the worst is assumed.
     """
-    doubt = 1.0 - np.clip(np.nan_to_num(quality, nan=0.0), 0.0, 1.0)
-    return np.where(np.isnan(uv[..., 0]), np.nan, _CLEAR_PX + _DOUBT_PX * doubt)
+    quality_loss = 1.0 - np.clip(np.nan_to_num(quality, nan=0.0), 0.0, 1.0)
+    return np.where(np.isnan(uv[..., 0]), np.nan, _CLEAR_PX + _POOR_PX * quality_loss)

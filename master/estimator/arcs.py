@@ -23,7 +23,7 @@ from math import sqrt
 
 from common.arrays import Bool, Float
 from common.kernels import constant, inlined, inner
-from master.estimator.certainty import MOST_ROTATIONS, Certainty, joint_jacobian
+from master.estimator.cov_scratch import MOST_ROTATIONS, CovarianceScratch, joint_jacobian
 from master.estimator.hand_tables import HandTables
 from master.estimator.kinematics import PLACE, Scratch, finger_jacobian, marker_point, palm_jacobian
 from master.estimator.matrices import cholesky, eigen
@@ -34,7 +34,7 @@ _NONE = constant(0)
 
 
 @inner
-def _rotation_columns(settings: Settings, cov: Float, scratch: Certainty) -> int:
+def _rotation_columns(settings: Settings, cov: Float, scratch: CovarianceScratch) -> int:
     """Write the turns that are not straight, as columns of a pivoted Cholesky factor; return how many.
 
     One that is less sure than `rotation_most_rad` leads nowhere farther.
@@ -71,7 +71,7 @@ def _rotation_columns(settings: Settings, cov: Float, scratch: Certainty) -> int
 
 
 @inner
-def _bone_rotations(hand: HandTables, T: Float, count: int, work: Scratch, scratch: Certainty) -> None:
+def _bone_rotations(hand: HandTables, T: Float, count: int, work: Scratch, scratch: CovarianceScratch) -> None:
     """Write how each turn turns each bone (5, 4, K, 3): the palm, and the axes of the joints before it."""
     for f in range(5):
         columns = hand.first[f + 1] - hand.first[f]
@@ -104,7 +104,7 @@ def _bone_rotations(hand: HandTables, T: Float, count: int, work: Scratch, scrat
 
 
 @inlined
-def _arc(one: Float, other: Float, bx: float, by: float, bz: float, i: int) -> float:
+def _second_derivative(one: Float, other: Float, bx: float, by: float, bz: float, i: int) -> float:
     """Component i of h of a bone that is turned by two turns (3,)."""
     b = bx if i == 0 else (by if i == 1 else bz)
     one_b = one[0] * bx + one[1] * by + one[2] * bz
@@ -114,8 +114,8 @@ def _arc(one: Float, other: Float, bx: float, by: float, bz: float, i: int) -> f
 
 
 @inner
-def _arcs(
-    rig: Rig, T: Float, seen: Bool, k: int, m: int, pair: int, work: Scratch, scratch: Certainty
+def _second_derivatives(
+    rig: Rig, T: Float, seen: Bool, k: int, m: int, pair: int, work: Scratch, scratch: CovarianceScratch
 ) -> None:
     """Write the arcs of joints and markers by turns k and m: room.joint, room.marker (not yet whitened)."""
     hand, mounts, w = rig.hand, rig.mounts, scratch.w
@@ -128,7 +128,7 @@ def _arcs(
             by += T[1, j] * hand.rest_m[joint, j]
             bz += T[2, j] * hand.rest_m[joint, j]
         for i in range(3):
-            scratch.joint[pair, joint, i] = _arc(w[0, 0, k], w[0, 0, m], bx, by, bz, i)
+            scratch.joint[pair, joint, i] = _second_derivative(w[0, 0, k], w[0, 0, m], bx, by, bz, i)
     for joint in range(26):
         f, level = hand.finger[joint], hand.level[joint]
         if f < 0:
@@ -143,7 +143,7 @@ def _arcs(
         else:
             bx, by, bz = bx - T[0, 3], by - T[1, 3], bz - T[2, 3]
         for i in range(3):
-            second_derivative = _arc(w[f, level, k], w[f, level, m], bx, by, bz, i)
+            second_derivative = _second_derivative(w[f, level, k], w[f, level, m], bx, by, bz, i)
             scratch.joint[pair, joint, i] = second_derivative + (
                 scratch.joint[pair, joint - 1, i] if level > 0 else 0.0
             )
@@ -162,10 +162,10 @@ def _arcs(
             )
         for i in range(3):
             if f < 0:
-                scratch.marker[pair, 3 * marker + i] = _arc(w[0, 0, k], w[0, 0, m], bx, by, bz, i)
+                scratch.marker[pair, 3 * marker + i] = _second_derivative(w[0, 0, k], w[0, 0, m], bx, by, bz, i)
             else:
                 carried = scratch.joint[pair, scratch.joint_of[f, level], i]
-                second_derivative = _arc(w[f, bone, k], w[f, bone, m], bx, by, bz, i)
+                second_derivative = _second_derivative(w[f, bone, k], w[f, bone, m], bx, by, bz, i)
                 scratch.marker[pair, 3 * marker + i] = carried + second_derivative
 
 
@@ -195,7 +195,7 @@ def _gain(
     information: Float,
     pairs: int,
     work: Scratch,
-    scratch: Certainty,
+    scratch: CovarianceScratch,
 ) -> int:
     """Write the answer of the fit to moved markers (N, K), and whiten the markers' arcs; return K."""
     hand, mounts, N, K = rig.hand, rig.mounts, cov.shape[0], 0
@@ -242,7 +242,7 @@ def _gain(
 
 
 @inner
-def _at_most_one(N: int, K: int, scratch: Certainty) -> None:
+def _at_most_one(N: int, K: int, scratch: CovarianceScratch) -> None:
     """Divide the gain by what is wider than its markers, because misfit or two hypotheses made it so."""
     for r in range(K):
         for q in range(K):
@@ -267,7 +267,7 @@ def _at_most_one(N: int, K: int, scratch: Certainty) -> None:
 
 
 @inner
-def add_arcs(
+def add_second_order(
     rig: Rig,
     settings: Settings,
     T: Float,
@@ -275,7 +275,7 @@ def add_arcs(
     seen: Bool,
     information: Float,
     work: Scratch,
-    scratch: Certainty,
+    scratch: CovarianceScratch,
     joint_cov: Float,
 ) -> None:
     """Add to covariances of the joints what the linear ones leave out.
@@ -295,7 +295,7 @@ def add_arcs(
     pairs = _NONE
     for k in range(count):
         for m in range(k + 1):
-            _arcs(rig, T, seen, k, m, pairs, work, scratch)
+            _second_derivatives(rig, T, seen, k, m, pairs, work, scratch)
             pairs += 1
     K = _gain(rig, T, cov, seen, information, pairs, work, scratch)
     _at_most_one(N, K, scratch)

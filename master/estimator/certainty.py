@@ -24,7 +24,7 @@ _LAST = constant(3)  # joint of a finger: its tip
 MOST_ROTATIONS = 12  # turns that count in arcs: those of the palm, which moves all joints, then the largest
 
 
-class Certainty:
+class CovarianceScratch:
     """Scratch for N unknowns and M markers."""
 
     A: Float  # (N, N)
@@ -51,7 +51,7 @@ class Certainty:
     joint_of: Int  # (5, 4) the joints of the chains
 
     @classmethod
-    def empty(cls, N: int, markers: int) -> "Certainty":
+    def empty(cls, N: int, markers: int) -> "CovarianceScratch":
         """Allocate it."""
         K, pairs = 3 * markers, MOST_ROTATIONS * (MOST_ROTATIONS + 1) // 2
         scratch = record(
@@ -84,7 +84,7 @@ class Certainty:
 
 
 @inner
-def surer(now: Float, past: Float, scratch: Certainty, out: Float) -> None:
+def surer(now: Float, past: Float, scratch: CovarianceScratch, out: Float) -> None:
     """Write the covariance (N, N) that is in each direction that of the surer of two, both positive definite."""
     N, L, A, V = now.shape[0], scratch.L, scratch.A, scratch.V
     if not cholesky(now, N, L):
@@ -137,7 +137,7 @@ def only_limits(hand: HandTables, x: Float, hidden: Hidden, cov: Float) -> None:
 
 
 @inner
-def joint_jacobian(hand: HandTables, joint: int, T: Float, work: Scratch, scratch: Certainty) -> int:
+def joint_jacobian(hand: HandTables, joint: int, T: Float, work: Scratch, scratch: CovarianceScratch) -> int:
     """Write derivatives of a joint (10, 3) and which unknowns they belong to; return how many."""
     f, level = hand.finger[joint], hand.level[joint]
     for i in range(3):
@@ -158,7 +158,7 @@ def joint_jacobian(hand: HandTables, joint: int, T: Float, work: Scratch, scratc
 
 
 @inlined
-def _project(cov: Float, count: int, scratch: Certainty, out: Float) -> None:
+def _project(cov: Float, count: int, scratch: CovarianceScratch, out: Float) -> None:
     """Write J' cov J (3, 3) of the rows in use."""
     for a in range(count):
         for i in range(3):
@@ -176,7 +176,7 @@ def _project(cov: Float, count: int, scratch: Certainty, out: Float) -> None:
 
 @inner
 def linear(
-    hand: HandTables, T: Float, cov: Float, work: Scratch, scratch: Certainty, joint_cov: Float
+    hand: HandTables, T: Float, cov: Float, work: Scratch, scratch: CovarianceScratch, joint_cov: Float
 ) -> None:
     """Write the covariances of the joints (26, 3, 3) [m^2], by their derivatives; `work` as `chains` left it."""
     for joint in range(26):
@@ -191,7 +191,7 @@ def tilts(
     T: Float,
     cov: Float,
     work: Scratch,
-    scratch: Certainty,
+    scratch: CovarianceScratch,
     tilt: Float,
     process_noise: Float,
 ) -> None:

@@ -92,14 +92,14 @@ class FittedHand(SolvedHand):
         alone: (6 + n, 6 + n) covariance of the palm's turn [rad] and shift [m] and of the free angles [rad], by this
             instant alone.
         x: (n,) free angles.
-        scale: By how much the misfit of the instant has scaled `alone`.
+        scale: By how much the misfit of the instant has scaled `measurement_cov`.
         natural: Probability that the hand obeys habits.
         surprise: (M,) chi square of each marker.
         steps: Of the search.
         twist: (5,) [rad] by which the hinges of each finger are rolled about its first bone.
     """
 
-    alone: Float
+    measurement_cov: Float
     x: Float
     scale: float
     natural_weight: float

@@ -164,8 +164,8 @@ class EpochSteps:
         epoch_prior.back_normal_w2[0] = self._settings.back_normal_rad**-2.0 if ground.back[0] else 0.0
         epoch_prior.depth_w2[0] = 0.0
         if known and ground.most[0] == 1:
-            alone = self._rig.cameras.centre[(self.observed.weight > 0.0).sum(axis=1).argmax()]
-            line_of_sight = self.now.palm[:3, 3] - alone
+            camera_centre = self._rig.cameras.centre[(self.observed.weight > 0.0).sum(axis=1).argmax()]
+            line_of_sight = self.now.palm[:3, 3] - camera_centre
             epoch_prior.line_of_sight[:] = line_of_sight / np.sqrt(line_of_sight @ line_of_sight)
             epoch_prior.depth_w2[0] = self._settings.held_depth_m**-2.0
         epoch_prior.oriented[0] = orientation is not None

@@ -122,8 +122,8 @@ class Estimator:
         task.palm_shown[0] = palm_shown
         known = self.has_previous(at.t_ns)
         steps.set_priors(at, known=known)
-        doubtful = self.wrist and at.orientation is not None and bool(ground.by_markers[0])
-        before, rejected = steps.kept() if doubtful else None, False
+        may_contradict = self.wrist and at.orientation is not None and bool(ground.by_markers[0])
+        before, rejected = steps.kept() if may_contradict else None, False
         out, reinitialised = self._solve(at, known=known)
         if out is not None and before is not None and self._at.found.contrary[0] > self.settings.contrary:
             # What the IMU says is left out: it began anew, or the wrist was flicked. But not where it alone tells.
@@ -221,7 +221,7 @@ class Estimator:
             cov_m2=out.cov,
             tilt_cov_rad2=out.tilt,
             tilt_process_noise_rad2_s2=out.tilt_process_noise,
-            alone=found.cov[:known, :known].copy(),
+            measurement_cov=found.cov[:known, :known].copy(),
             x=found.x.copy(),
             scale=float(found.scale[0]),
             natural_weight=float(found.natural_weight[0]),

@@ -123,7 +123,7 @@ class WristSide:
                 WRIST_ANGLES : WRIST_ANGLES + 2, WRIST_ANGLES : WRIST_ANGLES + 2
             ]
             estimator.begin_heading(
-                heading, float(np.trace(wrist_angles) + np.trace(hand.solution.alone[:3, :3]))
+                heading, float(np.trace(wrist_angles) + np.trace(hand.solution.measurement_cov[:3, :3]))
             )
 
     def completed(self, pose: HandPose, estimator: Estimator) -> HandPose:

@@ -261,11 +261,11 @@ class MarkerPipeline:
         """The epoch with one place for each marker."""
         assert frames.alt_uv is not None
         assert frames.alt_sigma_px is not None
-        in_doubt = np.isfinite(frames.alt_uv[..., 0]).any(axis=0)
-        if not in_doubt.any():  # an alternative was named in a frame nearby, and is not carried to this epoch
+        ambiguous = np.isfinite(frames.alt_uv[..., 0]).any(axis=0)
+        if not ambiguous.any():  # an alternative was named in a frame nearby, and is not carried to this epoch
             return replace(frames, alt_uv=None)
         first = triangulate(self._cameras, frames.uv, frames.sigma_px, self._rays_px)
-        clear = np.where((in_doubt | first.outliers)[:, None], np.nan, first.points_m)
+        clear = np.where((ambiguous | first.outliers)[:, None], np.nan, first.points_m)
         others = self._line.solve_once(clear, first.cov_m2, frames.area)
         associated = associate(
             self._cameras,

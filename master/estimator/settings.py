@@ -224,7 +224,7 @@ class Settings(NamedTuple):
             "1", 0.0, 1.0, "of what distances by light tell, that teaches their unit: fingers err together"
         ),
     ] = 0.15
-    doubted: Annotated[
+    teaching_gate: Annotated[
         float,
         Range("chi square", 1.0, 100.0, "of laser point and fingertip of a finger that teaches nothing"),
     ] = 5.0

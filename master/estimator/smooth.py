@@ -125,7 +125,7 @@ class HandOneEuro:
             cov_m2=shown.cov if off else solution.cov_m2,
             tilt_cov_rad2=solution.tilt_cov_rad2,
             tilt_process_noise_rad2_s2=solution.tilt_process_noise_rad2_s2,
-            alone=solution.alone,
+            measurement_cov=solution.measurement_cov,
             x=solution.x,
             scale=solution.scale,
             natural_weight=solution.natural_weight,

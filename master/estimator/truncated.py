@@ -109,12 +109,12 @@ def mean_within(hand: HandTables, normal: Float, gradient: Float, x: Float, cut:
                 continue
             variance = cut.cov[6 + i, 6 + i]
             # the distribution of the angle without the factor of its own limits
-            alone = 1.0 / max(1.0 / variance - cut.weight[i], 1e-9)
-            middle = alone * (mean[6 + i] / variance - cut.push[i])
-            at, narrow = _cut(middle, alone, below, above)
-            better = max(1.0 / narrow - 1.0 / alone, 0.0)
+            cavity_variance = 1.0 / max(1.0 / variance - cut.weight[i], 1e-9)
+            middle = cavity_variance * (mean[6 + i] / variance - cut.push[i])
+            at, narrow = _cut(middle, cavity_variance, below, above)
+            better = max(1.0 / narrow - 1.0 / cavity_variance, 0.0)
             cut.weight[i] += _DAMPING * (better - cut.weight[i])
-            cut.push[i] += _DAMPING * (at / narrow - middle / alone - cut.push[i])
+            cut.push[i] += _DAMPING * (at / narrow - middle / cavity_variance - cut.push[i])
     for i in range(n):
         below = -inf if hand.at_low_limit[i] else hand.low[i] - x[i]
         mean[6 + i] = min(max(mean[6 + i], below), hand.high[i] - x[i])

@@ -8,8 +8,8 @@ import numpy as np
 from common.arrays import Bool, Code, Float
 from common.kernels import inner, kernel
 from common.messages import Source
-from master.estimator.arcs import add_arcs
-from master.estimator.certainty import is_small, linear, only_limits, surer, tilts
+from master.estimator.arcs import add_second_order
+from master.estimator.cov_scratch import is_small, linear, only_limits, surer, tilts
 from master.estimator.extras import keep_extras
 from master.estimator.hypotheses import Blank, likelier
 from master.estimator.kinematics import angles_of, chains, clamp, free_of, joints, marker_point
@@ -25,7 +25,7 @@ from master.estimator.state import NEVER_NS, PALM_PART, HandState, grow, predict
 from master.estimator.workspace import Model
 from master.estimator.wrist_device import EXTRAS
 from master.estimator.wrist_rows import contrary, sensed_palm
-from master.estimator.wrist_update import extras_alone, start_scanned, take_scanned
+from master.estimator.wrist_update import extras_only, start_scanned, take_scanned
 
 _LONG_S = 10.0
 _SOLVED, _MEASURED, _HELD, _WRIST = (
@@ -111,7 +111,7 @@ def _judge(
 ) -> None:
     """Write which joints are tracked, and what each rests on.
 
-    Tracked is a joint whose 95 % region is small (`master.estimator.certainty.is_small`), and that rests on
+    Tracked is a joint whose 95 % region is small (`master.estimator.cov_scratch.is_small`), and that rests on
     measurements of its finger that are no older than `tracked_age_s`.
     """
     hand = rig.hand
@@ -273,7 +273,7 @@ def fit_epoch(model: Model, posture_prior: PosturePrior, observed: Observations,
         found,
     )
     if found.z.shape[0] == EXTRAS:
-        extras_alone(epoch_prior, found, search)
+        extras_only(epoch_prior, found, search)
     if epoch_prior.lines_of_sight.rows[0] > 0.0:
         take_scanned(rig, space.ground, space.scan, found, search.rows)
     found.contrary[0] = contrary(epoch_prior, found.palm, found.z, search) if epoch_prior.oriented[0] > 0.0 else 0.0
@@ -312,7 +312,7 @@ def take_over_epoch(
     state, space, settings = boxed_state[0], boxed_space[0], model.settings[0]
     rig, task = Rig(model.hand[0], model.mounts, model.cameras, model.device[0]), space.task
     t_ns, shown, palm_shown = task.t_ns[0], space.ground.shown, task.palm_shown[0] > 0
-    found, hidden, scratch, work = space.found, space.hidden, space.certainty, space.scratch.search.rows
+    found, hidden, scratch, work = space.found, space.hidden, space.cov_scratch, space.scratch.search.rows
     hand, n = rig.hand, found.x.shape[0]
     angles_of(hand, found.x, work.angles, work.by)
     clamp(hand, work.angles)
@@ -344,7 +344,7 @@ def take_over_epoch(
     linear(hand, found.palm, state.cov, work, scratch, out.cov)
     tilts(hand, settings, found.palm, found.cov, work, scratch, out.tilt, out.tilt_process_noise)
     if task.second_order[0] > 0:
-        add_arcs(
+        add_second_order(
             rig,
             settings,
             found.palm,

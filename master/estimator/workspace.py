@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 from common.arrays import Bool, Code, Float, Int
 from common.records import record
 from master.estimator.cameras import CameraArrays
-from master.estimator.certainty import Certainty
+from master.estimator.cov_scratch import CovarianceScratch
 from master.estimator.extras import ExtrasScratch
 from master.estimator.finger_scan import Prior, Scan
 from master.estimator.hand_tables import Mounts
@@ -87,7 +87,7 @@ class Workspace:
     hidden: Hidden
     found: Posterior
     scratch: Scratch
-    certainty: Certainty
+    cov_scratch: CovarianceScratch
     prior: Prior
     scan: Scan
     extras: ExtrasScratch
@@ -103,7 +103,7 @@ class Workspace:
             hidden=Hidden.none(n),
             found=Posterior.empty(n, extras, markers),
             scratch=Scratch.empty(n, extras, markers),
-            certainty=Certainty.empty(6 + n + extras, markers),
+            cov_scratch=CovarianceScratch.empty(6 + n + extras, markers),
             prior=Prior.empty(),
             scan=Scan.empty(),
             extras=ExtrasScratch.empty(extras),

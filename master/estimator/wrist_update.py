@@ -145,9 +145,9 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
             curled = f > 0 and scan.out[f, 2] > settings.branch_rad
             task.ambiguous[f] = scan.parts[f] > 1.5 or (curled and lines_of_sight.shown[f] == 0.0)
             # The unit of light is learnt a little at a time, and nothing of a finger that is in doubt.
-            doubted = task.ambiguous[f] or scan.misfit[f] > settings.doubted
-            lines_of_sight.teaches[f] = 1.0 if lines_of_sight.shown[f] > 0.0 and not doubted else 0.0
-            lines_of_sight.depth_w2[f] *= 0.0 if doubted else settings.light_share
+            excluded = task.ambiguous[f] or scan.misfit[f] > settings.teaching_gate
+            lines_of_sight.teaches[f] = 1.0 if lines_of_sight.shown[f] > 0.0 and not excluded else 0.0
+            lines_of_sight.depth_w2[f] *= 0.0 if excluded else settings.light_share
             if f > 0 and not curled and lines_of_sight.teaches[f] > 0.0:
                 learn_coupling(prior, f, scan, state)
     _count(lines_of_sight, space.ground)
@@ -190,7 +190,7 @@ def start_scanned(hand: HandTables, scan: Scan, scanned: Float, x: Float, out: F
 
 
 @inner
-def extras_alone(epoch_prior: EpochPrior, found: Posterior, search: Search) -> None:
+def extras_only(epoch_prior: EpochPrior, found: Posterior, search: Search) -> None:
     """Move the extras to where this instant alone has them, as its covariance has it.
 
     At the solution the pull of the past is that of the instant, reversed: a Newton step without it.

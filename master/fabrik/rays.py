@@ -289,8 +289,8 @@ def correct_centres(
         common = 0.0
         for c in range(observed.shape[0]):
             used = rays.weight[c] > 0.0 and not outliers[m]
-            alone = rays.variance[c] + rays_px * rays_px - (shared if meets else 0.0)
-            variance[c, m] = alone if used else np.nan
+            own_variance = rays.variance[c] + rays_px * rays_px - (shared if meets else 0.0)
+            variance[c, m] = own_variance if used else np.nan
             uv[c, m, 0], uv[c, m, 1] = rays.uv[c, 0], rays.uv[c, 1]
             if meets and used:
                 squared = 0.0

@@ -207,9 +207,9 @@ def _rotation_between(place: Float, sigma: Float, before: Float, sigma_before: F
     weight, total = np.empty(5), 0.0
     middle, middle_before = np.zeros(3), np.zeros(3)
     for f in range(5):
-        doubt = hypot(sigma[f], sigma_before[f])
-        doubt = max(doubt, 1e-3) if isfinite(doubt) else 0.1
-        weight[f] = 1.0 / (doubt * doubt)
+        sigma_m = hypot(sigma[f], sigma_before[f])
+        sigma_m = max(sigma_m, 1e-3) if isfinite(sigma_m) else 0.1
+        weight[f] = 1.0 / (sigma_m * sigma_m)
         total += weight[f]
         for i in range(3):
             middle[i] += weight[f] * place[f, i]

@@ -139,12 +139,12 @@ def _fit(
             if not table.asked[p, q]:
                 continue
             there = isfinite(value[q] + sigma[q])
-            doubt = sigma[q] if there else _ANYTHING
+            sigma_of = sigma[q] if there else _ANYTHING
             own = value[q] if isfinite(value[q]) else 0.0
             outside = max(table.low[p, q] - own, own - table.high[p, q], 0.0)
-            misfit[p, q] = outside / hypot(table.soft[p, q], doubt)
+            misfit[p, q] = outside / hypot(table.soft[p, q], sigma_of)
             squares += misfit[p, q] * misfit[p, q]
-            vague = doubt / (_VAGUE * table.soft[p, q])
+            vague = sigma_of / (_VAGUE * table.soft[p, q])
             share += 1.0 / (1.0 + vague * vague)
             asked += 1
         score[p] = confidence[p] = exp(-0.5 * squares)
@@ -239,7 +239,7 @@ class PoseRecogniser:
         lasted_s = 1e-9 * (t_ns - self._coming_ns)
         enough = known >= _ENOUGH
         at_rest = (
-            lasted_s >= (self._hold.begin_s if enough else self._hold.doubt_s)
+            lasted_s >= (self._hold.begin_s if enough else self._hold.uncertain_s)
             and speed <= self._hold.still_deg_s
         )
         return best if at_rest or lasted_s >= self._hold.slow_s else None

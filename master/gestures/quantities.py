@@ -63,7 +63,7 @@ def _write(
     joints: Float,
     tips: Float,
     radius: Float,
-    doubt: Float,
+    tip_sigma_m: Float,
     bend: Float,
     seen: Bool,
     T: Float,
@@ -75,7 +75,7 @@ def _write(
     sigma_deg = np.empty(5)
     for f in range(5):
         lever = _length(joints, CHAINS[f, 1], CHAINS[f, 2]) + _length(joints, CHAINS[f, 2], CHAINS[f, 3])
-        sigma_deg[f] = degrees(doubt[f] / lever)
+        sigma_deg[f] = degrees(tip_sigma_m[f] / lever)
     size = _length(joints, _FROM, _TO)
     value[_THUMB_BEND], sigma[_THUMB_BEND] = degrees(bend[0, 1] + bend[0, 2]), sigma_deg[0]
     for i in range(3):
@@ -83,8 +83,8 @@ def _write(
         for k in range(3):
             place += (tips[0, k] - T[k, 3]) * T[k, i]
         value[_THUMB_PLACE + i] = place * (side if i == 0 else -1.0 if i == 1 else 1.0) / size
-        sigma[_THUMB_PLACE + i] = doubt[0] / size
-    others, others_2, every, doubts = 0.0, 0.0, 0.0, 0.0
+        sigma[_THUMB_PLACE + i] = tip_sigma_m[0] / size
+    others, others_2, every, sigma_sum = 0.0, 0.0, 0.0, 0.0
     for f in range(1, 5):
         weight, sigma_deg[f] = _hidden(sigma_deg[f], seen[f])
         both, column = 0.0, 3 * (f - 1)
@@ -99,14 +99,14 @@ def _write(
             (tips[f, 0] - tips[0, 0]) ** 2 + (tips[f, 1] - tips[0, 1]) ** 2 + (tips[f, 2] - tips[0, 2]) ** 2
         )
         value[_GAPS + f - 1] = 1e3 * (off - radius[f] - radius[0])
-        sigma[_GAPS + f - 1] = 1e3 * hypot(doubt[f], doubt[0])
+        sigma[_GAPS + f - 1] = 1e3 * hypot(tip_sigma_m[f], tip_sigma_m[0])
         every += both / 4.0
-        doubts += sigma_deg[f] / 4.0  # neighbours are wrong alike
+        sigma_sum += sigma_deg[f] / 4.0  # neighbours are wrong alike
         if f > 1:
             others += both / 3.0
             others_2 += sigma_deg[f] * sigma_deg[f]
     value[_AHEAD], sigma[_AHEAD] = value[2] - others, hypot(sigma_deg[1], sqrt(others_2) / 3.0)
-    value[_ALL], sigma[_ALL] = every, doubts
+    value[_ALL], sigma[_ALL] = every, sigma_sum
     before = 0.0
     for f in range(1, 5):
         heading = _heading(f, joints, T, side)

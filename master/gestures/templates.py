@@ -128,7 +128,7 @@ def _shape(name: str, examples: Sequence[Example], weight: float) -> PoseShape:
     """Ranges of what is known in all examples."""
     known = np.all([known_of(example.quantities) for example in examples], axis=0)
     value = np.array([example.quantities.value for example in examples])
-    doubt = np.sqrt(
+    total_sigma = np.sqrt(
         np.mean([np.where(known, example.quantities.sigma, 0.0) ** 2 for example in examples], axis=0)
     )
     n = len(examples)
@@ -136,7 +136,7 @@ def _shape(name: str, examples: Sequence[Example], weight: float) -> PoseShape:
     ranges: dict[Quantity, Span] = {}
     for quantity in _ASKED:
         column, unit = QUANTITIES.index(quantity), _unit(quantity)
-        if not known[column] or doubt[column] > _WIDEST[unit]:
+        if not known[column] or total_sigma[column] > _WIDEST[unit]:
             continue
         spread = float(value[:, column].std(ddof=1))
         if spread > _WIDEST[unit]:

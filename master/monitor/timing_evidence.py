@@ -65,7 +65,7 @@ class Evidence:
     value: Float
     rate: Float
     instrument: Float
-    doubt: Float
+    pixel_effect: Float
     place: Float
 
 
@@ -109,8 +109,8 @@ class CameraPair:
         )  # of other frames again: its noise is not `xy`'s
         one, two = _pairs(xy.shape[1])
         place = np.concatenate([middle, 0.5 * (middle[:, one] + middle[:, two])], axis=1)
-        value, rate, instrument, doubt = self._equations(xy, known, seen, velocity)
-        return Evidence(value, rate, instrument, doubt, place)
+        value, rate, instrument, pixel_effect = self._equations(xy, known, seen, velocity)
+        return Evidence(value, rate, instrument, pixel_effect, place)
 
     def _equations(
         self, xy: Float, known: Float, seen: Float, velocity: Float
@@ -136,8 +136,8 @@ class CameraPair:
             before = self._depth(a, along, place - _STEP_S * (along * v).sum(-1))
             change = (distance - _distances(ray, before)) / _STEP_S
             changes.append(np.concatenate([self.focal_px * (normal * v).sum(-1), change], axis=-1))
-        rate, instrument, doubt = changes
-        return value, rate, instrument, _STEP_S * doubt
+        rate, instrument, pixel_effect = changes
+        return value, rate, instrument, _STEP_S * pixel_effect
 
     def _depth(self, a: Float, along: Float, place: Float) -> Float:
         """Depths (K, M) [m] along the reference rays of places on the epipolar lines; NaN where no hand can be."""

@@ -75,7 +75,7 @@ def unit_sums(evidence: Evidence, markers: int, tenth: Int) -> Float:
     good &= good.sum(axis=0) >= _AT_LEAST
     n = good.sum(axis=0)
     x, y = np.moveaxis(evidence.place, -1, 0)
-    parts = (x, y, evidence.instrument, evidence.value, evidence.rate, evidence.doubt)
+    parts = (x, y, evidence.instrument, evidence.value, evidence.rate, evidence.pixel_effect)
     x, y, z, e, g, c = (_about_mean(part, good, n) for part in parts)
     y = _without(y, x)
     z, e, g, c = (_without(_without(part, x), y) for part in (z, e, g, c))

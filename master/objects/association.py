@@ -13,7 +13,7 @@ from master.objects.start import Sighted, reach
 from master.objects.sums import Observations
 from master.objects.window import ImageObservation, Window
 
-Doubt = Callable[[int, Float, Float], Float]
+CentroidSigma = Callable[[int, Float, Float], Float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +33,7 @@ class Association:
         features: Features,
         cameras: tuple[CameraModel, ...],
         T: Float | None,
-        doubt: Doubt,
+        centroid_sigma: CentroidSigma,
     ) -> "Association | None":
         """All that is seen; None: nothing.
 
@@ -54,7 +54,7 @@ class Association:
                 uv, sigma = _nearer(observed, point, features, cameras[c], T)
                 if T is not None and kind == 0:
                     area = np.concatenate([one.area_px2 for one in observed]).reshape(len(observed), -1)
-                    sigma = np.hypot(sigma, doubt(c, T, area).ravel())
+                    sigma = np.hypot(sigma, centroid_sigma(c, T, area).ravel())
                 there: Int = np.flatnonzero(np.isfinite(uv[:, 0] + uv[:, 1] + sigma))
                 t_ns = np.concatenate([one.t_ns for one in observed])
                 size = [len(one.point) for one in observed]

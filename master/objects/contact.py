@@ -42,7 +42,7 @@ SURFACE_SIGMA_M = 1.0e-3  # standard deviation of the skin about the profile's r
 LED_S = 0.1  # by which an object's pose is led on, at most
 _POSES = 6
 _SURE_M = 0.02  # a distance less sure than this tells of no touch
-_DOUBT = 0.5  # of a standard deviation by which touching may begin early
+_SIGMA_SHARE = 0.5  # of a standard deviation by which touching may begin early
 _LED_M_S2, _LED_RAD_S2 = 5.0, 50.0  # what a hand does to what it holds while nobody sees it
 _BONES: Int = np.concatenate(
     [
@@ -130,8 +130,8 @@ def _away(distance: Float, sigma: Float) -> bool:
 def _touches(distance: Float, sigma: Float, before: Bool) -> Bool:
     """(N,) what touches, by distances and standard deviations (N,) [m] and what touched before; NaN: not known."""
     sure = sigma < _SURE_M
-    begins = distance < NEAR_M + _DOUBT * np.minimum(sigma, FAR_M)
-    stay_near = before & (distance < FAR_M + _DOUBT * np.minimum(sigma, FAR_M))
+    begins = distance < NEAR_M + _SIGMA_SHARE * np.minimum(sigma, FAR_M)
+    stay_near = before & (distance < FAR_M + _SIGMA_SHARE * np.minimum(sigma, FAR_M))
     return sure & (begins | stay_near)
 
 

@@ -60,7 +60,7 @@ class Fitted:
     weight: Float
     misfit: Float
     residual_m: Float
-    alone: bool = True
+    measured_only: bool = True
 
     @property
     def used(self) -> Bool:

@@ -59,7 +59,7 @@ class Hidden:
                 occluded |= self._partly(c, T_rig_object, markers, should[:beads] & used[c, :beads])
         return Seen(int(used.any(axis=0).sum()), int((expected | used).any(axis=0).sum()), occluded)
 
-    def doubt_px(self, c: int, T_rig_object: Float, area_px2: Float) -> Float:
+    def centroid_sigma_px(self, c: int, T_rig_object: Float, area_px2: Float) -> Float:
         """By how much the centroids of beads (..., B) in camera `c` may be off, as something hides a part of them [px].
 
         Whatever part of a disc is cut off, its centroid moves by at most about that part of the radius.

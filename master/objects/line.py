@@ -123,7 +123,7 @@ class ObjectLine:
             return self._held(window, predicted)
         if not self._trajectory.push(window.t_ns, fitted):
             return self._none(window)
-        tracked = fitted.alone or not fitted.poorer(_TRACKED_M, _TRACKED_RAD)
+        tracked = fitted.measured_only or not fitted.poorer(_TRACKED_M, _TRACKED_RAD)
         shown = self._hidden.look(window, fitted.motion.T, seen.used(fitted))
         self._lost_behind = shown.occluded
         T = self._filter.push(window.t_ns, fitted.motion.T, fitted.cov[:6, :6])
@@ -173,26 +173,26 @@ class ObjectLine:
 
     def _associated(self, window: Window, T: Float | None) -> Association | None:
         """What is seen of the object, near a pose (4, 4) if there is one."""
-        return Association.of(window, self._features, self._cameras, T, self._hidden.doubt_px)
+        return Association.of(window, self._features, self._cameras, T, self._hidden.centroid_sigma_px)
 
     def _fitted(self, seen: Association, start: Motion, t_ns: int, *, led: bool) -> Fitted | None:
         """The fit; of one that was led there with the past, where the present does not tell enough.
 
         How it may have moved since is then in it.
         """
-        alone = self._fit(seen.seen, start, feature=seen.feature)
-        if alone is not None and not alone.poorer(_POOR_M, _POOR_RAD):
-            return alone
+        measured = self._fit(seen.seen, start, feature=seen.feature)
+        if measured is not None and not measured.poorer(_POOR_M, _POOR_RAD):
+            return measured
         both = None
         if led:
             oldest_ns = t_ns + round(float(seen.seen.tau_s.min()) * 1e9)
             past = self._trajectory.past(t_ns, oldest_ns)
             both = self._fit(seen.seen, start, past, feature=seen.feature)
-        if alone is None:
-            return None if both is None else replace(both, alone=False)
-        if both is None or not alone.poorer(_INCOMPLETE_M, _INCOMPLETE_RAD):
-            return alone if both is None else both
-        return unheeded(both, alone, self._trajectory.unsure_s(t_ns), _POOR_M)
+        if measured is None:
+            return None if both is None else replace(both, measured_only=False)
+        if both is None or not measured.poorer(_INCOMPLETE_M, _INCOMPLETE_RAD):
+            return measured if both is None else both
+        return unheeded(both, measured, self._trajectory.unsure_s(t_ns), _POOR_M)
 
     def _holds(self, seen: Association, fitted: Fitted) -> bool:
         """Whether a pose is determined, and most of what is seen now is in its place."""

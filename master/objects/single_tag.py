@@ -49,12 +49,12 @@ class SingleTag:
     def __init__(self, features: Features, cameras: tuple[CameraModel, ...], fit: PoseFit) -> None:
         """Set up for an object's features, the rig's cameras and what fits the one in the other."""
         self._features, self._cameras, self._fit = features, cameras, fit
-        self._doubt = 0.0
+        self._log_odds = 0.0
         self._clear: _Clear | None = None
 
     def forget(self) -> None:
         """Begin anew: what is seen is another thing."""
-        self._doubt, self._clear = 0.0, None
+        self._log_odds, self._clear = 0.0, None
 
     def of_two(self, window: Window, seen: Association, fitted: Fitted, *, begins: bool) -> Fitted:
         """The pose to believe, its covariance grown by the other; the fit itself where more than a tag is seen.
@@ -67,7 +67,7 @@ class SingleTag:
         """
         features = np.unique(seen.feature[fitted.used])
         if len(features) != 1 or features[0] < self._features.beads:
-            self._doubt *= _FORGET
+            self._log_odds *= _FORGET
             self._clear = None
             return fitted
         feature = int(features[0])
@@ -75,20 +75,20 @@ class SingleTag:
         clear = self._clear
         if clear is not None and clear.seen_by == who and clear.frames > 0 and not begins:
             clear.frames -= 1
-            self._doubt = _FORGET * (self._doubt + clear.better)
+            self._log_odds = _FORGET * (self._log_odds + clear.better)
             return fitted
         self._clear = None
         other = self._other(window, seen, fitted, feature)
         if other is None:
-            self._doubt *= _FORGET
+            self._log_odds *= _FORGET
             return fitted
         better = 0.5 * (fitted.cost - other.cost)
-        self._doubt = _FORGET * self._doubt + 2.0 * better * (1.0 - _FORGET) * 2.0
+        self._log_odds = _FORGET * self._log_odds + 2.0 * better * (1.0 - _FORGET) * 2.0
         if begins:
             if better > 0.0:
                 fitted, other, better = other, fitted, -better
-        elif self._doubt > _BETTER:
-            fitted, other, better, self._doubt = other, fitted, -better, 0.0
+        elif self._log_odds > _BETTER:
+            fitted, other, better, self._log_odds = other, fitted, -better, 0.0
         elif better < _CLEAR:
             self._clear = _Clear(who, better, _UNLOOKED)
         return _reaching(fitted, other, better)

@@ -43,7 +43,7 @@ class Trajectory:
     def push(self, t_ns: int, fitted: Fitted) -> bool:
         """Take the pose of an instant; False: nothing has told all of it for too long, and all is forgotten."""
         self._known.append(_Known(t_ns, fitted))
-        if fitted.alone:
+        if fitted.measured_only:
             self._sure_ns = t_ns
         elif self.unsure_s(t_ns) > HELD_S:
             self._known.clear()
@@ -92,7 +92,7 @@ class Trajectory:
         return cov
 
 
-def unheeded(fitted: Fitted, alone: Fitted, since_s: float, poor_m: float) -> Fitted:
+def unheeded(fitted: Fitted, measured: Fitted, since_s: float, poor_m: float) -> Fitted:
     """A fit with what may have happened in directions that what is seen alone does not tell, for so long [s].
 
     A turn about the line through two beads shows in nothing but what it does to other turns, which is too little to
@@ -104,8 +104,8 @@ def unheeded(fitted: Fitted, alone: Fitted, since_s: float, poor_m: float) -> Fi
         since_s: For how long.
         poor_m: What is less sure than this is not told [m].
     """
-    size, axes = np.linalg.eigh(alone.cov[:6, :6] * np.outer(_SCALE, _SCALE))
+    size, axes = np.linalg.eigh(measured.cov[:6, :6] * np.outer(_SCALE, _SCALE))
     unobserved = axes[:, size > poor_m**2] / _SCALE[:, None]
     cov = fitted.cov.copy()
     cov[:6, :6] += (0.5 * _UNSEEN_M_S2 * min(since_s, HELD_S) ** 2) ** 2 * (unobserved @ unobserved.T)
-    return replace(fitted, cov=cov, alone=False)
+    return replace(fitted, cov=cov, measured_only=False)

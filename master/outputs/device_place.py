@@ -62,7 +62,7 @@ class DevicePlace:
         """Lines (T, 2, 3) [m] from the wrist towards the elbow."""
         return np.stack([self.wrist_m, self.wrist_m + length_m * (self.R_rig_forearm @ _ELBOW)], axis=1)
 
-    def doubt_m(self, length_m: float) -> Float:
+    def uncertainty_m(self, length_m: float) -> Float:
         """Rings (T, K, 3) [m] about the ends of `arm_m`: where these are at 2 sigma of the bend; NaN: not known."""
         angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
         around = np.stack([np.cos(angle), np.sin(angle)], axis=-1)

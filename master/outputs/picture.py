@@ -119,7 +119,7 @@ def best_row(poses: Poses, results: ResultPicture | None = None) -> int | None:
     tips = poses.position_m[:, TIPS]
     reach = np.linalg.norm(tips - poses.position_m[:, WRIST, None], axis=-1).sum(axis=1)
     spread = np.linalg.norm(np.diff(tips, axis=1), axis=-1).sum(axis=1)
-    score = 0.0 if results is None else 500.0 * results.worth(poses.t_ns)
+    score = 0.0 if results is None else 500.0 * results.interest(poses.t_ns)
     score = score + whole * 100.0 + poses.tracked.sum(axis=1) * 10.0 + np.nan_to_num(reach + spread)
     score = np.where(whole > 0, score, -1.0)
     return int(np.argmax(score))

@@ -46,7 +46,7 @@ class ResultPicture:
     contacts: Sequence[Contacts] = ()
     gestures: Sequence[Gesture] = ()
 
-    def worth(self, t_ns: Int) -> Float:
+    def interest(self, t_ns: Int) -> Float:
         """How much the instants (T,) show of the objects: 2 held, 1 known, 0 nothing."""
         known = np.zeros(len(t_ns))
         for poses in self.objects:

@@ -93,7 +93,7 @@ class WristPicture:
         """From the wrist towards the elbow, and where that end is at 2 sigma; return the entry of the legend."""
         place = DevicePlace.of(poses.rows(row, row + 1), self.setup.model)
         colour = unit(SOURCE_RGB[Source.WRIST])
-        arm, ring = view.project(place.arm_m(_FOREARM_M)[0]), view.project(place.doubt_m(_FOREARM_M)[0])
+        arm, ring = view.project(place.arm_m(_FOREARM_M)[0]), view.project(place.uncertainty_m(_FOREARM_M)[0])
         axes.plot(arm[:, 0], arm[:, 1], color=colour, lw=3.0, ls=(0, (4, 1.5)), zorder=4)
         axes.plot(ring[:, 0], ring[:, 1], color=colour, lw=1.0, zorder=4)
         flexion, deviation = np.degrees(place.wrist_angles_rad[0])

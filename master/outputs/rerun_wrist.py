@@ -12,7 +12,7 @@ Beside marker cameras the same entities stand in the rig frame: `world/laser`, `
 move with the device, which the solved palm and the wrist's bend place (`device_place`). Added are
 
 world/hand/HAND/forearm              from the wrist towards the elbow
-world/hand/HAND/forearm_doubt        a ring: where its far end is at 2 sigma of the bend
+world/hand/HAND/forearm_uncertainty        a ring: where its far end is at 2 sigma of the bend
 plots/wrist_angles_deg/...             flexion and deviation
 """
 
@@ -117,7 +117,7 @@ class WristLayer:
         root, t = rr.new_entity_path([WORLD, "hand", poses.hand]), poses.t_ns
         colour = int(pack([SOURCE_RGB[Source.WRIST]])[0])
         self._rows.lines(f"{root}/forearm", t, place.arm_m(_FOREARM_M), colour, _BONE_M)
-        self._rows.lines(f"{root}/forearm_doubt", t, place.doubt_m(_FOREARM_M), colour, _FAN_LINE_M)
+        self._rows.lines(f"{root}/forearm_uncertainty", t, place.uncertainty_m(_FOREARM_M), colour, _FAN_LINE_M)
         for i, name in enumerate(_WRIST_ANGLES):
             self._rows.scalars(
                 f"plots/wrist_angles_deg{self._group}/{name}", t, np.degrees(place.wrist_angles_rad[:, i])

@@ -23,15 +23,15 @@ class MasterClock:
 
     def __init__(self) -> None:
         self.ahead_ns = 0
-        self._doubt_ns: int | None = None
+        self._half_trip_ns: int | None = None
 
     def push(self, asked_ns: int, answered_ns: int, remote_ns: int) -> None:
         """Take one answer: it was told somewhere between the question and its arrival."""
-        doubt = (answered_ns - asked_ns) // 2
-        if self._doubt_ns is None or doubt < self._doubt_ns:
+        half_trip_ns = (answered_ns - asked_ns) // 2
+        if self._half_trip_ns is None or half_trip_ns < self._half_trip_ns:
             ahead = remote_ns - (asked_ns + answered_ns) // 2
-            self.ahead_ns = 0 if abs(ahead) <= doubt else ahead  # one clock looks so, and is exact then
-            self._doubt_ns = doubt
+            self.ahead_ns = 0 if abs(ahead) <= half_trip_ns else ahead  # one clock looks so, and is exact then
+            self._half_trip_ns = half_trip_ns
 
     def now_ns(self) -> int:
         """The master's time [ns]."""

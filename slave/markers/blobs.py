@@ -146,8 +146,8 @@ def with_fragments(blob: Blob, options: Sequence[Blob], extent: float, whole: fl
         ):
             left, top, right, bottom = box
             area, u, v = area + piece.area, u + piece.u * piece.area, v + piece.v * piece.area
-    doubt = 0.0 if known and area <= whole else math.hypot(u / area - blob.u, v / area - blob.v)
-    return blob._replace(left=left, top=top, right=right, bottom=bottom), doubt
+    shift_px = 0.0 if known and area <= whole else math.hypot(u / area - blob.u, v / area - blob.v)
+    return blob._replace(left=left, top=top, right=right, bottom=bottom), shift_px
 
 
 def _label(

@@ -172,10 +172,10 @@ class MarkerDetector:
         self._seeds = {}
         rows = list(chosen)
         alternatives: dict[int, Blob] = {}
-        doubt: dict[int, float] = {}
+        shift_px: dict[int, float] = {}
         for m in rows:
             if len(blobs[m]) > 1:
-                chosen[m], doubt[m] = with_fragments(chosen[m], blobs[m], *self._known(m, t_ns))
+                chosen[m], shift_px[m] = with_fragments(chosen[m], blobs[m], *self._known(m, t_ns))
                 alternative = self._alternative(m, chosen[m], blobs, windows[m])
                 if alternative is not None:
                     alternatives[m] = alternative
@@ -199,7 +199,7 @@ class MarkerDetector:
         for m, seen in seen_as.items():
             before = self._tracks[m] if windows[m] is not None else None
             reports[m] = self._report(
-                m, before, seen, outlines.get(m), chosen[m], alternatives.get(m), t_ns, doubt.get(m, 0.0)
+                m, before, seen, outlines.get(m), chosen[m], alternatives.get(m), t_ns, shift_px.get(m, 0.0)
             )
         values: list[float] = []
         for m in range(len(self._names)):
@@ -260,7 +260,7 @@ class MarkerDetector:
         blob: Blob,
         alternative: Blob | None,
         t_ns: int,
-        doubt: float,
+        shift_px: float,
     ) -> tuple[float, ...]:
         """What is reported of one marker, whose track was `before` if it was alive; it goes on."""
         other = (math.nan, math.nan) if alternative is None else (alternative.u, alternative.v)
@@ -286,7 +286,7 @@ class MarkerDetector:
             if whole is not None and explained(before.hidden(seen.area), shape, whole.u - x, whole.v - y):
                 u, v, area = seen.left + whole.u, seen.top + whole.v, before.typical
                 sigma = math.hypot(COVERED_PX, whole.rms)
-        sigma = math.hypot(sigma, doubt)
+        sigma = math.hypot(sigma, shift_px)
         clarity = clarity_of(seen, track.whole)
         if near:
             clarity *= 0.5

@@ -77,26 +77,26 @@ def initial_white_balance(image: Image, table: ColourTable, reference: Float, ex
         expected: (3,) log gains of the light that is expected, blue, green, red; 0 at a start.
     """
 
-    def worth(item: Evidence) -> float:
+    def score_of(item: Evidence) -> float:
         if item.beyond:
             return 0.0
         return item.score + (0.0 if different(item.log_gains, expected) else EXPECTED)
 
     half = np.ascontiguousarray(image[::STRIDE, ::STRIDE])
     tried = [evidence(half, table, reference, gains) for gains in (expected, *lights())]
-    best = max(tried, key=worth)
+    best = max(tried, key=score_of)
     for _ in range(2):  # the fit has moved it; what it finds there may be more
         again = evidence(half, table, reference, best.log_gains)
-        if worth(again) < worth(best):
+        if score_of(again) < score_of(best):
             break
         best = again
     if best.matched < PROOF or off_line(best.log_gains) > TINT:
         return best
-    other = max((worth(e) for e in tried if different(e.log_gains, best.log_gains)), default=0.0)
-    typical = max((worth(e) for e in tried if not different(e.log_gains, expected)), default=0.0)
+    other = max((score_of(e) for e in tried if different(e.log_gains, best.log_gains)), default=0.0)
+    typical = max((score_of(e) for e in tried if not different(e.log_gains, expected)), default=0.0)
     least = min(PROOF_ELSEWHERE, len(reference)) if different(best.log_gains, expected) else PROOF
-    proven = best.matched >= least and worth(best) - other >= AHEAD
-    return replace(best, proven=proven, excluded=worth(best) - typical >= AHEAD)
+    proven = best.matched >= least and score_of(best) - other >= AHEAD
+    return replace(best, proven=proven, excluded=score_of(best) - typical >= AHEAD)
 
 
 def lights() -> Float:

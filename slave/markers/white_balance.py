@@ -104,7 +104,7 @@ class WhiteBalance:
             else:
                 self._misfits += 1
                 if self._misfits >= MISFITS:
-                    self._doubt()
+                    self._lose_proof()
         return fit
 
     def warnings(self) -> list[ColourWarning]:
@@ -134,13 +134,13 @@ class WhiteBalance:
             )
             if before + AHEAD > after:
                 if before < AHEAD:
-                    self._doubt()  # no marker says that the light stayed, either
+                    self._lose_proof()  # no marker says that the light stayed, either
                 return
         self._drift.shift(change.log_gains)
         if self._proof is not None:  # what is being proven is the light of an earlier frame
             self._proof = self._proof[0] + change.log_gains, self._proof[1]
 
-    def _doubt(self) -> None:
+    def _lose_proof(self) -> None:
         if self._provable and self.proven:
             self.proven, self._plausible, self._tried_ns = False, False, None
 

@@ -245,11 +245,11 @@ def _met(uv: Float, outward: Float, reach: Float, density: Float, misfit: float,
     # Corner k ends side k - 1 and begins side k. Each line tells how far it moved across itself, there.
     normals = np.stack([np.roll(outward, 1, axis=1), outward], axis=-2)
     moved = np.stack([np.roll(offset[..., 1], 1, axis=1), offset[..., 0]], axis=-1)
-    doubt = np.stack([np.roll(variance[..., 1], 1, axis=1), variance[..., 0]], axis=-1)
+    edge_variance = np.stack([np.roll(variance[..., 1], 1, axis=1), variance[..., 0]], axis=-1)
     meet = np.abs(np.linalg.det(normals)) > SLIMMEST
     inverse = np.linalg.inv(np.where(meet[..., None, None], normals, np.eye(2)))
     met = uv + np.einsum("nkij,nkj->nki", inverse, moved)
-    spread = np.einsum("nkij,nkj->nk", inverse**2, doubt)
+    spread = np.einsum("nkij,nkj->nk", inverse**2, edge_variance)
     good = (
         meet
         & (np.abs(offset).max(axis=-1) < reach)

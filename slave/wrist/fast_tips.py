@@ -55,7 +55,7 @@ class _Limits(NamedTuple):
     modes: int
     mode_within: float
     apart: float
-    shown_worth: float
+    unseen_cost: float
     at_sigma: float
     size_sigma: float
     at_sure: float
@@ -133,7 +133,7 @@ _LIMITS = _Limits(
     fingertips.MODES,
     fingertips.MODE_WITHIN,
     fingertips.APART,
-    fingertips.SHOWN_WORTH,
+    fingertips.UNSEEN_COST,
     fingertips.AT_SIGMA,
     fingertips.SIZE_SIGMA,
     fingertips.AT_SURE,
@@ -228,7 +228,7 @@ def _search(
             _open(image, gain, table, row, float(found.abduction[k]), limits, open_)
             for _ in range(2):
                 _fit(led, circle, open_, edges)
-            misfit = found.cost[k] + limits.shown_worth * (1.0 - circle[4])
+            misfit = found.cost[k] + limits.unseen_cost * (1.0 - circle[4])
             misfit += _apart(found, k, table, limits, circle)
             if misfit < least:
                 least = misfit

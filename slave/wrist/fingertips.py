@@ -63,7 +63,7 @@ SIDE = 0.35  # cosine between outline and hidden skin, seen from the end: no out
 MODES = 8  # places of a finger whose outlines are looked at
 MODE_WITHIN = 24.0  # what they may cost more than the best
 APART = 0.4  # of the radius of a fingertip: places that differ
-SHOWN_WORTH = 30.0  # what an outline that is not seen at all costs
+UNSEEN_COST = 30.0  # what an outline that is not seen at all costs
 AT_SIGMA, SIZE_SIGMA = 0.35, 0.12  # of the radius: how far a posture's outline may be from the seen one
 AT_SURE, LASER_SURE_M = 0.1, 8e-4  # how well an outline is seen, of the radius, and a laser point
 TWIST_SIGMA = 0.05  # rad: of the hinges of real fingers
@@ -74,7 +74,7 @@ LEAST_SHOWN = np.array([0.75, 0.6])
 MOST_MISFIT, LIKELY = 32.0, 0.4  # of one that is less likely to be seen in proportion
 # Standard deviations: edges; of the radius, how far flesh is off its cones, and where on its disk an end is that faces
 # the camera; and the misfit at which they are twice as large.
-PIXEL, SURFACE, PULP, DOUBTFUL = 0.7, 0.05, 0.08, 20.0
+PIXEL, SURFACE, PULP, COST_SCALE = 0.7, 0.05, 0.08, 20.0
 OF_SPREAD = 0.6  # postures that are possible differ by more than the mean of them is off
 
 
@@ -331,7 +331,7 @@ def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) ->
     outline = np.repeat(_open(some, best, image, gain), OUTLINE // DIRECTIONS, axis=1)
     circle = fitted(led, some.uv[best, END], some.table.end[rows, 0], outline)
     circle = fitted(led, circle.middle, circle.radius, outline)
-    misfit = cost[best] + SHOWN_WORTH * (1.0 - circle.shown)
+    misfit = cost[best] + UNSEEN_COST * (1.0 - circle.shown)
     misfit += _apart(some.uv[best, END], some.table.end[rows, 0], circle.middle, circle.radius)
     order = np.lexsort((misfit, finger))
     chosen = order[np.append(True, finger[order[1:]] != finger[order[:-1]])]
@@ -374,7 +374,7 @@ def reported(finger: Int, circle: Circles, misfit: Float, ends: Ends) -> Candida
     surface = radius * np.sqrt(
         SURFACE**2 + (PULP * np.maximum(ends.facing, 0.0)) ** 2 + (OF_SPREAD * ends.spread) ** 2
     )
-    sigma = np.sqrt(PIXEL**2 + surface**2 + circle.sigma_px**2) * (1.0 + misfit / DOUBTFUL)
+    sigma = np.sqrt(PIXEL**2 + surface**2 + circle.sigma_px**2) * (1.0 + misfit / COST_SCALE)
     at = circle.middle + ends.towards * radius[:, None]
     return Candidates(finger, at, sigma, radius, misfit, circle.shown, ends.seen)
 

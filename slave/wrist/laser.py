@@ -62,10 +62,10 @@ def laser_lines(laser: Image, fingers: Fingers, view: WristView, engine: Engine 
     if seen[0]:
         thumb = np.flatnonzero(finger == 0)
         beyond = workspace.beyond_m(points[thumb])
-        off, doubt = beyond_ball(runs, thumb, beyond)
+        off, extra_sigma = beyond_ball(runs, thumb, beyond)
         seen[0] = not (workspace.flexed and on_ball(beyond))
         uv[0] += off
-        sigma[0] = np.hypot(np.hypot(sigma[0], doubt), _THUMB_PX)
+        sigma[0] = np.hypot(np.hypot(sigma[0], extra_sigma), _THUMB_PX)
     uv[~seen], sigma[~seen], length[~seen] = np.nan, np.nan, np.nan
     return LaserLines(uv, sigma, length)
 

@@ -92,7 +92,7 @@ def test_the_forearm_is_as_long_as_asked_and_its_uncertainty_as_wide_as_that_of_
     setup: RigSetup, poses: Poses
 ) -> None:
     place = DevicePlace.of(poses, setup.hand)
-    arm, ring = place.arm_m(0.2), place.doubt_m(0.2)
+    arm, ring = place.arm_m(0.2), place.uncertainty_m(0.2)
     np.testing.assert_allclose(arm[:, 0], poses.position_m[:, WRIST])
     np.testing.assert_allclose(np.linalg.norm(arm[:, 1] - arm[:, 0], axis=1), 0.2)
     off: Float = np.linalg.norm(ring - arm[:, None, 1], axis=2)
@@ -108,7 +108,7 @@ def test_a_fused_run_is_all_there_and_its_device_moves(setup: RigSetup, poses: P
     write_rrd(path, lost, setup)
     rows, hand = rows_of(path), f"/world/hand/{setup.hand.profile.name}"
     for entity in ("/world/markers/raw", "/world/rays/left", "/world/rays/wrist/laser", "/world/laser/points",
-                   "/world/cameras/wrist/laser", f"{hand}/skeleton", f"{hand}/forearm", f"{hand}/forearm_doubt",
+                   "/world/cameras/wrist/laser", f"{hand}/skeleton", f"{hand}/forearm", f"{hand}/forearm_uncertainty",
                    "/plots/wrist_angles_deg/flexion", "/plots/seen/markers", "/plots/seen/laser_points"):  # fmt: skip
         assert rows[entity] == len(poses), entity
     for entity in ROOT:

@@ -164,9 +164,9 @@ def test_what_is_not_seen_is_no_evidence() -> None:
 def test_a_marker_with_a_rival_is_not_used() -> None:
     models = cameras()
     messages = recorded(models, scenes.sideways(1), 60.0, 5.0, {}, 1, lost=0.0)
-    doubtful = [msgspec.structs.replace(message, alt_uv=message.uv + 9.0) for message in messages]
+    ambiguous = [msgspec.structs.replace(message, alt_uv=message.uv + 9.0) for message in messages]
     assert run(models, messages, 60.0).offset_of("right") is not None
-    assert run(models, doubtful, 60.0).offset_of("right") is None
+    assert run(models, ambiguous, 60.0).offset_of("right") is None
 
 
 def test_a_restarted_slave_is_measured_afresh() -> None:

@@ -96,7 +96,7 @@ def differs(a: Measured | None, b: Measured | None) -> bool:
 @needs_numba
 @pytest.mark.parametrize("name", [*KINDS, "standard"])
 def test_what_is_measured_is_the_same(numba: Engine, name: str) -> None:
-    count = doubtful = 0
+    count = differing = 0
     for image, table, bits, blobs, alone in calls_of(name):
         together = centroid.measure(image, table, bits, blobs, alone)
         fast = numba.measure(image, table, bits, blobs, alone)
@@ -105,7 +105,7 @@ def test_what_is_measured_is_the_same(numba: Engine, name: str) -> None:
             (single,) = centroid.measure(image, table, bits[k : k + 1], blobs[k : k + 1], alone[k : k + 1])
             if differs(one, single):
                 # Paint at the border of its window touches the next window of the stack: numpy has two answers.
-                doubtful += differs(single, other)
+                differing += differs(single, other)
                 continue
             assert not differs(one, other)
             if one is not None and other is not None:
@@ -113,7 +113,7 @@ def test_what_is_measured_is_the_same(numba: Engine, name: str) -> None:
                 np.testing.assert_allclose(one.window[:height, :width], other.window, atol=1e-3)
                 assert (one.left, one.top) == (other.left, other.top)
     assert count >= 40
-    assert doubtful <= 0.02 * count
+    assert differing <= 0.02 * count
 
 
 @needs_numba

@@ -82,14 +82,14 @@ class Normal:
         diagonal = np.einsum("tii->ti", own)
         diagonal[...] = (1.0 + damping) * diagonal + _NOTHING
         by_shared = np.asarray(np.linalg.solve(own, self.mixed), np.float64)
-        alone = np.asarray(np.linalg.solve(own, self.own_pull[..., None])[..., 0], np.float64)
+        own_step = np.asarray(np.linalg.solve(own, self.own_pull[..., None])[..., 0], np.float64)
         information = self.shared + damping * np.diag(np.diag(self.shared))
         information = information - np.einsum("tli,tlj->ij", self.mixed, by_shared)
-        pull = self.shared_pull - np.einsum("tli,tl->i", self.mixed, alone)
-        return information, pull, by_shared, alone
+        pull = self.shared_pull - np.einsum("tli,tl->i", self.mixed, own_step)
+        return information, pull, by_shared, own_step
 
     def step(self, damping: float) -> tuple[Float, Float]:
         """Of the shared unknowns (U,) and the hands (T, L)."""
-        information, pull, by_shared, alone = self.reduced(damping)
+        information, pull, by_shared, own_step = self.reduced(damping)
         step = -np.asarray(np.linalg.solve(information, pull), np.float64)
-        return step, -alone - by_shared @ step
+        return step, -own_step - by_shared @ step

@@ -134,13 +134,13 @@ class BorderedNormal:
         sides = np.concatenate([self.border, self.pull[..., None]], axis=-1)
         solved = _solve_tridiagonal(*self._blocks(damping), _padded(sides.reshape(count * n, g + 1), 3 * n))
         solved = solved.reshape(-1, g + 1)[: count * n]
-        across, alone = solved[:, :g], solved[:, g]
+        across, own_step = solved[:, :g], solved[:, g]
         border = self.border.reshape(-1, g)
         information = self.corner - border.T @ across
         damped = information + damping * np.diag(np.diag(self.corner))
-        right = self.pull_constants - border.T @ alone
+        right = self.pull_constants - border.T @ own_step
         constants = np.asarray(np.linalg.solve(damped, right), np.float64)
-        return (alone - across @ constants).reshape(count, n), constants, information
+        return (own_step - across @ constants).reshape(count, n), constants, information
 
     def _blocks(self, damping: float) -> tuple[Float, Float]:
         """The band as a block-tridiagonal matrix of threes of coefficients: (B, 3n, 3n) on and below the diagonal."""

@@ -97,8 +97,8 @@ def calibrate_subject(
     points = model.flat(setup.on_plane(laser))[:, 1:]
     chosen = guided(points[..., 1])
     tips = np.array([one.tip_uv for one in cycles])[chosen.row, 1:]
-    doubt = np.array([one.tip_sigma_px for one in cycles])[chosen.row, 1:]
-    seen = ImageObservations(points[chosen.row], tips, doubt, chosen.bend)
+    tip_sigma_px = np.array([one.tip_sigma_px for one in cycles])[chosen.row, 1:]
+    seen = ImageObservations(points[chosen.row], tips, tip_sigma_px, chosen.bend)
     sigma = prior_sigma(_pose_sigma(rig), _length_sigma(hand))
     fit = fit_subject(model, seen, sigma)
     _check(fit, seen)

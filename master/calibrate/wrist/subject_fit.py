@@ -267,17 +267,17 @@ class _Normal:
         eye = damping * np.eye(LOCAL)
         own = self.own * (1.0 + eye) + 1e-9 * np.eye(LOCAL)
         by_shared = _solve(own, self.mixed)
-        alone = _solve(own, self.own_pull[..., None])[..., 0]
+        own_step = _solve(own, self.own_pull[..., None])[..., 0]
         information = self.shared * (1.0 + damping * np.eye(UNKNOWN))
         information = information - np.einsum("tfij,tfik->jk", self.mixed, by_shared)
-        pull = self.shared_pull - np.einsum("tfij,tfi->j", self.mixed, alone)
-        return information, pull, by_shared, alone
+        pull = self.shared_pull - np.einsum("tfij,tfi->j", self.mixed, own_step)
+        return information, pull, by_shared, own_step
 
     def step(self, damping: float) -> tuple[Float, Float]:
         """Of the shared unknowns (26,) and the angles (T, 4, 3)."""
-        information, pull, by_shared, alone = self.reduced(damping)
+        information, pull, by_shared, own_step = self.reduced(damping)
         step = -_solve(information, pull[:, None])[:, 0]
-        return step, -alone - by_shared @ step
+        return step, -own_step - by_shared @ step
 
 
 def fists_of(cost: Float) -> Bool:

@@ -6,9 +6,9 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.kernels import kernel
-from master.estimator.arcs import add_arcs
+from master.estimator.second_order import add_second_order
 from master.estimator.cameras import CameraArrays, project
-from master.estimator.certainty import Certainty, linear, surer
+from master.estimator.certainty import CovarianceScratch, linear, surer
 from master.estimator.extras import keep_extras, predict_extras
 from master.estimator.finger_surface import MOVES, laser_centroid, look
 from master.estimator.kinematics import Scratch, angles_of, chains, twist_hand
@@ -22,7 +22,7 @@ from master.estimator.workspace import Model
 from master.estimator.wrist_device import flexed_palm
 from master.estimator.wrist_rows import rotation_vector_jacobian
 
-__all__ = ["Certainty", "Scratch"]
+__all__ = ["CovarianceScratch", "Scratch"]
 
 
 @kernel
@@ -114,7 +114,7 @@ def joint_covariances(
     chains(hand, T, work.angles, work.R, work.P)
     linear(hand, T, cov, work, scratch, straight)
     linear(hand, T, cov, work, scratch, whole)
-    add_arcs(rig, settings, T, cov, seen, information, work, scratch, whole)
+    add_second_order(rig, settings, T, cov, seen, information, work, scratch, whole)
 
 
 @kernel

@@ -10,7 +10,7 @@ from common.hand_model import CHAINS, TIPS, WRIST, HandModel
 from common.records import boxed
 from master.estimator.body_points import BodyPoints
 from master.estimator.cameras import CameraArrays
-from master.estimator.certainty import Certainty
+from master.estimator.certainty import CovarianceScratch
 from master.estimator.epoch import FittedHand
 from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.kinematics import Scratch
@@ -45,13 +45,13 @@ def covariances(hand: FittedHand, cov: Float, seen: Bool, model: HandModel = RIG
         boxed(Device.none()),
     )
     straight, whole = np.empty((26, 3, 3)), np.empty((26, 3, 3))
-    storage, information = Certainty.empty(len(cov), 16), np.asarray(np.linalg.inv(small_cov()), np.float64)
+    storage, information = CovarianceScratch.empty(len(cov), 16), np.asarray(np.linalg.inv(small_cov()), np.float64)
     T, work = hand.T_rig_palm, boxed(Scratch.empty())
     joint_covariances(rig, T, hand.x, cov, seen, information, work, boxed(storage), straight, whole)
     return straight, whole
 
 
-def arcs(hand: FittedHand, cov: Float, seen: Bool, model: HandModel = RIGHT) -> Float:
+def second_order(hand: FittedHand, cov: Float, seen: Bool, model: HandModel = RIGHT) -> Float:
     """What arcs add (26, 3, 3)."""
     straight, whole = covariances(hand, cov, seen, model)
     return whole - straight
@@ -73,7 +73,7 @@ def jacobians(hand: FittedHand, model: HandModel = RIGHT) -> Float:
 
 
 def unsure(hand: FittedHand, rotation_rad: float, angle_rad: float) -> Float:
-    n = len(hand.alone)
+    n = len(hand.measurement_cov)
     return np.diag(
         np.concatenate([np.full(3, rotation_rad), np.full(3, 1e-4), np.full(n - 6, angle_rad)]) ** 2
     )
@@ -89,7 +89,7 @@ def test_what_is_left_of_the_tangent_is_that_of_drawn_hands() -> None:
         expected = np.einsum("tpi,tpj->pij", off, off) / DRAWS
         for joint in (*CHAINS[:, 0], *TIPS):
             size = np.trace(expected[joint])
-            np.testing.assert_allclose(arcs(hand, cov, NONE, model)[joint], expected[joint], atol=0.12 * size)
+            np.testing.assert_allclose(second_order(hand, cov, NONE, model)[joint], expected[joint], atol=0.12 * size)
 
 
 def about_the_back(hand: FittedHand) -> Float:
@@ -131,12 +131,12 @@ def test_an_uncertain_palm_rotation_widens_joints_around_the_marker_on_its_back(
 
 def test_tips_that_are_seen_stay_where_they_are() -> None:
     hand = solution()
-    far = np.trace(arcs(hand, 4.0 * hand.alone, NONE)[TIPS], axis1=1, axis2=2)
-    seen = np.trace(arcs(hand, 4.0 * hand.alone, np.ones(6, bool))[TIPS], axis1=1, axis2=2)
+    far = np.trace(second_order(hand, 4.0 * hand.measurement_cov, NONE)[TIPS], axis1=1, axis2=2)
+    seen = np.trace(second_order(hand, 4.0 * hand.measurement_cov, np.ones(6, bool))[TIPS], axis1=1, axis2=2)
     assert (seen < 1.0e-3**2).all()
     assert (far > 9.0 * seen).all()
 
 
 def test_a_sure_hand_has_no_second_order_covariance() -> None:
     hand = solution()
-    assert not arcs(hand, unsure(hand, 0.01, 0.01), np.ones(6, bool)).any()
+    assert not second_order(hand, unsure(hand, 0.01, 0.01), np.ones(6, bool)).any()

@@ -12,7 +12,7 @@ from common.hand_model import CHAINS, PALM, TIPS, HandModel
 from common.records import boxed
 from common.sim.motion import HandMotion, ScriptedMotion
 from common.sim.poses import StudyPoses
-from master.estimator.certainty import Certainty
+from master.estimator.certainty import CovarianceScratch
 from tests.hand_helpers import RIGHT, natural_angles, palm
 from tests.master.estimator.fitted import PARAMETERS, STEP_NS, estimator, found, places, push
 from tests.master.estimator.kernels import surer_at
@@ -25,7 +25,7 @@ CENTRE = np.array([0.0, 0.0, 0.5])
 def surer(now: Float, past: Float) -> Float:
     """In each direction that of the surer of two covariances (n, n)."""
     out = np.empty_like(now)
-    surer_at(now, past, boxed(Certainty.empty(len(now), 2)), out)
+    surer_at(now, past, boxed(CovarianceScratch.empty(len(now), 2)), out)
     return out
 
 

@@ -151,7 +151,7 @@ def test_what_both_hypotheses_have_between_them_is_uncertainty_as_well() -> None
         if not 0.2 < both.natural_weight < 0.8:
             continue
         off = natural.x - both.x
-        spread = np.sqrt(np.diag(both.alone)[6:])
+        spread = np.sqrt(np.diag(both.measurement_cov)[6:])
         assert (np.abs(off) < 5.0 * spread + 1e-6).all()
     assert sum(0.2 < share < 0.8 for share in shares) > 3
 

@@ -298,12 +298,12 @@ def test_covariances_of_joints_and_directions_are_those_of_numpy() -> None:
 
     N = 6 + FREE
     J = np.stack([(joints(1e-6 * e) - joints(-1e-6 * e)) / 2e-6 for e in np.eye(N)], axis=-1)
-    expected = J @ hand.alone @ J.swapaxes(1, 2)
+    expected = J @ hand.measurement_cov @ J.swapaxes(1, 2)
     np.testing.assert_allclose(hand.cov_m2, expected, atol=1e-5 * np.abs(expected).max())
     ends, before = CHAINS[:, 3], CHAINS[:, 2]
     p = hand.joints.position_m
     orientation = (J[ends] - J[before]) / np.linalg.norm(p[ends] - p[before], axis=1)[:, None, None]
-    expected = orientation @ hand.alone @ orientation.swapaxes(1, 2)
+    expected = orientation @ hand.measurement_cov @ orientation.swapaxes(1, 2)
     np.testing.assert_allclose(hand.tilt_cov_rad2, expected, atol=1e-5 * np.abs(expected).max())
     # A bending joint turns the end of its finger as fast as it bends itself: MCP, PIP and DIP = 2/3 PIP together.
     rate = np.concatenate(

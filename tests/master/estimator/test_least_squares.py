@@ -101,7 +101,7 @@ def compare(hand: FittedHand, T: Float, x: Float, share: float) -> None:
         / 2.0
     )
     step = np.concatenate([off, hand.T_rig_palm[:3, 3] - T[:3, 3], hand.x - x])
-    assert (np.abs(step) / np.sqrt(np.diag(hand.alone))).max() < share
+    assert (np.abs(step) / np.sqrt(np.diag(hand.measurement_cov))).max() < share
 
 
 @pytest.mark.parametrize("seed", range(6))

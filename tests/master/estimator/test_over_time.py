@@ -442,7 +442,7 @@ def test_a_copied_state_goes_on_with_the_same_bytes() -> None:
         assert boxed(machine.state).tobytes() == boxed(other.state).tobytes()
         assert one.solution is not None
         assert same.solution is not None
-        for name in ("T_rig_palm", "angles_rad", "cov_m2", "tilt_cov_rad2", "alone", "surprise"):
+        for name in ("T_rig_palm", "angles_rad", "cov_m2", "tilt_cov_rad2", "measurement_cov", "surprise"):
             np.testing.assert_array_equal(getattr(one.solution, name), getattr(same.solution, name))
         np.testing.assert_array_equal(one.tracked, same.tracked)
         np.testing.assert_array_equal(one.sources, same.sources)

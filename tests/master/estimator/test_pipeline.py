@@ -101,9 +101,9 @@ def test_rays_that_pass_each_other_are_dropped_and_counted(exact_run: SyntheticR
 
 
 def mistaken(
-    run: SyntheticRun, thing_m: Float, cameras: tuple[str, ...], *, doubt: bool
+    run: SyntheticRun, thing_m: Float, cameras: tuple[str, ...], *, with_alternatives: bool
 ) -> list[MarkerDetections]:
-    """From its 20th frame on these cameras take a thing at rest for the index marker; in `doubt` they name both."""
+    """From its 20th frame on these cameras take a thing at rest for the index marker; `with_alternatives`: both."""
     out: list[MarkerDetections] = []
     for m in run.messages:
         if m.camera not in cameras or m.seq < 20:
@@ -112,7 +112,7 @@ def mistaken(
         new = changed(m, 1, run.setup.models[m.camera].project(thing_m))
         alternatives = np.full((6, 2), np.nan)
         alternatives[1] = m.uv[1]
-        out.append(msgspec.structs.replace(new, alt_uv=alternatives) if doubt else new)
+        out.append(msgspec.structs.replace(new, alt_uv=alternatives) if with_alternatives else new)
     return out
 
 
@@ -125,14 +125,14 @@ def test_a_thing_that_one_slave_takes_for_a_marker_is_rejected_by_the_other_came
 ) -> None:
     clear = solve_all(build_pipeline(exact_run.setup, StageTimes()), exact_run.messages)
     pipeline = build_pipeline(exact_run.setup, StageTimes())
-    poses = solve_all(pipeline, mistaken(exact_run, THING, ("right",), doubt=True))
+    poses = solve_all(pipeline, mistaken(exact_run, THING, ("right",), with_alternatives=True))
     for pose, true in zip(poses, clear, strict=True):
         np.testing.assert_allclose(pose.markers_raw_m, true.markers_raw_m, atol=2e-3)
     assert all(pose.tracked[SURE].all() for pose in poses[3:])
     assert pipeline.counts["alternative.index"] >= 18
     assert pipeline.counts["epipolar_misfits"] == pipeline.counts["unclear.index"] == 0
     sure = build_pipeline(exact_run.setup, StageTimes())  # without the slave's doubt nothing can be chosen
-    lost = solve_all(sure, mistaken(exact_run, THING, ("right",), doubt=False))
+    lost = solve_all(sure, mistaken(exact_run, THING, ("right",), with_alternatives=False))
     assert all(np.isnan(p.markers_raw_m[1]).all() for p in lost[22:])
     assert sure.counts["apart.index"] >= 18
 
@@ -140,10 +140,10 @@ def test_a_thing_that_one_slave_takes_for_a_marker_is_rejected_by_the_other_came
 def test_a_law_of_disparity_rejects_a_thing_by_the_difference_of_rows() -> None:
     run = synthetic_run(30, depth_model="power_law", power_law=PowerLawCalibration(k_m=37.5, z=-1.0))
     pipeline = build_pipeline(run.setup, StageTimes())
-    poses = solve_all(pipeline, mistaken(run, OUT_OF_REACH, ("right",), doubt=True))
+    poses = solve_all(pipeline, mistaken(run, OUT_OF_REACH, ("right",), with_alternatives=True))
     assert all(marker_mm(p)[1] < 5.0 for p in poses[3:])
     sure = build_pipeline(run.setup, StageTimes())
-    lost = solve_all(sure, mistaken(run, np.array([-0.03, 0.08, 0.5]), ("right",), doubt=False))
+    lost = solve_all(sure, mistaken(run, np.array([-0.03, 0.08, 0.5]), ("right",), with_alternatives=False))
     assert all(np.isnan(p.markers_raw_m[1]).all() for p in lost[22:])
     assert sure.counts["apart.index"] >= 8
 
@@ -152,24 +152,24 @@ def test_a_thing_that_both_slaves_take_for_a_marker_is_rejected_by_where_the_han
     exact_run: SyntheticRun,
 ) -> None:
     pipeline = build_pipeline(exact_run.setup, StageTimes())
-    poses = solve_all(pipeline, mistaken(exact_run, OUT_OF_REACH, ("left", "right"), doubt=True))
+    poses = solve_all(pipeline, mistaken(exact_run, OUT_OF_REACH, ("left", "right"), with_alternatives=True))
     assert all(marker_mm(p)[1] < 3.0 for p in poses[3:])
     assert pipeline.counts["alternative.index"] >= 18
 
 
 def test_what_was_mistaken_long_ago_is_not_the_past_of_a_marker(exact_run: SyntheticRun) -> None:
     """Both slaves are sure of the thing for ten frames, then doubt: the hand says what is its finger."""
-    sure = mistaken(exact_run, OUT_OF_REACH, ("left", "right"), doubt=False)
-    doubt = mistaken(exact_run, OUT_OF_REACH, ("left", "right"), doubt=True)
+    sure = mistaken(exact_run, OUT_OF_REACH, ("left", "right"), with_alternatives=False)
+    with_alternatives = mistaken(exact_run, OUT_OF_REACH, ("left", "right"), with_alternatives=True)
     pipeline = build_pipeline(exact_run.setup, StageTimes())
-    poses = solve_all(pipeline, [d if d.seq >= 30 else s for s, d in zip(sure, doubt, strict=True)])
+    poses = solve_all(pipeline, [d if d.seq >= 30 else s for s, d in zip(sure, with_alternatives, strict=True)])
     assert all(marker_mm(p)[1] > 50.0 for p in poses[22:28])
     assert all(marker_mm(p)[1] < 5.0 for p in poses[34:])
 
 
 def test_what_fits_no_camera_is_dropped_with_its_rays_and_counted_by_name(exact_run: SyntheticRun) -> None:
     other = np.array([-0.06, 0.12, 0.55])
-    false = mistaken(exact_run, THING, ("left",), doubt=True)
+    false = mistaken(exact_run, THING, ("left",), with_alternatives=True)
     false = [
         msgspec.structs.replace(
             changed(m, 1, exact_run.setup.models["right"].project(other)),

@@ -29,10 +29,10 @@ def shown(
 ) -> HandPose:
     """The hand of these angles; per finger the doubt of its joints (5,) [m] and whether it is observed (5,)."""
     joints = model.forward(palm() if T_rig_palm is None else T_rig_palm, angles_rad)
-    doubt, seen = np.full(26, 1e-3), np.ones(26, np.bool_)
+    joint_sigma_m, seen = np.full(26, 1e-3), np.ones(26, np.bool_)
     for f in range(5):
         own = slice(2, 6) if f == 0 else slice(7 + 5 * (f - 1), 11 + 5 * (f - 1))
-        doubt[own] = 1e-3 if sigma_m is None else sigma_m[f]
+        joint_sigma_m[own] = 1e-3 if sigma_m is None else sigma_m[f]
         seen[own] = True if tracked is None else tracked[f]
     return HandPose(
         hand=model.profile.name,
@@ -42,7 +42,7 @@ def shown(
         radius_m=model.radius_m,
         valid=np.ones(26, np.bool_),
         tracked=seen,
-        cov_m2=doubt[:, None, None] ** 2 * np.eye(3),
+        cov_m2=joint_sigma_m[:, None, None] ** 2 * np.eye(3),
         source=np.ones(26, np.uint8),
         angles_rad=angles_rad,
         markers_m=np.zeros((0, 3)),

@@ -113,7 +113,7 @@ def test_one_bad_instant_in_a_quick_turn_is_led_over() -> None:
 
 
 def test_an_uncertain_palm_does_not_delay_a_grip_whose_tips_stand_still() -> None:
-    def doubted(k: int) -> HandPose:
+    def uncertain(k: int) -> HandPose:
         pose = _pose(k, 0.0, 0.0)
         if k % 3:
             return pose
@@ -122,7 +122,7 @@ def test_an_uncertain_palm_does_not_delay_a_grip_whose_tips_stand_still() -> Non
         wxyz = matrix_to_quaternion(over @ MODEL.forward(np.eye(4), pose.angles_rad).rotation)
         return msgspec.structs.replace(pose, orientation_wxyz=wxyz)
 
-    gestures = _dial([doubted(k) for k in range(40)])
+    gestures = _dial([uncertain(k) for k in range(40)])
     begun = [one.t_ns for one in gestures if one.phase == "begin"]
     hold_ns = default_gestures().dial.hold_s * 1e9
     assert len(begun) == 1

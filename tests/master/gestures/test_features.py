@@ -93,9 +93,9 @@ def test_a_finger_that_a_pose_lacks_leaves_the_others() -> None:
 
 def test_a_hidden_finger_is_taken_for_bent_and_a_seen_one_is_not() -> None:
     column = QUANTITIES.index("ring_bend_deg")
-    straight, doubt = np.zeros((5, 4)), np.array([1e-3, 1e-3, 1e-3, 0.05, 1e-3])
-    seen = Quantities.of(of(shown(straight, sigma_m=doubt)))
-    hidden = Quantities.of(of(shown(straight, sigma_m=doubt, tracked=np.arange(5) != 3)))
+    straight, sigma_m = np.zeros((5, 4)), np.array([1e-3, 1e-3, 1e-3, 0.05, 1e-3])
+    seen = Quantities.of(of(shown(straight, sigma_m=sigma_m)))
+    hidden = Quantities.of(of(shown(straight, sigma_m=sigma_m, tracked=np.arange(5) != 3)))
     assert abs(seen.value[column]) < 15.0
     assert hidden.value[column] > 60.0
     assert hidden.sigma[column] < seen.sigma[column]

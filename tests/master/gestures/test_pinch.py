@@ -17,22 +17,22 @@ def recognised_in(
     gap_mm: tuple[float, float, float, float],
     sigma_mm: float = 1.0,
     apart_deg: float = 60.0,
-    doubt_deg: float = 5.0,
+    sigma_deg: float = 5.0,
 ) -> list[str]:
     """Names of the pinches that begin at such gaps to index ... little."""
     seen = FeatureExtractor(RIGHT).of(shown(posture(PINCH), FRAME_NS))
     assert seen is not None
-    touch = changed(thumb_touch(seen, RIGHT.radius_m), gap_mm, sigma_mm, apart_deg, doubt_deg)
+    touch = changed(thumb_touch(seen, RIGHT.radius_m), gap_mm, sigma_mm, apart_deg, sigma_deg)
     return [one.name for one in PinchMonitor(PINCHES).push(seen, touch, may_begin=True)]
 
 
 def changed(
-    touch: ThumbTouch, gap_mm: tuple[float, ...], sigma_mm: float, apart_deg: float, doubt_deg: float
+    touch: ThumbTouch, gap_mm: tuple[float, ...], sigma_mm: float, apart_deg: float, sigma_deg: float
 ) -> ThumbTouch:
     return touch._replace(
         gap_m=1e-3 * np.array(gap_mm),
         apart_rad=np.full(4, np.radians(apart_deg)),
-        apart_sigma_rad=np.full(4, np.radians(doubt_deg)),
+        apart_sigma_rad=np.full(4, np.radians(sigma_deg)),
         key_sigma_m=np.full((4, 3), 1e-3 * sigma_mm),
     )
 
@@ -57,15 +57,15 @@ def test_a_gap_that_is_not_known_is_no_pinch() -> None:
 
 
 def test_where_the_others_are_away_no_bend_is_asked_for() -> None:
-    assert recognised_in((3.0, 60.0, 70.0, 80.0), apart_deg=150.0, doubt_deg=60.0) == ["index"]
+    assert recognised_in((3.0, 60.0, 70.0, 80.0), apart_deg=150.0, sigma_deg=60.0) == ["index"]
 
 
 def test_a_closing_fist_whose_bends_are_uncertain_is_withheld() -> None:
     # The thumb comes over the index finger, the others follow at a finger's breadth each.
     fist = (6.0, 13.0, 32.0, 52.0)
-    assert recognised_in(fist, apart_deg=80.0, doubt_deg=5.0) == ["index"]
-    assert not recognised_in(fist, apart_deg=80.0, doubt_deg=30.0)
-    assert not recognised_in(fist, apart_deg=120.0, doubt_deg=1.0)
+    assert recognised_in(fist, apart_deg=80.0, sigma_deg=5.0) == ["index"]
+    assert not recognised_in(fist, apart_deg=80.0, sigma_deg=30.0)
+    assert not recognised_in(fist, apart_deg=120.0, sigma_deg=1.0)
 
 
 def test_fingers_in_a_bunch_are_nobodys_pinch() -> None:

@@ -100,15 +100,15 @@ def test_uncertainty_at_the_border_flickers_neither_on_nor_off() -> None:
 
 
 def test_hidden_fingers_do_not_stop_a_pose_but_an_unknown_hand_begins_none() -> None:
-    doubt, nothing = np.full(5, 0.2), np.zeros(5, np.bool_)
-    assert play([posture(POINT)] * 60, sigma_m=doubt, tracked=nothing)[1] == []
+    sigma_m, nothing = np.full(5, 0.2), np.zeros(5, np.bool_)
+    assert play([posture(POINT)] * 60, sigma_m=sigma_m, tracked=nothing)[1] == []
     recogniser = PoseRecogniser(SETTINGS)
     for k in range(5):
         recogniser.push(_features(shown(posture(POINT), k * FRAME_NS)))
     assert recogniser.held == POINT
     said: list[Gesture] = []
     for k in range(5, 240):
-        hidden = shown(posture(POINT), k * FRAME_NS, sigma_m=doubt, tracked=nothing)
+        hidden = shown(posture(POINT), k * FRAME_NS, sigma_m=sigma_m, tracked=nothing)
         said += recogniser.push(_features(hidden))
     assert [one.phase for one in said].count("end") == 1
     kept_s = 1e-9 * (said[-1].t_ns - 4 * FRAME_NS)
@@ -119,21 +119,21 @@ def test_hidden_fingers_do_not_stop_a_pose_but_an_unknown_hand_begins_none() -> 
 
 def test_a_pose_of_known_fingers_begins_where_no_sensor_sees_a_tip_just_now() -> None:
     nothing = np.zeros(5, np.bool_)
-    for doubt, said in ((0.005, [POINT]), (0.2, [])):
-        begun = play([posture(POINT)] * 30, sigma_m=np.full(5, doubt), tracked=nothing)[1]
+    for sigma_m, said in ((0.005, [POINT]), (0.2, [])):
+        begun = play([posture(POINT)] * 30, sigma_m=np.full(5, sigma_m), tracked=nothing)[1]
         assert [one.name for one in begun if one.phase == "begin"] == said
 
 
 def test_pointing_is_recognised_with_the_three_bent_fingers_hidden() -> None:
     # What cameras see from behind a pointing hand: thumb and index.
-    doubt = np.array([1e-3, 1e-3, 0.05, 0.05, 0.05])
-    assert play([posture(POINT)] * 30, sigma_m=doubt, tracked=np.arange(5) < 2)[0][-1] == POINT
+    sigma_m = np.array([1e-3, 1e-3, 0.05, 0.05, 0.05])
+    assert play([posture(POINT)] * 30, sigma_m=sigma_m, tracked=np.arange(5) < 2)[0][-1] == POINT
 
 
 def test_an_open_palm_is_recognised_without_its_thumb() -> None:
     # A device at the wrist does not see it.
-    doubt = np.array([0.05, 2e-3, 2e-3, 2e-3, 2e-3])
-    assert play([posture(OPEN)] * 4, sigma_m=doubt, tracked=np.arange(5) > 0)[0][-1] == OPEN
+    sigma_m = np.array([0.05, 2e-3, 2e-3, 2e-3, 2e-3])
+    assert play([posture(OPEN)] * 4, sigma_m=sigma_m, tracked=np.arange(5) > 0)[0][-1] == OPEN
 
 
 def test_a_lost_hand_ends_its_pose_in_time() -> None:

@@ -110,9 +110,9 @@ def test_examples_that_show_no_pose_are_refused() -> None:
 
 
 def test_a_hidden_hand_cannot_teach() -> None:
-    doubt, hidden = np.full(5, 0.1), np.zeros(5, np.bool_)
+    sigma_m, hidden = np.full(5, 0.1), np.zeros(5, np.bool_)
     made = [
-        FeatureExtractor(RIGHT).of(shown(horns(), k * FRAME_NS, sigma_m=doubt, tracked=hidden))
+        FeatureExtractor(RIGHT).of(shown(horns(), k * FRAME_NS, sigma_m=sigma_m, tracked=hidden))
         for k in range(8)
     ]
     unseen = Example.of([one for one in made if one is not None])

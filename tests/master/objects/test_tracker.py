@@ -91,8 +91,8 @@ def test_while_it_is_lost_the_pose_is_held_ever_less_sure_and_then_there_is_none
 def test_a_leap_is_first_rejected_and_then_accepted() -> None:
     line, far = TrackerLine(CUBE, RIG), HERE + np.array([0.5, 0.0, 0.0])
     one(line, pose_at(0.0))
-    doubted = one(line, pose_at(10.0, far))
-    assert (doubted.source, doubted.tracked) == (ObjectSource.HELD, False)
+    leapt = one(line, pose_at(10.0, far))
+    assert (leapt.source, leapt.tracked) == (ObjectSource.HELD, False)
     assert one(line, pose_at(20.0)).tracked
     poses = [one(line, pose_at(30.0 + 10.0 * k, far)) for k in range(17)]
     assert [pose.tracked for pose in poses] == [False] * 15 + [True] * 2

@@ -10,12 +10,12 @@ from master.objects.trajectory import HELD_S, Trajectory
 FRAME_NS = 16_666_667
 
 
-def fitted(speed_m_s: float, *, alone: bool = True) -> Fitted:
+def fitted(speed_m_s: float, *, measured_only: bool = True) -> Fitted:
     rates = np.zeros((ORDERS, 2, 3))
     rates[1, 0, 0] = speed_m_s
     motion = Motion(rigid(np.eye(3), np.array([0.0, 0.0, 0.5])), rates)
     one = np.ones(4)
-    return Fitted(motion, 1e-6 * np.eye(12), 0.0, one, one, one, alone)
+    return Fitted(motion, 1e-6 * np.eye(12), 0.0, one, one, one, measured_only)
 
 
 def test_its_speed_dies_away() -> None:
@@ -45,7 +45,7 @@ def test_a_never_complete_pose_is_forgotten() -> None:
     trajectory = Trajectory()
     assert trajectory.push(0, fitted(0.0))
     last = round(HELD_S * 1e9 / FRAME_NS)
-    accepted = [trajectory.push(k * FRAME_NS, fitted(0.0, alone=False)) for k in range(1, last + 3)]
+    accepted = [trajectory.push(k * FRAME_NS, fitted(0.0, measured_only=False)) for k in range(1, last + 3)]
     assert all(accepted[: last - 1])
     assert not accepted[-1]
 

@@ -81,15 +81,15 @@ def test_a_line_in_parts_has_more_uncertainty_by_what_its_parts_would_move_it() 
     fingers = separate(
         lit(renderer.render(0.0, Illumination.LED), renderer.render(0.0, Illumination.AMBIENT)), VIEW
     )
-    doubt: list[float] = []
+    sigma_px: list[float] = []
     for apart in (0.0, 12.0, 24.0):
 
         def row(u: Float, apart: float = apart) -> Float:
             return np.where(u < u0, v0, v0 - apart)
 
         found = laser_lines(drawn(row, (round(u0) - 14, round(u0) + 10), 220.0), fingers, VIEW)
-        doubt.append(float(found.sigma_px[INDEX]))
-    whole, near, far = doubt
+        sigma_px.append(float(found.sigma_px[INDEX]))
+    whole, near, far = sigma_px
     assert whole < 1.0 < near < far
 
 
