@@ -172,7 +172,7 @@ class Moment(NamedTuple):
 
     after_s: float
     off_deg: Float
-    surprise: Float
+    joint_chi2: Float
 
 
 def moments(arm: Arm, kind: Kind, rigs: tuple[RigSetup, WristSetup]) -> Iterator[Moment]:
@@ -209,13 +209,13 @@ def _moment(
     heading = remainder(z[HEADING] - arm.heading(sample), 2.0 * pi)
     bent = z[WRIST_ANGLES : WRIST_ANGLES + 2] - truth
     palm = matrix_to_rotation_vector(arm.palm(t_s) @ hand.solution.T_rig_palm[:3, :3].T)
-    surprise = (
+    joint_chi2 = (
         heading**2 / cov[HEADING, HEADING],
         bent @ np.linalg.solve(cov[WRIST_ANGLES : WRIST_ANGLES + 2, WRIST_ANGLES : WRIST_ANGLES + 2], bent),
         palm @ np.linalg.solve(hand.solution.measurement_cov[:3, :3], palm),
     )
     off = [float(np.linalg.norm(one)) for one in (heading, bent, palm, last - truth, truth)]
-    return Moment(after_s, np.degrees(off), np.array(surprise))
+    return Moment(after_s, np.degrees(off), np.array(joint_chi2))
 
 
 def rows() -> Iterator[Row]:
@@ -228,7 +228,7 @@ def rows() -> Iterator[Row]:
         for after_s in _AFTER_S:
             group = [one for one in found if one.after_s == after_s]
             off = _rms(np.array([one.off_deg for one in group]))
-            inside = 100.0 * (np.array([one.surprise for one in group]) < _REGION).mean(axis=0)
+            inside = 100.0 * (np.array([one.joint_chi2 for one in group]) < _REGION).mean(axis=0)
             when = "visible" if after_s == 0.0 else f"{after_s:g} s after"
             notes = "", f"; kept as it was {off[3]:.1f}, believed straight {off[4]:.1f}", ""
             for k, what in enumerate(("heading", "bend", "palm")):

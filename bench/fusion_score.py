@@ -121,12 +121,12 @@ class Figures:
     @classmethod
     def of(cls, solved: Solved, sighted: Sighted) -> Self:
         """Reckon them."""
-        off, pip, surprise, steps = solved.off_mm, solved.pip_deg, solved.surprise, solved.steps_mm
+        off, pip, joint_chi2, steps = solved.off_mm, solved.pip_deg, solved.joint_chi2, solved.steps_mm
         tracked = solved.poses.tracked
         unseen = tracked & ~sighted.observed
         far = tracked & (np.linalg.norm(solved.poses.position_m - solved.truth_m, axis=2) > OFF_M)
         bits = max(int(tracked.sum()), 1)
-        near = np.zeros(surprise.shape, np.bool_)
+        near = np.zeros(joint_chi2.shape, np.bool_)
         near[:, CHAINS - 1] = sighted.hand_over[:, :, None]
         span_s = float(solved.t_s[-1] - solved.t_s[0])
         worst = _most(steps)
@@ -138,8 +138,8 @@ class Figures:
             hidden_deg=_mean(np.where(sighted.hidden, pip, np.nan)[:, 1:]),
             valid=float(solved.poses.valid[:, 1:].mean()),
             tracked=float(tracked[:, 1:].mean()),
-            inside=_inside(surprise),
-            inside_hand_over=_inside(np.where(near, surprise, np.nan)),
+            inside=_inside(joint_chi2),
+            inside_hand_over=_inside(np.where(near, joint_chi2, np.nan)),
             step_mm=float(worst.max(initial=0.0)),
             over_step=60.0 * float((worst > STEP_MM).sum()) / span_s,
             false_tracked=float((unseen | far).any(axis=1).mean()),
@@ -162,8 +162,8 @@ def _mean(values: Float) -> float:
     return float(known.mean()) if known.size else float("nan")
 
 
-def _inside(surprise: Float) -> float:
-    known = surprise[np.isfinite(surprise)]
+def _inside(joint_chi2: Float) -> float:
+    known = joint_chi2[np.isfinite(joint_chi2)]
     return float((known < REGION).mean()) if known.size else float("nan")
 
 

@@ -85,7 +85,7 @@ class Solved:
         return np.where(self.poses.valid[:, CHAINS[:, 1]], off, np.nan)
 
     @property
-    def surprise(self) -> Float:
+    def joint_chi2(self) -> Float:
         """(N, 25) chi square of every joint by its own covariance; NaN where not valid or without one."""
         off = (self.poses.position_m - self.truth_m)[:, 1:]
         cov = self.poses.cov_m2[:, 1:]

@@ -235,7 +235,7 @@ def _simulated(part: str, rest_s: float, pooled: list[TiltErrors]) -> Iterator[R
     tilt: list[TiltErrors] = []
     theirs: list[float] = []
     drift: list[float] = []
-    surprise: list[float] = []
+    joint_chi2: list[float] = []
     for seed in _SEEDS:
         motion, fusion = Gestures(seed, rest_s), OrientationFilter(_LEVEL.rate_hz)
         sensor = SimulatedImu(motion, _LEVEL, seed, _PARTS[part])
@@ -256,7 +256,7 @@ def _simulated(part: str, rest_s: float, pooled: list[TiltErrors]) -> Iterator[R
         errors = Errors.of(found, recording)
         begun = said[int(np.argmax(moving))][1]
         drift.append(errors.drift_deg_per_min)
-        surprise.append(errors.heading_deg[-1] / np.degrees(np.sqrt(max(said[-1][1] ** 2 - begun**2, 1e-12))))
+        joint_chi2.append(errors.heading_deg[-1] / np.degrees(np.sqrt(max(said[-1][1] ** 2 - begun**2, 1e-12))))
     pooled += tilt
     name = f"simulated {part}, {'rested' if rest_s else 'never at rest'}"
     rms, within = _rms(np.array([one.rms_deg for one in tilt])), np.mean([one.within for one in tilt])
@@ -267,7 +267,7 @@ def _simulated(part: str, rest_s: float, pooled: list[TiltErrors]) -> Iterator[R
     yield Row(
         f"{name}: inclination", rms, "deg rms", f"{len(_SEEDS)} arms, a minute each; {against}; {stated_text}"
     )
-    note = f"{_rms(np.array(surprise)):.1f} of what heading_sigma_rad says (rms)"
+    note = f"{_rms(np.array(joint_chi2)):.1f} of what heading_sigma_rad says (rms)"
     yield Row(f"{name}: heading", _rms(np.array(drift)), "deg/min", note)
 
 

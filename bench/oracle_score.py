@@ -103,7 +103,7 @@ class Samples:
     thumb_deg: Float = field(default_factory=_nothing)
     rest_mm: Float = field(default_factory=_nothing)
     spent_us: Float = field(default_factory=_nothing)
-    misfit: Float = field(default_factory=lambda: np.zeros(len(LAGS_NS)))
+    lag_chi2: Float = field(default_factory=lambda: np.zeros(len(LAGS_NS)))
     wanted: int = 0
     epochs: int = 0
     without: int = 0
@@ -126,7 +126,7 @@ class Samples:
                     "spent_us",
                 )
             ),
-            misfit=self.misfit + other.misfit,
+            lag_chi2=self.lag_chi2 + other.lag_chi2,
             wanted=self.wanted + other.wanted,
             epochs=self.epochs + other.epochs,
             without=self.without + other.without,
@@ -168,7 +168,7 @@ def _piece(run: Solved, truth: Truth, other_ns: Int) -> Samples:
         thumb_deg=thumb_deg[np.isfinite(thumb_deg)],
         rest_mm=_rest_mm(run, truth, valid),
         spent_us=run.spent_us,
-        misfit=_misfit(run, truth, scored & run.tracked),  # others are off by more than they lag
+        lag_chi2=_lag_chi2(run, truth, scored & run.tracked),  # others are off by more than they lag
         wanted=int(known.sum()) + missed * int(known.any(axis=0).sum()),
         epochs=int(exists.sum()) + missed,
         without=int((exists & ~scored.any(axis=1)).sum()) + missed,
@@ -211,7 +211,7 @@ def _rest_mm(run: Solved, truth: Truth, valid: Bool) -> Float:
     return step[rests[:, None] & known & valid[1:] & valid[:-1]]
 
 
-def _misfit(run: Solved, truth: Truth, scored: Bool) -> Float:
+def _lag_chi2(run: Solved, truth: Truth, scored: Bool) -> Float:
     """(L,) sum over joints of the squares of what differs in motion, each joint's mean error left out."""
     out = np.zeros(len(LAGS_NS))
     if not truth.continuous:
@@ -249,7 +249,7 @@ def figures(samples: Samples) -> dict[str, float]:
         "TRACKED %": 100.0 * float(tracked.sum()) / samples.wanted if samples.wanted else np.nan,
         "false TRACKED %": 100.0 * _mean(samples.false[tracked]),
         "jitter mm": float(np.sqrt(_mean(samples.rest_mm**2))),
-        "lag ms": _lag_ms(samples.misfit),
+        "lag ms": _lag_ms(samples.lag_chi2),
         "pose us": _percentile(samples.spent_us, 50.0),
         "poses": float(len(samples.spent_us)),
         "no hand": float(samples.without),
@@ -265,11 +265,11 @@ def _percentile(values: Float, share: float) -> float:
     return float(np.percentile(values, share)) if len(values) else np.nan
 
 
-def _lag_ms(misfit: Float) -> float:
+def _lag_ms(lag_chi2: Float) -> float:
     """Where it is least, by a parabola through three; NaN where nothing moves, or at an end."""
-    k = int(misfit.argmin())
-    if not misfit.any() or k in (0, len(misfit) - 1):
+    k = int(lag_chi2.argmin())
+    if not lag_chi2.any() or k in (0, len(lag_chi2) - 1):
         return np.nan
-    before, at, after = misfit[k - 1 : k + 2]
+    before, at, after = lag_chi2[k - 1 : k + 2]
     bend = before - 2.0 * at + after
     return float(1e-6 * LAGS_NS[k] + (0.5 * (before - after) / bend if bend > 0.0 else 0.0))

@@ -159,7 +159,7 @@ def errors_of(run: _Run, imu: ImuCalibration | None, seed: int) -> _Errors:
             palm.append(float(np.degrees(2.0 * np.arccos(min(rotation[0], 1.0)))))
             off = (pose.position_m - truth.joints.position_m)[WRIST:]
             joint.append(1e3 * float(np.linalg.norm(off, axis=1).mean()))
-            surprise = np.vecdot(off, np.linalg.solve(pose.cov_m2[WRIST:], off[..., None])[..., 0])
-            held.append(float((surprise < _REGION).mean()))
+            joint_chi2 = np.vecdot(off, np.linalg.solve(pose.cov_m2[WRIST:], off[..., None])[..., 0])
+            held.append(float((joint_chi2 < _REGION).mean()))
             pip.append(float(np.degrees(np.abs(pose.angles_rad - truth.angles_rad)[1:, 2].mean())))
     return _Errors(np.array(palm), np.array(joint), np.array(pip), np.array(held))

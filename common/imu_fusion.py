@@ -36,7 +36,7 @@ _CLOCK_S = 1.0  # a sample so much older than the last is not late: a clock was 
 _RATE_RAD_S, _FORCE_M_S2 = 100.0, 2000.0  # beyond any range there is (4000 deg/s, 200 g)
 _FALLING_M_S2 = 1.0  # shorter forces have no direction
 _BIAS_MOST_RAD_S, _SCALE_MOST = 3.0 * BIAS_RAD_S, 0.03  # three sigma of what they begin with
-_SURPRISE_RAD_S = radians(0.1)  # three of it beyond what is believed: rather a slow turn
+_GATE_RAD_S = radians(0.1)  # three of it beyond what is believed: rather a slow turn
 _CONTRARY_S = 6.0  # of such rest: an even turn hardly lasts so long, rather the bias was learnt in one
 _NONE, _ZERO = np.full(4, np.nan), np.zeros(3)
 
@@ -137,7 +137,7 @@ class OrientationFilter:
         if not self._stillness.still:
             self._contrary_s = 0.0
             return
-        off, most = rate - self._bias, 3.0 * sqrt(self._errors.bias_rad_s**2 + _SURPRISE_RAD_S**2)
+        off, most = rate - self._bias, 3.0 * sqrt(self._errors.bias_rad_s**2 + _GATE_RAD_S**2)
         if np.abs(off).max() <= most:
             self._agreed_s = self._contrary_s = 0.0
         else:

@@ -24,7 +24,7 @@ from master.estimator.wrist_model import WristModel, loosened
 from master.estimator.wrist_pipeline import WristPipeline
 from master.fabrik.caps import CapTables
 from master.fabrik.compile import log_if_slow
-from master.fabrik.depth import LAW_MISFIT, CalibrationResidual, depth_law, law_contradicts, law_misfit
+from master.fabrik.depth import LAW_RESIDUAL, CalibrationResidual, depth_law, law_contradicts, law_residual
 from master.fabrik.intersection import RAYS, limits_of
 from master.fabrik.one_euro import OneEuroParameters, PointFilter
 from master.fabrik.rays import RayTriangulator
@@ -136,8 +136,8 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
                 f"rig {rig.name!r}: {contradiction}: calibrate the cameras and the depth again, or set solver to"
                 " 'fabrik', which takes the depth alone"
             )
-        off, _ = law_misfit(law, cameras, rig.volume)
-        tilt_px = 0.0 if off <= LAW_MISFIT else float(cameras[0].matrix[1, 1]) * _MOUNTED_RAD
+        off, _ = law_residual(law, cameras, rig.volume)
+        tilt_px = 0.0 if off <= LAW_RESIDUAL else float(cameras[0].matrix[1, 1]) * _MOUNTED_RAD
         row_px = hypot(sqrt(2.0) * RAYS.rig_px, tilt_px)
         tables = disparity_tables(cameras, law, residual.law, row_px, float(limits_of(2)[2]))
         triangulate = DepthTriangulator(tables, CapTables.of(setup.hand, rig.markers))

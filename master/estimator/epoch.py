@@ -103,7 +103,7 @@ class FittedHand(SolvedHand):
     x: Float
     scale: float
     natural_weight: float
-    surprise: Float
+    marker_chi2: Float
     steps: int
     twist: Float = field(default_factory=lambda: np.zeros(5))
 

@@ -225,10 +225,10 @@ class EpochSteps:
         back = self.at.ground.back[0]
         return bool(back and extent[0] > _LENGTH_M and abs(axes[0] @ at.back_normal) < _ACROSS)
 
-    def unexplained(self) -> bool:
+    def has_outlier(self) -> bool:
         """Return whether a marker is too far from what was found."""
-        surprise = self.at.found.surprise[: len(self.on_hand)]
-        return bool((surprise > self._settings.explained).any())
+        marker_chi2 = self.at.found.marker_chi2[: len(self.on_hand)]
+        return bool((marker_chi2 > self._settings.marker_gate).any())
 
     def _lay_out(self, wrist: WristModel) -> None:
         """Write what is believed of fingers before a wrist device, and of what it leaves open."""

@@ -151,10 +151,10 @@ class Estimator:
             The hand; None: there is none. And whether the one before was wrong.
         """
         if known:
-            wrong, explained = self._go_on(at, may_leave=True)
+            wrong, consistent = self._go_on(at, may_leave=True)
             # Where nothing is better, what goes on is kept.
-            goes_on = explained or wrong <= self.settings.misled + self._reinitialiser.begin(at)
-            if goes_on and not explained:
+            goes_on = consistent or wrong <= self.settings.misled + self._reinitialiser.begin(at)
+            if goes_on and not consistent:
                 self._go_on(at, may_leave=False)
         elif self._steps.enough(at):
             goes_on = False
@@ -181,7 +181,7 @@ class Estimator:
         # Whether a hand obeys habits, fingers before a wrist device say by themselves.
         wrong = self._steps.fit(self._posture_prior if self._at.ground.seen[0] > 0 else self._natural_prior)
         if self._natural_only and may_leave:
-            return wrong, not (self._steps.unexplained() and self._steps.enough(at))
+            return wrong, not (self._steps.has_outlier() and self._steps.enough(at))
         return wrong, not wrong > limit  # NaN: there is nothing to compare
 
     def _knows_place(self) -> bool:
@@ -225,7 +225,7 @@ class Estimator:
             x=found.x.copy(),
             scale=float(found.scale[0]),
             natural_weight=float(found.natural_weight[0]),
-            surprise=found.surprise[: len(self._steps.on_hand)].copy(),
+            marker_chi2=found.marker_chi2[: len(self._steps.on_hand)].copy(),
             steps=int(found.steps[0]),
             twist=self._now.z[:5].copy() if self.wrist else np.zeros(5),
         )

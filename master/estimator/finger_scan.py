@@ -144,7 +144,7 @@ class Scan:
     mode: Float
     way: Float
     pip2: Float
-    misfit: Float
+    chi2: Float
     parts: Float
     known: Float
     first: Int
@@ -181,7 +181,7 @@ class Scan:
             mode=(5, 5),
             way=(5, 5),
             pip2=5,
-            misfit=5,
+            chi2=5,
             parts=5,
             known=5,
             first=("i8", 5),
@@ -295,10 +295,10 @@ def scan_finger(
     tip: bool,
     scan: Scan,
 ) -> None:
-    """Write the valley of finger f, from `Scan.x` to `misfit`."""
+    """Write the valley of finger f, from `Scan.x` to `chi2`."""
     a, x, surface = scan.angles, scan.x, scan.surface
     low, high = hand.limits[f, 2, 0], hand.limits[f, 2, 1]
-    scan.misfit[f] = inf
+    scan.chi2[f] = inf
     scan.first[f], scan.last[f] = 0, NODES - 1
     if prior.near_rad[f] > 0.0:
         step = (high - low) / (NODES - 1)
@@ -377,7 +377,7 @@ def scan_finger(
         scan.lack[f, node, 0], scan.lack[f, node, 1] = lines_of_sight.lack[f, 0], lines_of_sight.lack[f, 1]
         for i in range(ROWS):
             scan.rows[f, node, i] = scan.r[i]
-        scan.misfit[f] = min(scan.misfit[f], 2.0 * cost)
+        scan.chi2[f] = min(scan.chi2[f], 2.0 * cost)
         scan.showing[f, node] = 1.0 if _shows(device, prior, length, scan) else 0.0
     # Where a node happens to lie on a turn of the ridge, its volume is of that pose alone.
     for node in range(scan.first[f] + 1, scan.last[f]):

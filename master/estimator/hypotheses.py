@@ -31,7 +31,7 @@ class Posterior:
     x: Float
     z: Float
     cov: Float
-    surprise: Float
+    marker_chi2: Float
     steps: Float
     natural_weight: Float
     scale: Float
@@ -47,7 +47,7 @@ class Posterior:
             x=n,
             z=extras,
             cov=(N, N),
-            surprise=markers,
+            marker_chi2=markers,
             steps=1,
             natural_weight=1,
             scale=1,
@@ -89,7 +89,7 @@ class Hypothesis:
     z: Float
     gradient: Float
     normal: Float
-    surprise: Float
+    marker_chi2: Float
     information: Float
     cost: Float
     outliers: Float
@@ -108,7 +108,7 @@ class Hypothesis:
             z=extras,
             gradient=N,
             normal=(N, N),
-            surprise=markers,
+            marker_chi2=markers,
             information=(markers, 3, 3),
             cost=1,
             outliers=1,

@@ -302,7 +302,7 @@ class MarkerPipeline:
         """Count markers whose rays do not meet, and what is left out of each camera."""
         if found.outliers.any():
             self._count("apart", found.outliers)
-            self.counts["epipolar_misfits"] += int(found.outliers.sum())
+            self.counts["epipolar_outliers"] += int(found.outliers.sum())
         sees = np.isfinite(frames.uv[..., 0]) & np.isfinite(found.points_m[:, 0])
         mostly = found.rejected.sum(axis=1) > 0.5 * sees.sum(axis=1)
         for c in np.flatnonzero(found.rejected.any(axis=1)):

@@ -34,7 +34,7 @@ from master.estimator.problem import EpochPrior, Rig
 from master.estimator.residuals import Observations
 from master.estimator.settings import Settings
 from master.estimator.solve import descend, linearise, own_cost, past_cost
-from master.estimator.truncated import mean_within
+from master.estimator.truncated import truncated_mean
 
 _LITTLE = 1e-4  # of a step: what a difference is taken over
 _ONLY = constant(0)  # hypothesis of `Blank`
@@ -81,7 +81,7 @@ def _solve_each(
         )
         one.outliers[0] = scratch.search.outliers[0]
         for m in range(rig.mounts.finger.shape[0]):
-            one.surprise[m] = scratch.search.surprise[m]
+            one.marker_chi2[m] = scratch.search.marker_chi2[m]
             for i in range(3):
                 for j in range(3):
                     one.information[m, i, j] = scratch.search.information[m, i, j]
@@ -203,7 +203,7 @@ def _mix(
             for j in range(N):
                 out.cov[i, j] += share * scratch.cov[i, j]
         if h > 0 and share > settings.noticed:
-            mean_within(rig.hand, one.normal, one.gradient, one.x, scratch.cut, one.step)
+            truncated_mean(rig.hand, one.normal, one.gradient, one.x, scratch.cut, one.step)
         for i in range(N):
             one.off[i] += one.step[i]
             scratch.middle[i] += share * one.off[i]
@@ -345,4 +345,4 @@ def posterior(
         for i in range(z.shape[0]):
             out.z[i] = likely.z[i]
     for m in range(rig.mounts.finger.shape[0]):
-        out.surprise[m] = likely.surprise[m]
+        out.marker_chi2[m] = likely.marker_chi2[m]

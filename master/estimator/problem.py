@@ -117,7 +117,7 @@ class Search:
     at: Int  # (8,)
     surface: Surface
     held: Bool  # (N,)
-    surprise: Float  # (M,)
+    marker_chi2: Float  # (M,)
     information: Float  # (M, 3, 3)
     outliers: Float  # (1,)
     rows: Scratch
@@ -154,7 +154,7 @@ class Search:
             at=("i8", 8),
             surface=Surface.empty(),
             held=("u1", N),
-            surprise=markers,
+            marker_chi2=markers,
             information=(markers, 3, 3),
             outliers=1,
             rows=Scratch.empty(),

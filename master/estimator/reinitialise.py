@@ -87,7 +87,7 @@ class Reinitialiser:
                 x = np.where(shows, self._parameters.of_angles(start.angles_rad), self._natural)
                 scratch.start_T[:], scratch.start_x[:] = start.T_rig_palm, self._with_scanned(x)
                 chi2 = steps.fit(posture_prior)
-                if steps.at.found.steps[0] < MAX_ITERATIONS and not steps.unexplained():
+                if steps.at.found.steps[0] < MAX_ITERATIONS and not steps.has_outlier():
                     return chi2
             ends = list[tuple[float, Float, Float]]()
             starts = self._starts(at)

@@ -137,7 +137,7 @@ class Settings(NamedTuple):
         1.0
     )
     # Gates.
-    explained: Annotated[float, Range("chi square", 5.0, 50.0, _CHI + " of three numbers, 1 in 1000")] = 16.3
+    marker_gate: Annotated[float, Range("chi square", 5.0, 50.0, _CHI + " of three numbers, 1 in 1000")] = 16.3
     misled: Annotated[
         float, Range("chi square", 5.0, 200.0, "twice that: another hand explains the markers better")
     ] = 32.6

@@ -129,7 +129,7 @@ class HandOneEuro:
             x=solution.x,
             scale=solution.scale,
             natural_weight=solution.natural_weight,
-            surprise=solution.surprise,
+            marker_chi2=solution.marker_chi2,
             steps=solution.steps,
             twist=solution.twist,
         )

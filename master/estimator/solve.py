@@ -207,7 +207,7 @@ def linearise(
     chains(hand, T, work.angles, work.R, work.P)
     search.outliers[0] = 0.0
     for m in range(mounts.finger.shape[0]):
-        search.surprise[m] = 0.0
+        search.marker_chi2[m] = 0.0
         if not observed.seen[m]:
             continue
         cost += _marker(rig, observed, m, T, gradient, normal, search)
@@ -222,8 +222,8 @@ def _marker(
     work, hand, mounts = search.rows, rig.hand, rig.mounts
     f = mounts.finger[m]
     marker_point(mounts, m, T, work.R, work.P, work.point)
-    cost, search.surprise[m] = marker_rows(rig.cameras, observed, m, work.point, work)
-    search.outliers[0] += cost - 0.5 * search.surprise[m]
+    cost, search.marker_chi2[m] = marker_rows(rig.cameras, observed, m, work.point, work)
+    search.outliers[0] += cost - 0.5 * search.marker_chi2[m]
     for i in range(3):
         work.arm[i] = work.point[i] - T[i, 3]
         for j in range(3):

@@ -121,19 +121,19 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
         scan_finger(hand, device, settings, lines_of_sight, prior, f, lines_of_sight.shown[f] > 0.0, scan)
         if loosen_short(device, lines_of_sight, f, _length_px(scan, f), scan.g[:3], scan.H[:2, :2]):
             scan_finger(hand, device, settings, lines_of_sight, prior, f, lines_of_sight.shown[f] > 0.0, scan)
-        if prior.near_rad[f] > 0.0 and scan.misfit[f] > settings.refused:
+        if prior.near_rad[f] > 0.0 and scan.chi2[f] > settings.refused:
             prior.near_rad[f] = 0.0
             scan_finger(hand, device, settings, lines_of_sight, prior, f, lines_of_sight.shown[f] > 0.0, scan)
-        if scan.misfit[f] > settings.refused and lines_of_sight.depth_w2[f] > 0.0:
+        if scan.chi2[f] > settings.refused and lines_of_sight.depth_w2[f] > 0.0:
             lines_of_sight.depth_w2[f] = (
                 0.0  # a tip may shine, or lie in shade: what it is off then is its light
             )
             scan_finger(hand, device, settings, lines_of_sight, prior, f, True, scan)
-        explained = settings.refused if lines_of_sight.depth_w2[f] > 0.0 else settings.refused_unlit
-        if scan.misfit[f] > explained and lines_of_sight.shown[f] > 0.0:
+        gate = settings.refused if lines_of_sight.depth_w2[f] > 0.0 else settings.refused_unlit
+        if scan.chi2[f] > gate and lines_of_sight.shown[f] > 0.0:
             task.refused[f], lines_of_sight.shown[f] = True, 0.0
             scan_finger(hand, device, settings, lines_of_sight, prior, f, False, scan)
-        if scan.misfit[f] > settings.refused:
+        if scan.chi2[f] > settings.refused:
             task.off[f], lines_of_sight.lit[f], scan.known[f] = True, 0.0, 0.0
     weigh_hands(hand, settings, lines_of_sight, prior, scan)
     for f in range(5):
@@ -145,7 +145,7 @@ def prepare_epoch(model: Model, boxed_state: Any, boxed_space: Any) -> None:
             curled = f > 0 and scan.out[f, 2] > settings.branch_rad
             task.ambiguous[f] = scan.parts[f] > 1.5 or (curled and lines_of_sight.shown[f] == 0.0)
             # The unit of light is learnt a little at a time, and nothing of a finger that is in doubt.
-            excluded = task.ambiguous[f] or scan.misfit[f] > settings.teaching_gate
+            excluded = task.ambiguous[f] or scan.chi2[f] > settings.teaching_gate
             lines_of_sight.teaches[f] = 1.0 if lines_of_sight.shown[f] > 0.0 and not excluded else 0.0
             lines_of_sight.depth_w2[f] *= 0.0 if excluded else settings.light_share
             if f > 0 and not curled and lines_of_sight.teaches[f] > 0.0:

@@ -27,7 +27,7 @@ PARALLEL_RAD = np.radians(3.0)
 """Most by which two cameras may be turned against each other where depth is a law of raw disparity."""
 ALIKE = 0.05
 """Most by which their focal lengths may differ, and the slope of their baseline against the image rows."""
-LAW_MISFIT = 0.02
+LAW_RESIDUAL = 0.02
 """Most by which a law of depth and the cameras' places may differ where both are used."""
 _DEPTHS_M = (0.35, 1.0)
 
@@ -163,12 +163,12 @@ def law_contradicts(rig: RigCalibration, cameras: Sequence[CameraModel]) -> str:
     law = depth_law(rig, cameras)
     if law is None or rig.solver == "fabrik":
         return ""
-    off, depth_m = law_misfit(law, cameras, rig.volume)
-    if off <= LAW_MISFIT:
+    off, depth_m = law_residual(law, cameras, rig.volume)
+    if off <= LAW_RESIDUAL:
         return ""
     return (
         f"depth_model {rig.depth_model!r} is {1e2 * off:.1f} % off the cameras' places at {depth_m:.2f} m, and solver"
-        f" 'estimator' needs both to agree within {1e2 * LAW_MISFIT:.0f} %"
+        f" 'estimator' needs both to agree within {1e2 * LAW_RESIDUAL:.0f} %"
     )
 
 
@@ -211,7 +211,7 @@ def disparity_on_axis(cameras: Sequence[CameraModel], depth_m: Float) -> Float:
     return (left.project(points) - right.project(points))[:, 0]
 
 
-def law_misfit(law: DepthLaw, cameras: Sequence[CameraModel], volume: Volume | None) -> tuple[float, float]:
+def law_residual(law: DepthLaw, cameras: Sequence[CameraModel], volume: Volume | None) -> tuple[float, float]:
     """Largest relative difference of the law from the cameras' own geometry on the axis, and its depth [m].
 
     Args:

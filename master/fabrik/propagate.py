@@ -295,10 +295,10 @@ def _fit(known: Float, n: int, speed2: float, acceleration2: float, L: Float, z:
         v += z[i, 0] * z[i, 2]
     u, v = u / c, v / c
     fit[0], fit[1], fit[2], fit[3], fit[4], fit[5] = 1.0, u, v, 1.0 / c, 0.0, 0.0
-    misfit = 0.0
+    residual2 = 0.0
     for i in range(n):
         off_u, off_v = z[i, 1] - u * z[i, 0], z[i, 2] - v * z[i, 0]
-        misfit += off_u * off_u + off_v * off_v
+        residual2 += off_u * off_u + off_v * off_v
         fit[4] += speed2 * z[i, 3] * off_u
         fit[5] += speed2 * z[i, 3] * off_v
     for i in range(n - 1, -1, -1):
@@ -307,5 +307,5 @@ def _fit(known: Float, n: int, speed2: float, acceleration2: float, L: Float, z:
             s -= L[k, i] * fit[6 + k]
         fit[6 + i] = s * L[i, i]
     return -_EVIDENCE * (
-        log(det * c) + 0.5 * misfit
+        log(det * c) + 0.5 * residual2
     )  # two axes: twice the logarithm of the determinant's root

@@ -189,28 +189,28 @@ class FabrikSolver:
         off = joints.position_m - fit.joints.position_m
         joint_cov = fit.cov_m2 + off[:, :, None] * off[:, None, :]
         hand = SolvedHand(T, angles, joints, joint_cov, fit.tilt_cov_rad2, fit.tilt_process_noise_rad2_s2)
-        self._judge(out, palm, fit.surprise, triangulated)
+        self._judge(out, palm, fit.marker_chi2, triangulated)
         self._last, self._last_ns = hand, out.t_ns
         solved = bool(np.isfinite(out.residual_m).any() or out.tracked.any())
         return replace(out, solution=hand, solved=solved)
 
-    def _judge(self, out: HandEstimate, palm: Fitted, surprise: Float, triangulated: Bool) -> None:
+    def _judge(self, out: HandEstimate, palm: Fitted, marker_chi2: Float, triangulated: Bool) -> None:
         """Write the bits of a solved hand; `triangulated`: (H,) which markers are.
 
         What they explain is tracked.
         """
         out.seen[self._finger_of[triangulated & self._on_finger]] = True
-        explained = out.seen.copy()
-        wrong = surprise >= self._palm.settings.explained
-        explained[self._finger_of[wrong & self._on_finger]] = False
+        inlier = out.seen.copy()
+        wrong = marker_chi2 >= self._palm.settings.marker_gate
+        inlier[self._finger_of[wrong & self._on_finger]] = False
         out.valid[:] = True
         out.source[CHAINS[out.seen]] = Source.SOLVED
         out.source[TIPS[out.seen]] = Source.MEASURED
         if palm.sources[PALM_PART] & ON_MARKERS:
             out.tracked[_PALM_JOINTS], out.source[_PALM_JOINTS] = True, Source.SOLVED
-            out.tracked[CHAINS[explained]] = True
+            out.tracked[CHAINS[inlier]] = True
         else:
-            out.tracked[TIPS[explained]] = True
+            out.tracked[TIPS[inlier]] = True
 
 
 def _drifted(hand: SolvedHand, age_s: float) -> SolvedHand:

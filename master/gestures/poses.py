@@ -95,7 +95,7 @@ class PoseTable:
                 at = row, QUANTITIES.index(name)
                 own.asked[at], own.low[at], own.high[at], own.soft[at] = True, span.low, span.high, span.soft
 
-    def misfit(self, quantities: Quantities) -> Float:
+    def residuals(self, quantities: Quantities) -> Float:
         """Distance to each pose's ranges (P, Q), in standard deviations; 0 inside, and where nothing is asked."""
         return self._fit(quantities, np.ones(len(FINGERS), np.bool_))[1]
 
@@ -109,11 +109,11 @@ class PoseTable:
         return self._fit(quantities, known)[0]
 
     def _fit(self, quantities: Quantities, known: Bool) -> tuple[Fit, Float]:
-        """The fit, and the misfits (P, Q)."""
-        poses, misfit = len(self.names), np.zeros(self._table.low.shape)
+        """The fit, and the residuals (P, Q)."""
+        poses, residuals = len(self.names), np.zeros(self._table.low.shape)
         score, confidence, enough = np.empty(poses), np.empty(poses), np.empty(poses, np.bool_)
-        best = _fit(self._table, quantities.value, quantities.sigma, known, misfit, score, confidence, enough)
-        return Fit(score, confidence, enough, best), misfit
+        best = _fit(self._table, quantities.value, quantities.sigma, known, residuals, score, confidence, enough)
+        return Fit(score, confidence, enough, best), residuals
 
 
 @kernel
@@ -122,14 +122,14 @@ def _fit(
     value: Float,
     sigma: Float,
     known: Bool,
-    misfit: Float,
+    residuals: Float,
     score: Float,
     confidence: Float,
     enough: Bool,
 ) -> int:
-    """Return the best pose; write the fields of `Fit`, and misfits (P, Q).
+    """Return the best pose; write the fields of `Fit`, and residuals (P, Q).
 
-    The misfits are zero before.
+    The residuals are zero before.
     """
     poses, count = table.low.shape
     total = 0.0
@@ -142,8 +142,8 @@ def _fit(
             sigma_of = sigma[q] if there else _ANYTHING
             own = value[q] if isfinite(value[q]) else 0.0
             outside = max(table.low[p, q] - own, own - table.high[p, q], 0.0)
-            misfit[p, q] = outside / hypot(table.soft[p, q], sigma_of)
-            squares += misfit[p, q] * misfit[p, q]
+            residuals[p, q] = outside / hypot(table.soft[p, q], sigma_of)
+            squares += residuals[p, q] * residuals[p, q]
             vague = sigma_of / (_VAGUE * table.soft[p, q])
             share += 1.0 / (1.0 + vague * vague)
             asked += 1

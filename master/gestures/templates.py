@@ -198,22 +198,22 @@ def _middle(shape: PoseShape) -> Example | None:
 
 def _scores(shape: PoseShape, examples: Sequence[Example]) -> list[float]:
     """How well a pose fits each example, as seen by what is known of it."""
-    return [float(np.exp(-0.5 * (_misfit(shape, example) ** 2).sum())) for example in examples]
+    return [float(np.exp(-0.5 * (_residuals(shape, example) ** 2).sum())) for example in examples]
 
 
-def _misfit(shape: PoseShape, example: Example) -> Float:
+def _residuals(shape: PoseShape, example: Example) -> Float:
     alone = GestureSettings(version=1, name="alone", poses={"one": shape})
-    return PoseTable(alone).misfit(example.quantities)[0]
+    return PoseTable(alone).residuals(example.quantities)[0]
 
 
 def _difference(other: str, shape: PoseShape, examples: Sequence[Example]) -> str:
     """What tells the examples from another pose, most telling first."""
-    misfit = np.median([_misfit(shape, example) for example in examples], axis=0)
+    residuals = np.median([_residuals(shape, example) for example in examples], axis=0)
     value = np.median([example.quantities.value for example in examples], axis=0)
     parts: list[str] = []
-    columns: list[int] = np.argsort(-misfit)[:_APART].tolist()
+    columns: list[int] = np.argsort(-residuals)[:_APART].tolist()
     for column in columns:
-        if misfit[column] < 0.5:
+        if residuals[column] < 0.5:
             break
         quantity: Quantity = QUANTITIES[column]
         span = shape.ranges[quantity]

@@ -52,7 +52,7 @@ class Track:
 class Evidence:
     """Equations `value = constant + offset * rate` (T, I), one constant per item; NaN: nothing seen.
 
-    Items are the M epipolar misfits [px], then distances between markers [m].
+    Items are the M epipolar residuals [px], then distances between markers [m].
 
     Attributes:
         value: What should be constant.
@@ -122,7 +122,7 @@ class CameraPair:
         length = np.hypot(line[..., 0], line[..., 1])
         normal = line[..., :2] / length[..., None]
         along = np.stack([-normal[..., 1], normal[..., 0]], axis=-1)
-        misfit = (normal * seen).sum(-1) + line[..., 2] / length
+        residual = (normal * seen).sum(-1) + line[..., 2] / length
         place = (along * seen).sum(-1)
         depth = self._depth(a, along, place)
         # The first camera's velocity in the other's image, as if the depth stayed.
@@ -130,7 +130,7 @@ class CameraPair:
         depth_there = depth * a[..., 2] + self.translation[2]
         expected = (moved[..., :2] - seen * moved[..., 2:]) / depth_there[..., None]
         distance = _distances(ray, depth)
-        value = np.concatenate([self.focal_px * misfit, distance], axis=-1)
+        value = np.concatenate([self.focal_px * residual, distance], axis=-1)
         changes: list[Float] = []
         for v in (velocity, expected, along / (self.focal_px * _STEP_S)):  # the last: a pixel
             before = self._depth(a, along, place - _STEP_S * (along * v).sum(-1))

@@ -30,7 +30,7 @@ from master.fabrik.intersection import RAYS
 from master.monitor.timing_evidence import Evidence
 
 TENTHS = 10  # of a block, the shortest batches
-MISFIT_FLOOR_PX, DISTANCE_FLOOR_M = 0.2, 1e-3
+RESIDUAL_FLOOR_PX, DISTANCE_FLOOR_M = 0.2, 1e-3
 """Residual below which a unit is not believed to be better: centroids of a tenth of a pixel, at half a metre."""
 _FITTED = 4  # constant, plane, offset
 _AT_LEAST = 8  # equations of a unit
@@ -66,11 +66,11 @@ def unit_sums(evidence: Evidence, markers: int, tenth: Int) -> Float:
 
     Args:
         evidence: Of the block's frames (K, I).
-        markers: How many of the items are misfits.
+        markers: How many of the items are residuals.
         tenth: In which tenth of the block each frame lies (K,).
     """
     floor = np.full(evidence.value.shape[1], DISTANCE_FLOOR_M**2)
-    floor[:markers] = MISFIT_FLOOR_PX**2
+    floor[:markers] = RESIDUAL_FLOOR_PX**2
     good = _plausible(evidence, floor)
     good &= good.sum(axis=0) >= _AT_LEAST
     n = good.sum(axis=0)

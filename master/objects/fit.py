@@ -47,7 +47,7 @@ class Fitted:
     Attributes:
         motion: Pose and derivatives.
         cov: (12, 12) of place, turn, speed and turning.
-        cost: Robust misfit, in units of chi square, priors included.
+        cost: Robust cost, in units of chi square, priors included.
         weight: (n,) of each observation, 0..1.
         misfit: (n,) chi square of each observation's feature in its camera, per number measured.
         residual_m: (n,) by how much each misses the object [m].
@@ -58,7 +58,7 @@ class Fitted:
     cov: Float
     cost: float
     weight: Float
-    misfit: Float
+    chi2: Float
     residual_m: Float
     measured_only: bool = True
 
@@ -151,7 +151,7 @@ class PoseFit:
             0.5 * (spread + spread.T),
             problem.cost,
             problem.weight,
-            problem.misfit,
+            problem.chi2,
             problem.residual_m,
         )
 
@@ -165,7 +165,7 @@ class _Problem:
     cost: float
     rates: Float
     weight: Float
-    misfit: Float
+    chi2: Float
     residual_m: Float
 
 
@@ -204,7 +204,7 @@ class _Task:
         by_rotation = -(by_place @ skew(arm))
         speed = by_place @ rates[1, :3] + by_rotation @ rates[1, 3:]
         lag_2 = np.vecdot(speed, speed) * self.seen.t_sigma_s**2 * 0.5
-        misfit, weight, cost = self.sums.weigh(miss, lag_2)
+        chi2, weight, cost = self.sums.weigh(miss, lag_2)
         rows = self._rows(by_place, by_rotation, rotation, way[:, 3:], miss)
         normal, gradient = self.sums.normal(rows, weight, lag_2)
         if self.past is not None:
@@ -213,7 +213,7 @@ class _Task:
         # Priors of the derivatives are about 0, so that what they are at now counts.
         now = rates.ravel()
         residual = np.sqrt(np.vecdot(miss, miss)) * depth / self.views.focal[:, 0]
-        return _Problem(normal, gradient - self.prior @ now, cost, now, weight, misfit, residual)
+        return _Problem(normal, gradient - self.prior @ now, cost, now, weight, chi2, residual)
 
     def _rows(self, by_place: Float, by_rotation: Float, rotation: Float, theta: Float, miss: Float) -> Float:
         """(n, 2, 31) derivatives by all unknowns, of each order place and turn; then what is missed."""

@@ -43,7 +43,7 @@ _POOR_M, _POOR_RAD = 6e-3, np.radians(4.0)  # less sure than this: the past coun
 _INCOMPLETE_M, _INCOMPLETE_RAD = 0.02, np.radians(12.0)  # less sure than this it does not tell all of the pose
 _LOST_M, _LOST_RAD = 0.05, np.radians(30.0)  # less sure than this is no pose
 _MOST = 0.5  # share of what is seen that must be in its place
-_START_MISFIT = 25.0  # chi square per number of what a pose from nothing rests on
+_START_CHI2 = 25.0  # chi square per number of what a pose from nothing rests on
 _TRACKED_M, _TRACKED_RAD = 15e-3, np.radians(10.0)  # less sure than this is led on rather than measured
 _MAX_AGE_PERIODS = 2.25  # an observation older than this is not now
 
@@ -204,7 +204,7 @@ class ObjectLine:
         """Whether a pose may begin with no past: three beads, or a tag, that fit."""
         features = np.unique(seen.feature[fitted.used])
         enough = len(features) >= 3 or bool((features >= self._features.beads).any())
-        return enough and float(fitted.misfit[fitted.used].mean()) < _START_MISFIT
+        return enough and float(fitted.chi2[fitted.used].mean()) < _START_CHI2
 
     def _starts(self, window: Window) -> list[Float]:
         """Poses (4, 4) that the nearest frames suggest."""

@@ -28,7 +28,7 @@ from slave.markers.classify import HUES
 Complex = npt.NDArray[np.complex128]
 
 MOST, LEAST = 7, 5  # paints whose orders are tried: 5040 at most; fewer than five have no shape to go by
-MISFIT = 0.25  # relative; a fist, or a hand from the side, has more
+MOST_RESIDUAL = 0.25  # relative; a fist, or a hand from the side, has more
 CLEARER = 0.75  # of the runner-up's misfit
 VOTES_LEAST = 5
 VOTES_SHARE = 0.8  # of all votes
@@ -113,12 +113,12 @@ def votes_of(uv: Float, pattern: Float, orders: Int) -> tuple[list[int], int]:
         z = _unit(frame[seen])
         ideal = _unit(p[orders[:, seen]])
         # |z - a p|^2 at the best a is 1 - |<p, z>|^2 for unit vectors.
-        misfit = np.sqrt(np.maximum(0.0, 1.0 - np.abs(ideal.conj() @ z) ** 2))
+        residual = np.sqrt(np.maximum(0.0, 1.0 - np.abs(ideal.conj() @ z) ** 2))
         reflected = np.sqrt(max(0.0, 1.0 - float(np.max(np.abs(ideal @ z))) ** 2))
-        first, second = np.argpartition(misfit, 1)[:2]
-        if reflected < CLEARER * misfit[first] and reflected < MISFIT:
+        first, second = np.argpartition(residual, 1)[:2]
+        if reflected < CLEARER * residual[first] and reflected < MOST_RESIDUAL:
             mirrored += 1
-        elif misfit[first] < MISFIT and misfit[first] < CLEARER * min(misfit[second], reflected):
+        elif residual[first] < MOST_RESIDUAL and residual[first] < CLEARER * min(residual[second], reflected):
             votes.append(int(first))
     return votes, mirrored
 
@@ -154,10 +154,10 @@ def by_hues(
         old = np.array([middle[name] for name in around])
         new = np.array([colours[k].hue for k in order])
         shifts = [(np.roll(old, s) - new + HUES / 2) % HUES - HUES / 2 for s in range(len(old))]
-        misfit = np.array([float(np.square(shift).sum()) for shift in shifts])
-        best = int(np.argmin(misfit))
+        residual = np.array([float(np.square(shift).sum()) for shift in shifts])
+        best = int(np.argmin(residual))
         worst = float(np.abs(shifts[best]).max())
-        if len(old) > 1 and misfit[best] > HUE_CLEARER * float(np.sort(misfit)[1]):
+        if len(old) > 1 and residual[best] > HUE_CLEARER * float(np.sort(residual)[1]):
             raise FitError(
                 f"{where}: its hues fit in two orders alike: the light is too different; give clicks, or leave the "
                 f"names to the shape of the hand"

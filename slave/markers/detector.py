@@ -23,7 +23,7 @@ from slave.markers.ambiguity import ColourAmbiguityMonitor
 from slave.markers.blobs import Blob, with_fragments
 from slave.markers.centroid import PAD, Measured
 from slave.markers.classify import ColourTable, table_of
-from slave.markers.edge import Ellipse, centre_of, explained
+from slave.markers.edge import Ellipse, centre_of, fits_occlusion
 from slave.markers.engine import NUMPY, Engine
 from slave.markers.group import (
     CLICKED,
@@ -283,7 +283,7 @@ class MarkerDetector:
         if before is not None and track.covered and smear < SMEARED and clear:
             shape, x, y = Ellipse(before.xx, before.xy, before.yy), u - seen.left, v - seen.top
             whole = centre_of(seen.window, shape, x, y)
-            if whole is not None and explained(before.hidden(seen.area), shape, whole.u - x, whole.v - y):
+            if whole is not None and fits_occlusion(before.hidden(seen.area), shape, whole.u - x, whole.v - y):
                 u, v, area = seen.left + whole.u, seen.top + whole.v, before.typical
                 sigma = math.hypot(COVERED_PX, whole.rms)
         sigma = math.hypot(sigma, shift_px)

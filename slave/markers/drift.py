@@ -55,7 +55,7 @@ class GainFit:
     """
 
     log_gains: Float
-    misfit: Float
+    residual: Float
 
 
 def fit_gains(colour: Float, reference: Float, weight: Float, known: Float) -> GainFit:
@@ -67,10 +67,10 @@ def fit_gains(colour: Float, reference: Float, weight: Float, known: Float) -> G
         weight: (M,) 0..1, how far each sighting is trusted.
         known: (3,) log gains known before; where the markers tell nothing, they stay.
     """
-    misfit = np.full(len(colour), np.nan)
+    residual = np.full(len(colour), np.nan)
     seen = np.flatnonzero((np.nan_to_num(colour) > 0.0).all(axis=1) & (np.nan_to_num(weight) > 0.0))
     if not seen.size:
-        return GainFit(known, misfit)
+        return GainFit(known, residual)
     now, then = colour[seen], reference[seen]
     shift = np.log(now / then)
     variance = UNEVEN**2 + (OUTLIER * np.exp(known) / now) ** 2 + (OUTLIER / then) ** 2
@@ -87,8 +87,8 @@ def fit_gains(colour: Float, reference: Float, weight: Float, known: Float) -> G
         total = heavy.sum(axis=0) + KNOWN
         right_side = (heavy @ shift[:, :, None]).sum(axis=0)[:, 0] + KNOWN @ known
         x = np.asarray(np.linalg.solve(total, right_side), np.float64)
-    misfit[seen] = _distance(shift - x, information)
-    return GainFit(x, misfit)
+    residual[seen] = _distance(shift - x, information)
+    return GainFit(x, residual)
 
 
 def _distance(away: Float, information: Float) -> Float:
@@ -160,6 +160,6 @@ class ColourDrift:
         most = RATE_PER_S * dt_s
         b, g, r = (min(max(step, -most), most) for step in (blue - green, green, red - green))
         self._x = bounded(self._x + np.array([g + b, g, g + r]))
-        if np.count_nonzero(np.isfinite(fit.misfit)) >= MANY:
+        if np.count_nonzero(np.isfinite(fit.residual)) >= MANY:
             self._anchor = self._anchor - math.expm1(-dt_s / ANCHOR_S) * (self._x - self._anchor)
         return fit

@@ -102,7 +102,7 @@ def centre_of(share: Float32, shape: Ellipse, u: float, v: float) -> Centre | No
     return Centre(float(centre[0]), float(centre[1]), rms)
 
 
-def explained(hidden: float, shape: Ellipse, du: float, dv: float) -> bool:
+def fits_occlusion(hidden: float, shape: Ellipse, du: float, dv: float) -> bool:
     """Whether what hides this share of a cap can have moved the centroid of the rest by (du, dv) [px].
 
     Of all parts of one area the segment behind a straight edge lies farthest out, so nothing moves the centroid more:

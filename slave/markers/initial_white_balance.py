@@ -61,7 +61,7 @@ class Evidence:
     log_gains: Float
     score: float
     matched: int
-    misfit: Float
+    residual: Float
     proven: bool = False
     excluded: bool = False
     beyond: bool = False
@@ -131,11 +131,11 @@ def evidence(half: Image, table: ColourTable, reference: Float, log_gains: Float
             colour[m] = min(seen, key=lambda c: float(np.ptp(np.log(c) - expected)))
     weight = np.ones(len(reference))
     fit = fit_gains(colour, reference, weight, log_gains)
-    close = np.nan_to_num(1.0 - (fit.misfit / FITS) ** 2, nan=0.0)
+    close = np.nan_to_num(1.0 - (fit.residual / FITS) ** 2, nan=0.0)
     score = float(np.maximum(close, 0.0).sum())
     light = bounded(fit.log_gains)
     beyond = _separated_hues(light, fit.log_gains) > ROUNDED
-    return Evidence(light, score, int((close > 0.0).sum()), fit.misfit, beyond=beyond)
+    return Evidence(light, score, int((close > 0.0).sum()), fit.residual, beyond=beyond)
 
 
 def different(a: Float, b: Float) -> bool:

@@ -37,7 +37,7 @@ SUDDEN = (
 CLEAR = 0.75  # share of still points that must agree on a sudden change that the markers do not vouch for
 DIM = 0.15  # what a change of brightness counts against a change of hue: the ranges are wide in brightness
 AGAIN_NS = 500_000_000  # between two attempts to prove the light
-MISFITS = 5  # looks in a row, half a second, in which the markers fit badly and put the light in doubt
+POOR_FITS = 5  # looks in a row, half a second, in which the markers fit badly and put the light in doubt
 
 
 class WhiteBalance:
@@ -61,7 +61,7 @@ class WhiteBalance:
         self._provable = len(reference) >= PROOF
         self.proven = not self._provable  # a rig of one marker can only be followed
         self._plausible = False
-        self._misfits = 0
+        self._poor_fits = 0
         self._tried_ns: int | None = None
         self._proof: tuple[Float, Future[Evidence]] | None = None
 
@@ -98,12 +98,12 @@ class WhiteBalance:
         """
         fit = self._drift.push(colour, clarity, t_ns)
         if fit is not None:
-            seen = fit.misfit[np.isfinite(fit.misfit)]
+            seen = fit.residual[np.isfinite(fit.residual)]
             if not seen.size or float(np.median(seen)) <= FITS:
-                self._misfits = 0
+                self._poor_fits = 0
             else:
-                self._misfits += 1
-                if self._misfits >= MISFITS:
+                self._poor_fits += 1
+                if self._poor_fits >= POOR_FITS:
                     self._lose_proof()
         return fit
 
@@ -154,7 +154,7 @@ class WhiteBalance:
         if self._proof is not None and self._proof[1].done():
             (since, job), self._proof = self._proof, None
             light = job.result()
-            self.proven, self._misfits = light.proven, 0
+            self.proven, self._poor_fits = light.proven, 0
             self._plausible = not light.excluded
             if light.proven and different(light.log_gains + since, self.log_gains):
                 self._drift.restart(light.log_gains + since)

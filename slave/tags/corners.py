@@ -36,8 +36,8 @@ CLEAR_PX, BLURRED = (
     0.05,
 )  # an edge that is wider is off by so much of what it is wider: motion has its own law
 BILINEAR = 9.0 / 4.0  # variance of a pixel against that of what is read between pixels
-MISFIT = 0.15  # of the contrast: an edge that departs more from the law has something on it,
-ROUGH_MISFIT = 0.4  # or is that of a small tag whose code is not known yet
+MOST_RESIDUAL = 0.15  # of the contrast: an edge that departs more from the law has something on it,
+COARSE_RESIDUAL = 0.4  # or is that of a small tag whose code is not known yet
 LEAST_CONTRAST = 0.008  # in linear light, white is 1
 SLIMMEST = 0.1  # sine of the angle between two sides
 LEAST_REACH_PX = 1.2
@@ -118,8 +118,8 @@ def _fit(
         None if inner is None else inner.reshape(4 * n, cells),
     )
     density = ALONG * ACROSS / (length * (1.0 - 2.0 * margin) * 2.0 * reach)  # samples per square pixel
-    misfit = ROUGH_MISFIT if inner is None else MISFIT
-    return _met(uv, outward, reach, density, misfit, _edges(sides))
+    most_residual = COARSE_RESIDUAL if inner is None else MOST_RESIDUAL
+    return _met(uv, outward, reach, density, most_residual, _edges(sides))
 
 
 def _on_side(begin: Float, end: Float, place: Float, lens: CameraModel | None) -> Float:
@@ -164,7 +164,7 @@ class _Lines:
 
     offset: Float
     variance: Float
-    misfit: Float
+    most_residual: Float
     contrast: Float
     width: Float
 
@@ -234,11 +234,11 @@ def normal_law(z: Float) -> Float:
     return 0.5 * (1.0 + np.tanh(0.7978845608 * z * (1.0 + 0.044715 * z * z)))
 
 
-def _met(uv: Float, outward: Float, reach: Float, density: Float, misfit: float, line: _Lines) -> Corners:
+def _met(uv: Float, outward: Float, reach: Float, density: Float, most_residual: float, line: _Lines) -> Corners:
     """Where the lines of neighbouring sides meet, and how sure that is."""
     n = len(uv)
     offset = line.offset.reshape(n, 4, 2)
-    noise = line.misfit.reshape(n, 4) * np.maximum(BILINEAR * density, 1.0)
+    noise = line.most_residual.reshape(n, 4) * np.maximum(BILINEAR * density, 1.0)
     contrast, width = line.contrast.reshape(n, 4), line.width.reshape(n, 4)
     floor = FLOOR_PX**2 + (BLURRED * np.maximum(width - CLEAR_PX, 0.0)) ** 2
     variance = noise[..., None] * line.variance.reshape(n, 4, 2) + floor[..., None]
@@ -256,6 +256,6 @@ def _met(uv: Float, outward: Float, reach: Float, density: Float, misfit: float,
         & (contrast > LEAST_CONTRAST)
         & (width < 0.99 * WIDEST_PX)
     )
-    good &= line.misfit.reshape(n, 4) < (misfit * contrast) ** 2
+    good &= line.most_residual.reshape(n, 4) < (most_residual * contrast) ** 2
     sigma = np.sqrt(spread.mean(axis=1) / 2.0)
     return Corners(met, np.where(good.all(axis=1), sigma, np.nan), contrast.min(axis=1), width.mean(axis=1))

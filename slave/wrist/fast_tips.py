@@ -179,9 +179,9 @@ def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) ->
     finger = np.flatnonzero(np.isfinite(out[:, 0]))
     if not len(finger):
         return None
-    x, y, radius, sigma, shown, misfit, *ends = out[finger].T
+    x, y, radius, sigma, shown, residual, *ends = out[finger].T
     circle = Circles(np.stack([x, y], axis=-1), radius, sigma, shown)
-    return reported(finger, circle, misfit, Ends(np.stack(ends[:2], axis=-1), *ends[2:]))
+    return reported(finger, circle, residual, Ends(np.stack(ends[:2], axis=-1), *ends[2:]))
 
 
 def prepare() -> None:
@@ -228,10 +228,10 @@ def _search(
             _open(image, gain, table, row, float(found.abduction[k]), limits, open_)
             for _ in range(2):
                 _fit(led, circle, open_, edges)
-            misfit = found.cost[k] + limits.unseen_cost * (1.0 - circle[4])
-            misfit += _apart(found, k, table, limits, circle)
-            if misfit < least:
-                least = misfit
+            residual = found.cost[k] + limits.unseen_cost * (1.0 - circle[4])
+            residual += _apart(found, k, table, limits, circle)
+            if residual < least:
+                least = residual
                 best[:] = circle
         if least < np.inf:
             out[finger, :5], out[finger, 5] = best, least

@@ -71,7 +71,7 @@ ENDS_WITHIN = 40.0  # of the best posture's cost: those whose ends are averaged
 CORRELATED = 2.5  # samples that differ for one reason
 # Of an end that is reported; of the thumb, whose four angles are searched less finely, and of the fingers.
 LEAST_SHOWN = np.array([0.75, 0.6])
-MOST_MISFIT, LIKELY = 32.0, 0.4  # of one that is less likely to be seen in proportion
+MOST_RESIDUAL, LIKELY = 32.0, 0.4  # of one that is less likely to be seen in proportion
 # Standard deviations: edges; of the radius, how far flesh is off its cones, and where on its disk an end is that faces
 # the camera; and the misfit at which they are twice as large.
 PIXEL, SURFACE, PULP, COST_SCALE = 0.7, 0.05, 0.08, 20.0
@@ -310,7 +310,7 @@ class Candidates:
     uv: Float
     sigma_px: Float
     radius_px: Float
-    misfit: Float
+    residual: Float
     shown: Float
     seen: Float
 
@@ -331,12 +331,12 @@ def candidates(led: Image, image: LedImage, laser_uv: Float, view: WristView) ->
     outline = np.repeat(_open(some, best, image, gain), OUTLINE // DIRECTIONS, axis=1)
     circle = fitted(led, some.uv[best, END], some.table.end[rows, 0], outline)
     circle = fitted(led, circle.middle, circle.radius, outline)
-    misfit = cost[best] + UNSEEN_COST * (1.0 - circle.shown)
-    misfit += _apart(some.uv[best, END], some.table.end[rows, 0], circle.middle, circle.radius)
-    order = np.lexsort((misfit, finger))
+    residual = cost[best] + UNSEEN_COST * (1.0 - circle.shown)
+    residual += _apart(some.uv[best, END], some.table.end[rows, 0], circle.middle, circle.radius)
+    order = np.lexsort((residual, finger))
     chosen = order[np.append(True, finger[order[1:]] != finger[order[:-1]])]
-    circle, misfit, finger = Circles(*(each[chosen] for each in circle)), misfit[chosen], finger[chosen]
-    return reported(finger, circle, misfit, _ends(some, cost, finger, circle))
+    circle, residual, finger = Circles(*(each[chosen] for each in circle)), residual[chosen], finger[chosen]
+    return reported(finger, circle, residual, _ends(some, cost, finger, circle))
 
 
 def _open(some: Hypotheses, which: Int, image: LedImage, gain: float) -> Float32:
@@ -368,15 +368,15 @@ class Ends(NamedTuple):
     seen: Float
 
 
-def reported(finger: Int, circle: Circles, misfit: Float, ends: Ends) -> Candidates:
+def reported(finger: Int, circle: Circles, residual: Float, ends: Ends) -> Candidates:
     """Ends of K fingers, by the circles about them."""
     radius = circle.radius
     surface = radius * np.sqrt(
         SURFACE**2 + (PULP * np.maximum(ends.facing, 0.0)) ** 2 + (OF_SPREAD * ends.spread) ** 2
     )
-    sigma = np.sqrt(PIXEL**2 + surface**2 + circle.sigma_px**2) * (1.0 + misfit / COST_SCALE)
+    sigma = np.sqrt(PIXEL**2 + surface**2 + circle.sigma_px**2) * (1.0 + residual / COST_SCALE)
     at = circle.middle + ends.towards * radius[:, None]
-    return Candidates(finger, at, sigma, radius, misfit, circle.shown, ends.seen)
+    return Candidates(finger, at, sigma, radius, residual, circle.shown, ends.seen)
 
 
 def _ends(some: Hypotheses, cost: Float32, finger: Int, circle: Circles) -> Ends:
@@ -465,8 +465,8 @@ def fingertips(
     if found is None:
         return out
     kind = np.minimum(found.finger, 1)
-    most = MOST_MISFIT * np.minimum(found.seen / LIKELY, 1.0)
-    good = (found.shown > LEAST_SHOWN[kind]) & (found.misfit < most)
+    most = MOST_RESIDUAL * np.minimum(found.seen / LIKELY, 1.0)
+    good = (found.shown > LEAST_SHOWN[kind]) & (found.residual < most)
     for k in np.flatnonzero(good).tolist():
         finger, at = int(found.finger[k]), found.uv[k]
         depth = depth_about(near, optics, float(at[0]), float(at[1]), float(found.radius_px[k]))

@@ -28,7 +28,7 @@ _Cells = cv2.typing.MatLike  # of a coarse frame
 _SIZE = (80, 60)  # cells across and down: 8 x 8 px of 640 x 480
 _NOISE = 6  # levels: five standard deviations of a cell near saturation (16 px of 5 levels of shot noise)
 _SWING = 0.125  # of the ambient light: how far lamps on the mains swing between two frames
-_EXPLAINED = (_NOISE + _SWING * np.arange(256)).astype(np.uint8)  # by the darker of two levels
+_NOISE_OF_LEVEL = (_NOISE + _SWING * np.arange(256)).astype(np.uint8)  # by the darker of two levels
 _LINE = 20  # levels beyond that: a line that a centroid can be taken of
 _SATURATED = 250  # level of a cell
 # Neighbourhoods, (rows, columns) of cells.
@@ -93,15 +93,15 @@ def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
     valid = _valid(darker)
     if valid < VALID_LEAST * ambient.size:
         return NO_EVIDENCE
-    explained = cv2.LUT(darker, _EXPLAINED)
-    led_gain = cv2.subtract(cv2.subtract(led, ambient), explained)
+    noise = cv2.LUT(darker, _NOISE_OF_LEVEL)
+    led_gain = cv2.subtract(cv2.subtract(led, ambient), noise)
     if cv2.countNonZero(led_gain) <= LED_LEAST * valid:
         return NO_EVIDENCE
     lit = _octaves(_broad(led_gain) / valid, LED_LEAST)
     laser_gain, laser_loss = _each_over(laser, ambient)
     if not lit > 0.0 or cv2.countNonZero(laser_gain) <= LASER_LEAST:
         return Evidence(lit, -inf, -inf, -inf)
-    led_loss = cv2.subtract(cv2.subtract(ambient, led), explained)
+    led_loss = cv2.subtract(cv2.subtract(ambient, led), noise)
     above_halo = cv2.subtract(laser_gain, cv2.convertScaleAbs(led_gain, alpha=HALO))
     steady = -_octaves(max(_broad(over) for over in (above_halo, laser_loss, led_loss)) / valid, LED_NEVER)
     if not steady > 0.0:
@@ -127,18 +127,18 @@ def unlit(frames: Sequence[Image]) -> bool:
     if valid < VALID_LEAST * darkest.size:
         return False
     gain = cv2.subtract(reduce(cv2.max, frames), darkest)
-    return _broad(cv2.subtract(gain, cv2.LUT(darkest, _EXPLAINED)), LED_NEVER * valid) <= LED_NEVER * valid
+    return _broad(cv2.subtract(gain, cv2.LUT(darkest, _NOISE_OF_LEVEL)), LED_NEVER * valid) <= LED_NEVER * valid
 
 
 def brighter(frame: Image, other: Image) -> bool:
     """Whether one coarse frame (60, 80) has broad light that the other has not, and lacks none: that of the LEDs."""
     darker = cv2.min(frame, other)
     valid = max(_valid(darker), VALID_LEAST * frame.size)
-    explained = cv2.LUT(darker, _EXPLAINED)
-    gain = cv2.subtract(cv2.subtract(frame, other), explained)
+    noise = cv2.LUT(darker, _NOISE_OF_LEVEL)
+    gain = cv2.subtract(cv2.subtract(frame, other), noise)
     if _broad(gain, LED_LEAST * valid) <= LED_LEAST * valid:
         return False
-    return _broad(cv2.subtract(cv2.subtract(other, frame), explained)) <= LED_NEVER * valid
+    return _broad(cv2.subtract(cv2.subtract(other, frame), noise)) <= LED_NEVER * valid
 
 
 def _valid(darker: _Cells) -> int:
@@ -148,9 +148,9 @@ def _valid(darker: _Cells) -> int:
 
 def _each_over(first: _Cells, second: _Cells) -> tuple[_Cells, _Cells]:
     """How far each frame is brighter than the other beyond what noise and a swing of ambient light explain [levels]."""
-    explained = cv2.LUT(cv2.min(first, second), _EXPLAINED)
+    noise = cv2.LUT(cv2.min(first, second), _NOISE_OF_LEVEL)
     one, other = cv2.subtract(first, second), cv2.subtract(second, first)
-    return cv2.subtract(one, explained), cv2.subtract(other, explained)
+    return cv2.subtract(one, noise), cv2.subtract(other, noise)
 
 
 def _lit(over: _Cells) -> _Cells:

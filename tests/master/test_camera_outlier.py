@@ -99,7 +99,7 @@ def test_a_camera_that_was_knocked_by_two_degrees_is_left_out(
         f"rejected.{knocked}": every,
         f"mostly_left_out.{knocked}": len(poses),
     }
-    assert counts["epipolar_misfits"] == 0
+    assert counts["epipolar_outliers"] == 0
     assert all((pose.source != Source.HELD).all() for pose in poses[1:])
 
 
@@ -110,7 +110,7 @@ def test_markers_that_one_camera_swaps_are_taken_from_the_others(
     poses, counts = solve(rig(names), messages(names, swapped))
     assert off_mm(poses).max() < 5.0
     assert counts[f"rejected.{swapped}"] == 2 * len(poses)
-    assert counts["epipolar_misfits"] == 0
+    assert counts["epipolar_outliers"] == 0
     assert f"mostly_left_out.{swapped}" not in counts
 
 
@@ -120,7 +120,7 @@ def test_nothing_is_left_out_where_rays_meet_or_two_cameras_disagree() -> None:
     two = THREE[:2]
     poses, counts = solve(rig(two, "right", np.radians([2.0, 0.0, 0.0])), messages(two))
     assert np.isnan(off_mm(poses)).all()
-    assert counts["epipolar_misfits"] == len(poses) * len(MARKERS)
+    assert counts["epipolar_outliers"] == len(poses) * len(MARKERS)
     assert not any("rejected" in name for name in counts)
 
 

@@ -21,7 +21,7 @@ from master.fabrik.depth import (
     depth_law,
     error_budget,
     ideal_law,
-    law_misfit,
+    law_residual,
     tolerable_skew_s,
 )
 
@@ -168,12 +168,12 @@ def test_cameras_at_the_bound_have_a_law() -> None:
 def test_a_law_is_held_against_the_geometry_where_it_is_farthest_off() -> None:
     exact, far = AffineDisparity(37.5, 0.0), AffineDisparity(37.5, 2.0)
     volume = Volume(low_m=(-0.1, -0.1, 0.5), high_m=(0.1, 0.1, 0.75))
-    assert law_misfit(exact, (LEFT, RIGHT), volume)[0] < 1e-9
-    off, depth_m = law_misfit(far, (LEFT, RIGHT), volume)
+    assert law_residual(exact, (LEFT, RIGHT), volume)[0] < 1e-9
+    off, depth_m = law_residual(far, (LEFT, RIGHT), volume)
     assert depth_m == pytest.approx(0.75)
     assert off == pytest.approx(1.0 / (1.0 - 2.0 / 50.0) - 1.0)  # 50 px at 0.75 m
-    assert law_misfit(far, (LEFT, RIGHT), None)[1] == pytest.approx(1.0)
-    assert law_misfit(AffineDisparity(37.5, 60.0), (LEFT, RIGHT), volume)[0] == np.inf
+    assert law_residual(far, (LEFT, RIGHT), None)[1] == pytest.approx(1.0)
+    assert law_residual(AffineDisparity(37.5, 60.0), (LEFT, RIGHT), volume)[0] == np.inf
 
 
 @pytest.mark.parametrize("bad", [(0.0, 1.0, 640), (0.075, 0.0, 640), (0.075, 4.0, 640), (np.nan, 1.0, 640)])

@@ -49,7 +49,7 @@ def test_gains_that_all_markers_share_are_found_whatever_the_shading(x: Float, s
         np.testing.assert_allclose(
             against_green(fit.log_gains), against_green(x), atol=0.02 + 0.02 * np.abs(x).max()
         )
-        assert fit.misfit.max() < 2.5
+        assert fit.residual.max() < 2.5
 
 
 @given(gains, st.integers(0, 5))
@@ -59,7 +59,7 @@ def test_one_marker_in_coloured_light_does_not_turn_the_others(x: Float, odd: in
     fit = fit_gains(np.minimum(seen, 0.89), COLOURS, ONES, CALIBRATED)
     if seen.max() < 0.89:
         np.testing.assert_allclose(against_green(fit.log_gains), 0.5 * against_green(x), atol=0.15)
-        assert int(np.argmax(fit.misfit)) == odd
+        assert int(np.argmax(fit.residual)) == odd
 
 
 def test_the_shading_spreads_over_markers_not_over_channels() -> None:
@@ -76,12 +76,12 @@ def test_nothing_seen_changes_nothing_and_one_marker_stays_alone() -> None:
     for k in range(5):
         fit = drift.push(nothing, np.full(6, np.nan), k * SECOND // 10)
         assert fit is not None
-        assert np.isnan(fit.misfit).all()
+        assert np.isnan(fit.residual).all()
     np.testing.assert_array_equal(drift.log_gains, [0.2, 0.1, -0.1])
     one = nothing.copy()
     one[2] = COLOURS[2]
     fit = fit_gains(one, COLOURS, ONES, CALIBRATED)
-    np.testing.assert_array_equal(np.isfinite(fit.misfit), [False, False, True, False, False, False])
+    np.testing.assert_array_equal(np.isfinite(fit.residual), [False, False, True, False, False, False])
 
 
 @pytest.mark.parametrize("single", range(6))

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slave.markers.edge import Ellipse, centre_of, explained
+from slave.markers.edge import Ellipse, centre_of, fits_occlusion
 
 OVER = 8
 
@@ -63,14 +63,14 @@ def test_a_straight_edge_is_followed_as_far_as_its_shift_and_not_twice_as_far(
     _, seen_u, seen_v = covered_ellipse(a, a * aspect, rotation, 24.3, 23.6, share, side)
     du, dv = 24.3 - seen_u, 23.6 - seen_v
     shape = moments(a, a * aspect, rotation)
-    assert explained(share, shape, du, dv)
-    assert not explained(share, shape, 2.0 * du + math.copysign(1.5, du), 2.0 * dv + math.copysign(1.5, dv))
+    assert fits_occlusion(share, shape, du, dv)
+    assert not fits_occlusion(share, shape, 2.0 * du + math.copysign(1.5, du), 2.0 * dv + math.copysign(1.5, dv))
 
 
 def test_a_loss_of_a_tenth_does_not_move_a_small_cap_by_its_radius() -> None:
     # A finger that turns its end to the camera: a crescent is left, whose edge fits an ellipse far away.
-    assert not explained(0.1, Ellipse(12.0, 1.6, 4.5), 3.0, 1.5)
-    assert not explained(0.1, Ellipse(0.0, 0.0, 0.0), 0.0, 0.0)
+    assert not fits_occlusion(0.1, Ellipse(12.0, 1.6, 4.5), 3.0, 1.5)
+    assert not fits_occlusion(0.1, Ellipse(0.0, 0.0, 0.0), 0.0, 0.0)
 
 
 def test_a_part_that_is_too_small_for_the_shape_is_no_answer() -> None:

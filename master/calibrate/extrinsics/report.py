@@ -8,7 +8,7 @@ from master.calibrate.extrinsics.seen import Fit
 from master.calibrate.extrinsics.unknown import CAMERA_IMU, CAMERA_LATE, FOREARM_IMU, IMU_LATE, SHIFT
 
 _ROTATION_RAD, _SHIFT_M, _CLOCK_S = np.radians(4.0), 4e-3, 8e-3  # standard deviations, at most
-_MISFIT, _STRAYS = 1.8, 0.35
+_MOST_RMS, _STRAYS = 1.8, 0.35
 
 
 def sigmas(fit: Fit) -> dict[str, float]:
@@ -36,7 +36,7 @@ def refuse(fit: Fit, sigma: dict[str, float]) -> None:
     Raises:
         FitError: With what to do.
     """
-    if fit.rms > _MISFIT or fit.strays > _STRAYS:
+    if fit.rms > _MOST_RMS or fit.strays > _STRAYS:
         raise FitError(
             f"no mounting explains what was seen: it is {fit.rms:.1f} times farther off than noise, and"
             f" {100 * fit.strays:.0f} % of it strays. Is the hand file that of this hand and side, the laser plane"

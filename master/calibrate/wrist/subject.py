@@ -32,9 +32,9 @@ _LENGTH, _MEASURED = (
     0.012,
 )  # of fingers: bones are 6.5 % off their shares, each alone; measured ones 1 mm
 _BENT_RAD = np.radians(60.0)  # at its knuckle: from here on the line hardly moves any more
-_MISFIT = 1.5  # standard deviations: angles are free, so what is left is small
+_MOST_RMS = 1.5  # standard deviations: angles are free, so what is left is small
 _UNLIKELY = 3.0  # standard deviations
-_SURPRISE = 1.5  # rms of standard deviations: one in a hundred subjects, of 14 numbers that a motion tells
+_MOST_PRIOR_RMS = 1.5  # rms of standard deviations: one in a hundred subjects, of 14 numbers that a motion tells
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,7 +162,7 @@ def _check_likely(fit: Fit) -> None:
     """
     pull = np.abs(fit.x) / fit.prior_sigma
     worst = int(pull.argmax())
-    if fit.rms > _MISFIT or pull[worst] > _UNLIKELY or fit.surprise > _SURPRISE or fit.unlike > _UNLIKELY:
+    if fit.rms > _MOST_RMS or pull[worst] > _UNLIKELY or fit.prior_rms > _MOST_PRIOR_RMS or fit.unlike > _UNLIKELY:
         raise FitError(
             f"no likely subject explains what was seen: it is {fit.rms:.1f} times farther off than skin explains,"
             f" fingers {fit.unlike:.1f} times from their habits, and {_name(worst)} {pull[worst]:.1f} standard"
@@ -192,7 +192,7 @@ def report_lines(setup: WristSetup, fit: Fit, count: int) -> tuple[str, ...]:
     knuckles = ~fit.fist & (fit.angles_rad[..., MCP].max(axis=1) > _BENT_RAD)
     lines = [
         f"subject from {len(fit.fist)} of {count} triples and {np.isfinite(fit.off[..., 2]).sum()} fingertips in them",
-        f"left: laser {1e3 * fit.laser_m:.2f} mm, tips {fit.tip_px:.1f} px; changed by {fit.surprise:.1f} of belief",
+        f"left: laser {1e3 * fit.laser_m:.2f} mm, tips {fit.tip_px:.1f} px; changed by {fit.prior_rms:.1f} of belief",
         f"palm turned by {rotation:.1f} deg, about x, y, z ± {_three(np.degrees(sigma.pose[:3]))}",
         f"palm shifted by {shift:.1f} mm, along x, y, z ± {_three(1e3 * sigma.pose[3:])}",
         f"{'':8} {'bent':>4} {'knuckle before':>20} {'after, mm':>20} {'±':>14} {'thick':>11} {'long':>13}",

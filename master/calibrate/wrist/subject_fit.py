@@ -90,7 +90,7 @@ class Fit:
     tip_px: float
 
     @property
-    def surprise(self) -> float:
+    def prior_rms(self) -> float:
         """Rms change in standard deviations of what was believed, by as many numbers as the motion told."""
         measured = (1.0 - np.diag(self.covariance) / self.prior_sigma**2).sum()
         return float(np.sqrt(((self.x / self.prior_sigma) ** 2).sum() / measured))

@@ -109,5 +109,5 @@ class Bench:
         }
         poses = self._add("master", "poses", 15.0)
         apart = self._add("master", "apart", 15.0 * self.apart * len(MARKERS))
-        group: Mapping[str, int] = {"poses": poses, "epipolar_misfits": apart}
+        group: Mapping[str, int] = {"poses": poses, "epipolar_outliers": apart}
         return MasterNow(True, senders, [group], self.disk_mb, self.files)

@@ -17,7 +17,7 @@ from master.estimator.problem import Rig
 from master.estimator.residuals import Observations, marker_rows
 from master.estimator.solve import linearise
 from master.estimator.state import grow, hide
-from master.estimator.truncated import mean_within
+from master.estimator.truncated import truncated_mean
 from master.estimator.workspace import Model
 from master.estimator.wrist_device import flexed_palm
 from master.estimator.wrist_rows import rotation_vector_jacobian
@@ -59,11 +59,11 @@ def linearise_at(
 
 
 @kernel
-def mean_within_at(
+def truncated_mean_at(
     boxed_hand: Any, normal: Float, gradient: Float, x: Float, boxed_cut: Any, mean: Float
 ) -> None:
-    """`master.estimator.truncated.mean_within`; records in their arrays."""
-    mean_within(boxed_hand[0], normal, gradient, x, boxed_cut[0], mean)
+    """`master.estimator.truncated.truncated_mean`; records in their arrays."""
+    truncated_mean(boxed_hand[0], normal, gradient, x, boxed_cut[0], mean)
 
 
 @kernel

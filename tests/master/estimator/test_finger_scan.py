@@ -64,7 +64,7 @@ def test_the_profile_passes_through_the_true_pose(
     angles = bent(mcp, pip)
     scan = scanned(wrist_case, angles)
     for f in range(1, 5):
-        assert scan.misfit[f] < 1.5
+        assert scan.chi2[f] < 1.5
         off = np.degrees(on_valley(wrist_case, scan, f, angles[f, PIP])[:4] - angles[f])
         np.testing.assert_allclose(off[1], 0.0, atol=1.5)
         np.testing.assert_allclose(off[[0, DIP]], 0.0, atol=3.0)

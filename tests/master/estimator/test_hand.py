@@ -76,7 +76,7 @@ def test_a_hand_at_the_posture_prior_is_found_exactly_in_any_orientation(model: 
     hand = found(fit(points, small_cov(), by=machine, back_normal=T[:3, 1]))
     assert joint_mm(hand, model.forward(T, angles).position_m).max() < 0.05
     np.testing.assert_allclose(np.degrees(hand.angles_rad), np.degrees(angles), atol=0.1)
-    assert hand.surprise.sum() < 1e-3
+    assert hand.marker_chi2.sum() < 1e-3
     assert residual_m(hand, points, model).max() < 1e-4
 
 
@@ -108,7 +108,7 @@ def test_a_missing_marker_costs_its_own_finger_only(gone: int) -> None:
     points = places(palm(), angles)
     points[gone] = np.nan
     hand = found(fit(points, small_cov(), by=machine))
-    assert hand.surprise[gone] == 0.0
+    assert hand.marker_chi2[gone] == 0.0
     assert residual_m(hand, points)[np.arange(6) != gone].max() < 2e-3
     tips = joint_mm(hand, RIGHT.forward(palm(), angles).position_m)[TIPS]
     assert tips[np.arange(5) != gone].max() < 6.0
@@ -163,7 +163,7 @@ def test_a_marker_without_a_covariance_is_not_seen() -> None:
     points[1] = np.nan
     without = found(fit(points, small_cov()))
     np.testing.assert_array_equal(with_nan.angles_rad, without.angles_rad)
-    assert with_nan.surprise[1] == 0.0
+    assert with_nan.marker_chi2[1] == 0.0
 
 
 def test_markers_without_any_covariance_are_no_hand() -> None:
@@ -329,7 +329,7 @@ def test_where_a_search_begins_does_not_decide_where_it_ends(rotated_deg: float,
     there = rigid(orientation @ T[:3, :3], T[:3, 3] + 0.02)
     other = found(fit(places(there, natural_angles(rng)), cov, back_normal=there[:3, 1]))
     near, reinitialise = (found(fit(points, cov, start=start)) for start in (other, None))
-    assert near.surprise.sum() < reinitialise.surprise.sum() + 1.0
+    assert near.marker_chi2.sum() < reinitialise.marker_chi2.sum() + 1.0
     assert residual_m(near, points).max() < residual_m(reinitialise, points).max() + 1e-3
 
 

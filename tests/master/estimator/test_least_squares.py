@@ -112,7 +112,7 @@ def test_points_are_fitted_as_scipy_fits_them(seed: int) -> None:
     hand = found(fit(points, small_cov(), by=MACHINE))
     near, x, cost = OfPoints(T, points, small_cov()).solve(PARAMETERS.of_angles(angles))
     compare(hand, near, x, 1e-3)
-    assert 0.5 * hand.surprise.sum() < cost
+    assert 0.5 * hand.marker_chi2.sum() < cost
 
 
 def pixels(seed: int) -> tuple[Float, Float, Epoch, FittedHand]:

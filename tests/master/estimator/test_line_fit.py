@@ -29,7 +29,7 @@ def test_a_natural_hand_is_found_from_its_markers_alone(model: HandModel) -> Non
         rotation.append(palm_deg(hand, T))
         assert (hand.x >= parameters.low - 1e-12).all()
         assert (hand.x <= parameters.high + 1e-12).all()
-        assert hand.surprise.max() < DEFAULT.explained
+        assert hand.marker_chi2.max() < DEFAULT.marker_gate
         assert hand.natural_weight == 1.0
     assert np.median(off) < 8e-3
     assert np.median(rotation) < 6.0

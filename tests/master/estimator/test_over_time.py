@@ -417,7 +417,7 @@ def test_a_hand_by_the_posture_prior_is_reinitialised_where_the_last_does_not_fi
     there = palm(np.array([5.0, 5.0, 120.0]), np.array([0.1, 0.0, 0.65]))
     hand = push(machine, STEP_NS, places(there, angles))
     assert hand.solution is not None
-    assert hand.solution.surprise.max() < DEFAULT.explained
+    assert hand.solution.marker_chi2.max() < DEFAULT.marker_gate
     assert np.linalg.norm(hand.solution.T_rig_palm[:3, 3] - there[:3, 3]) < 0.02
 
 
@@ -442,7 +442,7 @@ def test_a_copied_state_goes_on_with_the_same_bytes() -> None:
         assert boxed(machine.state).tobytes() == boxed(other.state).tobytes()
         assert one.solution is not None
         assert same.solution is not None
-        for name in ("T_rig_palm", "angles_rad", "cov_m2", "tilt_cov_rad2", "measurement_cov", "surprise"):
+        for name in ("T_rig_palm", "angles_rad", "cov_m2", "tilt_cov_rad2", "measurement_cov", "marker_chi2"):
             np.testing.assert_array_equal(getattr(one.solution, name), getattr(same.solution, name))
         np.testing.assert_array_equal(one.tracked, same.tracked)
         np.testing.assert_array_equal(one.sources, same.sources)

@@ -61,7 +61,7 @@ def test_exact_detections_give_the_hand_back(exact_run: SyntheticRun) -> None:
     assert np.mean([joint_mm(p)[1:].mean() for p in settled]) < 4.0
     assert all(p.valid.all() and p.tracked[SURE].all() for p in settled)
     assert pipeline.counts["poses"] == 40
-    assert pipeline.counts["epipolar_misfits"] == 0
+    assert pipeline.counts["epipolar_outliers"] == 0
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def test_rays_that_pass_each_other_are_dropped_and_counted(exact_run: SyntheticR
     assert np.isfinite(poses[15].markers_raw_m[1]).all()
     assert all(np.isnan(p.markers_raw_m[1]).all() for p in poses[22:])
     assert all(np.isfinite(np.delete(p.markers_raw_m, 1, axis=0)).all() for p in poses[22:])
-    assert pipeline.counts["epipolar_misfits"] >= 18
+    assert pipeline.counts["epipolar_outliers"] >= 18
     assert not any(p.tracked[CHAINS[1]].any() for p in poses[22:])
 
 
@@ -130,7 +130,7 @@ def test_a_thing_that_one_slave_takes_for_a_marker_is_rejected_by_the_other_came
         np.testing.assert_allclose(pose.markers_raw_m, true.markers_raw_m, atol=2e-3)
     assert all(pose.tracked[SURE].all() for pose in poses[3:])
     assert pipeline.counts["alternative.index"] >= 18
-    assert pipeline.counts["epipolar_misfits"] == pipeline.counts["unclear.index"] == 0
+    assert pipeline.counts["epipolar_outliers"] == pipeline.counts["unclear.index"] == 0
     sure = build_pipeline(exact_run.setup, StageTimes())  # without the slave's doubt nothing can be chosen
     lost = solve_all(sure, mistaken(exact_run, THING, ("right",), with_alternatives=False))
     assert all(np.isnan(p.markers_raw_m[1]).all() for p in lost[22:])

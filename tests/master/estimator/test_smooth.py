@@ -254,7 +254,7 @@ def test_what_is_not_filtered_stays() -> None:
         assert shown.solution is not None
         assert shown.valid is solved.valid
         assert shown.source is solved.source
-        assert shown.solution.surprise is solved.solution.surprise
+        assert shown.solution.marker_chi2 is solved.solution.marker_chi2
 
 
 def test_a_hand_that_was_shown_stays_as_it_was() -> None:

@@ -11,20 +11,20 @@ from master.estimator.hand_tables import HandTables
 from master.estimator.truncated import Cut
 from tests.hand_helpers import RIGHT
 from tests.master.estimator.fitted import FREE, PARAMETERS
-from tests.master.estimator.kernels import mean_within_at
+from tests.master.estimator.kernels import truncated_mean_at
 
 seeds = st.integers(0, 2**32 - 1)
 PALM = 6
 SIZE = PALM + FREE
 
 
-def mean_within(
+def truncated_mean(
     normal: Float, gradient: Float, x: Float, low: Float, high: Float, at_low_limit: bool = False
 ) -> Float:
     """The step (22,) to the mean of a hand with those limits; `at_low_limit`: its fingers rest at their low ones."""
     tables, mean = HandTables.of(RIGHT, PARAMETERS), np.empty(SIZE)
     tables.low[:], tables.high[:], tables.at_low_limit[:] = low, high, at_low_limit
-    mean_within_at(boxed(tables), normal, gradient, x, boxed(Cut.empty(FREE, SIZE)), mean)
+    truncated_mean_at(boxed(tables), normal, gradient, x, boxed(Cut.empty(FREE, SIZE)), mean)
     return mean
 
 
@@ -40,7 +40,7 @@ def test_angles_that_nothing_ties_have_the_mean_of_a_normal_distribution_that_is
     x = np.concatenate([np.zeros(4), rng.uniform(0.05, 0.95, FREE - 8), np.ones(4)])
     pull = np.concatenate([[0.0, 1.0, 3.0, 9.0], np.zeros(FREE - 8), [-9.0, -3.0, -1.0, 0.0]])
     normal = np.diag([1.0] * PALM + [sigma**-2.0] * FREE)
-    step = mean_within(normal, np.append(np.zeros(PALM), pull), x, np.zeros(FREE), np.ones(FREE))
+    step = truncated_mean(normal, np.append(np.zeros(PALM), pull), x, np.zeros(FREE), np.ones(FREE))
     middle = x - pull * sigma**2
     expected = truncnorm.mean(-middle / sigma, (1.0 - middle) / sigma, loc=middle, scale=sigma)
     np.testing.assert_allclose(x + step[PALM:], expected, atol=1e-4)
@@ -51,8 +51,8 @@ def test_nothing_piles_up_where_a_straight_finger_rests() -> None:
     """At the low limit of a finger that rests there: it does not move up, however poorly it is known."""
     normal, x = np.diag([1.0] * PALM + [16.0] * FREE), np.zeros(FREE)
     zero, far = np.zeros(SIZE), np.full(FREE, 50.0)
-    assert np.abs(mean_within(normal, zero, x, x, far, at_low_limit=True)).max() < 1e-9
-    assert mean_within(normal, zero, x, x, far)[PALM:].min() > 0.15
+    assert np.abs(truncated_mean(normal, zero, x, x, far, at_low_limit=True)).max() < 1e-9
+    assert truncated_mean(normal, zero, x, x, far)[PALM:].min() > 0.15
 
 
 @given(seeds)
@@ -71,7 +71,7 @@ def test_angles_that_are_tied_have_the_mean_of_what_is_drawn_within_the_limits(s
     inside = drawn[((angles >= 0.0) & (angles <= 1.0)).all(axis=1)]
     if len(inside) < 2000:
         return
-    step = mean_within(normal, np.zeros(SIZE), x, low, high)
+    step = truncated_mean(normal, np.zeros(SIZE), x, low, high)
     error = (step[:tied] - inside.mean(axis=0)) / np.sqrt(np.diag(cov))
     assert np.abs(error).max() < 0.08
     assert np.abs(step[tied:]).max() < 1e-9
@@ -79,7 +79,7 @@ def test_angles_that_are_tied_have_the_mean_of_what_is_drawn_within_the_limits(s
 
 def test_far_from_its_limits_a_hand_stays_where_it_is() -> None:
     normal, x = problem(np.random.default_rng(1)), np.full(FREE, 0.5)
-    step = mean_within(1e4 * normal, np.zeros(SIZE), x, np.full(FREE, -5.0), np.full(FREE, 6.0))
+    step = truncated_mean(1e4 * normal, np.zeros(SIZE), x, np.full(FREE, -5.0), np.full(FREE, 6.0))
     np.testing.assert_allclose(step, 0.0, atol=1e-6)
 
 
@@ -93,7 +93,7 @@ def test_no_step_leaves_the_limits_and_what_cannot_move_does_not(seed: int) -> N
     x = rng.uniform(low, high)
     x[0] = low[0]
     normal = problem(rng) * 10.0 ** rng.uniform(-3, 6)
-    step = mean_within(normal, 1e3 * rng.normal(size=SIZE), x, low, high)
+    step = truncated_mean(normal, 1e3 * rng.normal(size=SIZE), x, low, high)
     assert np.isfinite(step).all()
     assert (x + step[PALM:] >= low - 1e-12).all()
     assert (x + step[PALM:] <= high + 1e-12).all()

@@ -8,7 +8,7 @@ import pytest
 from common.arrays import Float
 from master.estimator.cameras import CameraArrays
 from master.fabrik.caps import CapTables
-from master.fabrik.depth import CalibrationResidual, depth_law, law_misfit
+from master.fabrik.depth import CalibrationResidual, depth_law, law_residual
 from master.fabrik.intersection import RAYS, limits_of, triangulate
 from master.fabrik.triangulate import DepthTriangulator, disparity_tables
 from master.rig import load_setup
@@ -23,7 +23,7 @@ def test_law_and_places_agree_as_the_estimator_asks(name: str, root: Path) -> No
     cameras = tuple(setup.models.values())
     law = depth_law(setup.rig, cameras)
     assert law is not None
-    assert law_misfit(law, cameras, setup.rig.volume)[0] < 0.02
+    assert law_residual(law, cameras, setup.rig.volume)[0] < 0.02
 
 
 @pytest.mark.parametrize("sigma_px", [0.0, 0.1])

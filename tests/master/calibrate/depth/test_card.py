@@ -12,7 +12,7 @@ from common.sim.card import DISTANCES_M, MARKER, CardScene
 from master.calibrate.depth.fit import FITS
 from master.calibrate.depth.source import pair_of, parse_target, straightened
 from master.calibrate.depth.sweep import Sweep, checked
-from master.fabrik.depth import law_misfit
+from master.fabrik.depth import law_residual
 from slave.markers.light_adaptive import LightAdaptiveDetector
 from slave.markers.workers import Inline
 
@@ -58,4 +58,4 @@ def test_the_laws_agree_with_the_geometry(sweep: Sweep) -> None:
     for name, most in (("power_law", 0.01), ("affine_disparity", 0.004)):
         law, error = FITS[name](good.disparity_px, good.distance_m)
         assert np.abs(error).max() < most, name
-        assert law_misfit(law, MODELS, RIG.volume)[0] < most, name
+        assert law_residual(law, MODELS, RIG.volume)[0] < most, name
