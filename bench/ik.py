@@ -28,10 +28,10 @@ HANDS = 2000
 _SEED = 2
 _PARTS = 10
 
-CLOSED, SEEDED, PAPER = "closed form", "FABRIK, seeded", "papers' way"
+CLOSED, WARM_STARTED, PAPER = "closed form", "FABRIK, seeded", "papers' way"
 FROM_REST, RESTARTED = "FABRIK, from rest", "FABRIK, from rest, restarts"
 _SLOW = {PAPER: 10, FROM_REST: 10, RESTARTED: 20, "scipy": 40, "mink": 10}  # one hand in so many
-_STRICT_MM = {CLOSED: 1e-3, SEEDED: 0.1}  # by how much these two may miss
+_STRICT_MM = {CLOSED: 1e-3, WARM_STARTED: 0.1}  # by how much these two may miss
 
 
 def rows(hands: int = HANDS) -> list[Row]:
@@ -78,7 +78,7 @@ def ways(model: HandModel) -> dict[str, Fingers]:
     fingers = finger_solvers(model)
     out: dict[str, Fingers] = {
         CLOSED: partial(closed_form, fingers),
-        SEEDED: _seeded(model),
+        WARM_STARTED: _warm_started(model),
         RESTARTED: _from_rest(fingers, 3),
         FROM_REST: _from_rest(fingers, 0),
         PAPER: PaperFingers(fingers).push,
@@ -92,7 +92,7 @@ def ways(model: HandModel) -> dict[str, Fingers]:
     return out
 
 
-def _seeded(model: HandModel) -> Fingers:
+def _warm_started(model: HandModel) -> Fingers:
     fingers = [Finger.of(model, f, model.mount(name).offset_m) for f, name in enumerate(MARKERS[:5])]
 
     def way(tips: Sequence[Vector]) -> Angles:

@@ -38,8 +38,8 @@ class Detector(Protocol):
         """Detect in one frame."""
         ...
 
-    def fresh(self, seeds: Mapping[str, tuple[float, float]] | None = None) -> "Detector":
-        """One that has seen nothing yet; `seeds` are clicks in the first frame, marker -> (u, v) [px]."""
+    def fresh(self, initial_uv: Mapping[str, tuple[float, float]] | None = None) -> "Detector":
+        """One that has seen nothing yet; `initial_uv` are clicks in the first frame, marker -> (u, v) [px]."""
         ...
 
 

@@ -94,35 +94,35 @@ def undistorted(lens: Lens, seen: Float) -> Float:
     r, shown = _radial(lens)
     rising = int(np.argmax(np.append(np.diff(shown) <= 0.0, True))) + 1
     length = np.hypot(seen[:, 0], seen[:, 1])
-    enough = 1e-10 * _reach(lens)
+    tolerance_px = 1e-10 * _reach(lens)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         ratio = np.interp(length, shown[:rising], r[:rising]) / length  # but for tangential terms
         start = seen * np.where(length > 0.0, ratio, 1.0)[:, None]
-        xy, settled = _newton(lens, seen, start, _STEPS, enough)
+        xy, settled = _newton(lens, seen, start, _STEPS, tolerance_px)
         if not settled.all():
             low, high = _borders(lens)
             rest = np.flatnonzero(~settled & ((seen >= low) & (seen <= high)).all(axis=1))
             way = np.zeros((len(rest), 2))
             for part in np.linspace(0.0, 1.0, _PARTS + 1)[1:] if len(rest) else ():
-                way, _ = _newton(lens, part * seen[rest], way, _PART_STEPS, enough)
-            xy[rest], settled[rest] = _newton(lens, seen[rest], way, _STEPS, enough)
+                way, _ = _newton(lens, part * seen[rest], way, _PART_STEPS, tolerance_px)
+            xy[rest], settled[rest] = _newton(lens, seen[rest], way, _STEPS, tolerance_px)
     return np.where(settled[:, None], xy, np.nan)
 
 
-def _newton(lens: Lens, seen: Float, start: Float, steps: int, enough: float) -> tuple[Float, Bool]:
+def _newton(lens: Lens, seen: Float, start: Float, steps: int, tolerance_px: float) -> tuple[Float, Bool]:
     """Go from `start` (N, 2) to the points whose distorted ones are `seen`.
 
-    Returns them (N, 2), and which have arrived (N,): nearer than `enough`, before the lens folds.
+    Returns them (N, 2), and which have arrived (N,): nearer than `tolerance_px`, before the lens folds.
     """
     xy = start.copy()
     for _ in range(steps):
         off_x, off_y = off = (seen - distorted(lens, xy)).T
-        if not (np.abs(off) > enough).any():
+        if not (np.abs(off) > tolerance_px).any():
             break
         xx, yy, mixed = _jacobian(lens, xy)
         det = xx * yy - mixed * mixed
         xy += np.stack([yy * off_x - mixed * off_y, xx * off_y - mixed * off_x], axis=-1) / det[:, None]
-    near = (np.abs(seen - distorted(lens, xy)) <= enough).all(axis=1)
+    near = (np.abs(seen - distorted(lens, xy)) <= tolerance_px).all(axis=1)
     return xy, near & (_least_eigenvalue(lens, xy) > 0.0)
 
 

@@ -23,7 +23,7 @@ _GOES_ON = 0.5  # of it: a motion that is not seen any more rather ends than goe
 _STALE_S = 0.1  # after such a gap nothing of a speed is left
 _STEP_M = 5e-3  # is the most that is led between two poses
 _EASE_S = 0.04  # in which the last of what is led fades
-_LITTLE_M, _NOTHING_M = 1e-3, 1e-5  # a part that is led by more is not yet where its markers are
+_BLENDED_M, _NOTHING_M = 1e-3, 1e-5  # a part that is led by more is not yet where its markers are
 
 
 class Blend:
@@ -53,7 +53,7 @@ class Blend:
                 goes_on[PLACE] = shown[PLACE] + went.mean(axis=0)
             off = np.sqrt(np.bincount(PARTS, np.square(goes_on - solved - self._offset)))
             triangulated = (sources & self._sources & BY_MARKERS) > 0
-            led = np.bincount(PARTS, np.abs(self._offset)) > _LITTLE_M
+            led = np.bincount(PARTS, np.abs(self._offset)) > _BLENDED_M
             leaps = ((sources != self._sources) | ~triangulated | led) & (off > _SUDDEN_M)
             self._offset = np.where(leaps[PARTS], goes_on - solved, self._offset)
             size_m = np.maximum(np.bincount(PARTS, np.abs(self._offset)), _NOTHING_M)

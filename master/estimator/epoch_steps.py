@@ -181,9 +181,9 @@ class EpochSteps:
         """Write where the state has the hand; as `predict_epoch`."""
         return self._predict(self._model, self._state, self.observed, self._space)
 
-    def fit(self, posture_prior: PosturePrior, *, rough: bool = False) -> float:
+    def fit(self, posture_prior: PosturePrior, *, coarse: bool = False) -> float:
         """Fit what is measured; return chi square, or the cost of a rough search."""
-        self.at.task.rough[0] = rough
+        self.at.task.coarse[0] = coarse
         return self._fit(self._model, posture_prior, self.observed, self._blank, self._space)
 
     def take_over(self, *, goes_on: bool) -> Estimate:
@@ -200,7 +200,7 @@ class EpochSteps:
         """Let the state be what it was."""
         self._state[:] = state
 
-    def enough(self, at: Epoch) -> bool:
+    def determines_hand(self, at: Epoch) -> bool:
         """Return whether the markers fix a hand: not in one line, or across `back_normal`.
 
         What faces the cameras turns the hand about a line of markers, but not about one that points at them. With an

@@ -156,7 +156,7 @@ class Estimator:
             goes_on = consistent or wrong <= self.settings.misled + self._reinitialiser.begin(at)
             if goes_on and not consistent:
                 self._go_on(at, may_leave=False)
-        elif self._steps.enough(at):
+        elif self._steps.determines_hand(at):
             goes_on = False
             self._reinitialiser.begin(at)
         else:
@@ -172,7 +172,7 @@ class Estimator:
             that may take its place is better.
         """
         start, task = at.start, self._at.task
-        task.may_leave[0] = may_leave and start is not None and self._steps.enough(at)
+        task.may_leave[0] = may_leave and start is not None and self._steps.determines_hand(at)
         if start is not None:
             task.palm[:], task.angles[:] = start.T_rig_palm, start.angles_rad.reshape(20)
         limit = self._steps.predict()
@@ -181,7 +181,7 @@ class Estimator:
         # Whether a hand obeys habits, fingers before a wrist device say by themselves.
         wrong = self._steps.fit(self._posture_prior if self._at.ground.seen[0] > 0 else self._natural_prior)
         if self._natural_only and may_leave:
-            return wrong, not (self._steps.has_outlier() and self._steps.enough(at))
+            return wrong, not (self._steps.has_outlier() and self._steps.determines_hand(at))
         return wrong, not wrong > limit  # NaN: there is nothing to compare
 
     def _knows_place(self) -> bool:

@@ -62,7 +62,7 @@ def stationary_of(settings: Settings, *, loose: bool, tilt_rad: float) -> Float:
         [settings.flexion_rad, settings.deviation_rad] if loose else 2 * [settings.calibrated_palm_rad]
     )
     stationary[WRIST_ANGLES : WRIST_ANGLES + 2] = wrist_angles**2
-    stationary[RATE : RATE + 2] = (settings.pace_1_s * wrist_angles) ** 2
+    stationary[RATE : RATE + 2] = (settings.wrist_rate_1_s * wrist_angles) ** 2
     stationary[TILT : TILT + 2] = max(tilt_rad, 1e-3) ** 2
     stationary[HEADING] = np.pi**2 / 3.0
     stationary[LED_SCALE] = settings.led_scale**2
@@ -101,12 +101,12 @@ def predict_extras(
         for j in range(K):
             M[i, j] = 0.0
         M[i, i] = 1.0 if i == HEADING else exp(-away / _correlation_time(settings, i))
-    paced = settings.pace_1_s * away
+    paced = settings.wrist_rate_1_s * away
     decay = exp(-paced)
     for b in range(2):
         at, rate = WRIST_ANGLES + b, RATE + b
         M[at, at], M[at, rate] = (1.0 + paced) * decay, away * decay
-        M[rate, at], M[rate, rate] = -(settings.pace_1_s**2) * away * decay, (1.0 - paced) * decay
+        M[rate, at], M[rate, rate] = -(settings.wrist_rate_1_s**2) * away * decay, (1.0 - paced) * decay
         z[at] -= state.wrist_mean_rad[b]
     for i in range(K):
         total = 0.0

@@ -96,7 +96,7 @@ class Reinitialiser:
                 return steps.fit(posture_prior)
             for T, x in starts:
                 task.palm[:], task.x[:] = T, x
-                ends.append((steps.fit(posture_prior, rough=True), task.palm.copy(), task.x.copy()))
+                ends.append((steps.fit(posture_prior, coarse=True), task.palm.copy(), task.x.copy()))
             _, scratch.start_T[:], scratch.start_x[:] = min(ends, key=lambda end: end[0])
             return steps.fit(posture_prior)
         finally:

@@ -240,7 +240,7 @@ class Settings(NamedTuple):
     strap_rad: Annotated[
         float, Range("rad", 0.001, 0.5, "of a palm by markers, and of how IMU and camera are mounted")
     ] = radians(1.5)
-    pace_1_s: Annotated[float, Range("1/s", 0.1, 30.0, "of wrists; Hansson et al. 2009")] = 1.5
+    wrist_rate_1_s: Annotated[float, Range("1/s", 0.1, 30.0, "of wrists; Hansson et al. 2009")] = 1.5
     wrist_mean_s: Annotated[float, Range("s", 1.0, 600.0, "as long as a posture of the wrist is kept")] = 20.0
     tilt_s: Annotated[float, Range("s", 0.1, 600.0, "as long as an IMU has the vertical off")] = 5.0
     errs_s: Annotated[float, Range("s", 0.01, 60.0, "as long as errors of shape and skin stay")] = 0.5
@@ -253,7 +253,7 @@ class Settings(NamedTuple):
     # The search.
     tolerance: Annotated[float, Range("half chi square", 1e-12, 1.0, "what a step may leave")] = 1e-7
     tolerance_share: Annotated[float, Range("1", 0.0, 0.1, "of the cost, likewise")] = 1e-4
-    rough: Annotated[
+    coarse: Annotated[
         float, Range("half chi square", 1e-7, 1.0, "where one of several starts is to be chosen")
     ] = 1e-2
 

@@ -312,7 +312,7 @@ def descend(
     while iterations < MAX_ITERATIONS and damping <= _MOST_DAMPING:
         iterations += 1
         hoped = _step(rig, x, damping, gradient, normal, search)
-        little = tolerance + share * cost
+        least_gain = tolerance + share * cost
         if hoped < 0.0:
             damping, growth = damping * growth, 2.0 * growth
             continue
@@ -323,7 +323,7 @@ def descend(
             search.z[i] = z[i] + search.step[6 + n + i]
         for i in range(5 if K == EXTRAS else 0):
             search.z[i] = min(max(search.z[i], -_ROLLED_RAD), _ROLLED_RAD)
-        if damping <= _FIRST_DAMPING and hoped < little:
+        if damping <= _FIRST_DAMPING and hoped < least_gain:
             copy(search.next_palm, T)
             for i in range(n):
                 x[i] = search.x[i]
@@ -357,6 +357,6 @@ def descend(
             z[i] = search.z[i]
         for i in range(6 + n + K):
             gradient[i] = search.gradient[i]
-        if gain < little:
+        if gain < least_gain:
             break
     return cost, iterations

@@ -239,14 +239,14 @@ def fit_epoch(model: Model, posture_prior: PosturePrior, observed: Observations,
         space.scratch,
     )
     search, found = scratch.search, space.found
-    if task.rough[0] > 0:
+    if task.coarse[0] > 0:
         cost, _ = descend(
             rig,
             posture_prior,
             epoch_prior,
             observed,
             posture_prior.constant.shape[0] - 1,
-            settings.rough,
+            settings.coarse,
             settings.tolerance_share,
             task.palm,
             task.x,

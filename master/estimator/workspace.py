@@ -41,7 +41,7 @@ class Task:
     angles: Float
     x: Float
     may_leave: Bool
-    rough: Bool
+    coarse: Bool
     natural_weight: Float
     counts: Float
     second_order: Bool
@@ -64,7 +64,7 @@ class Task:
             angles=20,
             x=n,
             may_leave=("u1", 1),
-            rough=("u1", 1),
+            coarse=("u1", 1),
             natural_weight=1,
             counts=1,
             second_order=("u1", 1),

@@ -39,7 +39,7 @@ from master.fabrik.limits import hinge_fit, swing_and_flex
 from master.fabrik.rotations import Vector, dot, length, minus, plus, rotate, rotate_back
 
 REACHED_M = 1e-6
-_ENOUGH_M = 0.05 * REACHED_M
+_TOLERANCE_M = 0.05 * REACHED_M
 _SLACK_RAD = 1e-6
 """A limit passed by less is rounding: the angle is clamped, which moves the point < 0.2 um."""
 _FIRST = constant(0)
@@ -65,7 +65,7 @@ def closed_form(
     goal: Vector,
     warm_start: Float,
     angles: Float,
-    seeds: Float,
+    initial_angles: Float,
 ) -> float:
     """The legal pose that hits the target.
 
@@ -98,9 +98,9 @@ def closed_form(
                 if miss < REACHED_M and rank < best:
                     best, residual = rank, miss
                     _copy(trial, angles)
-            _keep(seeds, penalties, trial, cut + 1e2 * sqrt(max(off, 0.0)))
+            _keep(initial_angles, penalties, trial, cut + 1e2 * sqrt(max(off, 0.0)))
     if residual == inf:
-        _in_plane(chain, edges, ratio, local, seeds)
+        _in_plane(chain, edges, ratio, local, initial_angles)
     return residual
 
 
@@ -217,26 +217,26 @@ def _copy_row(rows: Float, row: int, out: Float) -> None:
 
 
 @inner
-def _keep(seeds: Float, penalties: Float, angles: Float, penalty: float) -> None:
+def _keep(initial_angles: Float, penalties: Float, angles: Float, penalty: float) -> None:
     """Keep a pose among the two (rows 1 and 2) that are least beyond what is legal."""
     row = 1
     if penalty < penalties[0]:
         penalties[1] = penalties[0]
         for i in range(4):
-            seeds[2, i] = seeds[1, i]
+            initial_angles[2, i] = initial_angles[1, i]
     elif penalty < penalties[1]:
         row = 2
     else:
         return
     penalties[row - 1] = penalty
     for i in range(4):
-        seeds[row, i] = angles[i]
+        initial_angles[row, i] = angles[i]
 
 
 @inner
-def _in_plane(chain: ChainArrays, edges: Float, ratio: float, local: Vector, seeds: Float) -> None:
+def _in_plane(chain: ChainArrays, edges: Float, ratio: float, local: Vector, initial_angles: Float) -> None:
     """Write row 0: with row 1's abduction, its plane's nearest point to the target."""
-    a = seeds[1, 0]
+    a = initial_angles[1, 0]
     c, s = cos(chain.links[ROOT, SIGN] * a), sin(chain.links[ROOT, SIGN] * a)
     x, y, z = local
     x, y, z = rotate_back(matrix_at(chain.links, ROOT, REST), (c * x - s * z, y, s * x + c * z))
@@ -247,11 +247,11 @@ def _in_plane(chain: ChainArrays, edges: Float, ratio: float, local: Vector, see
         lateral = _point(chain, pip, ratio * pip)[0]
     w = _point(chain, pip, ratio * pip)
     f = hinge_fit(chain.spans[1, 0], chain.spans[1, 1], (-1.0, 0.0, 0.0), w, (x, y, z), 0.0)
-    seeds[0, 0], seeds[0, 1], seeds[0, 2], seeds[0, 3] = a, f, pip, ratio * pip
+    initial_angles[0, 0], initial_angles[0, 1], initial_angles[0, 2], initial_angles[0, 3] = a, f, pip, ratio * pip
 
 
 @kernel
-def nearest_pose(chain: ChainArrays, goal: Vector, warm_start: Float, seeds: Float, angles: Float) -> float:
+def nearest_pose(chain: ChainArrays, goal: Vector, warm_start: Float, initial_angles: Float, angles: Float) -> float:
     """The legal pose nearest to the target, where none hits it in closed form.
 
     Args:
@@ -264,15 +264,15 @@ def nearest_pose(chain: ChainArrays, goal: Vector, warm_start: Float, seeds: Flo
     """
     best, trial = inf, np.empty(4)
     local = rotate_back(matrix_at(chain.links, ROOT, ROTATION), goal)
-    starts = len(seeds) if chain.follower >= 0 else _STARTS
+    starts = len(initial_angles) if chain.follower >= 0 else _STARTS
     for start in range(starts + 1):
         steps = _FIRST_STEPS
         if start < starts:
-            _start(chain, local, warm_start, seeds, start, trial)
+            _start(chain, local, warm_start, initial_angles, start, trial)
         else:
             steps = _MOST_STEPS
             _copy(angles, trial)
-        left = least_squares(chain, goal, _ENOUGH_M, steps, trial)
+        left = least_squares(chain, goal, _TOLERANCE_M, steps, trial)
         if start == 0 or left < best:
             best = left
             _copy(trial, angles)
@@ -283,14 +283,14 @@ def nearest_pose(chain: ChainArrays, goal: Vector, warm_start: Float, seeds: Flo
 
 @inner
 def _start(
-    chain: ChainArrays, local: Vector, warm_start: Float, seeds: Float, start: int, angles: Float
+    chain: ChainArrays, local: Vector, warm_start: Float, initial_angles: Float, start: int, angles: Float
 ) -> None:
     """Write start (4,): a seed; for a free DIP also the last pose, and pairs."""
-    pair = start - len(seeds) - 1
-    if start < len(seeds):
-        _copy_row(seeds, start, angles)
+    pair = start - len(initial_angles) - 1
+    if start < len(initial_angles):
+        _copy_row(initial_angles, start, angles)
     elif pair < 0:
-        _copy_row(seeds, _FIRST, angles)
+        _copy_row(initial_angles, _FIRST, angles)
         if _known(warm_start):
             _copy(warm_start, angles)
     else:

@@ -124,7 +124,7 @@ class Fabrik:
     def solve(
         self,
         target: Vector,
-        seed: Pose | None = None,
+        initial: Pose | None = None,
         root: Vector = (0.0, 0.0, 0.0),
         frame: Matrix = IDENTITY,
     ) -> ChainResult:
@@ -142,7 +142,7 @@ class Fabrik:
         goal = rotate_back(frame, minus(target, root))
         reach = self._reach(goal)
         chain = self.chain
-        angles = np.zeros(len(chain.arrays.spans)) if seed is None else chain.flat(seed)
+        angles = np.zeros(len(chain.arrays.spans)) if initial is None else chain.flat(initial)
         if reach is Reach.NOT_SEEN:
             return self._not_seen(chain.pose(np.full_like(angles, np.nan)))
         restarts = self.restarts if reach is Reach.WITHIN else 0

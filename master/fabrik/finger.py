@@ -218,9 +218,9 @@ def start_of(
     Returns:
         Distance of the point to the target [m].
     """
-    seeds = np.empty((3, 4))
-    left = closed_form(chain, edges, ratio, goal, warm_start, angles, seeds)
-    return left if left < inf else nearest_pose(chain, goal, warm_start, seeds, angles)
+    initial_angles = np.empty((3, 4))
+    left = closed_form(chain, edges, ratio, goal, warm_start, angles, initial_angles)
+    return left if left < inf else nearest_pose(chain, goal, warm_start, initial_angles, angles)
 
 
 @kernel

@@ -34,13 +34,13 @@ _COUPLED_RAD = 1e-12
 
 
 @kernel
-def least_squares(chain: ChainArrays, goal: Vector, enough_m: float, max_steps: int, angles: Float) -> float:
+def least_squares(chain: ChainArrays, goal: Vector, tolerance_m: float, max_steps: int, angles: Float) -> float:
     """Improve a finger's angles until the target is hit or no legal step helps.
 
     Args:
         chain: A rotor (box) and two flexion hinges; its coupling, when it has one, is obeyed.
         goal: Target [m], root frame, finite.
-        enough_m: Residual that ends the search [m].
+        tolerance_m: Residual that ends the search [m].
         max_steps: Of the search, taken or refused.
         angles: (4,) [rad]; in: start, clamped to the limits; out: legal.
 
@@ -55,7 +55,7 @@ def least_squares(chain: ChainArrays, goal: Vector, enough_m: float, max_steps: 
     left = _evaluate(chain, goal, unknowns, angles, columns)
     cost, damping = dot(left, left), _FIRST_DAMPING_M2
     for _ in range(max_steps):
-        if cost <= enough_m * enough_m or not _step(chain, unknowns, left, columns, damping, trial):
+        if cost <= tolerance_m * tolerance_m or not _step(chain, unknowns, left, columns, damping, trial):
             break
         trial_left = _evaluate(chain, goal, trial, next_angles, trial_columns)
         trial_cost = dot(trial_left, trial_left)

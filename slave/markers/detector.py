@@ -99,7 +99,7 @@ class MarkerDetector:
         self,
         camera: CameraCalibration,
         markers: tuple[str, ...],
-        seeds: Mapping[str, tuple[float, float]] | None = None,
+        initial_uv: Mapping[str, tuple[float, float]] | None = None,
         table: ColourTable | None = None,
         engine: Engine = NUMPY,
         free: Collection[str] = (),
@@ -126,7 +126,7 @@ class MarkerDetector:
         self._free = tuple(markers.index(name) for name in free)
         self._engine = engine
         engine.prepare(self._table)
-        self._seeds = {markers.index(name): uv for name, uv in (seeds or {}).items() if name in markers}
+        self._initial_uv = {markers.index(name): uv for name, uv in (initial_uv or {}).items() if name in markers}
         self._tracks: list[Track | None] = [None] * len(markers)
         self._scanner = Scanner(camera.width_px, camera.height_px, engine)
         self._last_ns: int | None = None  # time of the last frame
@@ -139,10 +139,10 @@ class MarkerDetector:
         self.ambiguity = ColourAmbiguityMonitor(markers)
         self.evidence: dict[int, Evidence] = {}
 
-    def fresh(self, seeds: Mapping[str, tuple[float, float]] | None = None) -> "MarkerDetector":
+    def fresh(self, initial_uv: Mapping[str, tuple[float, float]] | None = None) -> "MarkerDetector":
         """A detector of the same camera that has seen nothing yet; shares the colour table."""
         free = [self._names[m] for m in self._free]
-        other = MarkerDetector(self._camera, self._names, seeds, self._table, self._engine, free)
+        other = MarkerDetector(self._camera, self._names, initial_uv, self._table, self._engine, free)
         other.windows_only, other._gains = self.windows_only, self._gains
         return other
 
@@ -169,7 +169,7 @@ class MarkerDetector:
         blobs = scanned.blobs
         chosen = self._decide(scanned, windows)
         self.ambiguity.push(blobs, chosen)
-        self._seeds = {}
+        self._initial_uv = {}
         rows = list(chosen)
         alternatives: dict[int, Blob] = {}
         shift_px: dict[int, float] = {}
@@ -226,7 +226,7 @@ class MarkerDetector:
 
     def adopt(self, other: "MarkerDetector") -> None:
         """Go on with the tracks of another detector, of the markers that both seek."""
-        self._seeds = {}
+        self._initial_uv = {}
         if other._names == self._names:
             self._tracks, self._scanner, self.ambiguity = other._tracks, other._scanner, other.ambiguity
             self._last_ns, self._frame, self._outlines = other._last_ns, other._frame, other._outlines
@@ -336,7 +336,7 @@ class MarkerDetector:
         """Marker row -> its blob, by prediction alone where that answers for every colour that was seen."""
         blobs = scanned.blobs
         tracked: dict[int, Blob] = {}
-        certain = not self._seeds
+        certain = not self._initial_uv
         for m, options in enumerate(blobs):
             track, window = self._tracks[m], windows[m]
             if not options:
@@ -371,10 +371,10 @@ class MarkerDetector:
         return {m: c.blob for m, c in chosen.items()}
 
     def _bonus(self, m: int, blob: Blob, tracked: Blob | None) -> float:
-        seed = self._seeds.get(m)
-        if seed is not None:
-            x = max(blob.left - seed[0], seed[0] - blob.right, 0.0)
-            y = max(blob.top - seed[1], seed[1] - blob.bottom, 0.0)
+        initial_uv = self._initial_uv.get(m)
+        if initial_uv is not None:
+            x = max(blob.left - initial_uv[0], initial_uv[0] - blob.right, 0.0)
+            y = max(blob.top - initial_uv[1], initial_uv[1] - blob.bottom, 0.0)
             if max(x, y) <= CLICK_REACH:
                 return CLICKED + math.sqrt(blob.area)  # the click names it; of its fragments take the largest
         track = self._tracks[m]

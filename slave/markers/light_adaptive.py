@@ -43,7 +43,7 @@ class LightAdaptiveDetector:
         camera: CameraCalibration,
         markers: tuple[str, ...],
         workers: Workers,
-        seeds: Mapping[str, tuple[float, float]] | None = None,
+        initial_uv: Mapping[str, tuple[float, float]] | None = None,
         engine: Engine = NUMPY,
         free: Collection[str] = (),
     ) -> None:
@@ -63,7 +63,7 @@ class LightAdaptiveDetector:
         self._table = table_of(markers, camera.markers, f"camera {camera.name!r}")
         ranges = camera.markers or {}
         reference = np.array([ranges[name].reference_bgr_linear or (np.nan,) * 3 for name in markers])
-        self._detector = MarkerDetector(camera, markers, seeds, self._table, engine, free)
+        self._detector = MarkerDetector(camera, markers, initial_uv, self._table, engine, free)
         self._light = WhiteBalance(self._table, reference, (camera.width_px, camera.height_px), workers)
         self._watch = ColourMonitor(markers, ranges)
         self._workers, self._engine = workers, engine
@@ -99,10 +99,10 @@ class LightAdaptiveDetector:
         """As of `MarkerDetector`; what an exposure does to the colours is seen as a change of the light."""
         self._detector.tune(camera)
 
-    def fresh(self, seeds: Mapping[str, tuple[float, float]] | None = None) -> "LightAdaptiveDetector":
+    def fresh(self, initial_uv: Mapping[str, tuple[float, float]] | None = None) -> "LightAdaptiveDetector":
         """A detector of the same camera, under the same light, that has seen no marker yet."""
         other = copy(self)
-        other._detector = self._detector.fresh(seeds)
+        other._detector = self._detector.fresh(initial_uv)
         return other
 
     def push(self, image: Image, t_ns: int) -> Detections:
@@ -163,7 +163,7 @@ def detector_for(
     camera: CameraCalibration,
     markers: tuple[str, ...],
     workers: Workers,
-    seeds: Mapping[str, tuple[float, float]] | None = None,
+    initial_uv: Mapping[str, tuple[float, float]] | None = None,
     engine: Engine = NUMPY,
     free: Collection[str] = (),
 ) -> LightAdaptiveDetector | MarkerDetector:
@@ -173,8 +173,8 @@ def detector_for(
         CalibrationError: The camera has no colour range for a marker.
     """
     if can_adapt(camera, markers):
-        return LightAdaptiveDetector(camera, markers, workers, seeds, engine, free)
-    return MarkerDetector(camera, markers, seeds, None, engine, free)
+        return LightAdaptiveDetector(camera, markers, workers, initial_uv, engine, free)
+    return MarkerDetector(camera, markers, initial_uv, None, engine, free)
 
 
 def can_adapt(camera: CameraCalibration, markers: tuple[str, ...]) -> bool:

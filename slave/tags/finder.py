@@ -167,16 +167,16 @@ class TagFinder:
         begun = (begun + 0.5) * scale - 0.5 + np.array(box[:2], np.float64)
         begun = begun[[not _known(quad, found) for quad in begun]] if len(begun) else begun
         for codes in self._codes if len(begun) else ():
-            rough = refine(grey, begun, codes.cells, self._lens)
-            good = np.isfinite(rough.sigma_px)
+            coarse = refine(grey, begun, codes.cells, self._lens)
+            good = np.isfinite(coarse.sigma_px)
             if not good.any():
                 continue
-            rough = Corners(rough.uv[good], rough.sigma_px[good], rough.contrast[good], rough.width_px[good])
-            read = codes.read(grey, rough)
+            coarse = Corners(coarse.uv[good], coarse.sigma_px[good], coarse.contrast[good], coarse.width_px[good])
+            read = codes.read(grey, coarse)
             sure = np.flatnonzero(read.fit >= codes.sure)
             if not len(sure):
                 continue
-            printed = np.array([np.roll(rough.uv[k], -read.quarter_turns[k], axis=0) for k in sure])
+            printed = np.array([np.roll(coarse.uv[k], -read.quarter_turns[k], axis=0) for k in sure])
             final = refine(grey, printed, codes.cells, self._lens, codes.inner[read.which[sure]])
             fits = read.fit[sure]
             for k in np.argsort(-fits, kind="stable"):

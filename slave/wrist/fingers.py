@@ -26,8 +26,8 @@ from slave.wrist.view import WristView
 
 _SHOWN = 24  # grey levels that the palm of a lit hand exceeds, or what hides it; the sun leaves less
 _TAKEN = 10.0  # energy for the thumb's seam where another seam runs
-_ONE_VALLEY = 0.35  # of the distance of two corridors, and of the rows of the hand
-_VALLEY = 3.0  # samples of the thumb's corridor: half the breadth of such a valley
+_SAME_MINIMUM = 0.35  # of the distance of two corridors, and of the rows of the hand
+_HALF_WIDTH = 3.0  # samples of the thumb's corridor: half the breadth of such a valley
 _CREASE = np.ones((5, 5), dtype=np.uint8)
 
 
@@ -89,9 +89,9 @@ def separate(led: Image, view: WristView, engine: Engine = NUMPY) -> Fingers:
     np.minimum.accumulate(order * seams[:3], axis=0, out=seams[:3])
     seams[:3] *= order
     taken = _in_thumbs(search_bands, seams[:3])
-    if (np.abs(paths[3] - taken) < _VALLEY).any():  # else it would pay nothing for what is taken
+    if (np.abs(paths[3] - taken) < _HALF_WIDTH).any():  # else it would pay nothing for what is taken
         thumb = energy[:, STARTS[3] :]
-        thumb += _TAKEN * (np.abs(np.arange(WIDTHS[3]) - taken[..., None]) < _VALLEY).any(axis=0)
+        thumb += _TAKEN * (np.abs(np.arange(WIDTHS[3]) - taken[..., None]) < _HALF_WIDTH).any(axis=0)
         seams[3:] = search_bands.across(slice(3, 4), engine.minimum_cost_paths(thumb, WIDTHS[3:]))
     return Fingers(search_bands, seams, shown, palm_pose)
 
@@ -104,8 +104,8 @@ def _part(
     `paths` (3, S) and `energy` are changed.
     """
     lit = straightened[:, : STARTS[3]].max(axis=1) > DARK
-    near = _ONE_VALLEY * np.abs(np.diff(search_bands.middle[:3], axis=0))
-    most = _ONE_VALLEY * np.count_nonzero(lit)
+    near = _SAME_MINIMUM * np.abs(np.diff(search_bands.middle[:3], axis=0))
+    most = _SAME_MINIMUM * np.count_nonzero(lit)
     for seam in range(2):
         across = search_bands.across(slice(0, 3), paths)
         same = (np.abs(np.diff(across, axis=0)) < near) & lit
@@ -119,7 +119,7 @@ def _part(
         start = STARTS[loser]
         band_energy = energy[:, start : start + WIDTHS[loser]]
         at = search_bands.sample(loser, across[winner])
-        band_energy += _TAKEN * (np.abs(np.arange(WIDTHS[loser]) - at[:, None]) < _VALLEY)
+        band_energy += _TAKEN * (np.abs(np.arange(WIDTHS[loser]) - at[:, None]) < _HALF_WIDTH)
         paths[loser] = engine.minimum_cost_paths(band_energy, WIDTHS[loser : loser + 1])[0]
 
 

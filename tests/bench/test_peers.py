@@ -36,10 +36,10 @@ def value(lines: list[Row], name: str) -> float:
 
 def test_on_reachable_targets_ours_and_scipy_miss_none_and_the_papers_way_misses_many() -> None:
     lines = ik.rows(hands=80)
-    for name in (ik.CLOSED, ik.SEEDED, "scipy"):
+    for name in (ik.CLOSED, ik.WARM_STARTED, "scipy"):
         assert value(lines, f"{name}: missed by > 1 mm") == 0.0
     assert value(lines, f"{ik.CLOSED}: missed by > 1 um") == 0.0
-    assert value(lines, f"{ik.SEEDED}: missed by > 100 um") == 0.0
+    assert value(lines, f"{ik.WARM_STARTED}: missed by > 100 um") == 0.0
     found, _, _ = ik.timed(MODEL, ik.ways(MODEL)[ik.PAPER], draw(MODEL, 4, 12, coupling_off_rad=0.0))
     assert found.missed_percent > 10.0
     assert found.violations == 0

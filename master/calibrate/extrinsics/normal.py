@@ -9,7 +9,7 @@ from master.calibrate.extrinsics.hands import HandProblem, Hands, Linear
 from master.calibrate.extrinsics.unknown import CAMERA_LATE, UNKNOWN
 from master.estimator.parameters import HandParameters
 
-_LITTLE = 1e-5
+_DIFFERENCE_STEP = 1e-5
 _NOTHING = 1e-9  # information of what nothing tells
 
 
@@ -36,9 +36,9 @@ class Normal:
         """Of the markers, which move with the camera's clock by `speed` (T, M, 3) [m/s]."""
         count, size = linear.gradient.shape
         mixed, shared, pull = np.zeros((count, size, UNKNOWN)), np.zeros((UNKNOWN,) * 2), np.zeros(UNKNOWN)
-        later = replace(problem, points_m=problem.points_m + _LITTLE * speed)
+        later = replace(problem, points_m=problem.points_m + _DIFFERENCE_STEP * speed)
         after = later.linearise(hands).gradient  # linear in the points
-        mixed[..., CAMERA_LATE] = (after - linear.gradient) / _LITTLE
+        mixed[..., CAMERA_LATE] = (after - linear.gradient) / _DIFFERENCE_STEP
         off = problem.place(hands) - problem.points_m
         residual, by_late = ((problem.whiten @ v[..., None])[..., 0] for v in (off, -speed))
         shared[CAMERA_LATE, CAMERA_LATE] = (by_late**2).sum()

@@ -6,7 +6,7 @@ from common.arrays import Float
 from common.geometry import rotation_vector_to_matrix
 from common.wrist_joint import wrist_angles_of
 
-_LITTLE = 1e-5
+_DIFFERENCE_STEP = 1e-5
 
 
 def wrist_rotation_angles(R_forearm_palm: Float) -> Float:
@@ -18,6 +18,6 @@ def bends_by_rotation(R_forearm_palm: Float) -> Float:
     """Derivatives (T, 3, 3) of `wrist_rotation_angles` by a turn of the palms (T, 3, 3), forearm axes."""
     here, out = wrist_rotation_angles(R_forearm_palm), np.empty((len(R_forearm_palm), 3, 3))
     for k in range(3):
-        rotated = rotation_vector_to_matrix(_LITTLE * np.eye(3)[k]) @ R_forearm_palm
-        out[..., k] = (wrist_rotation_angles(rotated) - here) / _LITTLE
+        rotated = rotation_vector_to_matrix(_DIFFERENCE_STEP * np.eye(3)[k]) @ R_forearm_palm
+        out[..., k] = (wrist_rotation_angles(rotated) - here) / _DIFFERENCE_STEP
     return out

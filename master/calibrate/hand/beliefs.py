@@ -10,7 +10,7 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.hand_routine import move_at, posture_at
 
-_ROUGHLY_S = 0.1
+_COARSE_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ class RoutineTargets:
     @classmethod
     def of(cls, script_s: Float) -> "RoutineTargets":
         """At routine times (K,) [s]; what may be moving by then counts as moving, since times are known roughly."""
-        around = [[move_at(t + d) for d in (-_ROUGHLY_S, 0.0, _ROUGHLY_S)] for t in script_s.tolist()]
+        around = [[move_at(t + d) for d in (-_COARSE_S, 0.0, _COARSE_S)] for t in script_s.tolist()]
         return cls(
             np.radians([posture_at(t) for t in script_s.tolist()]),
             np.array([np.any([move.moving for move in moves], axis=0) for moves in around]),

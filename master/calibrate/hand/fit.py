@@ -11,7 +11,7 @@ from master.calibrate.hand.problem import HandRoutineProblem
 from master.calibrate.hand.shape import Shape
 
 _STEPS = 40
-_ENOUGH = 0.05  # of half chi square, against thousands
+_TOLERANCE = 0.05  # of half chi square, against thousands
 _REFUSED = 12
 
 
@@ -59,7 +59,7 @@ def fit_shape(
             gain, state, normal, cost = cost - next_cost, tried, next_normal, next_cost
             damping, taken, refused = max(damping / 5.0, 1e-9), taken + 1, 0
             progress(min(taken / 15.0, 0.99))
-            settled = gain < _ENOUGH
+            settled = gain < _TOLERANCE
             if settled:
                 break
         else:

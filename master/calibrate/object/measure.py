@@ -72,7 +72,7 @@ def measure_object(seen: Seen) -> Measurement:
     Raises:
         FitError: Too little is seen, the beads lie in one line, are not rigid, or the motion does not tell them.
     """
-    refuse_little(seen)
+    refuse_insufficient(seen)
     refuse_loose(seen)
     bundle = fit_bundle(seen)
     own = own_frame(bundle.beads_m, seen.names)
@@ -97,7 +97,7 @@ def measure_object(seen: Seen) -> Measurement:
     return found
 
 
-def refuse_little(seen: Seen) -> None:
+def refuse_insufficient(seen: Seen) -> None:
     """Refuse what is too short, or too seldom seen whole.
 
     Raises:

@@ -120,8 +120,8 @@ def fit_registration(seen: PoseTrack, tracker: PoseTrack, first: Placed) -> Fit:
         tracker: The device, by its system.
         first: Right to some centimetres, degrees and ten milliseconds.
     """
-    rough = _Problem(seen, tracker, shared_epochs(seen, tracker, first.late_s, MOST))
-    better, _ = _refined(rough, first)
+    coarse = _Problem(seen, tracker, shared_epochs(seen, tracker, first.late_s, MOST))
+    better, _ = _refined(coarse, first)
     # Again, because the lag decides which instants are known.
     problem = _Problem(seen, tracker, shared_epochs(seen, tracker, better.late_s, MOST))
     placed, scale = _refined(problem, better)

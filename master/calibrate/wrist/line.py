@@ -73,8 +73,8 @@ def line_on_board(
     background = float(np.median(flat))
     noise = 1.4826 * float(np.median(np.abs(flat - background))) + 0.5
     point, along = _brightest_line(flat - background, at, noise, 1.5 * texel_m)
-    rough = _profiles(difference, point, along, pixel_m, noise, placed, board, optics)
-    found = _profiles(difference, rough.point, rough.along, pixel_m, noise, placed, board, optics)
+    coarse = _profiles(difference, point, along, pixel_m, noise, placed, board, optics)
+    found = _profiles(difference, coarse.point, coarse.along, pixel_m, noise, placed, board, optics)
     return BoardLine(found.points_m, optics.project(found.points_m), found.sigma_px, found.rms_px)
 
 

@@ -34,7 +34,7 @@ _KNUCKLE_M = 3e-3  # against a hand of this size, per axis
 _INDEPENDENT = 4.0  # triples of a bend
 _STRAYS = 2.5  # standard deviations from which a sighting is believed less
 _FARTHEST = 8.0  # of a finger that the laser should meet and does not
-_ROUGH = np.array([4e-3, 25.0])  # of a guess: laser point along the plane [m], tip [px]
+_GUESS_SIGMA = np.array([4e-3, 25.0])  # of a guess: laser point along the plane [m], tip [px]
 _ROUGHEST = 3.0
 _GRID_RAD = np.radians(np.arange(0.0, 97.0, 4.0))
 _PAST_RAD = np.radians(84.0)  # PIP beyond which the last phalanx may fold into the light
@@ -144,7 +144,7 @@ class _Problem:
         grid[_FIST, ..., MCP] = self._model.mcp_per_pip * _GRID_RAD[:, None]
         shown = np.stack([self._model(x, poses) for poses in grid])  # (2, G, 4, 4)
         # Abductions, of which nothing is known yet, move points and tips across.
-        along = (self._data[:, None, None, :, 1::2] - shown[..., 1::2]) / _ROUGH
+        along = (self._data[:, None, None, :, 1::2] - shown[..., 1::2]) / _GUESS_SIGMA
         unseen = np.isnan(self._data[:, None, None, :, 1::2])
         far = np.where(unseen, 0.0, np.nan_to_num(np.abs(along), nan=_ROUGHEST))
         cost: Float = (np.minimum(far, _ROUGHEST) ** 2).sum(axis=-1)  # (T, 2, G, 4)

@@ -77,14 +77,14 @@ def test_a_bend_moves_as_its_closed_form(dt_s: float) -> None:
     mean = np.zeros(EXTRAS)
     mean[[WRIST_ANGLES, RATE]] = 0.3, -0.8
     found = Extras().set(mean, 1e-18 * np.eye(EXTRAS)).after(dt_s)
-    paced, sigma2 = DEFAULT.pace_1_s * dt_s, DEFAULT.flexion_rad**2
+    paced, sigma2 = DEFAULT.wrist_rate_1_s * dt_s, DEFAULT.flexion_rad**2
     decay = exp(-paced)
     wrist_angles = decay * ((1.0 + paced) * 0.3 - 0.8 * dt_s)
-    rate = decay * (-(DEFAULT.pace_1_s**2) * dt_s * 0.3 - 0.8 * (1.0 - paced))
+    rate = decay * (-(DEFAULT.wrist_rate_1_s**2) * dt_s * 0.3 - 0.8 * (1.0 - paced))
     np.testing.assert_allclose(found.mean[[WRIST_ANGLES, RATE]], [wrist_angles, rate], rtol=1e-9, atol=1e-12)
     variance = sigma2 * (1.0 - decay**2 * ((1.0 + paced) ** 2 + paced**2))
-    of_rate = DEFAULT.pace_1_s**2 * sigma2 * (1.0 - decay**2 * ((1.0 - paced) ** 2 + paced**2))
-    both = 2.0 * sigma2 * DEFAULT.pace_1_s * paced**2 * decay**2
+    of_rate = DEFAULT.wrist_rate_1_s**2 * sigma2 * (1.0 - decay**2 * ((1.0 - paced) ** 2 + paced**2))
+    both = 2.0 * sigma2 * DEFAULT.wrist_rate_1_s * paced**2 * decay**2
     expected = [[variance, both], [both, of_rate]]
     np.testing.assert_allclose(
         found.cov[np.ix_([WRIST_ANGLES, RATE], [WRIST_ANGLES, RATE])], expected, rtol=1e-6, atol=1e-12
@@ -130,9 +130,9 @@ def test_a_bend_goes_back_to_the_posture_that_is_kept() -> None:
     mean = np.zeros(EXTRAS)
     mean[WRIST_ANGLES : WRIST_ANGLES + 2] = 0.2, 0.2
     extras.set(mean, 1e-6 * np.eye(EXTRAS))
-    extras.after(0.3 / DEFAULT.pace_1_s)
+    extras.after(0.3 / DEFAULT.wrist_rate_1_s)
     assert -0.4 < extras.mean[WRIST_ANGLES] < 0.2
-    extras.after(15.0 / DEFAULT.pace_1_s)
+    extras.after(15.0 / DEFAULT.wrist_rate_1_s)
     np.testing.assert_allclose(extras.mean[WRIST_ANGLES : WRIST_ANGLES + 2], [-0.4, 0.1], atol=1e-3)
 
 

@@ -50,7 +50,7 @@ def nodes(wrist_case: WristCase, f: int) -> Float:
     return np.linspace(low, high, NODES)
 
 
-def on_valley(wrist_case: WristCase, scan: Scan, f: int, pip: float) -> Float:
+def on_profile(wrist_case: WristCase, scan: Scan, f: int, pip: float) -> Float:
     """Angles and twist (5,) where the valley has that PIP."""
     return np.array([np.interp(pip, nodes(wrist_case, f), scan.x[f, :, k]) for k in range(5)])
 
@@ -65,7 +65,7 @@ def test_the_profile_passes_through_the_true_pose(
     scan = scanned(wrist_case, angles)
     for f in range(1, 5):
         assert scan.chi2[f] < 1.5
-        off = np.degrees(on_valley(wrist_case, scan, f, angles[f, PIP])[:4] - angles[f])
+        off = np.degrees(on_profile(wrist_case, scan, f, angles[f, PIP])[:4] - angles[f])
         np.testing.assert_allclose(off[1], 0.0, atol=1.5)
         np.testing.assert_allclose(off[[0, DIP]], 0.0, atol=3.0)
 
@@ -78,7 +78,7 @@ def test_of_random_poses_every_one_is_on_its_profile(wrist_case: WristCase) -> N
         shown = wrist_case.looks(angles).length_px > 10.0
         for f in np.flatnonzero(shown[1:]) + 1:
             asked += 1
-            off = np.degrees(on_valley(wrist_case, scan, int(f), angles[f, PIP])[:PIP] - angles[f, :PIP])
+            off = np.degrees(on_profile(wrist_case, scan, int(f), angles[f, PIP])[:PIP] - angles[f, :PIP])
             lost += int(np.abs(off).max() > 3.0)
     assert asked > 40
     assert lost <= 0.05 * asked
@@ -112,7 +112,7 @@ def test_the_estimate_lies_on_the_profile_and_its_spread_is_that_of_the_density(
         scan = scanned(wrist_case, angles)
         for f in range(1, 5):
             for chosen in (scan.out[f], scan.mode[f]):
-                expected = on_valley(wrist_case, scan, f, float(chosen[PIP]))
+                expected = on_profile(wrist_case, scan, f, float(chosen[PIP]))
                 np.testing.assert_allclose(chosen, expected, atol=1e-9)
             assert 0.0 < scan.pip2[f] < 1.5
             assert scan.way[f, PIP] == pytest.approx(1.0)

@@ -51,7 +51,7 @@ def _narrowing(finger: int, left: float, coupled: bool) -> Fabrik:
     return Fabrik.of(finger_chain(model, finger, np.zeros(3), coupled=coupled))
 
 
-def _seeded(fabrik: Fabrik, closed_form: FingerSolver, target: Vector) -> ChainResult:
+def _with_initial(fabrik: Fabrik, closed_form: FingerSolver, target: Vector) -> ChainResult:
     """FABRIK from the closed form's pose; target in the palm frame [m]."""
     a, f, pip, dip, _, _ = closed_form.solve(target)
     return fabrik.solve(target, ((a, f), (pip,), (dip,)), closed_form.root)
@@ -98,7 +98,7 @@ def test_ten_thousand_reachable_targets(side: str, preset: Preset) -> None:
     for k in range(10_000):
         fabrik, closed_form = _finger(side, preset, k % 5)
         target = _random_target(closed_form, rng)
-        result = _seeded(fabrik, closed_form, target)
+        result = _with_initial(fabrik, closed_form, target)
         miss = math.dist(result.positions[-1], target)
         missed += not miss < 1e-4
         undefined += not math.isfinite(sum(q for joint in result.angles for q in joint) + miss)
@@ -129,13 +129,13 @@ def test_without_a_seed_restarts_heal_the_deadlock() -> None:
     left=st.sampled_from([0.0, 0.2, 0.625, 1.0]),
     local=st.tuples(*[st.floats(-0.12, 0.12)] * 3),
     coupled=st.booleans(),
-    seeded=st.booleans(),
+    with_initial=st.booleans(),
 )
 def test_whatever_flexion_leaves_of_the_abduction_is_kept(
-    finger: int, left: float, local: Vector, coupled: bool, seeded: bool
+    finger: int, left: float, local: Vector, coupled: bool, with_initial: bool
 ) -> None:
     fabrik = _narrowing(finger, left, coupled)
-    seed = ((0.3, 1.5), (0.5,), (0.4,)) if seeded else None  # itself outside
+    seed = ((0.3, 1.5), (0.5,), (0.4,)) if with_initial else None  # itself outside
     result = fabrik.solve(local, seed)
     assert not _violated(fabrik.chain, result.angles)
     assert result.residual_m == pytest.approx(math.dist(result.positions[-1], local), abs=1e-12)
@@ -237,7 +237,7 @@ def test_no_joint_twists(finger: int, local: Vector, side: str) -> None:
     x, y, z = (a + b for a, b in zip(local, closed_form.root, strict=True))
     for result in (
         fabrik.solve((x, y, z), None, closed_form.root),
-        _seeded(fabrik, closed_form, (x, y, z)),
+        _with_initial(fabrik, closed_form, (x, y, z)),
     ):
         parent = np.eye(3)
         for k, link in enumerate(fabrik.chain.links):
@@ -313,7 +313,7 @@ def test_no_finite_target_gives_nan_or_raises(finger: int, local: Vector) -> Non
     target = tuple(a + b for a, b in zip(local, closed_form.root, strict=True))
     for result in (
         fabrik.solve((target[0], target[1], target[2]), None, closed_form.root),
-        _seeded(fabrik, closed_form, (target[0], target[1], target[2])),
+        _with_initial(fabrik, closed_form, (target[0], target[1], target[2])),
     ):
         assert np.isfinite(result.positions).all()
         assert np.isfinite(result.orientations).all()
@@ -329,7 +329,7 @@ def test_not_seen_is_nan_and_says_so() -> None:
     fabrik, closed_form = _finger("right", "K", 0)
     for result in (
         fabrik.solve((math.nan, 0.0, 0.0)),
-        _seeded(fabrik, closed_form, (0.0, math.inf, 0.0)),
+        _with_initial(fabrik, closed_form, (0.0, math.inf, 0.0)),
     ):
         assert result.reach is Reach.NOT_SEEN
         assert not result.reached

@@ -45,7 +45,7 @@ def test_bands_side_by_side_are_as_each_alone() -> None:
 
 def test_a_minimum_is_followed_as_steeply_as_two_samples_a_station() -> None:
     energy = np.full((12, 40), 5.0, dtype=np.float32)
-    valley = 6 + 2 * np.arange(12)
-    energy[np.arange(12), valley] = 0.0
+    minimum = 6 + 2 * np.arange(12)
+    energy[np.arange(12), minimum] = 0.0
     energy[:, :2] = energy[:, -2:] = FENCE
-    np.testing.assert_array_equal(minimum_cost_paths(energy, (40,))[0], valley)
+    np.testing.assert_array_equal(minimum_cost_paths(energy, (40,))[0], minimum)

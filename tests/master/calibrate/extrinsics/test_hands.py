@@ -13,7 +13,7 @@ from master.estimator.parameters import HandParameters
 from master.estimator.priors import PosturePrior, posture_prior_of
 from tests.master.calibrate.extrinsics.moved import moved
 
-COUNT, LITTLE = 4, 1e-5
+COUNT, DIFFERENCE_STEP = 4, 1e-5
 
 
 def problem(seed: int = 5) -> tuple[HandProblem, Hands]:
@@ -36,9 +36,9 @@ def problem(seed: int = 5) -> tuple[HandProblem, Hands]:
 def derivatives(at: HandProblem, hands: Hands) -> Float:
     """Of the cost (T, 6 + n) by turn, shift and angles, by central differences."""
     size = 6 + hands.x.shape[1]
-    steps = LITTLE * np.eye(size)[:, None] * np.ones((COUNT, 1))
+    steps = DIFFERENCE_STEP * np.eye(size)[:, None] * np.ones((COUNT, 1))
     ways = [at.cost(hands.retracted(step)) - at.cost(hands.retracted(-step)) for step in steps]
-    return np.array(ways).T / (2.0 * LITTLE)
+    return np.array(ways).T / (2.0 * DIFFERENCE_STEP)
 
 
 def test_the_gradient_is_the_derivative_of_the_cost() -> None:
