@@ -2,7 +2,7 @@
 
 `python -m bench.faults_sender CAMERA BEACON_PORT EPOCH_NS RATE_HZ [--clock-s OFFSET] [--wire VERSION]`, the rig key in
 PHALANX_RIG_KEY. It reads lines from its standard input: `step SECONDS` steps its clock; the end of it ends the process.
-It says `ready` when it listens. The link is that of a slave (`slave.uplink`), all else is as `bench.told_sender`: it
+It says `ready` when it listens. The link is that of a slave (`slave.uplink`), else as `bench.detections_sender`: it
 costs little, so that a fault of the link is measured and not a machine too slow to draw.
 """
 
@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 import common.datagram
-from bench.told_sender import CALIBRATION, NOISE_PX
+from bench.detections_sender import CALIBRATION, NOISE_PX
 from common.calibration import HandProfile, load
 from common.clock import SkewedClock, SystemClock
 from common.keys import rig_key

@@ -21,7 +21,7 @@ import numpy as np
 
 from bench.gesture_recorded import leap_rows, static_rows
 from bench.gesture_rigs import rows as rigs
-from bench.gesture_told import RecognisedPoses, pose_of, recognised_in
+from bench.recognised_poses import RecognisedPoses, pose_of, recognised_in
 from bench.hand_draws import MARKERS
 from bench.row import Row, median_us
 from bench.solved_hand import PointHand

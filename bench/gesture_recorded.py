@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.gesture_told import pose_of, recognised_in
+from bench.recognised_poses import pose_of, recognised_in
 from bench.hand_draws import FACING_ROTATION, MARKERS
 from bench.real_motion import SIGMA_M, Recorded, recordings, wide_limits
 from bench.row import Row

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.hand_draws import FACING_ROTATION, MARKERS
-from bench.joint_certainty import leap_recordings, motions
+from bench.joint_covariance import leap_recordings, motions
 from bench.row import Row
 from bench.solved_hand import PointHand
 from common.arrays import Float

@@ -22,7 +22,7 @@ from pathlib import Path
 from bench.local_rig import free_port, join_bus, until
 from bench.processes import footprint
 from bench.scale_rig import ROOM, room, detections_of
-from bench.told_sender import send
+from bench.detections_sender import send
 from common.bus import Subscription
 from common.clock import SystemClock
 from common.errors import BusError, PhalanxError

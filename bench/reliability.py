@@ -22,13 +22,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.stats import chi2
 
-from bench import imu, joint_certainty, real_hands, real_markers
+from bench import joint_covariance
+from bench import imu, real_hands, real_markers
 from bench.marker_photos import DATASETS
 from common.arrays import Float
 from common.calibration import HandProfile, load
 
 LEVELS: Final = np.linspace(0.0, 1.0, 101)
-_SEEDS: Final = joint_certainty.SEEDS[:2]
+_SEEDS: Final = joint_covariance.SEEDS[:2]
 _COLOURS: Final = ("#14507a", "#b0473a", "#e0a030", "#3f8f5b", "#7a5ca8")
 
 
@@ -40,15 +41,15 @@ def found_in(chi_2: Float, degrees: int) -> Float:
 
 def joints() -> dict[str, Float]:
     """Chi squares of joints, by what was looked at."""
-    profile = load(joint_certainty.HAND, HandProfile)
-    parts: dict[str, list[joint_certainty.Coverage]] = {}
+    profile = load(joint_covariance.HAND, HandProfile)
+    parts: dict[str, list[joint_covariance.Coverage]] = {}
     for seed in _SEEDS:
-        for _, model, motion in joint_certainty.motions(profile, seed):
-            run = joint_certainty.compared(model, motion, joint_certainty.NOISE_M["1 mm"], seed)
-            for kind, some in joint_certainty.kinds(run):
+        for _, model, motion in joint_covariance.motions(profile, seed):
+            run = joint_covariance.compared(model, motion, joint_covariance.NOISE_M["1 mm"], seed)
+            for kind, some in joint_covariance.kinds(run):
                 parts.setdefault(kind, []).append(some)
     out = {
-        f"simulated, {kind}": joint_certainty.joined(parts[kind]).chi_2
+        f"simulated, {kind}": joint_covariance.joined(parts[kind]).chi_2
         for kind in ("visible", "hidden up to 300 ms")
     }
     if files := real_hands.motion_files():

@@ -1,7 +1,7 @@
 """What it costs a master to be watched: processor time of its process per pose, with console, recording and four live
 outputs, against the same process without them, in turns of one run.
 
-Two cameras at 30 Hz that are told, not drawn (`bench.told_sender`), over sealed UDP. Watchers are processes of their
+Two cameras at 30 Hz, not drawn (`bench.detections_sender`), over sealed UDP. Watchers are processes of their
 own and share the machine; what they cost themselves is a row of its own. Nothing may be lost.
 """
 
@@ -91,7 +91,7 @@ class _Run:
         place = ["--beacon", f"127.255.255.255:{beacon}", "--bind", f"127.0.0.1:{data}", "--bus", self._end]
         self._master = self._start("master", ["-m", "master", "run", "--rig", "desk", *place])
         stack.callback(end, self._master)
-        sender = self._start("sender", ["-m", "bench.told_sender", str(beacon), "3600", str(RATE_HZ)])
+        sender = self._start("sender", ["-m", "bench.detections_sender", str(beacon), "3600", str(RATE_HZ)])
         stack.callback(end, sender)
         self._bus = join_bus(self._end, READY_S)
         stack.callback(self._bus.close)

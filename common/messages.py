@@ -49,7 +49,7 @@ from common.message_state import (
     Preview,
     Still,
 )
-from common.message_told import (
+from common.message_results import (
     Contact,
     Gesture,
     GestureKind,

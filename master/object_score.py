@@ -9,7 +9,7 @@ from common.arrays import Float, Int
 from common.errors import RecordingError
 from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix, rotation_vector_to_matrix
 from common.recorded_files import TRUTH, has_truth, read_truth
-from master.outputs.told_files import ObjectPoses
+from master.outputs.result_files import ObjectPoses
 
 _NEAR_NS = 100_000_000  # between truths farther apart nothing is interpolated
 _FIRST_NS = 1_000_000_000  # scene time 0 of a recording

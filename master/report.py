@@ -17,7 +17,7 @@ from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from master.outputs.files import load_poses
 from master.outputs.picture import best_row, draw_summary
-from master.outputs.picture_told import ResultPicture
+from master.outputs.picture_results import ResultPicture
 from master.outputs.picture_wrist import WristPicture
 from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
@@ -25,7 +25,7 @@ from master.outputs.truth import PosesTruth
 from master.rig_setup import RigSetup
 from master.score import Truth, score, score_hidden
 from master.solve import fingers_of
-from master.told_report import RunResults
+from master.run_results import RunResults
 from master.wrist_report import forearm_tilt, laser_scores, lit_view, wrist_images, wrist_truth_of
 from master.wrist_score import score_wrist
 

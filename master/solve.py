@@ -32,7 +32,7 @@ from master.dispatcher import Dispatcher
 from master.object_score import load_object_truth, score_object, score_objects
 from master.outputs.files import RunFiles, path_of_hand
 from master.outputs.poses import Poses
-from master.outputs.told_files import ObjectPoses
+from master.outputs.result_files import ObjectPoses
 from master.rates import CameraRates
 from master.recorded import recorded_cycles, recorded_detections
 from master.recorded_imu import recorded_samples

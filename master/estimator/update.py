@@ -8,7 +8,7 @@ import numpy as np
 from common.arrays import Bool, Code, Float
 from common.kernels import inner, kernel
 from common.messages import Source
-from master.estimator.arcs import add_second_order
+from master.estimator.second_order import add_second_order
 from master.estimator.cov_scratch import is_small, linear, only_limits, surer, tilts
 from master.estimator.extras import keep_extras
 from master.estimator.hypotheses import Blank, likelier

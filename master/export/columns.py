@@ -15,7 +15,7 @@ from common.arrays import Float, Int
 from common.hand_model import FINGERS, JOINTS
 from common.messages import Gesture, ObjectSource, Source
 from master.outputs.poses import Poses
-from master.outputs.told_files import Contacts, ObjectPoses
+from master.outputs.result_files import Contacts, ObjectPoses
 
 RIG = "rig"
 _AXES = ("x", "y", "z")

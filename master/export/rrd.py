@@ -14,7 +14,7 @@ from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
 from master.rig import load_setups
 from master.rig_setup import RigSetup
-from master.told_report import contact_row, object_row
+from master.run_results import contact_row, object_row
 
 
 def setup_of(hand: str, tree: Path, rigs: Sequence[str], profiles: Sequence[Path]) -> RigSetup:

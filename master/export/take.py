@@ -22,7 +22,7 @@ from common.recording import MessageRecording, open_messages
 from master.export.window import Window
 from master.outputs.files import load_poses, path_of_hand
 from master.outputs.poses import Poses
-from master.outputs.told_files import (
+from master.outputs.result_files import (
     GESTURES,
     Contacts,
     ObjectPoses,

@@ -9,7 +9,7 @@ import numpy as np
 from common.arrays import Bool, Int
 from common.errors import PhalanxError
 from master.outputs.poses import Poses
-from master.outputs.told_files import Contacts, ObjectPoses
+from master.outputs.result_files import Contacts, ObjectPoses
 
 _Table = TypeVar("_Table", Poses, ObjectPoses, Contacts)
 

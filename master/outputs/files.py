@@ -13,7 +13,7 @@ from common.messages import Gesture, HandPose, ObjectPose, ResultMessage
 from common.npz import read_npz
 from master.outputs.poses import Poses, record
 from master.outputs.table_file import TableFile
-from master.outputs.told_files import GesturesFile, contact_file, object_file
+from master.outputs.result_files import GesturesFile, contact_file, object_file
 
 
 class PosesFile:

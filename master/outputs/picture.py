@@ -27,7 +27,7 @@ from master.outputs.hand_render import View, render_hand
 from master.outputs.palette import SOURCE_MEANING, SOURCE_RGB, TRUTH_RGB, Rgb, series_rgb
 from master.outputs.picture_panels import INK, PAPER, draw_panels, unit
 from master.outputs.picture_rig import STRIPS, draw_rig
-from master.outputs.picture_told import ResultPicture
+from master.outputs.picture_results import ResultPicture
 from master.outputs.picture_wrist import WristPicture
 from master.outputs.poses import Poses
 from master.outputs.truth import PosesTruth

@@ -42,7 +42,7 @@ from master.outputs.poses import Poses
 from master.outputs.rerun_blueprint import WORLD, camera_path, legend
 from master.outputs.rerun_columns import PIXEL_CENTRE, Columns, seen
 from master.outputs.rerun_images import CameraImages
-from master.outputs.rerun_told import ResultLayer
+from master.outputs.rerun_results import ResultLayer
 from master.outputs.rerun_wrist import WristLayer
 from master.outputs.truth import PosesTruth, distance_m, mean_known
 from master.rig_setup import RigSetup

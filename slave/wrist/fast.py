@@ -9,7 +9,8 @@ import numpy as np
 
 from common.arrays import Image, Int
 from slave.markers.fast_compile import compiled
-from slave.wrist import fast_tips, seams, valleys
+from slave.wrist import cost_map
+from slave.wrist import fast_tips, seams
 from slave.wrist.engine import Engine
 from slave.wrist.fast_lines import lines, measure
 from slave.wrist.search_bands import MARGIN, Float32
@@ -52,13 +53,13 @@ def _minimum_cost_paths(energy: Float32, widths: Int, step_cost: np.float32, out
 
 
 def energy(straightened: Image, crossed: int) -> Float32:
-    """As `valleys.energy`."""
-    before = np.asarray(cv2.dilate(straightened, valleys.SIDE_KERNEL, anchor=(MARGIN - 1, 0)), np.uint8)
-    behind = np.asarray(cv2.dilate(straightened, valleys.SIDE_KERNEL, anchor=(0, 0)), np.uint8)
-    around = np.asarray(cv2.dilate(straightened, valleys.AROUND), np.uint8)
+    """As `cost_map.energy`."""
+    before = np.asarray(cv2.dilate(straightened, cost_map.SIDE_KERNEL, anchor=(MARGIN - 1, 0)), np.uint8)
+    behind = np.asarray(cv2.dilate(straightened, cost_map.SIDE_KERNEL, anchor=(0, 0)), np.uint8)
+    around = np.asarray(cv2.dilate(straightened, cost_map.AROUND), np.uint8)
     out = np.empty(straightened.shape, dtype=np.float32)
-    limits = (valleys.DARK, valleys.SURFACE, valleys.OPEN, valleys.BEYOND_THUMB)
-    _energy(straightened, before, behind, around, valleys.PRIOR, valleys.STARTS[3], crossed, limits, out)
+    limits = (cost_map.DARK, cost_map.SURFACE, cost_map.OPEN, cost_map.BEYOND_THUMB)
+    _energy(straightened, before, behind, around, cost_map.PRIOR, cost_map.STARTS[3], crossed, limits, out)
     return out
 
 
@@ -101,8 +102,8 @@ def prepare() -> None:
     drawn[40:43, 100:400] = 200
     runs, _ = lines(drawn, 0)
     measure(runs, np.zeros(len(runs.column), np.int64), drawn.shape[1])
-    straightened = np.zeros((2, len(valleys.PRIOR)), np.uint8)
-    minimum_cost_paths(energy(straightened, 0), (len(valleys.PRIOR),))
+    straightened = np.zeros((2, len(cost_map.PRIOR)), np.uint8)
+    minimum_cost_paths(energy(straightened, 0), (len(cost_map.PRIOR),))
     fast_tips.prepare()
 
 

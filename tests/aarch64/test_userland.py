@@ -27,7 +27,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Report, Report, byte
     guest = guest_or_skip()
     folder = tmp_path_factory.mktemp("given")
     bodies = given.write(folder)
-    program = ["-m", "tests.aarch64.told", str(folder)]
+    program = ["-m", "tests.aarch64.report", str(folder)]
     with guest.start(program) as there:
         here = subprocess.run(
             [sys.executable, *program], capture_output=True, text=True, cwd=ROOT, check=True

@@ -3,7 +3,7 @@
 import numpy as np
 
 from bench.gesture_recorded import agrees
-from bench.gesture_told import ResultMessage
+from bench.recognised_poses import ResultMessage
 from common.geometry import axis_rotation
 from common.sim.motion import POSES
 from tests.hand_helpers import LEFT, RIGHT

@@ -24,7 +24,7 @@ from common.messages import (
 from common.object_profile import ObjectProfile
 from common.zenoh_bus import ZenohBus
 from master.live import LiveSettings, cameras_line, run_live
-from master.outputs.told_files import contact_path, load_contact, load_object, object_path
+from master.outputs.result_files import contact_path, load_contact, load_object, object_path
 from master.rig import RigFiles, load_setups
 from slave.uplink import Uplink
 from tests.network_helpers import free_endpoint, free_udp_port, until

@@ -10,7 +10,7 @@ import pytest
 from common.errors import RecordingError
 from common.messages import Contact, Gesture, ObjectPose, ObjectSource, ResultMessage
 from master.outputs.files import RunFiles
-from master.outputs.told_files import (
+from master.outputs.result_files import (
     GESTURES,
     ObjectPoses,
     contact_path,

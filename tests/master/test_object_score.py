@@ -16,7 +16,7 @@ from master.object_score import (
     score_objects,
     tracked_share,
 )
-from master.outputs.told_files import ObjectPoses
+from master.outputs.result_files import ObjectPoses
 
 MS = 1_000_000
 

@@ -10,7 +10,7 @@ import pytest
 from common.errors import RecordingError
 from common.frame_recording import FrameRecording, Manifest
 from common.messages import ObjectSource, TagDetections
-from master.outputs.told_files import contact_path, load_contact, load_object, object_path
+from master.outputs.result_files import contact_path, load_contact, load_object, object_path
 from master.rig import load_setups, setups_with_hands
 from master.rig_setup import RigSetup
 from master.solve import rigs_to_solve, solve_hands

@@ -29,7 +29,7 @@ from master.app import Observed, RunFigures, health, run
 from master.dispatcher import Dispatcher
 from master.estimator.pipeline import SolvedPose
 from master.object_score import ObjectTruth, errors
-from master.outputs.told_files import ObjectPoses
+from master.outputs.result_files import ObjectPoses
 from master.rig import load_setups, setups_of
 from master.rig_pipeline import pipeline_of
 from master.rig_setup import RigSetup

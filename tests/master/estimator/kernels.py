@@ -8,7 +8,7 @@ from common.arrays import Bool, Float
 from common.kernels import kernel
 from master.estimator.second_order import add_second_order
 from master.estimator.cameras import CameraArrays, project
-from master.estimator.certainty import CovarianceScratch, linear, surer
+from master.estimator.joint_covariance import CovarianceScratch, linear, surer
 from master.estimator.extras import keep_extras, predict_extras
 from master.estimator.finger_surface import MOVES, laser_centroid, look
 from master.estimator.kinematics import Scratch, angles_of, chains, twist_hand
@@ -68,7 +68,7 @@ def truncated_mean_at(
 
 @kernel
 def surer_at(now: Float, past: Float, boxed_scratch: Any, out: Float) -> None:
-    """`master.estimator.certainty.surer`; the record in its array."""
+    """`master.estimator.joint_covariance.surer`; the record in its array."""
     surer(now, past, boxed_scratch[0], out)
 
 

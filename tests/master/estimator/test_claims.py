@@ -5,14 +5,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.joint_certainty import NOISE_M, Coverage, compared, joined, kinds
+from bench.joint_covariance import NOISE_M, Coverage, compared, joined, kinds
 from common.arrays import Float
 from common.geometry import rigid
 from common.hand_model import CHAINS, PALM, TIPS, HandModel
 from common.records import boxed
 from common.sim.motion import HandMotion, ScriptedMotion
 from common.sim.poses import StudyPoses
-from master.estimator.certainty import CovarianceScratch
+from master.estimator.joint_covariance import CovarianceScratch
 from tests.hand_helpers import RIGHT, natural_angles, palm
 from tests.master.estimator.fitted import PARAMETERS, STEP_NS, estimator, found, places, push
 from tests.master.estimator.kernels import surer_at

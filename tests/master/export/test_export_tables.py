@@ -15,7 +15,7 @@ from master.export.columns import Column, contact_columns, gesture_columns, hand
 from master.export.run import Wanted, export
 from master.outputs.files import PosesFile, RunFiles
 from master.outputs.poses import Poses
-from master.outputs.told_files import ObjectPoses, load_contact
+from master.outputs.result_files import ObjectPoses, load_contact
 from tests.master.export.made import BEGIN_NS, LEFT, NEAR_M, STEP_NS, poses_of, positions, results
 
 

@@ -10,7 +10,7 @@ from common.hand_model import CHAINS, TIPS, WRIST, HandModel
 from common.records import boxed
 from master.estimator.body_points import BodyPoints
 from master.estimator.cameras import CameraArrays
-from master.estimator.certainty import CovarianceScratch
+from master.estimator.joint_covariance import CovarianceScratch
 from master.estimator.epoch import FittedHand
 from master.estimator.hand_tables import HandTables, Mounts
 from master.estimator.kinematics import Scratch

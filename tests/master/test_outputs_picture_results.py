@@ -7,11 +7,11 @@ import numpy as np
 
 from master.outputs.files import RunFiles
 from master.outputs.picture import best_row, draw_summary
-from master.outputs.picture_told import STRIP_BOX, ResultPicture, spans
+from master.outputs.picture_results import STRIP_BOX, ResultPicture, spans
 from master.outputs.poses import Poses
-from master.told_report import RunResults
+from master.run_results import RunResults
 from tests.master.test_outputs_rerun import MODEL, RIG, moving_hand
-from tests.master.test_outputs_told import START_NS, STEP_NS, WATCHED, bar, contact, gesture
+from tests.master.test_outputs_results import START_NS, STEP_NS, WATCHED, bar, contact, gesture
 
 GREEN = np.array([115, 158, 0])  # BGR of a tracked object
 

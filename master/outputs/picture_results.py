@@ -17,7 +17,7 @@ from master.outputs.hand_render import View
 from master.outputs.object_appearance import OBJECT_RGB, ObjectAppearance
 from master.outputs.palette import GESTURE_RGB
 from master.outputs.picture_panels import INK, PAPER, style, unit
-from master.outputs.told_files import Contacts, ObjectPoses
+from master.outputs.result_files import Contacts, ObjectPoses
 
 STRIP_BOX = (0.285, 0.055, 0.315, 0.135)  # left, bottom, width, height of the figure
 _NEAR_NS = 60_000_000  # an object is shown where it was this close to the instant

@@ -1,6 +1,6 @@
 """The program that runs on both architectures: what it found, encoded and sealed must be equal, byte for byte.
 
-    python -m tests.aarch64.told FOLDER      prints one line of JSON
+    python -m tests.aarch64.report FOLDER      prints one line of JSON
 
 FOLDER is made by `tests.aarch64.given`; it also holds `sealed.json`, datagrams that another machine sealed.
 """

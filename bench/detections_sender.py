@@ -1,7 +1,7 @@
 """Two cameras that see the standard scene, without drawing it: exact projections with noise, over sealed UDP.
 
-`python -m bench.told_sender BEACON_PORT SECONDS [RATE_HZ]`, the rig key in PHALANX_RIG_KEY. It costs a few percent of a
-core, so that what a master costs can be told from what its cameras would.
+`python -m bench.detections_sender BEACON_PORT SECONDS [RATE_HZ]`, the rig key in PHALANX_RIG_KEY.
+It costs a few percent of a core, so that what a master costs can be told from what its cameras would.
 """
 
 import os

@@ -8,9 +8,9 @@ import pytest
 
 from common.messages import Contact, Gesture, ObjectPose
 from master.outputs.files import RunFiles
-from master.told_report import Annotated, RunResults, judge_gestures
+from master.run_results import Annotated, RunResults, judge_gestures
 from tests.master.test_outputs_rerun import STEP_NS
-from tests.master.test_outputs_told import START_NS, WATCHED, bar, contact, gesture
+from tests.master.test_outputs_results import START_NS, WATCHED, bar, contact, gesture
 
 EPOCH_NS = START_NS
 

@@ -12,7 +12,7 @@ from common.arrays import Bool, Int
 from common.messages import Contact, Gesture, ObjectPose, ResultMessage
 from common.sim.scene import Scene
 from master.object_score import ObjectTruth, score_object, score_objects
-from master.outputs.told_files import (
+from master.outputs.result_files import (
     GESTURES,
     Contacts,
     ObjectPoses,
