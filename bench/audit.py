@@ -90,7 +90,9 @@ def judge(versions: dict[str, str], answered: Sequence[Package], who: dict[str, 
         told: What was answered.
         who: Name -> who needs it.
     """
-    answers = {one.name: one for one in answered if not one.skip_reason and one.version == versions.get(one.name)}
+    answers = {
+        one.name: one for one in answered if not one.skip_reason and one.version == versions.get(one.name)
+    }
     lines: list[str] = []
     for name in sorted(answers):
         for one in answers[name].vulns:

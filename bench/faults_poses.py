@@ -7,8 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from bench.faults_sender import WAY_S, scene_s, standard_scene
 from bench.detections_sender import CALIBRATION
+from bench.faults_sender import WAY_S, scene_s, standard_scene
 from common.arrays import Float
 from common.messages import HandPose
 from common.zenoh_bus import ZenohBus

@@ -21,8 +21,8 @@ import numpy as np
 
 from bench.gesture_recorded import leap_rows, static_rows
 from bench.gesture_rigs import rows as rigs
-from bench.recognised_poses import RecognisedPoses, pose_of, recognised_in
 from bench.hand_draws import MARKERS
+from bench.recognised_poses import RecognisedPoses, pose_of, recognised_in
 from bench.row import Row, median_us
 from bench.solved_hand import PointHand
 from common.calibration import CameraCalibration, FilterCalibration, HandProfile, RigCalibration, load

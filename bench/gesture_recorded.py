@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.recognised_poses import pose_of, recognised_in
 from bench.hand_draws import FACING_ROTATION, MARKERS
 from bench.real_motion import SIGMA_M, Recorded, recordings, wide_limits
+from bench.recognised_poses import pose_of, recognised_in
 from bench.row import Row
 from bench.solved_hand import PointHand
 from common.arrays import Float
@@ -75,7 +75,11 @@ def leap_rows() -> Iterator[Row]:
     lines: list[Row] = []
     for seed, recorded in enumerate(recordings(folder)):
         recognised = recognised_in(_shown(recorded, recorded.model(), seed), recorded.model())
-        begun = [k for k in range(len(recognised)) if recognised[k] is not None and (k == 0 or recognised[k] != recognised[k - 1])]
+        begun = [
+            k
+            for k in range(len(recognised))
+            if recognised[k] is not None and (k == 0 or recognised[k] != recognised[k - 1])
+        ]
         bad = [k for k in begun if not agrees(str(recognised[k]), recorded.fingers_m[k])]
         wrong, count, seconds = (
             wrong + len(bad),

@@ -19,8 +19,8 @@ from msgspec.structs import replace
 
 from bench.fusion_scene import Both, Observed, in_order, orientations
 from bench.fusion_watched import cycles_of
-from bench.recognised_poses import RecognisedPoses, recognised_in
 from bench.played import START_NS, message_of, times_of
+from bench.recognised_poses import RecognisedPoses, recognised_in
 from bench.row import Row
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.hand_model import HandModel

@@ -84,7 +84,9 @@ class Score:
             self._late(f"{event.kind} begin" if event.kind != "tap" else "tap", _s(found.t_ns) - at_s)
             if event.kind == "tap":
                 continue
-            updates = [one for one in recognised if (one.kind, one.began_t_ns) == (found.kind, found.began_t_ns)]
+            updates = [
+                one for one in recognised if (one.kind, one.began_t_ns) == (found.kind, found.began_t_ns)
+            ]
             if updates[-1].phase == "end":
                 self._late(f"{event.kind} end", _s(updates[-1].t_ns) - event.end_s)
             self._values(updates, truth, event.end_s)

@@ -87,7 +87,9 @@ def ways(model: HandModel) -> dict[str, Way]:
     out["scipy"] = lambda points: scipy.solve(points, fixed_palm(model, points), posture_prior.mean)
     if peers_mink.installed():
         sigma = np.sqrt(np.square(NOISE.place_m) + DEFAULT.bones_m**2)
-        mink = peers_mink.MinkHand(model, weight=1.0 / sigma, posture=(posture_prior.mean, posture_prior.per_sigma))
+        mink = peers_mink.MinkHand(
+            model, weight=1.0 / sigma, posture=(posture_prior.mean, posture_prior.per_sigma)
+        )
         mink.begin(rigid(FACING_ROTATION, np.array([0.0, 0.0, 0.5])), posture_prior.mean)
         out["mink"] = mink.push
     return out

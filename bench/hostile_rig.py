@@ -19,10 +19,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
+from bench.detections_sender import send
 from bench.local_rig import free_port, join_bus, until
 from bench.processes import footprint
-from bench.scale_rig import ROOM, room, detections_of
-from bench.detections_sender import send
+from bench.scale_rig import ROOM, detections_of, room
 from common.bus import Subscription
 from common.clock import SystemClock
 from common.errors import BusError, PhalanxError

@@ -256,7 +256,9 @@ def _simulated(part: str, rest_s: float, pooled: list[TiltErrors]) -> Iterator[R
         errors = Errors.of(found, recording)
         begun = said[int(np.argmax(moving))][1]
         drift.append(errors.drift_deg_per_min)
-        joint_chi2.append(errors.heading_deg[-1] / np.degrees(np.sqrt(max(said[-1][1] ** 2 - begun**2, 1e-12))))
+        joint_chi2.append(
+            errors.heading_deg[-1] / np.degrees(np.sqrt(max(said[-1][1] ** 2 - begun**2, 1e-12)))
+        )
     pooled += tilt
     name = f"simulated {part}, {'rested' if rest_s else 'never at rest'}"
     rms, within = _rms(np.array([one.rms_deg for one in tilt])), np.mean([one.within for one in tilt])

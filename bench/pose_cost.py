@@ -29,7 +29,7 @@ from msgspec.structs import replace
 
 from bench.fusion_shown import shown
 from bench.row import Row
-from bench.scale_rig import ROOM, in_order, room, detections_of
+from bench.scale_rig import ROOM, detections_of, in_order, room
 from common.messages import ImuSample, encode
 from master.app import result_at
 from master.dispatcher import Dispatcher

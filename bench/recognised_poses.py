@@ -122,7 +122,12 @@ def _passing(truth: Sequence[str | None], recognised: Sequence[str | None]) -> i
     held = [k for k, name in enumerate(truth) if name is not None]
     count = 0
     for k in range(1, len(recognised)):
-        if recognised[k] is None or recognised[k] == recognised[k - 1] or not held or not held[0] < k < held[-1]:
+        if (
+            recognised[k] is None
+            or recognised[k] == recognised[k - 1]
+            or not held
+            or not held[0] < k < held[-1]
+        ):
             continue
         before = next(truth[j] for j in range(k, -1, -1) if truth[j] is not None)
         after = next(truth[j] for j in range(k, len(truth)) if truth[j] is not None)

@@ -22,8 +22,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.stats import chi2
 
-from bench import joint_covariance
-from bench import imu, real_hands, real_markers
+from bench import imu, joint_covariance, real_hands, real_markers
 from bench.marker_photos import DATASETS
 from common.arrays import Float
 from common.calibration import HandProfile, load

@@ -4,7 +4,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from bench.scale_rig import ROOM, in_order, room, detections_of
+from bench.scale_rig import ROOM, detections_of, in_order, room
 from master.dispatcher import Dispatcher
 from master.rig import load_setups
 from master.stages import StageTimes

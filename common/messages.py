@@ -27,6 +27,18 @@ from common.message_parts import (
     OutOfBoundsError,
     TimeNs,
 )
+from common.message_results import (
+    Contact,
+    Gesture,
+    GestureKind,
+    HandPose,
+    ObjectPose,
+    ObjectSource,
+    Phase,
+    ResultMessage,
+    SolverMode,
+    Source,
+)
 from common.message_sensed import (
     Detections,
     ImuSample,
@@ -48,18 +60,6 @@ from common.message_state import (
     Health,
     Preview,
     Still,
-)
-from common.message_results import (
-    Contact,
-    Gesture,
-    GestureKind,
-    HandPose,
-    ObjectPose,
-    ObjectSource,
-    Phase,
-    SolverMode,
-    Source,
-    ResultMessage,
 )
 
 __all__ = [

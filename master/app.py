@@ -17,8 +17,8 @@ from common.messages import (
     Health,
     ImuSample,
     ObjectPose,
-    TagDetections,
     ResultMessage,
+    TagDetections,
     TrackerPose,
     restamped,
 )

@@ -23,9 +23,9 @@ from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
 from master.outputs.truth import PosesTruth
 from master.rig_setup import RigSetup
+from master.run_results import RunResults
 from master.score import Truth, score, score_hidden
 from master.solve import fingers_of
-from master.run_results import RunResults
 from master.wrist_report import forearm_tilt, laser_scores, lit_view, wrist_images, wrist_truth_of
 from master.wrist_score import score_wrist
 
@@ -193,7 +193,9 @@ def _fraction(renderer: Renderer, t_s: float) -> Float:
     return np.nan_to_num(renderer.visible_fraction(t_s))
 
 
-def _images(poses: Poses, scene: Scene, epoch_ns: int, progress: Progress) -> Iterator[tuple[str, int, Image]]:
+def _images(
+    poses: Poses, scene: Scene, epoch_ns: int, progress: Progress
+) -> Iterator[tuple[str, int, Image]]:
     first, last = int(poses.t_ns[0]), int(poses.t_ns[-1])
     for camera in scene.rig.cameras:
         renderer = Renderer(scene, camera)

@@ -163,7 +163,9 @@ def judge_gestures(
     for one, after_s in made:
         span = (one.start_s + after_s, one.stop_s + after_s + _LATE_S)
         own = [
-            k for k, published_one in enumerate(begun) if k not in received and _is(published_one, one, span, epoch_ns)
+            k
+            for k, published_one in enumerate(begun)
+            if k not in received and _is(published_one, one, span, epoch_ns)
         ]
         right += bool(own)
         received.update(own)

@@ -121,7 +121,9 @@ def score_hidden(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[s
     of_finger = (_FINGER_OF_JOINT[1:] >= 0) & hidden[:, _FINGER_OF_JOINT[1:]]
     out: dict[str, float] = {}
     put(out, "joint_mm_hidden", 1e3 * np.linalg.norm(found - exact, axis=2)[of_finger & valid], np.mean)
-    all_valid = np.stack([valid[:, [j - 1 for j in chain[1:]]].all(axis=1) for chain in FINGER_JOINTS[1:]], axis=1)
+    all_valid = np.stack(
+        [valid[:, [j - 1 for j in chain[1:]]].all(axis=1) for chain in FINGER_JOINTS[1:]], axis=1
+    )
     pip = np.degrees(np.abs(poses.angles_rad[rows][:, 1:, 2] - truth.pip_rad[columns]))
     put(out, "pip_deg_hidden", pip[hidden[:, 1:] & all_valid], np.mean)
     put(out, "hidden_invalid", (~all_valid)[hidden[:, 1:]].astype(np.float64), np.mean)

@@ -23,8 +23,8 @@ from common.messages import (
     HandPose,
     ImuSample,
     ObjectPose,
-    TagDetections,
     ResultMessage,
+    TagDetections,
     WristDetections,
 )
 from master.app import Solved

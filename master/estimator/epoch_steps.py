@@ -75,7 +75,10 @@ class EpochSteps:
         space = Workspace.empty(n, extras, _capacity(count))
         self.now, self.at = fields(state), fields(space)
         self._state, self._space, self._work = boxed(state), boxed(space), boxed(Scratch.empty())
-        self._ground, self._lines_of_sight = self._space["ground"], self._space["epoch_prior"]["lines_of_sight"]
+        self._ground, self._lines_of_sight = (
+            self._space["ground"],
+            self._space["epoch_prior"]["lines_of_sight"],
+        )
         hand, device = boxed(self._rig.hand), boxed(device)
         self._model = Model(hand, boxed(settings.record()), mounts, self._rig.cameras, device)
         self.at.scratch.search.wrist_share[0] = settings.wrist_share
@@ -170,7 +173,10 @@ class EpochSteps:
             epoch_prior.depth_w2[0] = self._settings.held_depth_m**-2.0
         epoch_prior.oriented[0] = orientation is not None
         if orientation is not None:
-            epoch_prior.forearm[:3, :3], epoch_prior.orientation_info[:] = orientation.rotation, orientation.information
+            epoch_prior.forearm[:3, :3], epoch_prior.orientation_info[:] = (
+                orientation.rotation,
+                orientation.information,
+            )
             epoch_prior.on_forearm[0] = orientation.axes is not None
             epoch_prior.axes[:] = 0.0 if orientation.axes is None else orientation.axes
         epoch_prior.place_w2[0] = 0.0

@@ -262,7 +262,9 @@ class MarkerPipeline:
         assert frames.alt_uv is not None
         assert frames.alt_sigma_px is not None
         ambiguous = np.isfinite(frames.alt_uv[..., 0]).any(axis=0)
-        if not ambiguous.any():  # an alternative was named in a frame nearby, and is not carried to this epoch
+        if (
+            not ambiguous.any()
+        ):  # an alternative was named in a frame nearby, and is not carried to this epoch
             return replace(frames, alt_uv=None)
         first = triangulate(self._cameras, frames.uv, frames.sigma_px, self._rays_px)
         clear = np.where((ambiguous | first.outliers)[:, None], np.nan, first.points_m)

@@ -77,7 +77,17 @@ def _solve_each(
             scratch.search,
         )
         one.cost[0] = linearise(
-            rig, posture_prior, epoch_prior, observed, h, one.palm, one.x, one.z, one.gradient, one.normal, scratch.search
+            rig,
+            posture_prior,
+            epoch_prior,
+            observed,
+            h,
+            one.palm,
+            one.x,
+            one.z,
+            one.gradient,
+            one.normal,
+            scratch.search,
         )
         one.outliers[0] = scratch.search.outliers[0]
         for m in range(rig.mounts.finger.shape[0]):
@@ -90,7 +100,9 @@ def _solve_each(
 
 
 @inner
-def _weigh(posture_prior: PosturePrior, settings: Settings, natural_weight: float, counts: float, scratch: Scratch) -> None:
+def _weigh(
+    posture_prior: PosturePrior, settings: Settings, natural_weight: float, counts: float, scratch: Scratch
+) -> None:
     """Write the probability of each hypothesis, from its evidence and what it was before.
 
     `natural_weight` is the probability of a natural hand a moment ago, `counts` what that counts, 0 ... 1.
@@ -129,7 +141,13 @@ def _least(posture_prior: PosturePrior, epoch_prior: EpochPrior, h: int, scratch
 
 @inner
 def _covariance(
-    rig: Rig, settings: Settings, posture_prior: PosturePrior, epoch_prior: EpochPrior, h: int, numbers: float, scratch: Scratch
+    rig: Rig,
+    settings: Settings,
+    posture_prior: PosturePrior,
+    epoch_prior: EpochPrior,
+    h: int,
+    numbers: float,
+    scratch: Scratch,
 ) -> float:
     """Write the covariance (N, N) of one hypothesis by this instant alone; return its scale."""
     N, A, one = scratch.middle.shape[0], scratch.A, scratch.each[h]
@@ -137,13 +155,17 @@ def _covariance(
         for j in range(i + 1):
             A[i, j] = one.normal[i, j]
         if i < 6 + epoch_prior.past_w2.shape[0]:
-            A[i, i] += rig.hand.anywhere[i] - (epoch_prior.palm_w2[i] if i < 6 else epoch_prior.past_w2[i - 6])
+            A[i, i] += rig.hand.anywhere[i] - (
+                epoch_prior.palm_w2[i] if i < 6 else epoch_prior.past_w2[i - 6]
+            )
     for i in range(one.x.shape[0]):  # a limit keeps an angle, and measures none
         if one.x[i] > rig.hand.legal_high[i] or one.x[i] < rig.hand.legal_low[i]:
             A[6 + i, 6 + i] -= rig.hand.beyond_w2[i]
     for i in range(3):
         for j in range(i + 1):
-            A[3 + i, 3 + j] -= epoch_prior.depth_w2[0] * epoch_prior.line_of_sight[i] * epoch_prior.line_of_sight[j]
+            A[3 + i, 3 + j] -= (
+                epoch_prior.depth_w2[0] * epoch_prior.line_of_sight[i] * epoch_prior.line_of_sight[j]
+            )
     if not cholesky(A, N, scratch.L):  # by rounding: nothing is known but limits
         known = rig.hand.anywhere.shape[0]
         for i in range(N):

@@ -48,9 +48,18 @@ class Reinitialiser:
     """Fits without the state. What it holds was prepared by the constructor."""
 
     def __init__(
-        self, steps: EpochSteps, parameters: HandParameters, posture_prior: PosturePriorTables, settings: Settings
+        self,
+        steps: EpochSteps,
+        parameters: HandParameters,
+        posture_prior: PosturePriorTables,
+        settings: Settings,
     ) -> None:
-        self._steps, self._parameters, self._posture_prior, self._settings = steps, parameters, posture_prior, settings
+        self._steps, self._parameters, self._posture_prior, self._settings = (
+            steps,
+            parameters,
+            posture_prior,
+            settings,
+        )
         postures = np.zeros((len(_BENDS_RAD), 5, 4))
         postures[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (_MCP_PER_PIP, 1.0))[:, None]
         self._postures = np.array([parameters.of_angles(angles) for angles in postures])
@@ -76,7 +85,12 @@ class Reinitialiser:
         """As `begin`, while the hidden fingers of `like` are bent as their neighbours."""
         steps, outliers, start = self._steps, frozenset(range(5)) - shown - like, at.start
         task, epoch_prior, scratch = steps.at.task, steps.at.epoch_prior, steps.at.scratch
-        epoch_prior.past_w2[:], epoch_prior.past[:], epoch_prior.palm_w2[:], epoch_prior.depth_w2[:] = 0.0, 0.0, 0.0, 0.0
+        epoch_prior.past_w2[:], epoch_prior.past[:], epoch_prior.palm_w2[:], epoch_prior.depth_w2[:] = (
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+        )
         fingers = np.isin(np.arange(5), list(outliers))
         epoch_prior.own_w2[:], epoch_prior.own[:] = curled(self._parameters, self._settings, fingers)
         task.natural_weight[0], task.counts[0] = _EVEN, 0.0

@@ -71,7 +71,9 @@ def _rotation_columns(settings: Settings, cov: Float, scratch: CovarianceScratch
 
 
 @inner
-def _bone_rotations(hand: HandTables, T: Float, count: int, work: Scratch, scratch: CovarianceScratch) -> None:
+def _bone_rotations(
+    hand: HandTables, T: Float, count: int, work: Scratch, scratch: CovarianceScratch
+) -> None:
     """Write how each turn turns each bone (5, 4, K, 3): the palm, and the axes of the joints before it."""
     for f in range(5):
         columns = hand.first[f + 1] - hand.first[f]
@@ -162,7 +164,9 @@ def _second_derivatives(
             )
         for i in range(3):
             if f < 0:
-                scratch.marker[pair, 3 * marker + i] = _second_derivative(w[0, 0, k], w[0, 0, m], bx, by, bz, i)
+                scratch.marker[pair, 3 * marker + i] = _second_derivative(
+                    w[0, 0, k], w[0, 0, m], bx, by, bz, i
+                )
             else:
                 carried = scratch.joint[pair, scratch.joint_of[f, level], i]
                 second_derivative = _second_derivative(w[f, bone, k], w[f, bone, m], bx, by, bz, i)
@@ -210,7 +214,9 @@ def _gain(
         size, start = 6, 0
         if f >= 0:
             start, size = hand.first[f], 6 + hand.first[f + 1] - hand.first[f]
-            finger_jacobian(hand, work.by, T, work.R, work.P, f, mounts.level[m], work.point, PLACE, scratch.J)
+            finger_jacobian(
+                hand, work.by, T, work.R, work.P, f, mounts.level[m], work.point, PLACE, scratch.J
+            )
         _whiten(information[m], scratch.white)
         for i in range(3):
             for c in range(N):

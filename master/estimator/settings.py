@@ -137,7 +137,9 @@ class Settings(NamedTuple):
         1.0
     )
     # Gates.
-    marker_gate: Annotated[float, Range("chi square", 5.0, 50.0, _CHI + " of three numbers, 1 in 1000")] = 16.3
+    marker_gate: Annotated[float, Range("chi square", 5.0, 50.0, _CHI + " of three numbers, 1 in 1000")] = (
+        16.3
+    )
     misled: Annotated[
         float, Range("chi square", 5.0, 200.0, "twice that: another hand explains the markers better")
     ] = 32.6
@@ -178,7 +180,9 @@ class Settings(NamedTuple):
     thumb_coupled_rad: Annotated[
         float, Range("rad", 0.01, 1.0, "of a thumb's IP about what goes with its MCP")
     ] = radians(12.0)
-    natural_finger_weight: Annotated[float, Range("1", 0.01, 0.99, "hands before anything of them is seen")] = 0.8
+    natural_finger_weight: Annotated[
+        float, Range("1", 0.01, 0.99, "hands before anything of them is seen")
+    ] = 0.8
     straight_pip_rad: Annotated[
         float, Range("rad", 0.02, 1.0, "by which fingers are bent that are stretched")
     ] = radians(10.0)

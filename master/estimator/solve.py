@@ -104,13 +104,17 @@ def _add_priors(
     for i in range(3):
         gradient[3 + i] += epoch_prior.depth_w2[0] * depth * epoch_prior.line_of_sight[i]
         for j in range(3):
-            normal[3 + i, 3 + j] += epoch_prior.depth_w2[0] * epoch_prior.line_of_sight[i] * epoch_prior.line_of_sight[j]
+            normal[3 + i, 3 + j] += (
+                epoch_prior.depth_w2[0] * epoch_prior.line_of_sight[i] * epoch_prior.line_of_sight[j]
+            )
     for i in range(n):
         total = 0.0
         for j in range(n):
             normal[6 + i, 6 + j] = posture_prior.normal[h, i, j]
             total += posture_prior.normal[h, i, j] * x[j]
-        gradient[6 + i] = total - posture_prior.pull[h, i] + epoch_prior.own_w2[i] * (x[i] - epoch_prior.own[i])
+        gradient[6 + i] = (
+            total - posture_prior.pull[h, i] + epoch_prior.own_w2[i] * (x[i] - epoch_prior.own[i])
+        )
         gradient[6 + i] += epoch_prior.past_w2[i] * (x[i] - epoch_prior.past[i])
         normal[6 + i, 6 + i] += epoch_prior.own_w2[i] + epoch_prior.past_w2[i]
     for i in range(K):

@@ -8,7 +8,6 @@ import numpy as np
 from common.arrays import Bool, Code, Float
 from common.kernels import inner, kernel
 from common.messages import Source
-from master.estimator.second_order import add_second_order
 from master.estimator.cov_scratch import is_small, linear, only_limits, surer, tilts
 from master.estimator.extras import keep_extras
 from master.estimator.hypotheses import Blank, likelier
@@ -19,6 +18,7 @@ from master.estimator.posterior import posterior
 from master.estimator.priors import PosturePrior
 from master.estimator.problem import EpochPrior, Rig, Search
 from master.estimator.residuals import Observations, marker_rows
+from master.estimator.second_order import add_second_order
 from master.estimator.settings import Settings
 from master.estimator.solve import descend
 from master.estimator.state import NEVER_NS, PALM_PART, HandState, grow, predict
@@ -155,7 +155,9 @@ def _depth_noise(
     for joint in range(26):
         for i in range(3):
             for j in range(3):
-                out.cov[joint, i, j] += sigma_m * sigma_m * epoch_prior.line_of_sight[i] * epoch_prior.line_of_sight[j]
+                out.cov[joint, i, j] += (
+                    sigma_m * sigma_m * epoch_prior.line_of_sight[i] * epoch_prior.line_of_sight[j]
+                )
 
 
 @kernel
@@ -219,7 +221,9 @@ def _rotate_on(state: HandState, epoch_prior: EpochPrior, search: Search) -> Non
 
 
 @kernel
-def fit_epoch(model: Model, posture_prior: PosturePrior, observed: Observations, blank: Blank, boxed_space: Any) -> float:
+def fit_epoch(
+    model: Model, posture_prior: PosturePrior, observed: Observations, blank: Blank, boxed_space: Any
+) -> float:
     """Fit an epoch: from where `predict_epoch` says, or roughly from the task's hand, in place.
 
     Args:
@@ -276,7 +280,9 @@ def fit_epoch(model: Model, posture_prior: PosturePrior, observed: Observations,
         extras_only(epoch_prior, found, search)
     if epoch_prior.lines_of_sight.rows[0] > 0.0:
         take_scanned(rig, space.ground, space.scan, found, search.rows)
-    found.contrary[0] = contrary(epoch_prior, found.palm, found.z, search) if epoch_prior.oriented[0] > 0.0 else 0.0
+    found.contrary[0] = (
+        contrary(epoch_prior, found.palm, found.z, search) if epoch_prior.oriented[0] > 0.0 else 0.0
+    )
     return chi_square(rig, observed, found.palm, found.x, 0.0, search)
 
 

@@ -103,7 +103,11 @@ def orientation_row(
             D[i, c] = J[c, i]
     for a in range(K):
         for c in range(3):
-            D[3 + a, c] = -(J[0, c] * extras_jacobian[a, 0] + J[1, c] * extras_jacobian[a, 1] + J[2, c] * extras_jacobian[a, 2])
+            D[3 + a, c] = -(
+                J[0, c] * extras_jacobian[a, 0]
+                + J[1, c] * extras_jacobian[a, 1]
+                + J[2, c] * extras_jacobian[a, 2]
+            )
     for a in range(3 + K):
         ia = a if a < 3 else _column(n, a - 3)
         gradient[ia] += D[a, 0] * w[0] + D[a, 1] * w[1] + D[a, 2] * w[2]
@@ -137,7 +141,14 @@ def rotate_by_vector(rotation: Float, R: Float, out: Float) -> None:
 
 @inner
 def finger_rows(
-    rig: Rig, epoch_prior: EpochPrior, f: int, z: Float, n: int, gradient: Float, normal: Float, search: Search
+    rig: Rig,
+    epoch_prior: EpochPrior,
+    f: int,
+    z: Float,
+    n: int,
+    gradient: Float,
+    normal: Float,
+    search: Search,
 ) -> float:
     """Add the rows of finger f, of angles `search.rows.angles`; return their cost.
 

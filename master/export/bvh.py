@@ -143,7 +143,11 @@ def _numbers(values: Float) -> str:
 
 
 def _frames(
-    file: IO[bytes], rotated: Float, offset: Float, free: tuple[int, ...], progress: Callable[[int, int], None]
+    file: IO[bytes],
+    rotated: Float,
+    offset: Float,
+    free: tuple[int, ...],
+    progress: Callable[[int, int], None],
 ) -> None:
     """A line a frame: the channels of the joints in the order of the hierarchy."""
     columns: list[Float] = []

@@ -62,7 +62,9 @@ class Wanted:
     axes: Axes = field(default_factory=Axes)
 
 
-def export(source: Path, wanted: Wanted, notify: Callable[[str], None], progress: ProgressCallback) -> tuple[Path, ...]:
+def export(
+    source: Path, wanted: Wanted, notify: Callable[[str], None], progress: ProgressCallback
+) -> tuple[Path, ...]:
     """Export a source.
 
     Args:
@@ -238,7 +240,9 @@ def _motions(
     return tuple(written)
 
 
-def _motion(path: Path, motion: Motion, skeleton: Skeleton, wanted: Wanted, progress: ProgressCallback) -> str:
+def _motion(
+    path: Path, motion: Motion, skeleton: Skeleton, wanted: Wanted, progress: ProgressCallback
+) -> str:
     """Write one; what is to be said of it."""
     rate_hz = wanted.rate_hz
     if wanted.kind == "bvh":

@@ -247,11 +247,18 @@ def _in_plane(chain: ChainArrays, edges: Float, ratio: float, local: Vector, ini
         lateral = _point(chain, pip, ratio * pip)[0]
     w = _point(chain, pip, ratio * pip)
     f = hinge_fit(chain.spans[1, 0], chain.spans[1, 1], (-1.0, 0.0, 0.0), w, (x, y, z), 0.0)
-    initial_angles[0, 0], initial_angles[0, 1], initial_angles[0, 2], initial_angles[0, 3] = a, f, pip, ratio * pip
+    initial_angles[0, 0], initial_angles[0, 1], initial_angles[0, 2], initial_angles[0, 3] = (
+        a,
+        f,
+        pip,
+        ratio * pip,
+    )
 
 
 @kernel
-def nearest_pose(chain: ChainArrays, goal: Vector, warm_start: Float, initial_angles: Float, angles: Float) -> float:
+def nearest_pose(
+    chain: ChainArrays, goal: Vector, warm_start: Float, initial_angles: Float, angles: Float
+) -> float:
     """The legal pose nearest to the target, where none hits it in closed form.
 
     Args:

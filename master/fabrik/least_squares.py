@@ -34,7 +34,9 @@ _COUPLED_RAD = 1e-12
 
 
 @kernel
-def least_squares(chain: ChainArrays, goal: Vector, tolerance_m: float, max_steps: int, angles: Float) -> float:
+def least_squares(
+    chain: ChainArrays, goal: Vector, tolerance_m: float, max_steps: int, angles: Float
+) -> float:
     """Improve a finger's angles until the target is hit or no legal step helps.
 
     Args:

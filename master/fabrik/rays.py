@@ -110,7 +110,9 @@ def _covariance(
                     gain[i, axis] += rays.weight[c] * rays.cov[i, k] * rays.J[axis, k]
         for i in range(3):
             for t in range(count):
-                correction_jacobian_m[t, i] += gain[i, 0] * views.bias[t, c, 0] + gain[i, 1] * views.bias[t, c, 1]
+                correction_jacobian_m[t, i] += (
+                    gain[i, 0] * views.bias[t, c, 0] + gain[i, 1] * views.bias[t, c, 1]
+                )
             for j in range(3):
                 step[i, j] += gain[i, 0] * cameras.R[c, 0, j] + gain[i, 1] * cameras.R[c, 1, j]
                 both[i, j] += gain[i, 0] * gain[j, 0] + gain[i, 1] * gain[j, 1]
@@ -121,7 +123,11 @@ def _covariance(
             shape += CAPS.relief_m**2 if row < 0 and i == j else 0.0
             tilt = 0.0
             for t in range(1, count):
-                tilt += (correction_jacobian_m[t, i] - correction_jacobian_m[0, i]) * (correction_jacobian_m[t, j] - correction_jacobian_m[0, j]) / (count - 1)
+                tilt += (
+                    (correction_jacobian_m[t, i] - correction_jacobian_m[0, i])
+                    * (correction_jacobian_m[t, j] - correction_jacobian_m[0, j])
+                    / (count - 1)
+                )
             cov[i, j] = rays.cov[i, j] + shared * common + shape + tilt
             own[i, j] = shape + (1.0 + process_noise) * tilt
 

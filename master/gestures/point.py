@@ -74,7 +74,9 @@ class PointMonitor:
         last = self._last
         if self._point is None or last is None or not self._over(t_ns):
             return []
-        return self._end(self._point.message("end", t_ns, 0.0, origin_m=last.origin_m, direction=last.direction))
+        return self._end(
+            self._point.message("end", t_ns, 0.0, origin_m=last.origin_m, direction=last.direction)
+        )
 
     def _over(self, t_ns: int) -> bool:
         """Whether the shape has been lost for long; counts from the first time it is asked."""

@@ -112,7 +112,9 @@ class PoseTable:
         """The fit, and the residuals (P, Q)."""
         poses, residuals = len(self.names), np.zeros(self._table.low.shape)
         score, confidence, enough = np.empty(poses), np.empty(poses), np.empty(poses, np.bool_)
-        best = _fit(self._table, quantities.value, quantities.sigma, known, residuals, score, confidence, enough)
+        best = _fit(
+            self._table, quantities.value, quantities.sigma, known, residuals, score, confidence, enough
+        )
         return Fit(score, confidence, enough, best), residuals
 
 
@@ -182,7 +184,9 @@ class FingerSpeed:
         for then_ns, before, known_then in reversed(self._past):
             if t_ns - then_ns >= 1e9 * _RATE_S:
                 moved = [now - then for now, then in zip(bend_deg, before, strict=True)]
-                both = [one for one, *sure in zip(moved, known_then, known, strict=True) if all(sure)] or moved
+                both = [
+                    one for one, *sure in zip(moved, known_then, known, strict=True) if all(sure)
+                ] or moved
                 return sqrt(sum(one * one for one in both) / len(both)) / (1e-9 * (t_ns - then_ns))
         return inf
 

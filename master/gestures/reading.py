@@ -62,7 +62,9 @@ def spans_of(gestures: Iterable[Gesture]) -> list[Spoken]:
 def lines_of(gesture: Gesture) -> str:
     """A message as a line of JSON: arrays as lists, what is not told as null."""
     fields = {name: getattr(gesture, name) for name in gesture.__struct_fields__}
-    plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in fields.items()}
+    plain = {
+        name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in fields.items()
+    }
     return msgspec.json.encode(plain).decode()
 
 

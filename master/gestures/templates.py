@@ -69,8 +69,12 @@ class Example:
         each = [Quantities.of(frame) for frame in frames]
         measured = np.array([known_of(one) for one in each])
         enough = measured.mean(axis=0) >= _KNOWN_SHARE
-        value = np.array([np.where(known, one.value, np.nan) for known, one in zip(measured, each, strict=True)])
-        sigma = np.array([np.where(known, one.sigma, np.nan) for known, one in zip(measured, each, strict=True)])
+        value = np.array(
+            [np.where(known, one.value, np.nan) for known, one in zip(measured, each, strict=True)]
+        )
+        sigma = np.array(
+            [np.where(known, one.sigma, np.nan) for known, one in zip(measured, each, strict=True)]
+        )
         known = np.mean([frame.known for frame in frames], axis=0) >= _KNOWN_SHARE
         medians = [np.full(len(QUANTITIES), fill) for fill in (0.0, np.inf)]
         for median, of in zip(medians, (value, sigma), strict=True):

@@ -40,7 +40,10 @@ from master.objects.window import Window, Windows
 # What light does to a ball's centroid beyond what a slave says, and to a corner.
 _BEAD_FLOOR_PX, _CORNER_FLOOR_PX = 0.08, 0.03
 _POOR_M, _POOR_RAD = 6e-3, np.radians(4.0)  # less sure than this: the past counts
-_INCOMPLETE_M, _INCOMPLETE_RAD = 0.02, np.radians(12.0)  # less sure than this it does not tell all of the pose
+_INCOMPLETE_M, _INCOMPLETE_RAD = (
+    0.02,
+    np.radians(12.0),
+)  # less sure than this it does not tell all of the pose
 _LOST_M, _LOST_RAD = 0.05, np.radians(30.0)  # less sure than this is no pose
 _MOST = 0.5  # share of what is seen that must be in its place
 _START_CHI2 = 25.0  # chi square per number of what a pose from nothing rests on

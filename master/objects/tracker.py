@@ -179,7 +179,9 @@ def covariance_of(profile: ObjectProfile) -> Float:
     how = profile.provenance.get("T_object_tracker")
     residual = {} if how is None else how.residual
     place_m = np.hypot(residual.get("position_mm", 0.0), residual.get("position_sigma_mm", 0.0)) * 1e-3
-    rotation_rad = np.radians(np.hypot(residual.get("rotation_deg", 0.0), residual.get("rotation_sigma_deg", 0.0)))
+    rotation_rad = np.radians(
+        np.hypot(residual.get("rotation_deg", 0.0), residual.get("rotation_sigma_deg", 0.0))
+    )
     # The figures are of the whole offset: a third of its square belongs to each axis.
     place_m = place_m / np.sqrt(3.0) if place_m > 0.0 else _UNKNOWN_M
     rotation_rad = rotation_rad / np.sqrt(3.0) if rotation_rad > 0.0 else _UNKNOWN_RAD

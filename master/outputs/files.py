@@ -12,8 +12,8 @@ from common.errors import RecordingError
 from common.messages import Gesture, HandPose, ObjectPose, ResultMessage
 from common.npz import read_npz
 from master.outputs.poses import Poses, record
-from master.outputs.table_file import TableFile
 from master.outputs.result_files import GesturesFile, contact_file, object_file
+from master.outputs.table_file import TableFile
 
 
 class PosesFile:

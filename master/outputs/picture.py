@@ -26,8 +26,8 @@ from common.replacing import replacing
 from master.outputs.hand_render import View, render_hand
 from master.outputs.palette import SOURCE_MEANING, SOURCE_RGB, TRUTH_RGB, Rgb, series_rgb
 from master.outputs.picture_panels import INK, PAPER, draw_panels, unit
-from master.outputs.picture_rig import STRIPS, draw_rig
 from master.outputs.picture_results import ResultPicture
+from master.outputs.picture_rig import STRIPS, draw_rig
 from master.outputs.picture_wrist import WristPicture
 from master.outputs.poses import Poses
 from master.outputs.truth import PosesTruth
@@ -175,7 +175,9 @@ def _hand(
         rotated = axis_rotation(0, _WRIST_PITCH) @ axis_rotation(2, _WRIST_YAW * model.side_sign)
     shown = [at] if wrist is None else [at, wrist.reach_m(poses, row)]
     t_ns = int(poses.t_ns[row])
-    view = fit_view(np.concatenate(shown if results is None else [*shown, results.points_m(t_ns)]), rotated, box)
+    view = fit_view(
+        np.concatenate(shown if results is None else [*shown, results.points_m(t_ns)]), rotated, box
+    )
     axes = figure.add_axes(box)
     axes.set_axis_off()
     axes.set_xlim(0, view.width_px)

@@ -35,7 +35,7 @@ from common.camera_model import CameraModel
 from common.geometry import matrix_to_quaternion
 from common.hand_limits import FLEXION
 from common.hand_model import FINGER_JOINTS, FINGERS, TIPS, WRIST, HandModel
-from common.messages import Detections, Health, MarkerDetections, Source, ResultMessage, WristDetections
+from common.messages import Detections, Health, MarkerDetections, ResultMessage, Source, WristDetections
 from master.outputs.laser_fan import fan_rays
 from master.outputs.palette import LIMIT_RGB, RAY_RGB, SOURCE_RGB, TRUTH_RGB, dim, pack, series_rgb
 from master.outputs.poses import Poses

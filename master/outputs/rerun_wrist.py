@@ -117,7 +117,9 @@ class WristLayer:
         root, t = rr.new_entity_path([WORLD, "hand", poses.hand]), poses.t_ns
         colour = int(pack([SOURCE_RGB[Source.WRIST]])[0])
         self._rows.lines(f"{root}/forearm", t, place.arm_m(_FOREARM_M), colour, _BONE_M)
-        self._rows.lines(f"{root}/forearm_uncertainty", t, place.uncertainty_m(_FOREARM_M), colour, _FAN_LINE_M)
+        self._rows.lines(
+            f"{root}/forearm_uncertainty", t, place.uncertainty_m(_FOREARM_M), colour, _FAN_LINE_M
+        )
         for i, name in enumerate(_WRIST_ANGLES):
             self._rows.scalars(
                 f"plots/wrist_angles_deg{self._group}/{name}", t, np.degrees(place.wrist_angles_rad[:, i])

@@ -30,7 +30,9 @@ class MasterClock:
         half_trip_ns = (answered_ns - asked_ns) // 2
         if self._half_trip_ns is None or half_trip_ns < self._half_trip_ns:
             ahead = remote_ns - (asked_ns + answered_ns) // 2
-            self.ahead_ns = 0 if abs(ahead) <= half_trip_ns else ahead  # one clock looks so, and is exact then
+            self.ahead_ns = (
+                0 if abs(ahead) <= half_trip_ns else ahead
+            )  # one clock looks so, and is exact then
             self._half_trip_ns = half_trip_ns
 
     def now_ns(self) -> int:

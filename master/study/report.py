@@ -158,7 +158,9 @@ def _reach_lines(cells: list[Cell], poses: list[str]) -> list[str]:
     for finger in FINGERS:
         own = [cell for cell in cells if cell.finger == finger]
         lines.append(
-            f"| {finger} | " + " | ".join(f"{cell.laser_seen} / {cell.tip} of {cell.trials}" for cell in own) + " |"
+            f"| {finger} | "
+            + " | ".join(f"{cell.laser_seen} / {cell.tip} of {cell.trials}" for cell in own)
+            + " |"
         )
     unseen = [cell for cell in cells if cell.unseen]
     listed = ", ".join(f"{cell.finger} {_LETTER[cell.pose]} {cell.unseen}" for cell in unseen) or "none"

@@ -143,7 +143,11 @@ def grow(hsv: Image, name: str, click: tuple[float, float]) -> Bool:
     if not (0 <= u < width and 0 <= v < height):
         raise FitError(f"clicks.{name}: ({u}, {v}) is outside the {width}x{height} image")
     clicked = hsv[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2].reshape(-1, 3)
-    hue, saturation, value = circular_median(clicked[:, 0]), np.median(clicked[:, 1]), np.median(clicked[:, 2])
+    hue, saturation, value = (
+        circular_median(clicked[:, 0]),
+        np.median(clicked[:, 1]),
+        np.median(clicked[:, 2]),
+    )
     if saturation < PALE:
         raise FitError(f"clicks.{name}: ({u}, {v}) is not on a paint: saturation {saturation:.0f} of 255")
     near = hue_distance(hsv[..., 0], hue) <= HUE_GROW

@@ -126,7 +126,9 @@ class MarkerDetector:
         self._free = tuple(markers.index(name) for name in free)
         self._engine = engine
         engine.prepare(self._table)
-        self._initial_uv = {markers.index(name): uv for name, uv in (initial_uv or {}).items() if name in markers}
+        self._initial_uv = {
+            markers.index(name): uv for name, uv in (initial_uv or {}).items() if name in markers
+        }
         self._tracks: list[Track | None] = [None] * len(markers)
         self._scanner = Scanner(camera.width_px, camera.height_px, engine)
         self._last_ns: int | None = None  # time of the last frame
@@ -283,7 +285,9 @@ class MarkerDetector:
         if before is not None and track.covered and smear < SMEARED and clear:
             shape, x, y = Ellipse(before.xx, before.xy, before.yy), u - seen.left, v - seen.top
             whole = centre_of(seen.window, shape, x, y)
-            if whole is not None and fits_occlusion(before.hidden(seen.area), shape, whole.u - x, whole.v - y):
+            if whole is not None and fits_occlusion(
+                before.hidden(seen.area), shape, whole.u - x, whole.v - y
+            ):
                 u, v, area = seen.left + whole.u, seen.top + whole.v, before.typical
                 sigma = math.hypot(COVERED_PX, whole.rms)
         sigma = math.hypot(sigma, shift_px)

@@ -234,7 +234,9 @@ def normal_law(z: Float) -> Float:
     return 0.5 * (1.0 + np.tanh(0.7978845608 * z * (1.0 + 0.044715 * z * z)))
 
 
-def _met(uv: Float, outward: Float, reach: Float, density: Float, most_residual: float, line: _Lines) -> Corners:
+def _met(
+    uv: Float, outward: Float, reach: Float, density: Float, most_residual: float, line: _Lines
+) -> Corners:
     """Where the lines of neighbouring sides meet, and how sure that is."""
     n = len(uv)
     offset = line.offset.reshape(n, 4, 2)

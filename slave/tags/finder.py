@@ -171,7 +171,9 @@ class TagFinder:
             good = np.isfinite(coarse.sigma_px)
             if not good.any():
                 continue
-            coarse = Corners(coarse.uv[good], coarse.sigma_px[good], coarse.contrast[good], coarse.width_px[good])
+            coarse = Corners(
+                coarse.uv[good], coarse.sigma_px[good], coarse.contrast[good], coarse.width_px[good]
+            )
             read = codes.read(grey, coarse)
             sure = np.flatnonzero(read.fit >= codes.sure)
             if not len(sure):

@@ -6,12 +6,12 @@ from typing import TypeAlias
 
 from common.arrays import Bool, Image, Int
 from slave.engines import engine_of
+from slave.wrist.cost_map import energy
 from slave.wrist.finger_lines import FingerLines, measure
 from slave.wrist.fingertips import Search, candidates
 from slave.wrist.runs import Runs, lines
 from slave.wrist.seams import minimum_cost_paths
 from slave.wrist.search_bands import Float32
-from slave.wrist.cost_map import energy
 
 Energy: TypeAlias = Callable[[Image, int], Float32]
 MinimumCostPaths: TypeAlias = Callable[[Float32, tuple[int, ...]], Int]

@@ -9,8 +9,7 @@ import numpy as np
 
 from common.arrays import Image, Int
 from slave.markers.fast_compile import compiled
-from slave.wrist import cost_map
-from slave.wrist import fast_tips, seams
+from slave.wrist import cost_map, fast_tips, seams
 from slave.wrist.engine import Engine
 from slave.wrist.fast_lines import lines, measure
 from slave.wrist.search_bands import MARGIN, Float32

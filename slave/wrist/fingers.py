@@ -17,11 +17,11 @@ import cv2
 import numpy as np
 
 from common.arrays import Float, Image, Int
+from slave.wrist.cost_map import DARK, STARTS, WIDTHS
 from slave.wrist.engine import NUMPY, Engine
 from slave.wrist.finger_lines import NONE
 from slave.wrist.palm_pose import PalmPose, find_palm_pose
 from slave.wrist.search_bands import STATION_PX, Float32, SearchBands, search_bands_of
-from slave.wrist.cost_map import DARK, STARTS, WIDTHS
 from slave.wrist.view import WristView
 
 _SHOWN = 24  # grey levels that the palm of a lit hand exceeds, or what hides it; the sun leaves less

@@ -127,7 +127,9 @@ def unlit(frames: Sequence[Image]) -> bool:
     if valid < VALID_LEAST * darkest.size:
         return False
     gain = cv2.subtract(reduce(cv2.max, frames), darkest)
-    return _broad(cv2.subtract(gain, cv2.LUT(darkest, _NOISE_OF_LEVEL)), LED_NEVER * valid) <= LED_NEVER * valid
+    return (
+        _broad(cv2.subtract(gain, cv2.LUT(darkest, _NOISE_OF_LEVEL)), LED_NEVER * valid) <= LED_NEVER * valid
+    )
 
 
 def brighter(frame: Image, other: Image) -> bool:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bench.gesture_truth import GestureTruth
-from bench.gestures import Score, seen_poses, recognised_in
+from bench.gestures import Score, recognised_in, seen_poses
 from bench.played import START_NS
 from common.gesture_settings import default_gestures
 from common.messages import Gesture

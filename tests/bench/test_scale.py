@@ -9,7 +9,7 @@ import pytest
 
 from bench.scale import cost_per_camera, summary
 from bench.scale_page import into_page
-from bench.scale_rig import ROOM, dome, room, detections_of
+from bench.scale_rig import ROOM, detections_of, dome, room
 from bench.scale_run import ScaleRun
 from master.rig import load_setup
 

@@ -152,7 +152,9 @@ def test_a_camera_speaks_for_itself_alone(rig: Rig) -> None:
 
 def test_a_camera_publishes_no_poses_and_nothing_in_the_name_of_another(rig: Rig) -> None:
     """Also not inside a message that travels under its own name, nor under a name that stands for several."""
-    subscriptions = {stream: rig.viewer.subscribe(stream) for stream in ("health", "hand", "gesture", "taken")}
+    subscriptions = {
+        stream: rig.viewer.subscribe(stream) for stream in ("health", "hand", "gesture", "taken")
+    }
     assert until(lambda: arrives(rig.right, subscriptions["health"], "right"))
     for name in ("right", "*", "r$*"):
         rig.right.publish("gesture", name, gesture())

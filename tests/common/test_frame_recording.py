@@ -194,7 +194,9 @@ def test_recordings_of_the_data_sets_open_whole(datasets: Path) -> None:
         assert all((folder / row.file).is_file() for row in recording.rows)
 
 
-def test_frames_of_one_camera_at_one_time_are_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_frames_of_one_camera_at_one_time_are_reported(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     open_recording(write(tmp_path))
     assert "the time of another" not in caplog.text
     open_recording(write(tmp_path, rows=(*ROWS, "left,2,2000,none,left/2.png")))

@@ -37,7 +37,11 @@ def test_a_certificate_is_valid_for_a_machine_without_a_clock_and_for_ten_years(
 def test_only_the_master_may_listen() -> None:
     authority = new_authority(NOW)
     printed = {name: shown(issue(authority, name, NOW).certificate) for name in (MASTER, OPERATOR, "left")}
-    assert {name: one.listens for name, one in printed.items()} == {MASTER: True, OPERATOR: False, "left": False}
+    assert {name: one.listens for name, one in printed.items()} == {
+        MASTER: True,
+        OPERATOR: False,
+        "left": False,
+    }
     assert {one.name for one in printed.values()} == set(printed)
     assert not shown(authority.certificate).listens
 

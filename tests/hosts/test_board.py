@@ -87,7 +87,9 @@ def test_after_a_reboot_it_streams_by_itself(deployed: Ran, rig: BoardRig, measu
     took = first_data(rig, silent) + silent - begin
     measured("  ... processor time of this machine that the board had of it", rig.board.processor_s() - had)
     assert rig.board.run("cat /proc/sys/kernel/random/boot_id") != boot
-    assert measured.at_most(REBOOT_S, "reboot, from the command to the first datagram", took), rig.board.journal()
+    assert measured.at_most(REBOOT_S, "reboot, from the command to the first datagram", took), (
+        rig.board.journal()
+    )
 
 
 def test_uninstall_leaves_nothing(deployed: Ran, rig: BoardRig, measured: Measured) -> None:

@@ -102,7 +102,9 @@ def test_a_version_that_hangs_before_it_is_ready_is_taken_back(
     assert "it says nothing; everything is as before" in last_line(ran), str(ran)
 
 
-def test_a_full_disk_is_reported_and_nothing_stops(deployed: Deployment, rig: Rig, measured: Measured) -> None:
+def test_a_full_disk_is_reported_and_nothing_stops(
+    deployed: Deployment, rig: Rig, measured: Measured
+) -> None:
     host, tap = rig.fleet.hosts["left"], rig.fleet.tap
     good = changed_wheels(rig.cache, rig.folder / "disk full", "92.0", {})
     streams(rig, "left")

@@ -505,7 +505,8 @@ def test_no_frame_is_of_the_future_however_the_slave_answers_echoes(ahead_ms: in
     wires.run(1.0)
     stamp_ns = wires.clock.t_ns + ahead_ms * 1_000_000
     wires.send(
-        slave, msgspec.structs.replace(detections("left", slave.process, 1), t_ns=stamp_ns, ready_t_ns=stamp_ns)
+        slave,
+        msgspec.structs.replace(detections("left", slave.process, 1), t_ns=stamp_ns, ready_t_ns=stamp_ns),
     )
     assert len(wires.got) == taken
     assert master.unsynchronised == (not taken)

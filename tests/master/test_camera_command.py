@@ -13,7 +13,7 @@ from common.camera_settings import CameraSettings, ColourPick
 from common.errors import BusError, CalibrationError, CameraError, PhalanxError
 from common.messages import Command, Health
 from master import camera_command
-from master.camera_command import commands, settings, table, send_all
+from master.camera_command import commands, send_all, settings, table
 
 ROOT = Path(__file__).resolve().parents[2]
 LEFT = ROOT / "calib_json/cameras/left.json"

@@ -75,7 +75,9 @@ class Lived:
     dropped_epochs: int
 
     def ages_ms(self) -> list[float]:
-        return [1e-6 * (result_ns - epoch) for result_ns, epoch in zip(self.result_ns, self.epochs, strict=True)]
+        return [
+            1e-6 * (result_ns - epoch) for result_ns, epoch in zip(self.result_ns, self.epochs, strict=True)
+        ]
 
 
 def lived(

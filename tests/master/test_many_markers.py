@@ -86,7 +86,9 @@ def test_a_hand_among_eighteen_other_markers_is_the_hand_alone(six: SyntheticRun
     assert fingers_of(many.setup) == tuple(MARKERS.index(n) if n in MARKERS[:5] else -1 for n in ALL)
 
 
-def test_a_free_markers_alternative_is_rejected_by_the_other_camera_and_by_its_own_past(many: SyntheticRun) -> None:
+def test_a_free_markers_alternative_is_rejected_by_the_other_camera_and_by_its_own_past(
+    many: SyntheticRun,
+) -> None:
     row, thing = ALL.index("cube-3"), np.array([0.1, -0.1, 0.5])
     messages: list[MarkerDetections] = []
     for m in many.messages:

@@ -47,7 +47,11 @@ def test_the_moment_that_is_shown_is_one_that_holds_the_object(tmp_path: Path) -
 def test_the_picture_has_the_object_and_the_strip(tmp_path: Path) -> None:
     poses, picture = Poses.of(moving_hand(6)), shown(tmp_path, held_row=2)
     images = []
-    for name, what in (("with", picture), ("without", None), ("lost", shown(tmp_path, held_row=2, known=False))):
+    for name, what in (
+        ("with", picture),
+        ("without", None),
+        ("lost", shown(tmp_path, held_row=2, known=False)),
+    ):
         draw_summary(tmp_path / f"{name}.png", poses, RIG, MODEL, {}, None, 2, None, what)
         image = cv2.imread(str(tmp_path / f"{name}.png"))
         assert image is not None

@@ -50,7 +50,11 @@ def test_what_was_made_and_reported_is_right_and_what_was_not_made_is_false() ->
     ]
     made = judge_gestures(received, Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 10 * 10**9)
     assert (made["gestures_right"], made["gestures_made"], made["gestures_false"]) == (3, 3, 0)
-    wrong = [recognised("pinch", "ring", 1.2), recognised("tap", "5", 2.0, "end"), recognised("pose", "open_palm", 2.0)]
+    wrong = [
+        recognised("pinch", "ring", 1.2),
+        recognised("tap", "5", 2.0, "end"),
+        recognised("pose", "open_palm", 2.0),
+    ]
     made = judge_gestures(wrong, Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 10 * 10**9)
     assert (made["gestures_right"], made["gestures_made"], made["gestures_false"]) == (0, 3, 2)
 
@@ -79,7 +83,9 @@ def test_what_the_beginning_of_the_run_cuts_off_is_neither_asked_for_nor_false()
 
 
 def test_too_late_is_not_right() -> None:
-    made = judge_gestures([recognised("pinch", "index", 2.6)], Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 10**10)
+    made = judge_gestures(
+        [recognised("pinch", "index", 2.6)], Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 10**10
+    )
     assert (made["gestures_right"], made["gestures_false"]) == (0, 1)
 
 

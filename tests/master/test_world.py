@@ -21,8 +21,8 @@ from common.messages import (
     MarkerDetections,
     ObjectPose,
     ObjectSource,
-    TagDetections,
     ResultMessage,
+    TagDetections,
     TrackerPose,
 )
 from master.app import Observed, RunFigures, health, run

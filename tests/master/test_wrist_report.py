@@ -47,7 +47,9 @@ def test_the_forearm_is_scored_against_the_vertical_whatever_its_heading(
         rotated = axis_rotation(2, 1.0) @ axis_rotation(0, np.radians(tilt_deg)) @ lies
         measured = replace(poses, palm_world_wxyz=matrix_to_quaternion(rotated))
         measured.palm_world_wxyz[:3] = np.nan
-        assert forearm_tilt(measured, scene, START_NS)["forearm_tilt_deg"] == pytest.approx(tilt_deg, abs=1e-4)
+        assert forearm_tilt(measured, scene, START_NS)["forearm_tilt_deg"] == pytest.approx(
+            tilt_deg, abs=1e-4
+        )
 
 
 @pytest.mark.parametrize("late_ms", [0, 30])

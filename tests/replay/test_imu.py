@@ -119,7 +119,9 @@ def test_a_heading_is_not_accepted_of_a_sensor_that_measured_none(
 ) -> None:
     used = recorded[0].solved(tmp_path / "used", IMU)
     with caplog.at_level(logging.WARNING):
-        changed = recorded[0].solved(tmp_path / "changed", msgspec.structs.replace(IMU, heading_sigma_rad=0.05))
+        changed = recorded[0].solved(
+            tmp_path / "changed", msgspec.structs.replace(IMU, heading_sigma_rad=0.05)
+        )
     assert "imu.csv: orientations of rates and forces: imu.heading_sigma_rad not used" in caplog.text
     np.testing.assert_array_equal(changed, used)
     folder = tmp_path / "of a slave"  # which writes what its filter made of the same

@@ -64,7 +64,9 @@ def test_a_straight_edge_is_followed_as_far_as_its_shift_and_not_twice_as_far(
     du, dv = 24.3 - seen_u, 23.6 - seen_v
     shape = moments(a, a * aspect, rotation)
     assert fits_occlusion(share, shape, du, dv)
-    assert not fits_occlusion(share, shape, 2.0 * du + math.copysign(1.5, du), 2.0 * dv + math.copysign(1.5, dv))
+    assert not fits_occlusion(
+        share, shape, 2.0 * du + math.copysign(1.5, du), 2.0 * dv + math.copysign(1.5, dv)
+    )
 
 
 def test_a_loss_of_a_tenth_does_not_move_a_small_cap_by_its_radius() -> None:

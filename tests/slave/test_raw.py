@@ -114,7 +114,11 @@ def test_frames_between_the_commands_are_kept_to_the_last_bit_and_join(
         for one in (left, right):
             one.raw.close()  # as at the end of the loop, whose last frame is kept, too
             answer = one.ask("raw_stop")
-            assert (answer.counts["raw.frames"], answer.counts["raw.dropped"], answer.counts["raw.ended"]) == (
+            assert (
+                answer.counts["raw.frames"],
+                answer.counts["raw.dropped"],
+                answer.counts["raw.ended"],
+            ) == (
                 10,
                 0,
                 0,

@@ -408,7 +408,9 @@ def test_rate_margin_and_ranges_are_set_by_name_and_reported(tuning: CameraTunin
         name: colour for name, colour in FILE.markers.items() if name != "ring"
     }
     assert (answer["roi_margin"], answer["wanted.frame_rate_hz"]) == (0.1, 30.0)
-    ranges = [answer[f"marker.ring.{key}"] for key in ("h_low", "s_low", "v_low", "h_high", "s_high", "v_high")]
+    ranges = [
+        answer[f"marker.ring.{key}"] for key in ("h_low", "s_low", "v_low", "h_high", "s_high", "v_high")
+    ]
     assert ranges == [120, 1, 2, 150, 4, 5]
     assert "marker.back2.h_low" not in answer, "it is no marker of this rig"
     tuning.commands()["set"]('{"markers": {"ring": null}}')

@@ -76,7 +76,9 @@ class LinesOfSight:
         seen = self._seen(all_of)
         out = np.zeros((*seen.shape[1:], len(_STEPS) + 1))
         out[..., :-1] = np.moveaxis(seen[1:] - seen[0], 0, -1) / _STEPS
-        farther = self._placed_at(R, shift_m, surface, radius, self._local(angles, thick, reach_m + _SHIFT_M)[2])
+        farther = self._placed_at(
+            R, shift_m, surface, radius, self._local(angles, thick, reach_m + _SHIFT_M)[2]
+        )
         out[..., 2:, -1] = (self._setup.optics.project(farther[2]) - seen[0][..., 2:]) / _SHIFT_M
         return seen[0], np.nan_to_num(out)
 

@@ -231,7 +231,8 @@ class Problem:
         about, observed = self._observed.about, self._observed.orientations
         late_s = unknown.camera_late_s - unknown.imu_late_s - about.camera_late_s + about.imu_late_s
         return replace(
-            observed, R_world_imu=observed.R_world_imu @ rotation_vector_to_matrix(late_s * observed.rate_rad_s)
+            observed,
+            R_world_imu=observed.R_world_imu @ rotation_vector_to_matrix(late_s * observed.rate_rad_s),
         )
 
     def _rig_imu(self, unknown: Unknown, orientations: ImuOrientations) -> Float:
@@ -359,5 +360,8 @@ class Problem:
 
 def _loosest(posture_prior: PosturePrior) -> PosturePrior:
     """Those of the free hand, the last hypothesis, with a share of their information."""
-    normal, pull, constant = (_PRIOR_SHARE * part[-1:] for part in (posture_prior.normal, posture_prior.pull, posture_prior.constant))
+    normal, pull, constant = (
+        _PRIOR_SHARE * part[-1:]
+        for part in (posture_prior.normal, posture_prior.pull, posture_prior.constant)
+    )
     return PosturePrior(normal, pull, constant, posture_prior.log_density[-1:])

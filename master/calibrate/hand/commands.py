@@ -148,7 +148,9 @@ def hand_command(
     _finish(out, profile, report, json_file)
 
 
-def _finish(out: Path | None, profile: HandProfile, report: dict[str, object], json_file: Path | None) -> None:
+def _finish(
+    out: Path | None, profile: HandProfile, report: dict[str, object], json_file: Path | None
+) -> None:
     written = None if out is None else write_hand(out, profile)
     typer.echo("nothing written: give --out DIR" if written is None else f"wrote {written}")
     if json_file is not None:

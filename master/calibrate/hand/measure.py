@@ -16,10 +16,10 @@ from common.errors import FitError
 from common.hand_model import FINGERS, TIPS, WRIST, HandModel
 from common.hand_profiles import mirrored_profile, scaled_profile
 from master.calibrate.hand.align import GRID_S, Alignment, align, flat_scale, missing_steps
-from master.calibrate.hand.priors import Priors, RoutineTargets
 from master.calibrate.hand.curves import Knots
 from master.calibrate.hand.fit import ShapeFit, fit_shape
 from master.calibrate.hand.observed import Observed
+from master.calibrate.hand.priors import Priors, RoutineTargets
 from master.calibrate.hand.problem import HandRoutineProblem
 from master.calibrate.hand.shape import PER_FINGER, Shape
 

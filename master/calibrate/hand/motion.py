@@ -101,7 +101,9 @@ def hand_from_motion(motion: JointMotion, name: str) -> MotionHand:
     )
     origin = _provenance(hand)
     back = profile.markers["back"]
-    profile = replace(profile, markers=like.markers | {"back": back}, radius_m=like.radius_m, provenance=origin)
+    profile = replace(
+        profile, markers=like.markers | {"back": back}, radius_m=like.radius_m, provenance=origin
+    )
     HandModel.of(profile)  # refuses what cannot be
     return changed(hand, profile=profile)
 

@@ -129,7 +129,9 @@ def closed_form(RA: Float, pA: Float, RB: Float, pB: Float) -> tuple[Float, Floa
     total = np.einsum("nij,nkl->ikjl", RB, RA).reshape(9, 9)
     left, _, right = np.linalg.svd(total)
     RX, RY = _rotation(left[:, 0]), _rotation(right[0])
-    if _rotation_residual(RX, RY, RA, RB) > _rotation_residual(-RX, RY, RA, RB):  # the sign of singular vectors means nothing
+    if _rotation_residual(RX, RY, RA, RB) > _rotation_residual(
+        -RX, RY, RA, RB
+    ):  # the sign of singular vectors means nothing
         RX = -RX
     RX, RY = (RX, RY) if np.linalg.det(RX) > 0.0 else (-RX, -RY)
     RX, RY = _nearest(RX), _nearest(RY)

@@ -87,7 +87,9 @@ def place_corners(corners_px: Float, board: Board, optics: CameraModel) -> Board
         )
     points = transform(T, drawn)
     centre = points.mean(axis=0)
-    jacobian = np.stack([_pixel_derivative(points, centre, k, optics) for k in range(6)], axis=-1).reshape(-1, 6)
+    jacobian = np.stack([_pixel_derivative(points, centre, k, optics) for k in range(6)], axis=-1).reshape(
+        -1, 6
+    )
     dof = 2.0 * len(drawn) - 6.0
     sigma = max(rms * np.sqrt(len(drawn) / dof), _CORNER_SIGMA_PX)
     return BoardPose(T, centre, sigma**2 * np.linalg.inv(jacobian.T @ jacobian), rms)

@@ -21,7 +21,7 @@ from master.calibrate.wrist.board_pose import board_pose
 from master.calibrate.wrist.device import Device, device_of, print_line, write_device
 from master.calibrate.wrist.flat_field import FlatFit, WhiteSamples, fit_flat_field, gathered, white_samples
 from master.calibrate.wrist.laser_command import Source
-from master.calibrate.wrist.lit_views import LitView, lit_views, grouped_by_reason
+from master.calibrate.wrist.lit_views import LitView, grouped_by_reason, lit_views
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.summary import write_summary
 

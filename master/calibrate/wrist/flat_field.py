@@ -195,7 +195,9 @@ def fit_flat_field(samples: WhiteSamples, optics: CameraModel) -> FlatFit:
 def _law(xy: Float, light: Float) -> Float:
     """Coefficients of the logarithm of k F by least squares; samples that stray are weighed down (Huber)."""
     terms, wanted = _law_terms(xy), np.log(light)
-    prior_information = np.diag(np.r_[0.0, 0.0, np.full(terms.shape[1] - 2, (_SAMPLE_SIGMA / _CORRECTION_SIGMA) ** 2)])
+    prior_information = np.diag(
+        np.r_[0.0, 0.0, np.full(terms.shape[1] - 2, (_SAMPLE_SIGMA / _CORRECTION_SIGMA) ** 2)]
+    )
     weight = np.ones(len(light))
     found = np.zeros(terms.shape[1])
     for _ in range(8):

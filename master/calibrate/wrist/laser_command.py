@@ -19,7 +19,7 @@ from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.board_pose import board_pose
 from master.calibrate.wrist.device import Device, device_of, print_line, write_device
 from master.calibrate.wrist.line import line_on_board
-from master.calibrate.wrist.lit_views import LitView, lit_views, grouped_by_reason
+from master.calibrate.wrist.lit_views import LitView, grouped_by_reason, lit_views
 from master.calibrate.wrist.plane import PlaneFit, ViewLine, fit_plane
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.summary import write_summary

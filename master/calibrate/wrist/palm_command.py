@@ -19,7 +19,7 @@ from master.calibrate.cameras.options import Dictionary, MarkerMm, board_of
 from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.board_pose import BoardPose, board_pose
 from master.calibrate.wrist.device import Device, device_of, print_line, write_device
-from master.calibrate.wrist.lit_views import lit_views, grouped_by_reason
+from master.calibrate.wrist.lit_views import grouped_by_reason, lit_views
 from master.calibrate.wrist.palm_board import BoardOffset, PalmFit, palm_from_board
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.summary import write_summary

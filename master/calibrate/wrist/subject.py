@@ -34,7 +34,9 @@ _LENGTH, _MEASURED = (
 _BENT_RAD = np.radians(60.0)  # at its knuckle: from here on the line hardly moves any more
 _MOST_RMS = 1.5  # standard deviations: angles are free, so what is left is small
 _UNLIKELY = 3.0  # standard deviations
-_MOST_PRIOR_RMS = 1.5  # rms of standard deviations: one in a hundred subjects, of 14 numbers that a motion tells
+_MOST_PRIOR_RMS = (
+    1.5  # rms of standard deviations: one in a hundred subjects, of 14 numbers that a motion tells
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,7 +118,10 @@ def _pose_sigma(rig: RigCalibration) -> Float:
     """
     how = rig.provenance.get("T_camera_palm")
     stated = {} if how is None or how.tool == TOOL else how.residual
-    rotation, shift = np.radians(stated.get("rotation_sigma_deg", 0.0)), 1e-3 * stated.get("shift_sigma_mm", 0.0)
+    rotation, shift = (
+        np.radians(stated.get("rotation_sigma_deg", 0.0)),
+        1e-3 * stated.get("shift_sigma_mm", 0.0),
+    )
     if how is not None and how.tool == "calibrate palm":
         return np.repeat([np.hypot(rotation, _RULER[0]), np.hypot(shift, _RULER[1])], 3)
     return np.repeat([rotation, shift] if rotation > 0.0 and shift > 0.0 else _GUESS, 3)
@@ -162,7 +167,12 @@ def _check_likely(fit: Fit) -> None:
     """
     pull = np.abs(fit.x) / fit.prior_sigma
     worst = int(pull.argmax())
-    if fit.rms > _MOST_RMS or pull[worst] > _UNLIKELY or fit.prior_rms > _MOST_PRIOR_RMS or fit.unlike > _UNLIKELY:
+    if (
+        fit.rms > _MOST_RMS
+        or pull[worst] > _UNLIKELY
+        or fit.prior_rms > _MOST_PRIOR_RMS
+        or fit.unlike > _UNLIKELY
+    ):
         raise FitError(
             f"no likely subject explains what was seen: it is {fit.rms:.1f} times farther off than skin explains,"
             f" fingers {fit.unlike:.1f} times from their habits, and {_name(worst)} {pull[worst]:.1f} standard"

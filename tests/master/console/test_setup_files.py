@@ -140,7 +140,9 @@ def test_the_same_mode_keeps_a_lens_and_another_keeps_the_old_file_aside(tmp_pat
     ("names", "settings"),
     [(("left",), "two or more"), (("left", "left"), "'left' stands twice")],
 )
-def test_cameras_that_cannot_be_a_rig_are_refused(tmp_path: Path, names: tuple[str, ...], settings: str) -> None:
+def test_cameras_that_cannot_be_a_rig_are_refused(
+    tmp_path: Path, names: tuple[str, ...], settings: str
+) -> None:
     cameras = tuple(CameraPlan(name=name, kind="usb", mode="vga60") for name in names)
     with pytest.raises(CalibrationError, match=settings):
         write_cameras(tmp_path, Plan(cameras=cameras))

@@ -6,15 +6,15 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.kernels import kernel
-from master.estimator.second_order import add_second_order
 from master.estimator.cameras import CameraArrays, project
-from master.estimator.joint_covariance import CovarianceScratch, linear, surer
 from master.estimator.extras import keep_extras, predict_extras
 from master.estimator.finger_surface import MOVES, laser_centroid, look
+from master.estimator.joint_covariance import CovarianceScratch, linear, surer
 from master.estimator.kinematics import Scratch, angles_of, chains, twist_hand
 from master.estimator.priors import PosturePrior
 from master.estimator.problem import Rig
 from master.estimator.residuals import Observations, marker_rows
+from master.estimator.second_order import add_second_order
 from master.estimator.solve import linearise
 from master.estimator.state import grow, hide
 from master.estimator.truncated import truncated_mean
@@ -55,7 +55,9 @@ def linearise_at(
 ) -> float:
     """`master.estimator.solve.linearise`; records in their arrays."""
     rig = Rig(model.hand[0], model.mounts, model.cameras, model.device[0])
-    return linearise(rig, posture_prior, boxed_prior[0], observed, h, T, x, z, gradient, normal, boxed_search[0])
+    return linearise(
+        rig, posture_prior, boxed_prior[0], observed, h, T, x, z, gradient, normal, boxed_search[0]
+    )
 
 
 @kernel

@@ -58,9 +58,7 @@ def on_profile(wrist_case: WristCase, scan: Scan, f: int, pip: float) -> Float:
 @pytest.mark.parametrize(
     ("mcp", "pip"), [(10.0, 5.0), (20.0, 40.0), (45.0, 30.0), (30.0, 75.0), (45.0, 62.0)]
 )
-def test_the_profile_passes_through_the_true_pose(
-    wrist_case: WristCase, mcp: float, pip: float
-) -> None:
+def test_the_profile_passes_through_the_true_pose(wrist_case: WristCase, mcp: float, pip: float) -> None:
     angles = bent(mcp, pip)
     scan = scanned(wrist_case, angles)
     for f in range(1, 5):

@@ -88,7 +88,9 @@ def test_the_covariance_of_an_unobserved_palm_grows(cut: Solved) -> None:
     assert (np.linalg.eigvalsh(cut.poses.cov_m2[at][:, 1]) > 0.0).all()
 
 
-def test_wrist_angles_and_rotation_of_the_palm_are_published_with_their_uncertainty(seen: Seen, whole: Solved) -> None:
+def test_wrist_angles_and_rotation_of_the_palm_are_published_with_their_uncertainty(
+    seen: Seen, whole: Solved
+) -> None:
     truth = np.array([seen[0].scene.motion.at(t).wrist_angles_rad for t in whole.t_s.tolist()])
     off = np.abs(whole.poses.wrist_angles_rad - truth)
     assert np.isfinite(whole.poses.wrist_angles_sigma_rad).all()

@@ -76,7 +76,8 @@ def after(
         memory.moved(bent(before_deg[0]), bent(before_deg[1]), STEP_NS * 1e-9)
     seen = ALL - gone
     return [
-        memory.epoch_prior((k + 1) * STEP_NS, k * STEP_NS, bent(pip), seen) for k, pip in enumerate(history_deg)
+        memory.epoch_prior((k + 1) * STEP_NS, k * STEP_NS, bent(pip), seen)
+        for k, pip in enumerate(history_deg)
     ]
 
 

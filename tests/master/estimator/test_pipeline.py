@@ -162,7 +162,9 @@ def test_what_was_mistaken_long_ago_is_not_the_past_of_a_marker(exact_run: Synth
     sure = mistaken(exact_run, OUT_OF_REACH, ("left", "right"), with_alternatives=False)
     with_alternatives = mistaken(exact_run, OUT_OF_REACH, ("left", "right"), with_alternatives=True)
     pipeline = build_pipeline(exact_run.setup, StageTimes())
-    poses = solve_all(pipeline, [d if d.seq >= 30 else s for s, d in zip(sure, with_alternatives, strict=True)])
+    poses = solve_all(
+        pipeline, [d if d.seq >= 30 else s for s, d in zip(sure, with_alternatives, strict=True)]
+    )
     assert all(marker_mm(p)[1] > 50.0 for p in poses[22:28])
     assert all(marker_mm(p)[1] < 5.0 for p in poses[34:])
 

@@ -268,7 +268,9 @@ def test_a_measured_orientation_turns_the_palm() -> None:
         noise = rng.normal(0.0, SIGMA_M, (6, 3))
         seen = rotation_vector_to_matrix(rng.normal(0.0, sigma, 3)) @ T[:3, :3]
         alone.append(palm_deg(solved(SOLVER, T, truth, noise), T))
-        by_imu.append(palm_deg(solved(SOLVER, T, truth, noise, orientation_of(seen, sigma**2 * np.eye(3))), T))
+        by_imu.append(
+            palm_deg(solved(SOLVER, T, truth, noise, orientation_of(seen, sigma**2 * np.eye(3))), T)
+        )
     assert np.mean(by_imu) < 3.0
     assert np.mean(by_imu) < 0.6 * np.mean(alone)
 

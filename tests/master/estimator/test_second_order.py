@@ -10,9 +10,9 @@ from common.hand_model import CHAINS, TIPS, WRIST, HandModel
 from common.records import boxed
 from master.estimator.body_points import BodyPoints
 from master.estimator.cameras import CameraArrays
-from master.estimator.joint_covariance import CovarianceScratch
 from master.estimator.epoch import FittedHand
 from master.estimator.hand_tables import HandTables, Mounts
+from master.estimator.joint_covariance import CovarianceScratch
 from master.estimator.kinematics import Scratch
 from master.estimator.parameters import HandParameters
 from master.estimator.settings import DEFAULT
@@ -45,7 +45,10 @@ def covariances(hand: FittedHand, cov: Float, seen: Bool, model: HandModel = RIG
         boxed(Device.none()),
     )
     straight, whole = np.empty((26, 3, 3)), np.empty((26, 3, 3))
-    storage, information = CovarianceScratch.empty(len(cov), 16), np.asarray(np.linalg.inv(small_cov()), np.float64)
+    storage, information = (
+        CovarianceScratch.empty(len(cov), 16),
+        np.asarray(np.linalg.inv(small_cov()), np.float64),
+    )
     T, work = hand.T_rig_palm, boxed(Scratch.empty())
     joint_covariances(rig, T, hand.x, cov, seen, information, work, boxed(storage), straight, whole)
     return straight, whole
@@ -89,7 +92,9 @@ def test_what_is_left_of_the_tangent_is_that_of_drawn_hands() -> None:
         expected = np.einsum("tpi,tpj->pij", off, off) / DRAWS
         for joint in (*CHAINS[:, 0], *TIPS):
             size = np.trace(expected[joint])
-            np.testing.assert_allclose(second_order(hand, cov, NONE, model)[joint], expected[joint], atol=0.12 * size)
+            np.testing.assert_allclose(
+                second_order(hand, cov, NONE, model)[joint], expected[joint], atol=0.12 * size
+            )
 
 
 def about_the_back(hand: FittedHand) -> Float:

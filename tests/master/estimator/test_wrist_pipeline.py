@@ -374,7 +374,9 @@ def test_a_lost_finger_is_held_for_half_a_second_with_growing_covariance(wrist_c
     assert not held[2].tracked[CHAINS[1]].any()  # a triple late it is shown as it was
     variance_m2 = np.array([pose.cov_m2[10].trace() for pose in (first, *held)])
     assert (np.diff(variance_m2[1:]) > 0.0).all()
-    assert variance_m2[1] > 0.95 * variance_m2[0]  # habits hold the first of them as they did while it was seen
+    assert (
+        variance_m2[1] > 0.95 * variance_m2[0]
+    )  # habits hold the first of them as they did while it was seen
     line.t_ns += 3 * CYCLE_NS
     gone = line.takes(laser)
     assert not gone.valid[CHAINS[1]].any()

@@ -68,7 +68,11 @@ def orientation(whole: Whole, seen: Seen, off: float) -> None:
     epoch_prior, rng = whole.epoch_prior, whole.rng
     palm = rotation_vector_to_matrix(off * rng.normal(size=3)) @ whole.T[:3, :3]
     epoch_prior.forearm[:3, :3] = palm @ forearm_palm(FLEXED).T
-    epoch_prior.orientation_info[:], epoch_prior.oriented[0], epoch_prior.on_forearm[0] = spd(rng, 3), 1.0, 1.0
+    epoch_prior.orientation_info[:], epoch_prior.oriented[0], epoch_prior.on_forearm[0] = (
+        spd(rng, 3),
+        1.0,
+        1.0,
+    )
     epoch_prior.axes[:] = any_rotation(rng)
     whole.z[TILT : HEADING + 1] = epoch_prior.z[TILT : HEADING + 1] = rng.normal(0.0, 0.2, 3)
 
@@ -144,7 +148,9 @@ def test_rows_that_are_not_seen_say_nothing(wrist_case: WristCase) -> None:
 
 
 @pytest.mark.parametrize("teaches", [True, False])
-def test_a_finger_constrains_its_own_angles_and_twist_and_the_wrist_angles(wrist_case: WristCase, teaches: bool) -> None:
+def test_a_finger_constrains_its_own_angles_and_twist_and_the_wrist_angles(
+    wrist_case: WristCase, teaches: bool
+) -> None:
     """One that is in doubt teaches nothing of its hinges."""
     whole, seen = hand(wrist_case, 2)
     tip_depth(whole, seen, 0.3)

@@ -9,7 +9,7 @@ from common.calibration import save
 from common.geometry import matrix_to_quaternion, rigid
 from common.hand_model import HandModel
 from common.hand_profiles import generated_profile
-from common.messages import Contact, Gesture, HandPose, ObjectPose, ObjectSource, Source, ResultMessage
+from common.messages import Contact, Gesture, HandPose, ObjectPose, ObjectSource, ResultMessage, Source
 from master.export.skeleton import Skeleton
 from master.outputs.poses import Poses
 from tests.hand_helpers import any_rotation, natural_angles

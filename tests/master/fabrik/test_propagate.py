@@ -295,7 +295,9 @@ def by_formula(t_s: Float, y: Float, sigma: Float) -> tuple[Float, float]:
         c = weights.sum()
         x = weights @ y / c
         residual2 = float(np.trace((y - x).T @ np.linalg.solve(S, y - x)))
-        found.append((-0.5 * (np.linalg.slogdet(S)[1] + np.log(c) + 0.5 * residual2), x, 1.0 / c, weights / c))
+        found.append(
+            (-0.5 * (np.linalg.slogdet(S)[1] + np.log(c) + 0.5 * residual2), x, 1.0 / c, weights / c)
+        )
     share = np.exp(np.array([one[0] for one in found]) - max(one[0] for one in found))
     share /= share.sum()
     mean = share @ np.array([one[1] for one in found])

@@ -52,7 +52,9 @@ def gap_at(k: int, down: int = 5, pace: int = 8) -> float:
     return float(np.interp(k, knots, [UP_M, DOWN_M, DOWN_M, UP_M]))
 
 
-def recognised_in(pose: Callable[[int], HandPose], frames: int = 80, settings: TapSettings = TAPS) -> list[Gesture]:
+def recognised_in(
+    pose: Callable[[int], HandPose], frames: int = 80, settings: TapSettings = TAPS
+) -> list[Gesture]:
     watch, out = ThumbTapMonitor(settings), list[Gesture]()
     for k in range(frames):
         seen = FeatureExtractor(RIGHT).of(pose(k))

@@ -51,7 +51,9 @@ def test_a_hand_that_rests_next_to_what_others_move_carries_nothing() -> None:
 
 
 def test_a_hand_that_passes_an_object_at_rest_carries_nothing() -> None:
-    assert not any(carried_rows(1.0, lambda t_s: transform(object_at(0.0), PALM_M) + np.array([0.2 * t_s, 0.0, 0.0])))
+    assert not any(
+        carried_rows(1.0, lambda t_s: transform(object_at(0.0), PALM_M) + np.array([0.2 * t_s, 0.0, 0.0]))
+    )
 
 
 def test_what_moves_alike_but_far_away_is_not_carried() -> None:

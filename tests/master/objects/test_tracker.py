@@ -98,7 +98,9 @@ def test_a_leap_is_first_rejected_and_then_accepted() -> None:
     assert [pose.tracked for pose in poses] == [False] * 15 + [True] * 2
     assert line.counts["leap"] == 16
     quick = TrackerLine(CUBE, RIG)  # 4 m/s are none
-    assert all(one(quick, pose_at(10.0 * k, HERE + np.array([0.04 * k, 0.0, 0.0]))).tracked for k in range(20))
+    assert all(
+        one(quick, pose_at(10.0 * k, HERE + np.array([0.04 * k, 0.0, 0.0]))).tracked for k in range(20)
+    )
 
 
 def test_poses_come_once_and_rise_and_a_new_process_may_have_another_clock() -> None:

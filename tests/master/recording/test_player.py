@@ -59,7 +59,9 @@ def whole(run: RecordedRun) -> tuple[Passed, list[HandPose]]:
     return Player(recording, recorded_setups(recording), [kept], speed=0.0).run(), kept.poses
 
 
-def test_every_speed_publishes_what_was_published_live(run: RecordedRun, whole: tuple[Passed, list[HandPose]]) -> None:
+def test_every_speed_publishes_what_was_published_live(
+    run: RecordedRun, whole: tuple[Passed, list[HandPose]]
+) -> None:
     recording = open_messages(run.path)
     setups = recorded_setups(recording)
     for passed in (whole[0], Player(recording, setups, [], speed=1.0).run()):

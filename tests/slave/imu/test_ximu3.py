@@ -164,7 +164,9 @@ def test_who_does_not_answer_or_refuses_is_reported(
     device.unplug()
 
 
-def test_a_setting_that_older_devices_lack_is_only_reported(link: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_setting_that_older_devices_lack_is_only_reported(
+    link: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     device = FakeXimu3(link, refuses="gyroscope_offset_correction_enabled")
     opened(link).close()
     assert "refused gyroscope_offset_correction_enabled=False: Unknown key" in caplog.text

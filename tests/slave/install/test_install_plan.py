@@ -204,7 +204,9 @@ def test_what_config_txt_says_already_is_not_said_again() -> None:
         ({"video": []}, "v4l2:/dev/video2", "no V4L2 camera is there (/dev/video2)"),
     ],
 )
-def test_a_machine_that_cannot_is_refused_with_the_reason(facts: dict[str, object], camera: str, output: str) -> None:
+def test_a_machine_that_cannot_is_refused_with_the_reason(
+    facts: dict[str, object], camera: str, output: str
+) -> None:
     assert judge(FACTS, camera) is None
     assert output in (judge(FACTS | facts, camera) or "")
 

@@ -34,7 +34,8 @@ def output(folder: Path, *parts: bytes) -> str:
 
 def test_it_is_asked_to_write_poses_alone_and_they_come_at_once(tmp_path: Path) -> None:
     command = program(
-        tmp_path, f'echo "$@" > {tmp_path}/arguments; {output(tmp_path, HEAD, pose(8.0), pose(8.01))}; sleep 60'
+        tmp_path,
+        f'echo "$@" > {tmp_path}/arguments; {output(tmp_path, HEAD, pose(8.0), pose(8.01))}; sleep 60',
     )
     source = opened(command)
     begin_ns = SystemClock().now_ns()

@@ -7,7 +7,16 @@ import numpy as np
 
 from common.arrays import Float
 from master.calibrate.cameras.boards import board_corners
-from master.calibrate.cameras.bundle import Bundle, Free, Observation, _jacobian, _retracted, predict, rms, solve
+from master.calibrate.cameras.bundle import (
+    Bundle,
+    Free,
+    Observation,
+    _jacobian,
+    _retracted,
+    predict,
+    rms,
+    solve,
+)
 from tests.master.calibrate.cameras.board_scenes import SIZE, Scene, scene
 
 

@@ -58,7 +58,9 @@ def problem() -> tuple[Problem, Unknown, Hands]:
 
 def derivatives(at: Problem, unknown: Unknown, hands: Hands, steps: Float) -> Float:
     """Of half of the cost by each of these steps (N, UNKNOWN), by central differences."""
-    out = [at.cost(unknown.retracted(step), hands) - at.cost(unknown.retracted(-step), hands) for step in steps]
+    out = [
+        at.cost(unknown.retracted(step), hands) - at.cost(unknown.retracted(-step), hands) for step in steps
+    ]
     return 0.25 * np.array(out)
 
 
