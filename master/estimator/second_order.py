@@ -23,8 +23,8 @@ from math import sqrt
 
 from common.arrays import Bool, Float
 from common.kernels import constant, inlined, inner
-from master.estimator.cov_scratch import MOST_ROTATIONS, CovarianceScratch, joint_jacobian
 from master.estimator.hand_tables import HandTables
+from master.estimator.joint_covariance import MOST_ROTATIONS, CovarianceScratch, joint_jacobian
 from master.estimator.kinematics import PLACE, Scratch, finger_jacobian, marker_point, palm_jacobian
 from master.estimator.matrices import cholesky, eigen
 from master.estimator.problem import Rig

@@ -10,8 +10,8 @@ from common.hand_model import CHAINS, MIDDLE_PROXIMAL, TIPS, HandModel
 from common.kernels import constant, inner, kernel
 from common.records import record
 from master.estimator.blend import PARTS
-from master.estimator.cov_scratch import is_small
 from master.estimator.hand_tables import HandTables
+from master.estimator.joint_covariance import is_small
 from master.estimator.kinematics import Scratch, chains, clamp, joints, rotate_by, rotation_between
 from master.estimator.matrices import copy
 from master.estimator.settings import Settings

@@ -8,9 +8,9 @@ import numpy as np
 from common.arrays import Bool, Code, Float
 from common.kernels import inner, kernel
 from common.messages import Source
-from master.estimator.cov_scratch import is_small, linear, only_limits, surer, tilts
 from master.estimator.extras import keep_extras
 from master.estimator.hypotheses import Blank, likelier
+from master.estimator.joint_covariance import is_small, linear, only_limits, surer, tilts
 from master.estimator.kinematics import angles_of, chains, clamp, free_of, joints, marker_point
 from master.estimator.matrices import copy, inverse_3
 from master.estimator.observation_sources import Ground
@@ -111,7 +111,7 @@ def _judge(
 ) -> None:
     """Write which joints are tracked, and what each rests on.
 
-    Tracked is a joint whose 95 % region is small (`master.estimator.cov_scratch.is_small`), and that rests on
+    Tracked is a joint whose 95 % region is small (`master.estimator.joint_covariance.is_small`), and that rests on
     measurements of its finger that are no older than `tracked_age_s`.
     """
     hand = rig.hand

@@ -5,11 +5,11 @@ from typing import Any, NamedTuple
 from common.arrays import Bool, Code, Float, Int
 from common.records import record
 from master.estimator.cameras import CameraArrays
-from master.estimator.cov_scratch import CovarianceScratch
 from master.estimator.extras import ExtrasScratch
 from master.estimator.finger_scan import Prior, Scan
 from master.estimator.hand_tables import Mounts
 from master.estimator.hypotheses import Posterior, Scratch
+from master.estimator.joint_covariance import CovarianceScratch
 from master.estimator.observation_sources import Ground
 from master.estimator.problem import EpochPrior
 from master.estimator.state import Hidden

@@ -3,7 +3,7 @@
 import numpy as np
 
 from bench.gesture_recorded import agrees
-from bench.recognised_poses import ResultMessage
+from bench.recognised_poses import RecognisedPoses
 from common.geometry import axis_rotation
 from common.sim.motion import POSES
 from tests.hand_helpers import LEFT, RIGHT
@@ -11,7 +11,7 @@ from tests.master.gestures.shown_hands import posture
 
 
 def test_frames_count_from_the_third_of_a_held_pose_on() -> None:
-    recognised = ResultMessage()
+    recognised = RecognisedPoses()
     truth = [None, "pinch", "pinch", "pinch", "pinch", None, "pointing", "pointing", "pointing"]
     recognised.add(truth, [None, None, None, "pinch", None, "open_palm", None, None, "pinch"])
     assert dict(recognised.frames) == {("pinch", "pinch"): 1, ("pinch", "none"): 1, ("pointing", "pinch"): 1}

@@ -66,7 +66,7 @@ class Displaced:
         found = self.inner.push(image, t_ns)
         return Displaced.Shifted(found.uv + np.array([1.0 / 3.0, 0.0]), found.quality)
 
-    def fresh(self, seeds: object = None) -> "Displaced":
+    def fresh(self, initial_uv: object = None) -> "Displaced":
         return Displaced(self.inner.fresh())
 
     class Shifted:

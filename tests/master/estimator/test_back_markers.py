@@ -20,18 +20,18 @@ NOISE_M, POSES, IMU_RAD = 1e-3, 60, np.radians(2.0)
 
 
 def palm_errors_deg(side: str, names: tuple[str, ...], *, imu: bool = False) -> Float:
-    """Turn (N,) of the solved palm against the truth [deg]; the same poses and noise for all sets of markers."""
+    """Rotation (N,) of the solved palm against the truth [deg]; the same poses and noise for all sets of markers."""
     model, rng = MODELS[side], np.random.default_rng(12)
     machine, cov = forgetful(model, names), np.tile(NOISE_M**2 * np.eye(3), (len(names), 1, 1))
     errors: list[float] = []
     for _ in range(POSES):
         T = palm(rng.uniform(-35.0, 35.0, 3))
         joints = model.forward(T, natural_angles(rng))
-        noise, orientation = rng.normal(0.0, NOISE_M, (len(EIGHT), 3)), rng.normal(0.0, IMU_RAD, 3)
+        noise, tilt = rng.normal(0.0, NOISE_M, (len(EIGHT), 3)), rng.normal(0.0, IMU_RAD, 3)
         points = model.marker_points(joints, EIGHT) + noise
         seen = points[[EIGHT.index(name) for name in names]]
         orientation = orientation_of(
-            Rotation.from_rotvec(orientation).as_matrix() @ T[:3, :3], IMU_RAD**2 * np.eye(3)
+            Rotation.from_rotvec(tilt).as_matrix() @ T[:3, :3], IMU_RAD**2 * np.eye(3)
         )
         errors.append(palm_deg(fit(seen, cov, by=machine, orientation=orientation if imu else None), T))
     return np.array(errors)
