@@ -29,7 +29,7 @@ class Ears:
     """How datagrams are heard.
 
     Attributes:
-        options: Of `phalanx-master hear`.
+        options: Of `phalanx fleet status --hear`.
         keys: Keys folder.
         seconds: How long they are waited for.
     """
@@ -55,15 +55,15 @@ class Heard:
 
 
 def heard_of(names: Sequence[str], ears: Ears, ended: threading.Event | None = None) -> Heard:
-    """Ask `phalanx-master hear` which of the senders are heard; it ends early if `ended` is set."""
-    words = [sys.executable, "-m", "master.hear", "--json", "--seconds", str(ears.seconds), *ears.options]
-    words += [word for name in names for word in ("--name", name)]
+    """Ask `phalanx fleet status --hear` which of the senders are heard; it ends early if `ended` is set."""
+    words = [sys.executable, "-m", "master", "fleet", "status", "--json", "--seconds", str(ears.seconds)]
+    words += [*ears.options, *(word for name in names for word in ("--hear", name))]
     lines: list[str] = []
     environment = {"PHALANX_KEYS": str(ears.keys)}
     code, errors = run_bounded(words, b"", lines.append, ears.seconds + _END_S, environment, ended)
     results = [line for line in lines if line.startswith('{"heard"')]
     if not results:
-        said = [*lines, *errors] or [f"phalanx-master hear ended with {code}"]
+        said = [*lines, *errors] or [f"phalanx fleet status --hear ended with {code}"]
         return Heard(cause=f"cannot listen for it: {said[-1]}")
     told = cast(dict[str, object], json.loads(results[-1]))
     rates = cast(dict[str, float], told["heard"])

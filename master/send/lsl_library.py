@@ -104,7 +104,7 @@ def load_library(scope: str, told: str | None) -> Library:
         if told != scope:
             raise PhalanxError(
                 f"lsl.scope is {scope!r}, but liblsl began with {told!r} in this process: start"
-                " `phalanx-master send` anew"
+                " `phalanx send` anew"
             )
         return library
     if scope == "machine":

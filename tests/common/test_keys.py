@@ -85,7 +85,7 @@ def test_the_secrets_are_those_of_the_folder_and_of_the_rig_key_where_that_is_al
 def test_a_folder_without_secrets_makes_no_weaker_rig(keys: Path) -> None:
     (keys / "devices.key").unlink()
     (keys / "devices/left.secret").unlink()
-    with pytest.raises(PhalanxError, match=rf"devices\.key: missing.* keys make {keys} .*phalanx deploy"):
+    with pytest.raises(PhalanxError, match=rf"devices\.key: missing.* keys make {keys} .*phalanx fleet deploy"):
         link_key({}, None, keys)
     with pytest.raises(
         PhalanxError, match=r"no secret of 'left' \(devices/left\.secret, device-left\.secret.*--device left"

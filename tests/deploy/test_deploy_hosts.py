@@ -1,4 +1,4 @@
-"""`phalanx deploy` as far as it needs no other machine: names of hosts, wheels, what is sent, deadlines, going back."""
+"""`phalanx fleet deploy` as far as it needs no other machine: names of hosts, wheels, what is sent, deadlines, going back."""
 
 import json
 import os
@@ -314,7 +314,7 @@ def test_wheels_of_another_machine_are_refused_here(tmp_path: Path) -> None:
         assert wheels_module.fits(name, kind) is expected, name
     wrong = tmp_path / "numpy-2.4-cp312-cp312-manylinux_2_27_aarch64.whl"
     wrong.write_bytes(b"")
-    with pytest.raises(DeployError, match=r"phalanx wheels DIR --machine aarch64 --python 3\.13"):
+    with pytest.raises(DeployError, match=r"phalanx fleet wheels DIR --machine aarch64 --python 3\.13"):
         wheelhouse(kind, tmp_path, print)
 
 
@@ -375,7 +375,7 @@ def _file(path: Path, content: bytes) -> Path:
     [
         (["--options", "rihgt=--sync client"], "--options 'rihgt=--sync client': rig 'desk' has no 'rihgt'"),
         (["--camera", "up=v4l2"], "--camera 'up=v4l2': rig 'desk' has no 'up'; it has left, right"),
-        (["--wheelhouse", "nowhere"], "--wheelhouse nowhere: no wheels in it; phalanx wheels DIR"),
+        (["--wheelhouse", "nowhere"], "--wheelhouse nowhere: no wheels in it; phalanx fleet wheels DIR"),
         (["--identity", "nokey"], "--identity nokey: no such file"),
     ],
 )

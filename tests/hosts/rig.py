@@ -103,11 +103,11 @@ class Rig:
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """Both hosts, as `phalanx deploy` takes them."""
+        """Both hosts, as `phalanx fleet deploy` takes them."""
         return tuple(f"{name}={host.login}" for name, host in self.fleet.hosts.items())
 
     def deploy(self, *more: str, targets: tuple[str, ...] | None = None, timeout_s: float = 240.0) -> Ran:
-        """Run `phalanx deploy` for both hosts, or for some of them, with more options."""
+        """Run `phalanx fleet deploy` for both hosts, or for some of them, with more options."""
         where = ["--master", self.fleet.address, "--rig", "desk", "--calibration", str(self.calibration)]
         what = ["--keys", str(self.keys), "--bus", self.bus, "--camera", "synthetic", "--no-apt"]
         what += ["--beacon", f"{self.fleet.broadcast}:{BEACON_PORT}", *self.fleet.ssh_options]
@@ -115,12 +115,12 @@ class Rig:
         return self.program("deploy", "deploy", *hosts, *where, *what, *more, timeout_s=timeout_s)
 
     def rollback(self, *more: str) -> Ran:
-        """Run `phalanx rollback` for both hosts."""
+        """Run `phalanx fleet rollback` for both hosts."""
         hosts = [host.login for host in self.fleet.hosts.values()]
         return self.program("deploy", "rollback", *hosts, *more, *self.fleet.ssh_options)
 
     def uninstall(self) -> Ran:
-        """Run `phalanx uninstall` for both hosts."""
+        """Run `phalanx fleet uninstall` for both hosts."""
         hosts = [host.login for host in self.fleet.hosts.values()]
         return self.program("deploy", "uninstall", *hosts, *self.fleet.ssh_options)
 
@@ -176,7 +176,7 @@ def changed_wheels(cache: Path, folder: Path, new: str, replaced: dict[str, str]
     """A folder with the wheels that were gathered, ours as another version and with other text in some of its files.
 
     Args:
-        cache: Where `phalanx deploy` gathers them.
+        cache: Where `phalanx fleet deploy` gathers them.
         folder: To be made.
         new: Version of our wheel in it.
         replaced: File of the wheel -> its whole new text.

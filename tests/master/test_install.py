@@ -1,4 +1,4 @@
-"""`phalanx-master install`: the unit by systemd's own checks, its options, and how the loop shows that it lives."""
+"""`phalanx run --install`: the unit by systemd's own checks, its options, and how the loop shows that it lives."""
 
 import os
 import re
@@ -68,7 +68,7 @@ def test_systemd_has_nothing_to_say_about_the_unit(tmp_path: Path) -> None:
         ("WatchdogSec", "WatchdogSek", "Unknown key 'WatchdogSek'"),
         ("MemoryMax=1G", "MemoryMax=1X", "Invalid memory limit"),
         ("MemorySwapMax=0", "MemorySwapMax=none", "Invalid memory limit"),
-        ("phalanx-master run", "phalanx run", "not executable"),
+        ("phalanx run", "phalanx run", "not executable"),
     ],
 )
 def test_a_slip_in_the_unit_would_be_said(tmp_path: Path, old: str, new: str, said: str) -> None:

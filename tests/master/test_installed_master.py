@@ -57,7 +57,7 @@ class Installed:
         )
 
     def install(self, *more: str) -> subprocess.CompletedProcess[str]:
-        """`phalanx-master install` with the options of the rig."""
+        """`phalanx run --install` with the options of the rig."""
         return self.asked(str(PROGRAM), "install", *self.options, *more)
 
     def ends(self) -> list[str]:

@@ -94,7 +94,7 @@ def test_a_folder_from_before_there_were_secrets_gets_them_for_all_its_devices(k
     for name in files(keys).keys() - old.keys():
         (keys / name).unlink()
     said = CliRunner().invoke(keys_app(), ["show", str(keys)])
-    assert f"No secret of its own has left, pi.right-2_x: phalanx-master keys make {keys}" in said.output
+    assert f"No secret of its own has left, pi.right-2_x: phalanx fleet keys {keys} --make" in said.output
     said = CliRunner().invoke(keys_app(), ["make", str(keys)])
     assert said.exit_code == 0
     assert "made devices.key, devices/left.secret, devices/pi.right-2_x.secret" in said.output

@@ -39,7 +39,7 @@ class Stub:
         return self.board.try_run(" ".join(line), 600.0)
 
     def lights(self, *words: str) -> "subprocess.CompletedProcess[str]":
-        """Run `phalanx-slave lights` on the stub."""
+        """Run `phalanx-slave doctor --lights` on the stub."""
         return self.slave("lights", "--rig", "wrist", "--lights", f"i2c:{self.bus}:{LIGHTS:#x}", *words)
 
 

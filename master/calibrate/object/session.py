@@ -53,14 +53,14 @@ def lead(
             continue
         told_ns = now_ns
         if not poses:
-            say("no pose comes: is `phalanx-master run` running, on this --bus?")
+            say("no pose comes: is `phalanx run` running, on this --bus?")
             continue
         line, enough = progress(seen_in(poses, rig, names))
         say(line)
         if enough:
             break
     if not poses:
-        raise FitError("no pose came: is `phalanx-master run` running, on this --bus?")
+        raise FitError("no pose came: is `phalanx run` running, on this --bus?")
     return seen_in(poses, rig, names)
 
 

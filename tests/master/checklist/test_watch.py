@@ -241,7 +241,7 @@ CASES = [
         lambda b: b.away.add("imu"),
         lambda b: b.away.clear(),
         "not heard any more",
-        "phalanx-slave imu",
+        "phalanx-slave run --imu",
     ),
     Case(
         "twin_sender",
@@ -273,7 +273,7 @@ CASES = [
         _other_rig,
         _same_rig,
         "left sends 8 markers, the rig of this master has 6",
-        "phalanx deploy",
+        "phalanx fleet deploy",
     ),
 ]
 

@@ -189,5 +189,5 @@ def test_a_recording_without_truth_or_hand_is_refused_before_it_is_detected(
 
 
 def test_what_the_slave_says_when_it_fails_is_passed_on(tmp_path: Path) -> None:
-    with pytest.raises(PhalanxError, match=r"phalanx-slave detect .*ended with 1: .*recording\.json"):
+    with pytest.raises(PhalanxError, match=r"phalanx-slave run -o .*ended with 1: .*recording\.json"):
         detect(tmp_path, "wrist", HAND_FILE, tmp_path / "found")

@@ -1,4 +1,4 @@
-"""`phalanx-slave import` and `colours` of videos: what a stranger types, and what it says."""
+"""`phalanx-slave record --from` and `colours` of videos: what a stranger types, and what it says."""
 
 import json
 from pathlib import Path

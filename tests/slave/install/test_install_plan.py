@@ -120,7 +120,7 @@ def test_keys_that_others_can_read_and_keys_that_are_missing_are_refused(board: 
     (board.keys / "devices/left.secret").chmod(0o600)
     (board.keys / "devices/left.key").unlink()
     with pytest.raises(
-        InstallError, match=r"no device-left.key; make them on the PC: phalanx-master keys make"
+        InstallError, match=r"no device-left.key; make them on the PC: phalanx fleet keys --make"
     ):
         board.install(site)
     with pytest.raises(InstallError, match=r"/etc/phalanx/keys/rig.key: missing; give --keys DIR"):

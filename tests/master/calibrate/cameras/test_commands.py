@@ -170,7 +170,7 @@ def test_a_law_that_new_places_contradict_is_to_be_fitted_anew(k_m: float, kept:
     new, said = without_wrong_law(rig, cameras)
     assert new.depth_model == ("power_law" if kept else "stereo")
     assert new.power_law == rig.power_law
-    again = "depth_model is 'stereo' now; `phalanx-master calibrate depth --use power_law` fits it anew"
+    again = "depth_model is 'stereo' now; `phalanx calibrate depth --use power_law` fits it anew"
     assert said == "" if kept else again in said
     assert without_wrong_law(rig, {**cameras, "left": None}) == (rig, "")
 

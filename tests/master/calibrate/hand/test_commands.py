@@ -1,4 +1,4 @@
-"""`phalanx-master calibrate hand` as a user runs it."""
+"""`phalanx calibrate hand` as a user runs it."""
 
 import json
 from pathlib import Path

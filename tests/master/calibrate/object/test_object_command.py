@@ -163,7 +163,7 @@ def test_a_person_is_told_that_nothing_comes() -> None:
     said: list[str] = []
     with pytest.raises(Exception, match="no pose came"):
         lead(lambda wait_s: None, RIG, BEADS, Clock(), said.append, 3.0)
-    assert any("phalanx-master run" in line for line in said[1:])
+    assert any("phalanx run" in line for line in said[1:])
 
 
 def test_progress_counts_ways_of_turning_and_names_what_is_not_seen() -> None:

@@ -252,9 +252,9 @@ def test_broken_recordings_say_what_is_wrong(
         (
             ("wearer", "nowhere", "--detections", "x", "--rig", "wrist"),
             RecordingError,
-            "phalanx-slave detect",
+            "phalanx-slave run -o",
         ),
-        (("curl", "nowhere", "--detections", "x", "--rig", "wrist"), RecordingError, "phalanx-slave detect"),
+        (("curl", "nowhere", "--detections", "x", "--rig", "wrist"), RecordingError, "phalanx-slave run -o"),
     ],
 )
 def test_wrong_calls_name_file_key_and_remedy(
