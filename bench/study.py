@@ -169,9 +169,7 @@ def study(options: Namespace) -> None:
         )
     else:
         if options.hand is not None:
-            raise CalibrationError(
-                "--hand: is for options.recordings; simulated people have hands of their own"
-            )
+            raise CalibrationError("--hand: is for recordings; simulated people have hands of their own")
         judged: Condition = (options.known, "detected")
         conditions = tuple(dict.fromkeys((judged, *CAUSES))) if options.causes else (judged,)
         device = _device(options.rig, options.calibration)
@@ -188,7 +186,7 @@ def study(options: Namespace) -> None:
             options.keep,
         )
         workers = options.jobs or min(os.cpu_count() or 1, options.participants)
-        people = f"{options.participants} options.participants x {options.blocks} options.blocks x 6 poses"
+        people = f"{options.participants} participants x {options.blocks} blocks x 6 poses"
         echo(f"study: {people}, {workers} at a time, into {options.out}", error=True)
         result = simulate(Study(task, options.participants, workers, judged), _progress())
     for line in finish(result, options.out):

@@ -8,6 +8,7 @@ nothing heavy. The other does the work: it takes the options, and returns the ex
 import difflib
 import logging
 import os
+import re
 import sys
 from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Callable, Sequence
@@ -26,6 +27,20 @@ _EXAMPLES = "Examples:"
 _HELP = ("-h", "--help")
 _OURS = frozenset({"common", "deploy", "master", "slave"})
 _LOG = "%(levelname)s %(name)s: %(message)s"
+
+
+class Parser(ArgumentParser):
+    """A parser for which all that begins as a negative number is a value: `--angles -20:20:10`."""
+
+    def __init__(self, program: str, about: str, examples: str) -> None:
+        super().__init__(
+            prog=program,
+            description=about,
+            epilog=f"examples:\n{examples}" if examples else None,
+            formatter_class=RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+        self._negative_number_matcher = re.compile(r"-[.\d]")
 
 
 class UsageError(Exception):
@@ -53,13 +68,7 @@ class Command:
     def parser(self, program: str) -> ArgumentParser:
         """The parser of its options."""
         about, examples = help_of(_function(self.options))
-        parser = ArgumentParser(
-            prog=f"{program} {self.name}",
-            description=about,
-            epilog=f"examples:\n{examples}" if examples else None,
-            formatter_class=RawDescriptionHelpFormatter,
-            allow_abbrev=False,
-        )
+        parser = Parser(f"{program} {self.name}", about, examples)
         self.declare(parser)
         return parser
 

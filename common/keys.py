@@ -56,8 +56,8 @@ def rig_key(environment: Mapping[str, str], key_file: Path | None = None, keys: 
     path = key_file or (folder / RIG_KEY if folder else None)
     if path is None:
         raise PhalanxError(
-            f"no rig key: set {ENVIRONMENT} or give --key-file FILE; {_ADVICE}. Or make a keys folder, phalanx-master"
-            f" keys make DIR, and give --keys DIR (or set {FOLDER})"
+            f"no rig key: set {ENVIRONMENT} or give --key-file FILE; {_ADVICE}. Or make a keys folder,"
+            f" phalanx fleet keys DIR --make, and give --keys DIR (or set {FOLDER})"
         )
     return _read(path, "the rig key", environment)
 
@@ -204,7 +204,7 @@ class Access:
         make = "" if self.role in (MASTER, OPERATOR) else f" --device {self.role}"
         raise BusError(
             f"{folder}: no certificate of {self.role!r} ({where}); make it on the PC that has ca.key:"
-            f" phalanx fleet keys {folder}{make} --make"
+            f" phalanx fleet keys {folder} --make{make}"
         )
 
 

@@ -1,8 +1,8 @@
 """The keys folder of a rig on its PC: made, shown, renewed, a device taken out of it. `common.keys` says what is in it.
 
 A certificate cannot be called back one by one, and a device that is lost also has the rig key, which every device has.
-So whoever is taken out costs everybody else new keys; that is a second of work here, and a `phalanx fleet deploy` for the
-rest.
+So whoever is taken out costs everybody else new keys; that is a second of work here, and a `phalanx fleet deploy` for
+the rest.
 """
 
 import os

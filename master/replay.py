@@ -3,7 +3,6 @@
 Videos and pictures of other programs become a recording before that, by `phalanx-slave record --from`.
 """
 
-import re
 import subprocess
 import sys
 from argparse import Namespace
@@ -16,7 +15,6 @@ from master.rig import setups_with_hands
 from master.said import progress
 from master.solve import rigs_to_solve, solve_hands
 
-_PLAIN = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 Say = Callable[[str], None]
 
 
@@ -52,7 +50,7 @@ def replay_recording(options: Namespace, say: Say) -> None:
 
 def _detect(folder: Path, camera: str, kind: str, options: Namespace, say: Say) -> None:
     say(f"detecting {'markers' if kind == 'markers' else 'fingers'} in camera {camera} ...")
-    words = ["--name", _plain(camera), "--camera", f"replay:{folder}"]
+    words = ["--name", camera, "--camera", f"replay:{folder}"]
     words += [] if options.calibration is None else ["--calibration", str(options.calibration)]
     words += [] if options.hand is None or kind == "markers" else ["--hand", str(options.hand)]
     _slave("run", *words, "-o", str(options.out / f"detections_{camera}.npz"))
@@ -103,14 +101,3 @@ def _slave(*words: str) -> None:
     done = subprocess.run([sys.executable, "-m", "slave", *words], check=False)
     if done.returncode != 0:
         raise RecordingError(f"phalanx-slave {words[0]} ended with code {done.returncode}")
-
-
-def _plain(name: str) -> str:
-    """A name that goes into a command line and a file's name.
-
-    Raises:
-        RecordingError: It is not plain.
-    """
-    if not _PLAIN.fullmatch(name):
-        raise RecordingError(f"cameras: {name!r:.80}: must be letters, digits, _ . -, at most 64")
-    return name

@@ -25,7 +25,7 @@ def told() -> Iterator[Measured]:
 
 @pytest.fixture(scope="session")
 def rig(told: Measured) -> Iterator[BoardRig]:
-    """The machine, on, with a camera of the kernel and the slave that `phalanx fleet deploy` put there, and a master."""
+    """The machine, on, with a camera of the kernel and the slave that a deployment put there, and a master."""
     with switched_on(AMD64, "PC", told) as one:
         one.board.run(LOAD)
         file = one.calibration / "cameras/left.json"

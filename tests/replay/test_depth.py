@@ -142,4 +142,7 @@ def test_without_detections_the_command_says_how_to_make_them(sweeps: dict[str, 
     recording = sweeps["sweep_paper"].recording
     done = run(sweeps["sweep_paper"].root, "master", "calibrate", "depth", recording)
     assert done.returncode == 1
-    assert f"phalanx-slave run --name right --camera replay:{recording} -o DIR/detections_right.npz" in done.stderr
+    assert (
+        f"phalanx-slave run --name right --camera replay:{recording} -o DIR/detections_right.npz"
+        in done.stderr
+    )

@@ -59,7 +59,7 @@ def _next(live: LiveViews, out: Path, rig: str) -> str:
     """The command that makes a calibration of what was kept."""
     several = len(live.cameras) > 1
     what, of_rig = ("stereo", f" --rig {rig}") if several else ("intrinsics", "")
-    return f"{what} {out} {options_of(live.board)}{of_rig} --out DIR"
+    return f"cameras {what} {out} {options_of(live.board)}{of_rig} --out DIR"
 
 
 def cameras_of(calibration: Path, rig: str) -> tuple[str, ...]:

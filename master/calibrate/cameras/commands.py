@@ -47,7 +47,7 @@ def intrinsics(options: Namespace) -> None:
         _draw(options.picture if len(views.cameras) == 1 else _named(options.picture, name), fit)
     files: dict[str, CameraCalibration] = {}
     for name, own in results.items():
-        how = lens_provenance(own, name, "calibrate intrinsics", (_source_name(options.source),))
+        how = lens_provenance(own, name, "calibrate cameras intrinsics", (_source_name(options.source),))
         lens = own.lenses[name].intrinsics
         files[name] = camera_with_lens(known[name], name, views.sizes_px[name], lens, how)
     if options.json_file is not None:
@@ -88,12 +88,12 @@ def stereo(options: Namespace) -> None:
             name,
             views.sizes_px[name],
             found.lenses[name].intrinsics,
-            lens_provenance(found, name, "calibrate stereo", data),
+            lens_provenance(found, name, "calibrate cameras stereo", data),
         )
         for name in views.cameras
         if name not in held
     }
-    how = places_provenance(found, "calibrate stereo", data)
+    how = places_provenance(found, "calibrate cameras stereo", data)
     new, dropped = without_wrong_law(
         rig_with_places(rig_known, options.rig, dict(found.T_rig_camera), how), {**known, **files}
     )

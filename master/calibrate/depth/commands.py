@@ -135,9 +135,9 @@ def laws_before(pair: Pair, rig: RigCalibration | None) -> dict[str, DepthLaw]:
     return laws | {f"previous {name.partition('_')[0]}": law for name, law in previous.items()}
 
 
-def _refuse_idle(where: str, **options: object) -> None:
+def _refuse_idle(where: str, **given: object) -> None:
     """Refuse options that `where` does not use, rather than to leave them out silently."""
-    for name, value in options.items():
+    for name, value in given.items():
         if value:
             told = "a recording or a table" if name == "source" else f"--{name}"
             raise CalibrationError(f"{told} has no meaning with {where}: leave it out")

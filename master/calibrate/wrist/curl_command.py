@@ -64,7 +64,7 @@ def rig_with_lines(device: Device, curls: tuple[FingerCurl, ...]) -> RigCalibrat
             residual[f"{found.finger}_mm"] = round(1e3 * found.line.residual_m, 4)
     missing = [found.finger for found in curls if found.line is None]
     note = f"not measured: {', '.join(missing)}" if missing else ""
-    how = provenance("calibrate curl", (device.source,), residual, note)
+    how = provenance("calibrate wrist curl", (device.source,), residual, note)
     rig = device.rig
     return replace(
         rig, finger_lines=rig.finger_lines | lines, provenance=rig.provenance | {"finger_lines": how}

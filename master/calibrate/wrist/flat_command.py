@@ -113,6 +113,6 @@ def rig_with_field(device: Device, fit: FlatFit, seen: WhiteSeen) -> RigCalibrat
         "foretold_rms_percent": round(100 * fit.foretold_rms, 4),
     }
     note = f"{len(seen.samples.light)} samples of white squares in {seen.views} views"
-    how = provenance("calibrate flat-field", (device.source,), residual, note)
+    how = provenance("calibrate wrist flat-field", (device.source,), residual, note)
     rig = device.rig
     return replace(rig, flat_field=fit.field, provenance=rig.provenance | {"flat_field": how})

@@ -128,6 +128,6 @@ def rig_with_plane(device: Device, fit: PlaneFit) -> RigCalibration:
         "offset_sigma_mm": round(1e3 * fit.offset_sigma_m, 4),
     }
     note = f"{int(fit.used.sum())} of {len(fit.used)} views of a board"
-    how = provenance("calibrate laser-plane", (device.source,), residual, note)
+    how = provenance("calibrate wrist laser-plane", (device.source,), residual, note)
     rig = device.rig
     return replace(rig, laser_plane=fit.plane, provenance=rig.provenance | {"laser_plane": how})

@@ -88,7 +88,7 @@ def rig_with_palm(device: Device, fit: PalmFit) -> RigCalibration:
         "turn_sigma_deg": round(float(np.degrees(fit.turn_sigma_rad)), 4),
         "shift_sigma_mm": round(1e3 * fit.shift_sigma_m, 4),
     }
-    how = provenance("calibrate palm", (device.source,), residual, fit.note)
+    how = provenance("calibrate wrist palm", (device.source,), residual, fit.note)
     rig = device.rig
     return replace(
         rig,

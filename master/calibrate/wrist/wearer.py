@@ -23,7 +23,7 @@ from master.calibrate.wrist.wearer_fit import Fit, Sightings, fit_wearer, prior_
 from master.calibrate.wrist.wearer_model import MCP, Unknown, WearerModel, wearing
 from master.wrist_setup import WristSetup
 
-TOOL = "calibrate wearer"
+TOOL = "calibrate wrist wearer"
 _NAMES = FINGERS[1:]
 _GUESS = np.radians(5.0), 5e-3  # of a drawing's pose of the palm, standard deviations
 _RULER = np.radians(1.0), 1.5e-3  # of a board's: how it lies on the palm, and what was measured with a ruler
@@ -117,7 +117,7 @@ def _pose_sigma(rig: RigCalibration) -> Float:
     how = rig.provenance.get("T_camera_palm")
     told = {} if how is None or how.tool == TOOL else how.residual
     turn, shift = np.radians(told.get("turn_sigma_deg", 0.0)), 1e-3 * told.get("shift_sigma_mm", 0.0)
-    if how is not None and how.tool == "calibrate palm":
+    if how is not None and how.tool == "calibrate wrist palm":
         return np.repeat([np.hypot(turn, _RULER[0]), np.hypot(shift, _RULER[1])], 3)
     return np.repeat([turn, shift] if turn > 0.0 and shift > 0.0 else _GUESS, 3)
 

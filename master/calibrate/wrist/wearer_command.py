@@ -25,7 +25,7 @@ def wearer(options: Namespace) -> None:
     if device.rig.T_camera_palm is None:
         raise CalibrationError(
             f"rig {device.file_name!r}: T_camera_palm: a first guess is needed, such as from the drawing of the device;"
-            " or lay a board on the palm (calibrate palm)"
+            " or lay a board on the palm (calibrate wrist palm)"
         )
     profile = load(options.hand or _hand_of(device.rig.hand, options.calibration, options.out), HandProfile)
     triples = list(recorded_triples(options.detections, device.camera.name))

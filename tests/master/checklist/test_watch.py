@@ -90,7 +90,7 @@ def _files(*items: CheckItem) -> Callable[[Bench], object]:
 
 
 LENS = CheckItem(
-    "calibration_absent", "left", "Camera left: its lens is not measured.", "calibrate intrinsics"
+    "calibration_absent", "left", "Camera left: its lens is not measured.", "calibrate cameras intrinsics"
 )
 OLD = CheckItem("calibration_stale", "left", "The lens of camera left was measured after.", "calibrate")
 CASES = [
@@ -150,7 +150,9 @@ CASES = [
         "colour of marker back",
         "cover it",
     ),
-    Case("calibration_absent", "left", _files(LENS), _files(), "not measured", "calibrate intrinsics"),
+    Case(
+        "calibration_absent", "left", _files(LENS), _files(), "not measured", "calibrate cameras intrinsics"
+    ),
     Case(
         "calibration_absent",
         "left",
@@ -168,7 +170,9 @@ CASES = [
         "1280 x 480",
         "same cameras/left.json",
     ),
-    Case("camera_moved", "left-right", _apart(0.8), _apart(0.0), "miss each other", "calibrate stereo"),
+    Case(
+        "camera_moved", "left-right", _apart(0.8), _apart(0.0), "miss each other", "calibrate cameras stereo"
+    ),
     Case(
         "clock_unsynchronised",
         "right",
