@@ -40,7 +40,7 @@ def words_of(entry: Command | Family | None) -> list[str]:
     return [] if entry is None else entry.name.split()
 
 
-def heavy_of(module: str, words: list[str], before: str = "") -> set[str]:
+def heavy_of(module: str, words: list[str], before: str = "") -> frozenset[str]:
     """What of the heavy packages a help loads, in a process of its own."""
     code = f"import sys\n{before}\nfrom {module}.__main__ import main\nsys.argv[1:] = {[*words, '--help']}\n"
     code += "try:\n    main()\nexcept SystemExit:\n    pass\nprint('loaded:', *sys.modules)"

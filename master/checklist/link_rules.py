@@ -124,8 +124,8 @@ class LinkRules:
             sender.markers is not None,
             f"{name} sends {sender.markers and sender.markers.sent} markers, the rig of this master has"
             f" {sender.markers and sender.markers.expected}: nothing of it is used.",
-            "Give both the same rig file: phalanx fleet deploy brings this one's to the slave; then restart the master if"
-            " the file here has changed since it began.",
+            "Give both the same rig file: phalanx fleet deploy brings this one's to the slave; then restart the master"
+            " if the file here has changed since it began.",
         )
 
     def _away(self, name: str, sender: SenderNow, t_ns: int) -> bool | None:

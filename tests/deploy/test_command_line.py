@@ -66,8 +66,14 @@ def steps_of_replay(
     def solve(_recording: object, rigs: list[RigCalibration], *_rest: object) -> None:
         solved.extend(rig.kind for rig in rigs)
 
-    monkeypatch.setattr(replay, "_slave", lambda *arguments: steps.append(arguments))
-    monkeypatch.setattr(replay, "setups_with_hands", lambda rigs, *_rest: rigs)
+    def setups(rigs: list[RigCalibration], *_rest: object) -> list[RigCalibration]:
+        return rigs
+
+    def step(*words: str) -> None:
+        steps.append(words)
+
+    monkeypatch.setattr(replay, "_slave", step)
+    monkeypatch.setattr(replay, "setups_with_hands", setups)
     monkeypatch.setattr(replay, "solve_hands", solve)
     write(folder, cameras={name: camera(name) for name in ("left", "right", "palm")}, kind="both", rig=None,
           rigs=[rig("wrist", ("palm",)), rig()])  # fmt: skip

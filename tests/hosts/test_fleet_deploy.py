@@ -45,7 +45,7 @@ def test_the_same_command_again_changes_nothing(deployed: Deployment, rig: Rig, 
 
 
 def test_the_fleet_is_told_by_name_and_version(deployed: Deployment, rig: Rig) -> None:
-    told = rig.program("deploy", "fleet", "--bus", rig.bus, "--keys", str(rig.keys), timeout_s=20.0)
+    told = rig.program("master", "fleet", "status", "--bus", rig.bus, "--keys", str(rig.keys), timeout_s=20.0)
     assert told.code == 0, str(told)
     for name in rig.fleet.hosts:
         line = next((line for line in told.out.splitlines() if name in line), None)

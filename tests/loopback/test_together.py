@@ -25,7 +25,7 @@ def poses_told(out: Path) -> int:
 
 
 def test_the_grab_test_runs_scores_and_outlives_its_wrist_device(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "deploy", "demo", "--scene", "grasp", "--headless", "--seconds", "180"]
+    command = [sys.executable, "-m", "master", "demo", "--scene", "grasp", "--headless", "--seconds", "180"]
     demo = subprocess.Popen(
         [*command, "--out", str(tmp_path)],
         cwd=ROOT,

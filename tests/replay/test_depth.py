@@ -67,9 +67,16 @@ def sweeps(datasets: Path, root: Path, tmp_path_factory: pytest.TempPathFactory)
         )
         shutil.copytree(colours / "cameras", out[name].tree / "cameras")
         for camera in CAMERAS:
-            arguments = ("--camera", camera, "--calibration", colours)
+            arguments = (
+                "--name",
+                camera,
+                "--camera",
+                f"replay:{recordings / name}",
+                "--calibration",
+                colours,
+            )
             target = out[name].found / f"detections_{camera}.npz"
-            done = run(root, "slave", "detect", recordings / name, *arguments, "-o", target)
+            done = run(root, "slave", "run", *arguments, "-o", target)
             assert done.returncode == 0, done.stderr
     return out
 
