@@ -44,7 +44,7 @@ def test_only_slaves_and_lsl_listen_beyond_this_machine() -> None:
         (Listener("master run", "tcp", "0.0.0.0", 47802), False),
         (Listener("master run", "udp", "::", 1), False),
         (Listener("master export", "tcp", "127.0.0.1", 1), False),
-        (Listener("slave imu", "udp", "0.0.0.0", 47800), True),
+        (Listener("slave run", "udp", "0.0.0.0", 47800), True),
         (Listener("slave run", "tcp", "127.0.0.1", 22), False),
     ],
 )

@@ -121,7 +121,7 @@ def test_a_session_that_is_not_the_hellos_and_a_leaping_seq_are_refused(rig: Hos
             sender.send_message(MarkerDetections, session=session, seq=MOST * (session % 2))
     assert refused(rise, SESSION) >= 3, rise
     assert refused(rise, SEQUENCE) >= 3, rise
-    for command in (("fleet", "--seconds", "1"), ("check",)):
+    for command in (("fleet", "status", "--seconds", "1", "--json"), ("check",)):
         code, said = rig.command(*command)
         assert code in (0, 1), said
         assert b"Traceback" not in said

@@ -245,7 +245,7 @@ CASES = [
         lambda b: b.away.add("imu"),
         lambda b: b.away.clear(),
         "not heard any more",
-        "phalanx-slave run --imu",
+        "phalanx-slave run --name imu",
     ),
     Case(
         "twin_sender",
