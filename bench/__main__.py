@@ -1,6 +1,7 @@
 """`make bench`: prints the table of performance, section by section; `python -m bench NAME ...` runs some of them.
 
-`python -m bench oracle --help`: two solvers on the same frozen messages.
+`python -m bench oracle --help`: two solvers on the same frozen messages. `python -m bench study --help`: the paper's
+study repeated.
 """
 
 import argparse
@@ -67,10 +68,10 @@ SECTIONS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the sections asked for, or the oracle with its own options; return the exit code."""
+    """Run the sections asked for, or oracle or study with their own options; return the exit code."""
     given = sys.argv[1:] if arguments is None else arguments
-    if given[:1] == ["oracle"]:
-        return int(importlib.import_module("bench.oracle").main(given[1:]))
+    if given[:1] in (["oracle"], ["study"]):  # with options of their own
+        return int(importlib.import_module(f"bench.{given[0]}").main(given[1:]))
     sections = "\n".join(f"  {name:18s} {what}" for name, what in SECTIONS.items())
     parser = argparse.ArgumentParser(
         prog="python -m bench",

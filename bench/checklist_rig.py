@@ -148,7 +148,7 @@ class Rig:
             "--rig",
             self._rig,
         ]
-        kind = ["imu", "--imu", "synthetic"]
+        kind = ["run", "--imu", "synthetic"]
         if name in self.faults:
             kind = ["run", "--camera", "synthetic", "--faults", str(self.faults[name])]
         self._popen(

@@ -168,7 +168,18 @@ def _sweep_rows() -> list[Row]:
             found, recording = Path(folder) / name, data / name
             for camera in ("left", "right"):
                 target = found / f"detections_{camera}.npz"
-                _run("slave", "detect", recording, "--camera", camera, "--calibration", colours, "-o", target)
+                _run(
+                    "slave",
+                    "run",
+                    "--name",
+                    camera,
+                    "--camera",
+                    f"replay:{recording}",
+                    "--calibration",
+                    colours,
+                    "-o",
+                    target,
+                )
             fit, checked = (_calibrate(verb, recording, found) for verb in ("depth", "verify"))
             law, models = fit["power_law"], fit["laws"]
             out += [

@@ -1,7 +1,7 @@
 """A rig of real processes for faults of links and processes: two cameras, a master, and a program on its bus.
 
 The cameras are processes of their own (`bench.faults_sender`), with clocks seconds apart; the master is
-`phalanx-master run`; between them lies a relay that can be made worse.
+`phalanx run`; between them lies a relay that can be made worse.
 """
 
 import json

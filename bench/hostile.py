@@ -134,7 +134,10 @@ def _asked_by_operators(rig: HostileRig) -> Generator[list[str]]:
 
     def ask() -> None:
         while not closing.is_set() and rig.alive():
-            for command, exits in ((("check",), (0, 1)), (("fleet", "--seconds", "1"), (0,))):
+            for command, exits in (
+                (("check",), (0, 1)),
+                (("fleet", "status", "--seconds", "1", "--json"), (0,)),
+            ):
                 code, said = rig.command(*command)
                 if code not in exits or b"Traceback" in said:
                     failed.append(f"{command[0]} ended with {code}: {said.decode(errors='replace')[-200:]!r}")

@@ -3,7 +3,7 @@
 The stolen ones say what they like; the rig measures what is lost by it.
 
 One hand before three cameras, of which two are honest; an object with a tracker; a second hand with a wrist device that
-has a camera and an IMU. The master is `phalanx-master run`, each stolen device a process (`bench.hostile_sender`).
+has a camera and an IMU. The master is `phalanx run`, each stolen device a process (`bench.hostile_sender`).
 """
 
 import json
@@ -224,7 +224,7 @@ class HostileRig:
         )  # fmt: skip
 
     def command(self, *arguments: str) -> tuple[int, bytes]:
-        """Run a command of `phalanx-master` on this master's bus.
+        """Run a command of `phalanx` on this master's bus.
 
         Returns its exit code and what it wrote.
         """

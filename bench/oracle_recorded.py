@@ -80,7 +80,9 @@ def _detected(folder: Path, tree: Path, hands: Path) -> Piece:
     with tempfile.TemporaryDirectory() as name:
         for camera in rig.cameras:
             target = Path(name) / f"detections_{camera}.npz"
-            slave("detect", folder, "--camera", camera, "--calibration", tree, "-o", target)
+            slave(
+                "run", "--name", camera, "--camera", f"replay:{folder}", "--calibration", tree, "-o", target
+            )
             messages += recorded_detections(Path(name), camera, len(rig.markers))
             files[f"cameras/{camera}.json"] = msgspec.json.encode(recording.manifest.cameras[camera])
     messages.sort(key=lambda one: one.t_ns)

@@ -75,7 +75,7 @@ def _detected(folder: Path, hands: Path) -> Piece:
     }
     with tempfile.TemporaryDirectory() as name:
         target = Path(name) / f"detections_{camera}.npz"
-        slave("detect", folder, "--camera", camera, "--hand", hand, "-o", target)
+        slave("run", "--name", camera, "--camera", f"replay:{folder}", "--hand", hand, "-o", target)
         messages = list(recorded_cycles(Path(name), camera))
     found = load_wrist_truth(recording, camera)
     if found is None:

@@ -37,7 +37,7 @@ def rows() -> list[Row]:
             _run("slave", "colours", data / "stereo/calib_colors", "--camera", camera, "-o", target)
         for name in _RECORDINGS:
             result = Path(folder) / name
-            _run("deploy", "replay", data / "stereo" / name, "--calibration", calibration, "--out", result)
+            _run("master", "replay", data / "stereo" / name, "--calibration", calibration, "--out", result)
             summary = read_summary(result / "summary.json")
             for key, label, unit, goal in _SCORES:
                 if isinstance(value := summary.get(key), int | float):

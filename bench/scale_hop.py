@@ -34,12 +34,12 @@ def hop_ms(folder: Path) -> tuple[float, float]:
     """
     keys = folder / "keys"
     run = [sys.executable, "-m", "master"]
-    subprocess.run([*run, "keys", "make", str(keys)], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run([*run, "fleet", "keys", str(keys), "--make"], check=True, stdout=subprocess.DEVNULL)
     ends = [f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}" for _ in range(3)]
     commands = (
-        ["router", "--listen", ends[1]],
-        ["router", "--listen", ends[2], "--connect", ends[1]],
-        ["relay", "--bus", ends[0], "--router", ends[1], "--site", SITE],
+        ["fleet", "relay", "--listen", ends[1]],
+        ["fleet", "relay", "--listen", ends[2], "--connect", ends[1]],
+        ["fleet", "relay", "--bus", ends[0], "--router", ends[1], "--site", SITE],
     )
     with ExitStack() as stack:
         master = ZenohBus(ends[0], None, access_of({}, MASTER, keys))

@@ -99,7 +99,7 @@ def running(settings: SoakSettings) -> Generator[SoakRig]:
             *place,
             *link,
         ]
-    commands["imu"] = ["slave", "imu", "--imu", "synthetic", "--name", "imu", "--rig", "wrist", *place, *link]
+    commands["imu"] = ["slave", "run", "--imu", "synthetic", "--name", "imu", "--rig", "wrist", *place, *link]
     epoch_ns = time.monotonic_ns() + round(1e9 * _LEAD_S)
     with ExitStack() as stack:
         processes: list[Process] = []
@@ -123,7 +123,7 @@ def _keys(folder: Path) -> Path:
     """
     shutil.rmtree(folder, ignore_errors=True)
     devices = [word for name in (*CAMERAS, "imu") for word in ("--device", name)]
-    make = [sys.executable, "-m", "master", "keys", "make", str(folder), *devices]
+    make = [sys.executable, "-m", "master", "fleet", "keys", str(folder), "--make", *devices]
     subprocess.run(make, check=True, stdout=subprocess.DEVNULL)
     return folder
 

@@ -159,7 +159,16 @@ def seen_rendered(rig: str, seed: int, folder: Path, pace: float = 1.0, seconds:
     record_both(folder, both.scene, both.wrist_scene, seconds, wrist_late_ns=late_ns, step=3, wrist_rig=wrong)
     for camera in (*both.markers.rig.cameras, *wrong.cameras):
         target = ["-o", str(folder / f"detections_{camera}.npz")]
-        command = ["detect", str(folder), "--camera", camera, "--calibration", str(CALIBRATION), *target]
+        command = [
+            "run",
+            "--name",
+            camera,
+            "--camera",
+            f"replay:{folder}",
+            "--calibration",
+            str(CALIBRATION),
+            *target,
+        ]
         subprocess.run([sys.executable, "-m", "slave", *command], check=True, capture_output=True)
     imu = wrong.imu
     samples = imu_samples(open_recording(folder), "imu" if imu is None else imu.name, 120.0)

@@ -6,7 +6,7 @@ a camera's key cannot play the master before the other cameras.
 
 They are valid from 1970 on, because a Raspberry Pi has no clock battery: where the network does not tell it the time,
 it starts at the time of its last shutdown or of its system image, and would refuse each certificate that is younger.
-They end ten years after they were made: `phalanx-master keys renew` makes new ones.
+They end ten years after they were made: `phalanx fleet keys --renew` makes new ones.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ LIFE = timedelta(days=3652)
 FIRST_DAY = datetime(1970, 1, 1, tzinfo=UTC)
 CLOCK_FIX = (
     "set the clock (timedatectl shows it; timedatectl set-ntp true, chrony, or a clock battery keep it); if it is "
-    "right, make new certificates: phalanx-master keys renew DIR, then phalanx deploy"
+    "right, make new certificates: phalanx fleet keys DIR --renew, then phalanx fleet deploy"
 )
 
 
@@ -63,7 +63,7 @@ def issue(authority: KeyPair, name: str, now: datetime) -> KeyPair:
         signer = serialization.load_pem_private_key(authority.key, None)
     except ValueError as error:
         raise PhalanxError(
-            f"ca.pem or ca.key: broken ({error}); make a new keys folder: phalanx-master keys make"
+            f"ca.pem or ca.key: broken ({error}); make a new keys folder: phalanx fleet keys --make"
         ) from error
     assert isinstance(signer, ec.EllipticCurvePrivateKey)  # we made it
     private = ec.generate_private_key(ec.SECP256R1())

@@ -38,7 +38,7 @@ def check(endpoint: str, open_bus: bool) -> None:
         return
     raise BusError(
         f"bus endpoint {endpoint!r}: is neither encrypted nor authenticated, and leaves this machine. Write"
-        f" tls/{endpoint.split('/', 1)[1]} and give keys (phalanx-master keys make DIR, then --keys DIR); or, in a"
+        f" tls/{endpoint.split('/', 1)[1]} and give keys (phalanx fleet keys DIR --make, then --keys DIR); or, in a"
         f" closed laboratory where everybody is trusted, --open (or {OPEN}=1) on both sides"
     )
 

@@ -4,7 +4,7 @@ The rig key is 32 random bytes that all processes of a rig share, written as 64 
 only its owner can read, or in the environment variable PHALANX_RIG_KEY; never on a command line, where every user of
 the machine could see it.
 
-A *keys folder* has all that processes need; `--keys DIR` or the variable PHALANX_KEYS names it. `phalanx-master keys
+A *keys folder* has all that processes need; `--keys DIR` or the variable PHALANX_KEYS names it. `phalanx fleet keys
 make` makes it (docs/keys.md):
 
 | file | what |
@@ -56,8 +56,8 @@ def rig_key(environment: Mapping[str, str], key_file: Path | None = None, keys: 
     path = key_file or (folder / RIG_KEY if folder else None)
     if path is None:
         raise PhalanxError(
-            f"no rig key: set {ENVIRONMENT} or give --key-file FILE; {_ADVICE}. Or make a keys folder, phalanx-master"
-            f" keys make DIR, and give --keys DIR (or set {FOLDER})"
+            f"no rig key: set {ENVIRONMENT} or give --key-file FILE; {_ADVICE}. Or make a keys folder,"
+            f" phalanx fleet keys DIR --make, and give --keys DIR (or set {FOLDER})"
         )
     return _read(path, "the rig key", environment)
 
@@ -86,8 +86,8 @@ def link_key(
     if device is None:
         if not (path := folder / DEVICES_KEY).exists():
             raise PhalanxError(
-                f"{path}: missing, the folder is older than the secrets of devices: phalanx-master keys make {folder}"
-                " makes them, phalanx deploy brings each device its own"
+                f"{path}: missing, the folder is older than the secrets of devices: phalanx fleet keys {folder} --make"
+                " makes them, phalanx fleet deploy brings each device its own"
             )
         return LinkKey(rig, root=_read(path, "the root of the secrets of devices", environment))
     path = secret_of(folder, device)
@@ -105,8 +105,8 @@ def secret_of(folder: Path, device: str) -> Path:
         return found
     where = ", ".join(str(path.relative_to(folder)) for path in places)
     raise PhalanxError(
-        f"{folder}: no secret of {device!r} ({where}); on the PC: phalanx-master keys make DIR --device {device}, then"
-        " phalanx deploy, which brings it"
+        f"{folder}: no secret of {device!r} ({where}); on the PC: phalanx fleet keys DIR --make --device {device}, then"
+        " phalanx fleet deploy, which brings it"
     )
 
 
@@ -176,7 +176,7 @@ class Access:
         """
         if self.folder is None:
             raise BusError(
-                f"no keys: give --keys DIR or set {FOLDER}; phalanx-master keys make DIR makes them"
+                f"no keys: give --keys DIR or set {FOLDER}; phalanx fleet keys DIR --make makes them"
             )
         own = self._stem(self.folder)
         found = tuple(sorted(path.stem for path in (self.folder / DEVICES).glob("*.pem")))
@@ -204,7 +204,7 @@ class Access:
         make = "" if self.role in (MASTER, OPERATOR) else f" --device {self.role}"
         raise BusError(
             f"{folder}: no certificate of {self.role!r} ({where}); make it on the PC that has ca.key:"
-            f" phalanx-master keys make {folder}{make}"
+            f" phalanx fleet keys {folder} --make{make}"
         )
 
 

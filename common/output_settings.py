@@ -80,7 +80,7 @@ OutputPart: TypeAlias = OscOutput | VmcOutput | Ros2Output | LslOutput | WebOutp
 
 
 class OutputSettings(Part, frozen=True):
-    """outputs/<name>.json: the live outputs of `phalanx-master send`."""
+    """outputs/<name>.json: the live outputs of `phalanx send`."""
 
     version: Literal[1]
     name: Name

@@ -12,7 +12,7 @@ own rig bends it to a PIP of 50 degrees, because skin folds. The breadths and de
 hand of Sancho-Bru et al. (0.23 and 0.23 of it at the proximal bone of the index finger, 0.17 and 0.16 at the middle
 bone of the little finger), with 0.57 of the depth on the palmar side of the bone, give the same within 0.8 mm RMS and
 1.5 mm at most, and as much may be wrong for another person: `SPREAD`. What a guided motion tells of a person
-(`phalanx-master calibrate subject`) is the file's `palmar_scale`, which multiplies both.
+(`phalanx calibrate wrist subject`) is the file's `palmar_scale`, which multiplies both.
 """
 
 from dataclasses import dataclass

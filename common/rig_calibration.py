@@ -158,7 +158,7 @@ class RigCalibration(Part, frozen=True):
         if camera not in self.T_rig_camera:
             raise CalibrationError(
                 f"rig {self.name!r}: T_rig_camera: camera {camera!r} has no place yet, which"
-                " `phalanx-master calibrate stereo` measures"
+                " `phalanx calibrate cameras stereo` measures"
             )
         return np.array(self.T_rig_camera[camera], dtype=np.float64)
 
@@ -213,7 +213,7 @@ def check_rig(rig: RigCalibration, where: str) -> None:
     if rig.depth_model != "stereo" and getattr(rig, rig.depth_model) is None:
         raise CalibrationError(
             f"{where}: depth_model is {rig.depth_model!r} but the key {rig.depth_model!r} is missing: set depth_model"
-            f" to 'stereo' until `phalanx-master calibrate depth --use {rig.depth_model}` has fitted it"
+            f" to 'stereo' until `phalanx calibrate depth --use {rig.depth_model}` has fitted it"
         )
 
 

@@ -77,7 +77,7 @@ def laser_plane_of(rig: RigCalibration, where: str) -> tuple[Float, float]:
     """
     if rig.laser_plane is None:
         raise CalibrationError(
-            f"{where}: laser_plane is missing, which `phalanx-master calibrate laser-plane` measures"
+            f"{where}: laser_plane is missing, which `phalanx calibrate wrist laser-plane` measures"
         )
     normal = np.array(rig.laser_plane.normal)
     length = float(np.linalg.norm(normal))
@@ -106,7 +106,7 @@ def _palm(rig: RigCalibration, where: str) -> Float:
     """`T_camera_palm` (4, 4) [m]."""
     if rig.T_camera_palm is None:
         raise CalibrationError(
-            f"{where}: T_camera_palm is missing, which `phalanx-master calibrate palm` measures"
+            f"{where}: T_camera_palm is missing, which `phalanx calibrate wrist palm` measures"
         )
     palm = np.array(rig.T_camera_palm, dtype=np.float64)
     rotation = palm[:3, :3]

@@ -1,62 +1,32 @@
-"""Command line of `phalanx` as text: commands, options, help. Each command's help shows its own examples."""
+"""Options of `phalanx demo` and of the commands of `phalanx fleet status` that reach other machines."""
 
 import argparse
+from argparse import ArgumentParser
 from pathlib import Path
 
-from deploy.host_options import AddParser, add_commands
+from deploy.checks import default_keys
+from deploy.sender_check import WAIT_SENDERS_S
 
-_EXAMPLES = {
-    "demo": """examples:
-  phalanx demo                                  two simulated cameras and the master, in the Rerun viewer
-  phalanx demo --console --seconds 600          the console in a browser instead: watch, tune and record the demo
-  phalanx demo --headless --seconds 60          without a screen: a picture, an .rrd and the figures
-  phalanx demo --wrist                          a simulated wrist device in their place: laser, LEDs, one camera, an IMU
-  phalanx demo --scene grasp                    both at once, while a hand closes round a bar: cameras lose its fingers
-  phalanx demo --scene grasp --rig desk-back3   the same without the wrist device, to compare
-  phalanx demo --scene object                   a wand of painted beads travels before the cameras
-  phalanx demo --scene grasp --rig desk-cube    the bar has a cube of tags: where it is, and which fingers touch it
-  phalanx demo --scene gestures --seconds 80 --bus tcp/127.0.0.1:47802
-                                                pinches, dials, taps and pointing, against what the hand really said
-""",
-    "replay": """examples:
-  phalanx replay RECORDING --out out/replay     the same line on recorded frames, the same bytes on every run
-  phalanx replay left.mp4 right.mp4 --calibration calib_json --out out/wave      your own videos, one per camera
-  phalanx replay takes/7 --times takes/7/times.csv --calibration calib_json --out out/take7
-                                                a folder with a video, or a folder of pictures, for each camera; the
-                                                table: camera,frame,time (frames from 0, seconds)
-  phalanx replay --camera left=GOPR0012.MP4 --camera right=GOPR0944.MP4 --calibration calib_json --out out/gopro
-  phalanx replay CURL --hand HAND.json --out out/curl       recorded frames of a wrist device
-  phalanx replay GRASP --out out/grasp          cameras and wrist device of one hand, solved together
-  phalanx replay GRASP --only markers --out out/grasp-markers    without what the wrist device tells, to compare
-  phalanx replay CURL --hand HAND.json --solver-mode fk --out out/fk   its fingers from the laser alone, to compare
-""",
-}
+_DEADLINE_S = 900.0
+_READY_S = 90.0
 
 
-def parser() -> argparse.ArgumentParser:
-    """The parser of `phalanx`; the command is in `command`."""
-    whole = argparse.ArgumentParser(
-        prog="phalanx",
-        description="Hand tracking from cameras that anyone can buy.",
-        epilog="`phalanx COMMAND --help` shows its examples.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    commands = whole.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    _add_demo(commands.add_parser)
-    _add_replay(commands.add_parser)
-    add_commands(commands.add_parser, _calibration())
-    return whole
+def add_demo(demo: ArgumentParser) -> None:
+    """Starts a slave with a synthetic camera for each camera of the rigs, one for each IMU and tracker, one master for
+    all of them and the viewer.
 
-
-def _add_demo(add_parser: AddParser) -> None:
-    demo = add_parser(
-        "demo",
-        help="everything on this machine, without hardware",
-        description="Starts a slave with a synthetic camera for each camera of the rigs, one for each IMU and tracker, "
-        "one master for all of them and the viewer.",
-        epilog=_EXAMPLES["demo"],
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    Examples:
+      phalanx demo                                  two simulated cameras and the master, in the Rerun viewer
+      phalanx demo --console --seconds 600          the console in a browser instead: watch, tune and record the demo
+      phalanx demo --headless --seconds 60          without a screen: a picture, an .rrd and the figures
+      phalanx demo --wrist                          a simulated wrist device in their place: laser, LEDs, camera, IMU
+      phalanx demo --scene grasp                    both at once; a hand closes round a bar: cameras lose its fingers
+      phalanx demo --scene grasp --rig desk-back3   the same without the wrist device, to compare
+      phalanx demo --scene object                   a wand of painted beads travels before the cameras
+      phalanx demo --scene grasp --rig desk-cube    the bar has a cube of tags: where it is, and which fingers touch it
+      phalanx demo --scene gestures --seconds 80 --bus tcp/127.0.0.1:47802
+                                                    pinches, dials, taps and pointing, against what the hand really said
+    """
     view = demo.add_mutually_exclusive_group()
     view.add_argument(
         "--headless", action="store_true", help="no viewer; hand.png and run.rrd are always written"
@@ -75,12 +45,12 @@ def _add_demo(add_parser: AddParser) -> None:
         "--out", type=Path, default=Path("out/demo"), metavar="DIR", help="default: %(default)s"
     )
     demo.add_argument(
-        "--calibration", type=Path, default=_calibration(), metavar="DIR", help="default: %(default)s"
+        "--calibration", type=Path, default=calibration_tree(), metavar="DIR", help="default: %(default)s"
     )
     _add_scene(demo)
 
 
-def _add_scene(demo: argparse.ArgumentParser) -> None:
+def _add_scene(demo: ArgumentParser) -> None:
     """What is simulated, and where it can be read."""
     rig = demo.add_mutually_exclusive_group()
     rig.add_argument(
@@ -113,65 +83,157 @@ def _add_scene(demo: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_replay(add_parser: AddParser) -> None:
-    replay = add_parser(
-        "replay",
-        help="a recording of raw frames, or your own videos, offline",
-        description="Detects markers, or fingers before a wrist device, in every camera's frames, solves the hand of "
-        "what all of them tell, scores it where there is a truth.",
-        epilog=_EXAMPLES["replay"],
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+def add_deploy(deploy: ArgumentParser) -> None:
+    """Installs a slave for each camera as a service of its machine, and waits until it streams.
+
+    Goes back to what was before where it does not. Needs ssh and rsync here, ssh, Python 3.11 and systemd there.
+
+    Examples:
+      phalanx fleet deploy pi-left.local pi-right.local --master 192.168.1.2
+            the cameras of rig desk in their order: left, then right; the second run changes nothing
+      phalanx fleet deploy left=pi@10.0.0.11 right=pi@10.0.0.12 --master 10.0.0.2 --options 'left=--sync server' \\
+          --options 'right=--sync client'
+            who is who by name, and with options of `phalanx-slave run`
+      phalanx fleet deploy left+right=cm5.local --master 10.0.0.2 --camera left=picamera2:0 --camera right=picamera2:1
+            two cameras of one machine
+      phalanx fleet deploy pi-wrist.local --rig wrist --imu lsm6dsox:1:0x6a --lights gpio:0:17,27 --master 10.0.0.2
+            a wrist device: its camera and its IMU
+      phalanx fleet deploy pi-left.local pi-right.local --master 192.168.1.2 --dry-run
+            what would be done; nothing is written, here or there
+    """
+    deploy.add_argument(
+        "hosts",
+        nargs="+",
+        metavar="[NAME=]HOST",
+        help="by ssh; NAME is a camera of the rig, NAME+NAME several (default: cameras in the order of the rig; its "
+        "IMU goes with its first camera)",
     )
-    replay.add_argument(
-        "paths",
-        type=Path,
-        nargs="*",
-        metavar="RECORDING|VIDEO",
-        help="folder with recording.json; or a video or a folder of pictures for each camera, or a folder of these",
+    deploy.add_argument("--master", required=True, metavar="HOST", help="this PC, as the machines reach it")
+    deploy.add_argument("--rig", default="desk", help="a file of DIR/rigs (default: %(default)s)")
+    deploy.add_argument("--role", choices=("camera", "wrist"), help="checked against the rig, if given")
+    for name, metavar, what in (
+        ("camera", "[NAME=]DRIVER", "as `phalanx-slave run --camera` has it (default: picamera2)"),
+        ("options", "[NAME=]TEXT", "more options of `phalanx-slave run`, of NAME or of all"),
+        (
+            "overlay",
+            "NAME",
+            "dtoverlay in config.txt, for cameras that a Raspberry Pi does not find by itself",
+        ),
+    ):
+        deploy.add_argument(f"--{name}", action="append", default=[], metavar=metavar, help=what)
+    deploy.add_argument("--imu", metavar="DRIVER", help="as `phalanx-slave run --imu` has it")
+    deploy.add_argument("--lights", metavar="DRIVER", help="as `phalanx-slave run --lights` has it")
+    deploy.add_argument(
+        "--calibration", type=Path, default=calibration_tree(), metavar="DIR", help="default: %(default)s"
     )
-    replay.add_argument(
-        "--camera",
+    _keys(deploy, "keys folder; made if it is missing")
+    deploy.add_argument(
+        "--wheelhouse", type=Path, metavar="DIR", help="use these wheels (default: download them)"
+    )
+    deploy.add_argument("--no-apt", action="store_true", help="install no packages of the system there")
+    deploy.add_argument(
+        "--no-wait", action="store_true", help="do not wait for datagrams, only until slaves are ready"
+    )
+    deploy.add_argument("--ready-s", type=float, default=_READY_S, metavar="S", help=argparse.SUPPRESS)
+    deploy.add_argument("--wait-s", type=float, default=WAIT_SENDERS_S, metavar="S", help=argparse.SUPPRESS)
+    deploy.add_argument(
+        "--beacon", metavar="ADDRESS:PORT", help="where slaves listen for the start (default: broadcast)"
+    )
+    deploy.add_argument(
+        "--bind", metavar="ADDRESS:PORT", help="where datagrams come (default: port 47801 of --master)"
+    )
+    deploy.add_argument(
+        "--bus", metavar="ENDPOINT", help="bus of the master, if it runs (default: that of --master)"
+    )
+    _reach(deploy)
+
+
+def add_rollback(rollback: ArgumentParser) -> None:
+    """One step back. It waits until what was before is ready; the release that is left is removed.
+
+    Examples:
+      phalanx fleet rollback pi-left.local pi-right.local
+            programs, options, keys and calibration as they were before the last deployment that changed something
+      phalanx fleet rollback pi-left.local --dry-run
+    """
+    rollback.add_argument("hosts", nargs="+", metavar="HOST", help="by ssh")
+    _reach(rollback)
+
+
+def add_uninstall(uninstall: ArgumentParser) -> None:
+    """Leaves nothing of ours there.
+
+    Examples:
+      phalanx fleet uninstall pi-left.local pi-right.local
+            services, programs, keys and calibration are gone; what apt brought stays
+      phalanx fleet uninstall pi-left.local --dry-run
+    """
+    uninstall.add_argument("hosts", nargs="+", metavar="HOST", help="by ssh")
+    _reach(uninstall)
+
+
+def add_wheels(wheels: ArgumentParser) -> None:
+    """Downloads for another machine what a slave needs, and adds Phalanx itself.
+
+    Examples:
+      phalanx fleet wheels wheels           for Raspberry Pi OS Trixie; then phalanx-slave install --wheelhouse wheels
+      phalanx fleet wheels wheels --python 3.11 --with simplejpeg        for Bookworm, whose own was built for numpy 1
+      phalanx fleet deploy HOST --master HOST --wheelhouse wheels           on a PC that has no network then
+    """
+    wheels.add_argument("folder", type=Path, metavar="DIR", help="new or empty")
+    wheels.add_argument(
+        "--machine", choices=("aarch64", "x86_64"), default="aarch64", help="default: %(default)s"
+    )
+    wheels.add_argument(
+        "--python", default="3.13", metavar="VERSION", help="of that machine (default: %(default)s)"
+    )
+    wheels.add_argument(
+        "--with",
+        dest="more",
         action="append",
         default=[],
-        metavar="NAME=PATH",
-        help="whose a video or folder is (default: that of its name, else in the order of the rig)",
+        metavar="REQUIREMENT",
+        help="one more; once for each",
     )
-    replay.add_argument(
-        "--rig", metavar="NAME", help="of videos: rig in DIR/rigs (default: the one with these cameras)"
+
+
+def calibration_tree() -> Path:
+    """The calib_json of the working directory, else the one beside the source."""
+    here = Path("calib_json")
+    return here if here.is_dir() else Path(__file__).resolve().parent.parent / "calib_json"
+
+
+def _keys(command: ArgumentParser, what: str) -> None:
+    command.add_argument(
+        "--keys", type=Path, default=default_keys(), metavar="DIR", help=f"{what} (default: %(default)s)"
     )
-    replay.add_argument(
-        "--times",
-        type=Path,
-        metavar="FILE.csv",
-        help="of videos: when each frame was taken; camera,frame,time",
+
+
+def _reach(command: ArgumentParser) -> None:
+    command.add_argument("--dry-run", action="store_true", help="write nothing, say what would be done")
+    command.add_argument(
+        "--deadline", type=_seconds, default=_DEADLINE_S, metavar="S", help="for all (default: %(default)g)"
     )
-    replay.add_argument("--out", type=Path, required=True, metavar="DIR")
-    replay.add_argument(
-        "--calibration",
-        type=Path,
-        metavar="DIR",
-        help="calib_json tree: marker colours, hands; of videos also cameras and rig",
+    command.add_argument("--user", metavar="USER", help="of ssh; root, or one with passwordless sudo")
+    command.add_argument("--port", type=int, metavar="PORT", help="of ssh")
+    command.add_argument("--identity", type=Path, metavar="FILE", help="private key of ssh")
+    command.add_argument(
+        "--ssh-option",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="as `ssh -o` has it; ~/.ssh/config holds, too",
     )
-    replay.add_argument(
-        "--hand", type=Path, metavar="FILE", help="hand profile; default: DIR/hands/<rig's hand>.json"
-    )
-    replay.add_argument(
-        "--only",
-        choices=("markers", "wrist"),
-        help="of a recording of both: what the cameras, or what the wrist device tells alone",
-    )
-    replay.add_argument(
-        "--solver-mode",
-        choices=("fk", "ik", "auto"),
-        help="fingers before a wrist device from the laser alone (fk), from laser and fingertip (ik), or from what "
-        "there is (auto); default: what its rig says",
-    )
-    replay.add_argument(
-        "--solver",
-        choices=("estimator", "fabrik"),
-        help="of markers the hand of disparity, depth law, 1 € filter and FABRIK (fabrik), or the one that is fitted "
-        "to all pixels from there (estimator); default: what its rig says",
-    )
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text}: must be a number") from error
+    if not 0.0 < value < 1e6:
+        raise argparse.ArgumentTypeError(f"{text}: must be positive")
+    return value
 
 
 def _positive(text: str) -> float:
@@ -182,9 +244,3 @@ def _positive(text: str) -> float:
     if not 0.0 < value < 1e6:
         raise argparse.ArgumentTypeError("seconds must be positive")
     return value
-
-
-def _calibration() -> Path:
-    """The calib_json of the working directory, else the one beside the source."""
-    here = Path("calib_json")
-    return here if here.is_dir() else Path(__file__).resolve().parent.parent / "calib_json"

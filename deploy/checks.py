@@ -11,7 +11,7 @@ _PREFIXED = re.compile(r"[A-Za-z0-9_.]+=")  # NAME= before a driver or before op
 
 
 def check_wish(options: argparse.Namespace, rig: RigFile) -> None:
-    """Look at the options of `phalanx deploy`.
+    """Look at the options of `phalanx fleet deploy`.
 
     Raises:
         DeployError: One is for a name that the rig does not have, or `--wheelhouse` has no wheels.
@@ -25,7 +25,7 @@ def check_wish(options: argparse.Namespace, rig: RigFile) -> None:
                 )
     if options.wheelhouse is not None and not any(options.wheelhouse.glob("*.whl")):
         raise DeployError(
-            f"--wheelhouse {options.wheelhouse}: no wheels in it; phalanx wheels DIR gathers them"
+            f"--wheelhouse {options.wheelhouse}: no wheels in it; phalanx fleet wheels DIR gathers them"
         )
 
 
@@ -42,17 +42,3 @@ def check_reach(options: argparse.Namespace) -> None:
 def default_keys() -> Path:
     """Where keys are, if nothing is said."""
     return Path(os.environ.get("PHALANX_KEYS") or Path.home() / ".config/phalanx/keys")
-
-
-def keys_of_fleet(options: argparse.Namespace) -> Path:
-    """The keys folder; without any the bus may be a plain one of this machine.
-
-    Raises:
-        DeployError: One was named that is not there.
-    """
-    folder: Path = options.keys
-    if folder != default_keys() and not folder.is_dir():
-        raise DeployError(
-            f"--keys {folder}: no such folder; phalanx deploy makes it, or phalanx-master keys make {folder}"
-        )
-    return folder

@@ -35,8 +35,8 @@ _READY_CORE_S, _KNOWN_S, _LEAST_S, _MOST_S = 2.0, 1.0, 4.0, 20.0
 _GIVES_WAY = 4
 _DRIVERS: dict[SensorKind, Callable[[str], list[str]]] = {
     "camera": lambda name: ["run", "--camera", "synthetic", "--name", name],
-    "imu": lambda name: ["imu", "--imu", "synthetic", "--name", name],
-    "tracker": lambda name: ["tracker", name, "--device", "synthetic"],
+    "imu": lambda name: ["run", "--imu", "synthetic", "--name", name],
+    "tracker": lambda name: ["run", "--tracker", "synthetic", "--name", name],
 }
 _LATE_MS, _APART_PPM, _ZERO_MS = 5.0, 50.0, 1234.5
 
@@ -120,7 +120,7 @@ def demo_keys(settings: DemoSettings) -> Generator[Path, None, None]:
     with tempfile.TemporaryDirectory(prefix="phalanx-demo-") as private:
         folder = Path(private) / "keys"
         names = [word for sensor in settings.sensors() for word in ("--device", sensor.name)]
-        command = [sys.executable, "-m", "master.keys_command", "make", str(folder), *names]
+        command = [sys.executable, "-m", "master", "fleet", "keys", str(folder), "--make", *names]
         made = subprocess.run(command, capture_output=True, text=True, check=False)
         if made.returncode != 0:
             raise DemoError(f"cannot make keys: {made.stderr.strip()}")
@@ -259,7 +259,7 @@ def _look_at_viewer(state: _State, processes: list[Process], notify: Callable[[s
         if not state.viewer_ended:  # its last words come a moment later
             state.viewer_ended = True
             return
-        reason = viewer.tail[-1].removeprefix("phalanx-master: ") if viewer.tail else f"exit code {code}"
+        reason = viewer.tail[-1].removeprefix("phalanx: ") if viewer.tail else f"exit code {code}"
         line = f"no viewer: {reason}; the run goes on" if code else "the viewer was closed; the run goes on"
     if line and line not in state.printed:
         state.printed.add(line)
@@ -302,7 +302,15 @@ def _report(settings: DemoSettings, epoch_ns: int, notify: Callable[[str], None]
     scene = ["--scene", settings.scene, "--seed", str(settings.seed)]
     place = [*rig_options(settings.rigs), "--calibration", str(settings.calibration), *scene]
     files = ["--poses", str(out / "poses.npz"), "--summary", str(out / "live.json"), "--out", str(out)]
-    command = [sys.executable, "-m", "master", "report", *place, *files, "--scene-epoch-ns", str(epoch_ns)]
+    command = [
+        sys.executable,
+        "-m",
+        "master.report_command",
+        *place,
+        *files,
+        "--scene-epoch-ns",
+        str(epoch_ns),
+    ]
     # A session of its own: the first Ctrl-C must not reach the report; the second ends it through `run`.
     done = subprocess.run(command, env=dict(os.environ), start_new_session=True, check=False)
     if done.returncode != 0:

@@ -30,7 +30,7 @@ class Reached:
 
 
 def make_keys(folder: Path, names: Sequence[str], notify: Notify) -> None:
-    """Make what a keys folder lacks for these senders, by `phalanx-master keys make`.
+    """Make what a keys folder lacks for these senders, by `phalanx fleet keys --make`.
 
     Raises:
         DeployError: They cannot be made.
@@ -41,11 +41,11 @@ def make_keys(folder: Path, names: Sequence[str], notify: Notify) -> None:
         return
     notify(f"making keys in {folder}")
     devices = [word for name in names for word in ("--device", name)]
-    words = [sys.executable, "-m", "master.keys_command", "make", str(folder), *devices]
+    words = [sys.executable, "-m", "master", "fleet", "keys", str(folder), "--make", *devices]
     lines: list[str] = []
     code, errors = run_bounded(words, b"", lines.append, _KEYS_S)
     if code != 0:
-        raise DeployError(f"keys: {([*lines, *errors] or ['phalanx-master keys make has no end'])[-1]}")
+        raise DeployError(f"keys: {([*lines, *errors] or ['phalanx fleet keys --make has no end'])[-1]}")
 
 
 def deploy(

@@ -29,7 +29,7 @@ class Ears:
     """How datagrams are heard.
 
     Attributes:
-        options: Of `phalanx-master hear`.
+        options: Of `phalanx fleet status --wait`.
         keys: Keys folder.
         seconds: How long they are waited for.
     """
@@ -55,23 +55,15 @@ class Received:
 
 
 def received_of(names: Sequence[str], ears: Ears, ended: threading.Event | None = None) -> Received:
-    """Ask `phalanx-master hear` which of the senders are heard; it ends early if `ended` is set."""
-    words = [
-        sys.executable,
-        "-m",
-        "master.wait_for_senders",
-        "--json",
-        "--seconds",
-        str(ears.seconds),
-        *ears.options,
-    ]
-    words += [word for name in names for word in ("--name", name)]
+    """Ask `phalanx fleet status --wait` which of the senders are heard; it ends early if `ended` is set."""
+    words = [sys.executable, "-m", "master", "fleet", "status", "--json", "--seconds", str(ears.seconds)]
+    words += [*ears.options, *(word for name in names for word in ("--wait", name))]
     lines: list[str] = []
     environment = {"PHALANX_KEYS": str(ears.keys)}
     code, errors = run_bounded(words, b"", lines.append, ears.seconds + _END_S, environment, ended)
     results = [line for line in lines if line.startswith('{"heard"')]
     if not results:
-        lines = [*lines, *errors] or [f"phalanx-master hear ended with {code}"]
+        lines = [*lines, *errors] or [f"phalanx fleet status --wait ended with {code}"]
         return Received(cause=f"cannot listen for it: {lines[-1]}")
     answer = cast(dict[str, object], json.loads(results[-1]))
     rates = cast(dict[str, float], answer["heard"])

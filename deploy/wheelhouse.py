@@ -113,7 +113,7 @@ def _check_given(files: Iterable[Path], kind: Kind, given: Path | None) -> None:
         if not fits(file.name, kind):
             raise DeployError(
                 f"--wheelhouse {given}: {file.name} is not for {kind.machine} with Python {kind.python}; "
-                f"those that are: phalanx wheels DIR --machine {kind.machine} --python {kind.python}"
+                f"those that are: phalanx fleet wheels DIR --machine {kind.machine} --python {kind.python}"
             )
 
 

@@ -1,11 +1,10 @@
-"""`phalanx-master camera`: see how a running camera is set, and set it otherwise, over the bus. No restart."""
+"""`phalanx camera`: see how a running camera is set, and set it otherwise, over the bus. No restart."""
 
 import time
+from argparse import Namespace
 from pathlib import Path
-from typing import Annotated
 
 import msgspec
-import typer
 
 from common.bus import Bus
 from common.calibration import CameraCalibration, load
@@ -13,8 +12,8 @@ from common.camera_settings import ROI_LEAST, ROI_MOST, WANTED, CameraSettings, 
 from common.errors import BusError, CalibrationError, PhalanxError
 from common.messages import Command, Health
 from common.streams import MASTER
+from common.terminal import echo
 from master.master_bus import join_bus
-from master.options import HERE_BUS, BusEnd
 
 ANSWER_S = (
     15.0  # 60 frames of a slow camera until it shows its settings, as many to go back, and a colour table
@@ -27,58 +26,18 @@ _EVENTS = ("camera.", "reload.")
 _MOST = 1e9
 
 
-def camera(
-    name: Annotated[str, typer.Argument(help="Name of a camera whose slave is running.")],
-    exposure_us: Annotated[float | None, typer.Option(help="Exposure in microseconds.")] = None,
-    gain: Annotated[float | None, typer.Option(help="Analogue gain.")] = None,
-    colour_gains: Annotated[
-        str | None, typer.Option(metavar="RED,BLUE", help="Gains of red and blue relative to green.")
-    ] = None,
-    rate_hz: Annotated[float | None, typer.Option(help="Frames a second.")] = None,
-    roi_margin: Annotated[
-        float | None,
-        typer.Option(help="How far a marker may be from where it is expected, share of the width."),
-    ] = None,
-    pick: Annotated[
-        str | None,
-        typer.Option(
-            metavar="MARKER@U,V", help="Colour of a marker from a pixel on its paint, in the newest frame."
-        ),
-    ] = None,
-    load_file: Annotated[
-        Path | None, typer.Option("--load", help="Camera file to use in place of the present content.")
-    ] = None,
-    save: Annotated[
-        bool, typer.Option("--save", help="Write what is in use to the slave's camera file.")
-    ] = False,
-    bus: BusEnd = HERE_BUS,
-) -> None:
-    """Show how a running camera is set, or set it otherwise: at once, read back, compared.
-
-    What the camera does not take is refused by name, and it goes back to what it had.
-
-    Examples:
-
-      phalanx-master camera left
-
-      phalanx-master camera left --exposure-us 4000 --gain 2
-
-      phalanx-master camera left --colour-gains 1.1,1.6 --save
-
-      phalanx-master camera left --rate-hz 30 --roi-margin 0.08
-
-      phalanx-master camera left --pick index@310,204 --save
-
-      phalanx-master camera left --load new/left.json --save
-    """
-    wanted = settings(exposure_us, gain, colour_gains, rate_hz, roi_margin)
-    steps = commands(name, wanted, pick, load_file, save)
-    connection = join_bus(bus)
+def camera(options: Namespace) -> None:
+    """Show how a running camera is set, or set it otherwise: at once, read back, compared."""
+    wanted = settings(
+        options.exposure_us, options.gain, options.colour_gains, options.rate_hz, options.roi_margin
+    )
+    steps = commands(options.name, wanted, options.pick, options.load_file, options.save)
+    connection = join_bus(options.bus)
     try:
         health = send_all(connection, steps)
     finally:
         connection.close()
-    typer.echo("\n".join(table(health)))
+    echo("\n".join(table(health)))
 
 
 def settings(

@@ -121,7 +121,7 @@ def warning(camera: str, offset: TimeOffset) -> str:
     return (
         f"camera {camera}: its frames are {abs(late):.1f} ms (sigma {sigma:.1f}) {'later' if late > 0 else 'earlier'}"
         " than its stamps say: record a moving hand, then"
-        " `phalanx-master calibrate time RECORDING --detections DIR --out DIR`"
+        " `phalanx calibrate time RECORDING --detections DIR --out DIR`"
     )
 
 

@@ -32,6 +32,6 @@ class ExtrinsicsMonitor:
             if self._looks[name] == _LOOKS:
                 lines.append(
                     f"camera {name}: its rays miss those of the others and are left out: it was knocked, or it is not"
-                    " the camera of its file: calibrate it anew, `phalanx-master calibrate stereo --help`"
+                    " the camera of its file: calibrate it anew, `phalanx calibrate cameras stereo --help`"
                 )
         return lines

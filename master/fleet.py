@@ -1,26 +1,30 @@
-"""`phalanx-master fleet`: one row for each process of a rig, from what it and the master say of it on the bus."""
+"""`phalanx fleet status`: one row for each process of a rig, from what it and the master say of it on the bus."""
 
 import json
 import os
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from argparse import Namespace
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Annotated
-
-import typer
+from pathlib import Path
 
 from common.bus import Bus
-from common.errors import PhalanxError
-from common.keys import keys_folder
+from common.command_line import UsageError
+from common.keys import FOLDER, keys_folder
 from common.messages import Health
 from common.streams import MASTER
+from common.terminal import echo
 from master.master_bus import join_bus
-from master.options import HERE_BUS, BusEnd
+from master.options import HERE_BUS, bus_end
 from master.stopping import stop_on_signals
 
 _POLL_S = 0.1
 _SILENT_S = 3.0  # three reports
+_ONCE_S = 3.0
+_HEAD = ("device", "host", "version", "temperature", "throttled", "rate", "clock offset", "state")
+_HOME = "\x1b[H\x1b[J"  # to the top of the screen, and clear it
+USUAL_KEYS = ".config/phalanx/keys"  # where `phalanx fleet deploy` makes them
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,36 +131,87 @@ def expected_devices(environment: Mapping[str, str]) -> list[str]:
     return [] if folder is None else sorted(path.stem for path in (folder / "devices").glob("*.pem"))
 
 
-def fleet(
-    bus: BusEnd = HERE_BUS,
-    seconds: Annotated[float, typer.Option(min=0.5, max=3600.0, help="How long it listens.")] = 3.0,
-    watch: Annotated[bool, typer.Option("--watch", help="A line of JSON each second, until Ctrl-C.")] = False,
-) -> None:
-    """Say how each process of the rig is, as JSON; `phalanx fleet` shows it as a table.
+def status(options: Namespace) -> int:
+    """Show each process of the rig, or wait until some are heard; the exit code.
 
-    Examples:
-
-      phalanx-master fleet --keys ~/.config/phalanx/keys
-
-      phalanx-master fleet --watch | jq -c '.devices[] | [.name, .state]'
+    Raises:
+        UsageError: `--wait` and `--watch` are both given.
     """
-    connection = join_bus(bus)
+    _use_usual_keys(options)
+    if options.wait:
+        if options.watch:
+            raise UsageError("--watch has no meaning with --wait: leave it out")
+        from master.wait_for_senders import wait_for_senders
+
+        return wait_for_senders(options)
+    show = _as_json if options.as_json else _as_table if not options.watch else _on_screen
+    period_s = 1.0 if options.watch else options.seconds or _ONCE_S
+    connection = join_bus(options.bus)
     try:
-        roll = Roll(expected_devices(os.environ))
-        _listen(connection, roll, 1.0 if watch else seconds, watch, stop_on_signals())
+        _listen(
+            connection, Roll(expected_devices(os.environ)), period_s, options.watch, stop_on_signals(), show
+        )
     finally:
         connection.close()
+    return 0
 
 
-def main() -> None:
-    """`python -m master.fleet`: the same, without loading what else the master's program can do."""
-    try:
-        typer.run(fleet)
-    except PhalanxError as error:
-        raise SystemExit(f"fleet: {error}") from error
+def _use_usual_keys(options: Namespace) -> None:
+    """Use the keys folder that a deployment makes, where no other is named."""
+    typical, bus = Path.home() / USUAL_KEYS, bus_end(HERE_BUS)
+    if FOLDER in os.environ or not typical.is_dir():
+        return
+    os.environ[FOLDER] = str(typical)
+    if options.bus == bus:
+        options.bus = bus_end(HERE_BUS)
 
 
-def _listen(bus: Bus, roll: Roll, period_s: float, watch: bool, stop: threading.Event) -> None:
+def table(devices: Sequence[Device]) -> list[str]:
+    """Lines for a person; a dash where nothing is known."""
+    rows = [_HEAD, *(_row(device) for device in devices)]
+    widths = [max(len(row[n]) for row in rows) for n in range(len(_HEAD))]
+    return [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    ]
+
+
+def _row(device: Device) -> tuple[str, ...]:
+    return (
+        device.name,
+        device.host or "-",
+        device.version or "-",
+        _number(device.temperature_c, "{:.0f} °C"),
+        "-" if device.throttled is None else "yes" if device.throttled else "no",
+        _number(device.rate_hz, "{:.1f}/s"),
+        "-" if device.offset_us is None else f"{device.offset_us:+.0f} ± {device.sigma_us or 0.0:.0f} µs",
+        device.state,
+    )
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else form.format(value)
+
+
+def _as_json(devices: Sequence[Device]) -> str:
+    return json.dumps({"devices": [asdict(one) for one in devices]})
+
+
+def _as_table(devices: Sequence[Device]) -> str:
+    return "\n".join(table(devices))
+
+
+def _on_screen(devices: Sequence[Device]) -> str:
+    return _HOME + _as_table(devices)
+
+
+def _listen(
+    bus: Bus,
+    roll: Roll,
+    period_s: float,
+    watch: bool,
+    stop: threading.Event,
+    show: Callable[[Sequence[Device]], str],
+) -> None:
     inbox = bus.subscribe("health", depth=256)
     due_s = time.monotonic() + period_s
     while not stop.is_set():
@@ -164,11 +219,7 @@ def _listen(bus: Bus, roll: Roll, period_s: float, watch: bool, stop: threading.
         if isinstance(health, Health):
             roll.push(health, time.monotonic())
         if time.monotonic() >= due_s:
-            typer.echo(json.dumps({"devices": [asdict(one) for one in roll.devices(time.monotonic())]}))
+            echo(show(roll.devices(time.monotonic())))
             due_s += period_s
             if not watch:
                 return
-
-
-if __name__ == "__main__":
-    main()

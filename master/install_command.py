@@ -1,4 +1,4 @@
-"""`phalanx-master install`: the master as a service of this user.
+"""`phalanx run --install`: the master as a service of this user.
 
 It needs no root, and the service starts again by itself.
 """
@@ -6,92 +6,82 @@ It needs no root, and the service starts again by itself.
 import getpass
 import os
 import sys
-from collections.abc import Sequence
+from argparse import Namespace
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import cast
 
-import typer
-
+from common.command_line import defaults_of
 from common.errors import PhalanxError
 from common.keys import ENVIRONMENT, FOLDER, OPEN, keys_folder, link_key
-from master.key_options import command_of as run_with_keys
+from common.terminal import echo
+from master.cli.run import run as declare_run
+from master.options import rigs_of
 from master.rig import load_setups
-from master.run_command import checked_ends, run
+from master.run_command import checked_ends
 from master.service_unit import unit_text
 from master.user_services import UserServices
 
-_ONE_RUN = ("poses", "summary", "record")  # files of one run: the next start would write over them
+PROGRAM = "phalanx-master"
+# The options of `run` that a service keeps: where they are in what was read, and how they are written.
+KEPT = {
+    "rig": "--rig",
+    "calibration": "--calibration",
+    "hand": "--hand",
+    "beacon": "--beacon",
+    "bind": "--bind",
+    "key_file": "--key-file",
+    "bus": "--bus",
+    "start_timeout_s": "--start-timeout-s",
+    "changes": "--set",
+}
+ONE_RUN = ("poses", "summary", "record")  # files of one run: the next start would write over them
 
 
-def install(
-    context: typer.Context,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Write nothing; print the unit.")] = False,
-    uninstall: Annotated[bool, typer.Option("--uninstall", help="Stop the service, and remove it.")] = False,
-) -> None:
-    """Install `phalanx-master run` as a service of this user, without root.
+def change_service(options: Namespace) -> None:
+    """Install the service with these options of `run`, or remove it.
 
-    It is started at login, and again after a fault. All other options are those of `run`, and are checked
-    before anything is written. With other options it is installed again, with the same ones nothing changes.
-    Keys stay where they are: the unit has the path of their folder alone.
-
-    `systemctl --user status phalanx-master` shows how it is, `journalctl --user -u phalanx-master` what it said.
-
-    Examples:
-
-      phalanx-master install --rig desk
-
-      phalanx-master install --keys DIR --beacon 192.168.1.255:47800 --bind 0.0.0.0:47801 --bus tls/0.0.0.0:47802
-
-      phalanx-master install --rig desk --rig wrist --dry-run
-
-      phalanx-master install --uninstall
+    Raises:
+        PhalanxError: An option that a service cannot have, a rig or a key that is not there.
     """
     services = UserServices()
-    if uninstall:
-        if context.args:
-            raise PhalanxError(f"--uninstall: takes no other option, found {' '.join(context.args)}")
-        typer.echo(services.remove(dry_run))
+    if options.uninstall:
+        if given := sorted(KEPT[name] for name in _given(options)):
+            raise PhalanxError(f"--uninstall: takes no other option, found {' '.join(given)}")
+        echo(services.remove(options.dry_run))
         return
-    command = command_of(context.args)  # which also finds the keys
-    text = unit_text(command, Path.cwd(), environment_of())
-    if dry_run:
-        typer.echo(f"would write {services.file}:\n{text}", nl=False)
+    text = unit_text(command_of(options), Path.cwd(), environment_of())
+    if options.dry_run:
+        echo(f"would write {services.file}:\n{text}", end="")
         return
-    typer.echo(services.install(text))
+    echo(services.install(text))
     if not Path("/var/lib/systemd/linger", user := getpass.getuser()).exists():
-        typer.echo(
-            f"it starts when {user} logs in; to start it with the machine: loginctl enable-linger {user}"
-        )
+        echo(f"it starts when {user} logs in; to start it with the machine: loginctl enable-linger {user}")
 
 
-def command_of(words: Sequence[str]) -> list[str]:
+def command_of(options: Namespace) -> list[str]:
     """The program and its words for these options of `run`; each path is absolute.
 
     Raises:
         PhalanxError: An option that a service cannot have, a rig or a key that is not there.
     """
-    made = run_with_keys(run).make_context("phalanx-master run", list(words))
-    values: dict[str, Any] = made.params
-    sources = {name: made.get_parameter_source(name) for name in values}
-    given = {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
-    if one := next((name for name in _ONE_RUN if name in given), None):
+    if one := next((name for name in ONE_RUN if getattr(options, name) is not None), None):
         raise PhalanxError(
-            f"--{one}: a service that starts again would write over it; beside the service use phalanx-master record"
+            f"--{one}: a service that starts again would write over it; beside the service use phalanx record"
         )
-    checked_ends(values["beacon"], values["bind"], values["bus"])
-    load_setups(values["calibration"], values["rig"], values["hand"])
-    if ENVIRONMENT in os.environ and "key_file" not in given:
+    checked_ends(options)
+    load_setups(options.calibration, rigs_of(options), options.hand)
+    if ENVIRONMENT in os.environ and options.key_file is None:
         raise PhalanxError(
-            f"{ENVIRONMENT}: a key is not written into a unit; give --keys DIR (phalanx-master keys make DIR)"
+            f"{ENVIRONMENT}: a key is not written into a unit; give --keys DIR (phalanx fleet keys DIR --make)"
         )
-    link_key(os.environ, values["key_file"])
-    options: list[str] = []
-    for parameter in made.command.params:
-        if parameter.name in given | {"calibration"}:
-            value = values[parameter.name]
+    link_key(os.environ, options.key_file)
+    words: list[str] = []
+    for name in KEPT:
+        if name in _given(options) or name == "calibration":
+            value = getattr(options, name)
             for one in cast("list[object]", value if isinstance(value, list) else [value]):
-                options += [parameter.opts[0], str(one.absolute() if isinstance(one, Path) else one)]
-    return [str(_program()), "run", *options]
+                words += [KEPT[name], str(one.absolute() if isinstance(one, Path) else one)]
+    return [str(_program()), "run", *words]
 
 
 def environment_of() -> dict[str, str]:
@@ -101,8 +91,14 @@ def environment_of() -> dict[str, str]:
     return keys | ({OPEN: "1"} if os.environ.get(OPEN) == "1" else {})
 
 
+def _given(options: Namespace) -> set[str]:
+    """The options of `KEPT` that are not as they are if nothing is said."""
+    typical = defaults_of(declare_run)
+    return {name for name in KEPT if getattr(options, name) != getattr(typical, name)}
+
+
 def _program() -> Path:
-    program = Path(sys.executable).with_name("phalanx-master")
+    program = Path(sys.executable).with_name(PROGRAM)
     if not program.exists():
         raise PhalanxError(f"{program}: missing; install the package there: pip install '.[master]'")
     return program

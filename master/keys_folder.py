@@ -1,8 +1,8 @@
 """The keys folder of a rig on its PC: made, shown, renewed, a device taken out of it. `common.keys` says what is in it.
 
 A certificate cannot be called back one by one, and a device that is lost also has the rig key, which every device has.
-So whoever is taken out costs everybody else new keys; that is a second of work here, and a `phalanx deploy` for the
-rest.
+So whoever is taken out costs everybody else new keys; that is a second of work here, and a `phalanx fleet deploy` for
+the rest.
 """
 
 import os
@@ -143,7 +143,7 @@ def devices_of(folder: Path) -> list[str]:
     """
     if not (folder / AUTHORITY_KEY).exists():
         raise PhalanxError(
-            f"{folder}: no keys folder (no {AUTHORITY_KEY}): phalanx-master keys make {folder}"
+            f"{folder}: no keys folder (no {AUTHORITY_KEY}): phalanx fleet keys {folder} --make"
         )
     return sorted(path.stem for path in (folder / DEVICES).glob("*.pem"))
 
@@ -201,7 +201,7 @@ def _secret(folder: Path, name: str) -> bytes:
             raise ValueError(f"{len(root)} bytes, must be {KEY_BYTES}")
     except ValueError as error:
         raise PhalanxError(
-            f"{folder / DEVICES_KEY}: broken ({error}); phalanx-master keys renew {folder} makes all keys anew"
+            f"{folder / DEVICES_KEY}: broken ({error}); phalanx fleet keys {folder} --renew makes all keys anew"
         ) from error
     return f"{device_secret(root, name).hex()}\n".encode()
 

@@ -139,7 +139,7 @@ def marker_line(name: str, counts: MarkerCounts) -> str:
     """What a person is told of a slave whose rig file is another than the master's."""
     return (
         f"camera {name}: its slave sends {counts.sent} markers, the rig here has {counts.expected}: nothing of it is"
-        " used. Deploy the rig to it again (phalanx deploy), then restart this master if its own file has changed"
+        " used. Deploy the rig to it again (phalanx fleet deploy), then restart this master if its own file has changed"
     )
 
 
@@ -158,5 +158,5 @@ def unplaced_line(name: str, tracker: str) -> str:
     """What a person is told of a tracker whose poses mean nothing in the rig."""
     return (
         f"object {name}: its tracker {tracker} is not registered to the rig, what it says is not used:"
-        f" `phalanx-master calibrate tracker {name}`"
+        f" `phalanx calibrate tracker {name}`"
     )

@@ -1,4 +1,4 @@
-"""Reads what `phalanx-slave detect` wrote of a recording, detections_<camera>.npz, as the messages of its rows."""
+"""Reads what `phalanx-slave run -o` wrote of a recording, detections_<camera>.npz, as the messages of its rows."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -107,7 +107,7 @@ def recorded_cycles(folder: Path, camera: str) -> Iterator[WristDetections]:
 
 def _file_of(folder: Path, camera: str) -> tuple[Path, str]:
     """The file, and what to do where it is missing or broken."""
-    return folder / f"detections_{camera}.npz", f"run `phalanx-slave detect` for camera {camera!r} first"
+    return folder / f"detections_{camera}.npz", f"run `phalanx-slave run -o` for camera {camera!r} first"
 
 
 def _check_times(path: Path, t_ns: Int, seq: Int, fix: str) -> None:

@@ -1,4 +1,4 @@
-"""Reads what `phalanx-slave detect` wrote of the tags of a recording, tags_<camera>.npz, as messages of its frames."""
+"""Reads what `phalanx-slave run -o` wrote of the tags of a recording, tags_<camera>.npz, as messages of its frames."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +21,7 @@ def recorded_tags(folder: Path, camera: str) -> Iterator[TagDetections]:
     Raises:
         RecordingError: The file is missing or broken.
     """
-    path, fix = folder / f"tags_{camera}.npz", f"run `phalanx-slave detect` for camera {camera!r} first"
+    path, fix = folder / f"tags_{camera}.npz", f"run `phalanx-slave run -o` for camera {camera!r} first"
     data = read_npz(path, _ARRAYS, fix)
     try:
         t_ns, seq, row, ids = (

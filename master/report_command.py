@@ -1,47 +1,77 @@
-"""`phalanx-master report`: a simulated run against the truth of its scene."""
+"""`python -m master.report_command`: what `phalanx demo` calls at its end, a simulated run against the exact truth."""
 
+import logging
+import sys
+from argparse import ArgumentParser
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
-import typer
-
-from common.sim.scenes import NAMES
-from common.sim.wrist.scene import WRIST_NAMES
-from master.options import CALIB_JSON, Calibration, Rigs
+from common.errors import PhalanxError
+from common.terminal import echo
+from master.options import add_calibration, add_rigs, rigs_of
 from master.outputs.files import path_of_hand
 from master.rig import load_setups
 from master.summary import read_summary, write_summary
+from master.summary_lines import summary_lines
 from master.terminal import progress
 
 
-def report(
-    poses: Annotated[Path, typer.Option(help="poses.npz of the run.")],
-    scene_epoch_ns: Annotated[
-        int, typer.Option(help="Scene time 0 on this machine's monotonic clock, in ns.")
-    ],
-    out: Annotated[Path, typer.Option(help="Folder for hand.png, run.rrd and summary.json.")],
-    rig: Rigs,
-    scene: Annotated[str, typer.Option(help=f"Scene: {NAMES}; of a wrist rig: {WRIST_NAMES}.")] = "standard",
-    seed: Annotated[int, typer.Option(help="Seed of the scene.")] = 7,
-    calibration: Calibration = CALIB_JSON,
-    summary: Annotated[Path | None, typer.Option(help="summary.json of the run, to be completed.")] = None,
-) -> None:
-    """Compare a simulated run with the exact truth of its scene; write figures, a picture and a Rerun file.
+def report(words: Sequence[str]) -> None:
+    """Write figures, a picture and a Rerun file of a run. Of a second hand they are in a folder of its name below OUT.
 
-    `phalanx demo` calls it at the end. Of a second hand the results are in a folder of its name below OUT.
-
-    Examples:
-
-      phalanx-master report --poses out/demo/poses.npz --scene-epoch-ns 123456789 --out out/demo
+    Raises:
+        PhalanxError: A file is missing or broken, or there is no such scene.
     """
     from master.report import Played, report_scene
 
-    setups = load_setups(calibration, rig)
-    figures = {} if summary is None else read_summary(summary)
+    options = _parser().parse_args(words)
+    out: Path = options.out
+    setups = load_setups(options.calibration, rigs_of(options))
+    figures = {} if options.summary is None else read_summary(options.summary)
     for number, setup in enumerate(setups):
         hand = setup.hand.profile.name
-        file, folder = (path_of_hand(poses, hand), out / hand) if number else (poses, out)
+        file, folder = (path_of_hand(options.poses, hand), out / hand) if number else (options.poses, out)
         folder.mkdir(parents=True, exist_ok=True)
-        played = Played.of(setup, scene, seed)
-        full = report_scene(file, setup, played, scene_epoch_ns, folder, figures, progress)
+        played = Played.of(setup, options.scene, options.seed)
+        full = report_scene(file, setup, played, options.scene_epoch_ns, folder, figures, progress)
         write_summary(folder / "summary.json", full)
+    echo()
+    for line in summary_lines(read_summary(out / "summary.json")):
+        echo(f"  {line}")
+
+
+def _parser() -> ArgumentParser:
+    parser = ArgumentParser("master.report_command", description="Compare a simulated run with its truth.")
+    parser.add_argument("--poses", type=Path, required=True, metavar="FILE", help="poses.npz of the run")
+    parser.add_argument(
+        "--scene-epoch-ns",
+        type=int,
+        required=True,
+        metavar="NS",
+        help="scene time 0 on this machine's monotonic clock",
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="for hand.png, run.rrd and summary.json"
+    )
+    add_rigs(parser)
+    parser.add_argument("--scene", default="standard", metavar="NAME", help="scene, as of `phalanx demo`")
+    parser.add_argument("--seed", type=int, default=7, metavar="N", help="seed of the scene")
+    add_calibration(parser)
+    parser.add_argument(
+        "--summary", type=Path, metavar="FILE", help="summary.json of the run, to be completed"
+    )
+    return parser
+
+
+def main() -> None:
+    """Run it; an error is a line."""
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it tells of its font cache on the first run
+    try:
+        report(sys.argv[1:])
+    except PhalanxError as error:
+        raise SystemExit(f"phalanx: {error}") from error
+
+
+if __name__ == "__main__":
+    main()

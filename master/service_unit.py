@@ -13,7 +13,7 @@ UNIT = "phalanx-master.service"
 _UNQUOTED = re.compile(r"[A-Za-z0-9_@+=:,./-]+")
 ERROR_WAIT_S = 5  # between two tries after an error that the user has to mend
 _TEXT = """\
-# Written by `phalanx-master install`, which writes it again; `phalanx-master install --uninstall` removes it.
+# Written by `phalanx run --install`, which writes it again; `phalanx run --uninstall` removes it.
 [Unit]
 Description=Phalanx master
 # It is tried again without an end: a network, a file or a port may be there in a minute.

@@ -2,15 +2,15 @@
 
 import sys
 
-import typer
+from common.terminal import echo
 
 
 def print_line(line: str) -> None:
     """A line to whoever started the master."""
-    typer.echo(f"master: {line}")
+    echo(f"master: {line}")
 
 
 def progress(what: str, done: int, total: int) -> None:
     """How much is done, in place; nothing where no terminal shows it."""
     if sys.stderr.isatty():
-        typer.echo(f"\r{what}: {100 * done // max(total, 1)} %   ", nl=False, err=True)
+        echo(f"\r{what}: {100 * done // max(total, 1)} %   ", end="", error=True)

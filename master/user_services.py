@@ -1,4 +1,4 @@
-"""The services of a user, as `phalanx-master install` needs them.
+"""The services of a user, as `phalanx run --install` needs them.
 
 Its unit is written, started, looked at, and removed.
 """
@@ -77,7 +77,7 @@ class UserServices:
             words = self._state().get("StatusText") or str(error)
             raise PhalanxError(
                 f"{UNIT} does not run: {words}; {_LOG} has more. It is tried again, every {ERROR_WAIT_S} s; "
-                "phalanx-master install --uninstall removes it"
+                "phalanx run --uninstall removes it"
             ) from error
         return f"{UNIT} runs; `systemctl --user status {UNIT}` shows how it is, `{_LOG}` what it said"
 

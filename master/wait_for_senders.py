@@ -1,4 +1,4 @@
-"""`phalanx-master hear`: are these cameras and IMUs heard here? For an installer, which goes back if they are not.
+"""`phalanx fleet status --wait`: are these cameras and IMUs heard here? An installer goes back if they are not.
 
 Where a master runs, it is asked what it takes. Where none does, this command gives the start and counts the
 datagrams that come. When it ends, slaves wait for their master again.
@@ -8,10 +8,8 @@ import json
 import os
 import threading
 import time
+from argparse import Namespace
 from collections.abc import Sequence
-from typing import Annotated
-
-import typer
 
 from common.bus import Bus
 from common.calibration import RigCalibration, load
@@ -22,73 +20,41 @@ from common.keys import link_key
 from common.link_key import LinkKey
 from common.messages import Health
 from common.streams import MASTER
+from common.terminal import echo
 from common.zenoh_bus import ZenohBus
 from master.ingest import Ingest
 from master.master_bus import join_bus
-from master.options import (
-    CALIB_JSON,
-    HERE_BEACON,
-    HERE_BIND,
-    HERE_BUS,
-    Beacon,
-    Bind,
-    BusEnd,
-    Calibration,
-    KeyFile,
-    Rig,
-    address,
-)
+from master.options import address
 from master.stopping import stop_on_signals
 
 _APPEAR_S = 1.5  # whoever has just connected is not known everywhere yet
 _POLL_S = 0.1
 _START_S = 1.0
+_MOST_S = 20.0
 _RATE_S = 1.0  # how long datagrams are counted after the first of each
 Received = dict[str, float]
 
 
-def wait_for_senders(
-    names: Annotated[list[str], typer.Option("--name", help="Camera or IMU; once for each.")],
-    rig: Rig = "desk",
-    calibration: Calibration = CALIB_JSON,
-    seconds: Annotated[float, typer.Option(min=1.0, max=3600.0, help="How long they are waited for.")] = 20.0,
-    beacon: Beacon = HERE_BEACON,
-    bind: Bind = HERE_BIND,
-    bus: BusEnd = HERE_BUS,
-    key_file: KeyFile = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="As JSON: datagrams a second by name, and whether a master runs.")
-    ] = False,
-) -> None:
-    """Wait until datagrams of all these senders come, at the master that runs or, where none does, here.
-
-    Ends with 1 if one of them is not heard.
-
-    Examples:
-
-      phalanx-master hear --name left --name right --keys ~/.config/phalanx/keys
-
-      phalanx-master hear --rig wrist --name wrist --name imu --bind 0.0.0.0:47801 --beacon 192.168.1.255:47800
-    """
+def wait_for_senders(options: Namespace) -> int:
+    """Wait until datagrams of all these senders come; the exit code, 1 if one of them is not heard."""
     stop = stop_on_signals()
-    connection = _running(bus)
+    names: list[str] = options.wait
+    seconds = options.seconds or _MOST_S
+    connection = _running(options.bus)
     if connection is not None:
         try:
             received = at_master(connection, names, seconds, stop)
         finally:
             connection.close()
     else:
-        setup = load(calibration / "rigs" / f"{rig}.json", RigCalibration)
-        received = here(names, setup, link_key(os.environ, key_file), address(beacon, "--beacon"),
-                     address(bind, "--bind"), seconds, stop)  # fmt: skip
-    if as_json:
-        typer.echo(json.dumps({"heard": received, "master": connection is not None}))
-    for name in names if not as_json else ():
-        typer.echo(
-            f"{name}: {f'{received[name]:.0f} datagrams a second' if name in received else 'not received'}"
-        )
-    if len(received) < len(set(names)):
-        raise typer.Exit(1)
+        setup = load(options.calibration / "rigs" / f"{options.rig}.json", RigCalibration)
+        received = here(names, setup, link_key(os.environ, options.key_file), address(options.beacon, "--beacon"),
+                     address(options.bind, "--bind"), seconds, stop)  # fmt: skip
+    if options.as_json:
+        echo(json.dumps({"heard": received, "master": connection is not None}))
+    for name in names if not options.as_json else ():
+        echo(f"{name}: {f'{received[name]:.0f} datagrams a second' if name in received else 'not received'}")
+    return int(len(received) < len(set(names)))
 
 
 def at_master(bus: Bus, names: Sequence[str], seconds: float, stop: threading.Event) -> Received:
@@ -184,15 +150,3 @@ def _running(endpoint: str) -> ZenohBus | None:
         time.sleep(_POLL_S)
     bus.close()
     return None
-
-
-def main() -> None:
-    """`python -m master.wait_for_senders`: the same, without loading what else the master's program can do."""
-    try:
-        typer.run(wait_for_senders)
-    except PhalanxError as error:
-        raise SystemExit(f"hear: {error}") from error
-
-
-if __name__ == "__main__":
-    main()

@@ -55,16 +55,16 @@ _DUPLICATE_SENDER = "the master has another process that is {!r}: two of one nam
 _OTHER_VERSION = "the master at {} speaks wire version {}, this slave {}: install one version on both"
 
 _SECRET = (
-    "the secret of {0!r} is not the one that the master at {1} has for it: phalanx deploy brings"
+    "the secret of {0!r} is not the one that the master at {1} has for it: phalanx fleet deploy brings"
     " device-{0}.secret"
 )
 _NO_SECRET = (
-    "the master at {1} asks for the secret of {0!r}, and this device has the rig key alone: phalanx deploy brings"
+    "the master at {1} asks for the secret of {0!r}, and this device has the rig key alone: phalanx fleet deploy brings"
     " device-{0}.secret; --keys DIR says where it is"
 )
 _MASTER_HAS_NONE = (
     "the master at {1} has the rig key alone, and {0!r} a secret of its own: start the master with --keys DIR, a folder"
-    " that has devices.key (phalanx-master keys make DIR)"
+    " that has devices.key (phalanx fleet keys DIR --make)"
 )
 
 

@@ -237,7 +237,9 @@ def _why_alone(counts: Mapping[str, int]) -> str:
     if counts.get("refused.version", 0):
         return "a master is heard, but of another version of the wire: install the same version on both sides"
     if counts.get("refused.secret", 0):
-        return "a master is heard, but not with the secret of this device: phalanx deploy brings what fits"
+        return (
+            "a master is heard, but not with the secret of this device: phalanx fleet deploy brings what fits"
+        )
     if counts.get("refused.twin", 0):
         return "a master is heard, but it has somebody of this name already: two slaves of one name?"
     return "no master heard yet: is it running, and does its --beacon reach this network and port?"

@@ -11,7 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _FORKED = multiprocessing.get_context("forkserver")
-_FORKED.set_forkserver_preload(["master.__main__", "master.commands", "slave.__main__", "master.export.run"])
+_FORKED.set_forkserver_preload(
+    ["master.__main__", "master.replay", "slave.__main__", "slave.offline", "master.export.run"]
+)
 _WAIT_S = 120.0
 
 

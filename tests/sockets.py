@@ -6,6 +6,10 @@ from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
 
+from common.command_line import Family
+from master.cli.table import TABLE
+
+FAMILIES = {word for entry in TABLE if isinstance(entry, Family) for word in entry.name.split()}
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "security.md"
 _LISTENS = {
     "tcp": "0A",
@@ -63,11 +67,14 @@ def _sockets(pid: int) -> Iterator[tuple[str, str, int, str]]:
 
 
 def _program(words: list[str]) -> str:
-    """`master run` of `python -m master run …` or of the script phalanx-master; `master send` of `-m master.send`."""
+    """`master run` of `python -m master run …` or of a script of ours; `master status` of `master fleet status`."""
     for k, word in enumerate(words):
-        side, _, module = Path(word).name.removeprefix("phalanx-").partition(".")
-        if side in ("master", "slave", "deploy"):
-            return " ".join([side, *([module] if module else words[k + 1 : k + 2])])
+        side = Path(word).name.removeprefix("phalanx-").replace("phalanx", "master")
+        if side in ("master", "slave"):
+            names = words[k + 1 :]
+            while names[:1] and names[0] in FAMILIES:
+                names = names[1:]
+            return " ".join([side, *names[:1]])
     return Path(words[0]).name
 
 

@@ -4,9 +4,10 @@ from ipaddress import ip_address
 
 import pytest
 
+from common.endpoints import default_bus
 from common.output_settings import OutputSettings
 from master.console.state import ConsoleSettings
-from master.options import CALIB_JSON, HERE_BEACON, HERE_BIND, default_bus
+from master.options import CALIB_JSON, HERE_BEACON, HERE_BIND
 from master.outputs.rerun_process import viewer_arguments
 from slave.uplink import ANYWHERE
 from tests.sockets import PAGE, Listener, rows, undocumented
@@ -43,7 +44,7 @@ def test_only_slaves_and_lsl_listen_beyond_this_machine() -> None:
         (Listener("master run", "tcp", "0.0.0.0", 47802), False),
         (Listener("master run", "udp", "::", 1), False),
         (Listener("master export", "tcp", "127.0.0.1", 1), False),
-        (Listener("slave imu", "udp", "0.0.0.0", 47800), True),
+        (Listener("slave run", "udp", "0.0.0.0", 47800), True),
         (Listener("slave run", "tcp", "127.0.0.1", 22), False),
     ],
 )

@@ -1,7 +1,7 @@
 // What a wrist device is built on: camera and laser 30 mm apart, four LEDs about the lens, a strap, an IMU.
 // It sits under the wrist, the camera looks along the palm at the fingers. All lengths in millimetres.
 
-apart = 30;           // lens to laser (Digits, UIST 2012); measured by `calibrate laser-plane`
+apart = 30;           // lens to laser (Digits, UIST 2012); measured by `calibrate wrist laser-plane`
 base = [52, 46, 4];   // on the forearm, between two slits for a strap of 25 mm
 wall = [52, 4, 56];   // what camera, laser and LEDs look out of
 holes = [21, 12.5];   // M2, camera module 1, 2, 3

@@ -1,53 +1,32 @@
-"""`phalanx-master check`: the checklist of a running master in the terminal; the exit code says whether all is well."""
+"""`phalanx check`: the checklist of a running master in the terminal; the exit code says whether all is well."""
 
-import sys
-from typing import Annotated
-
-import typer
+from argparse import Namespace
 
 from common.bus import Subscription
 from common.errors import BusError
 from common.messages import CheckItem, Checklist
 from common.streams import MASTER
+from common.terminal import echo
 from master.master_bus import join_bus
-from master.options import HERE_BUS, BusEnd, Site
 
 ANSWER_S = 3.0  # a master tells once a second
 
 
-def check(
-    bus: BusEnd = HERE_BUS,
-    site: Site = None,
-    watch: Annotated[
-        bool, typer.Option("--watch", help="Go on until Ctrl-C, and print the list whenever it changes.")
-    ] = False,
-) -> None:
-    """Print what is not as it should be; exit code 1 if there is anything, 0 if all is well.
-
-    What each line means, how it is measured and what to do: docs/checklist.md.
-
-    Examples:
-
-      phalanx-master check
-
-      phalanx-master check --watch
-
-      phalanx-master check --keys DIR --bus tls/192.168.1.2:47802 && echo ready
-    """
+def check(options: Namespace) -> int:
+    """Print what is not as it should be; exit code 1 if there is anything, 0 if all is well."""
     items: tuple[CheckItem, ...] = ()
-    connection = join_bus(bus, site)
+    connection = join_bus(options.bus, options.site)
     try:
         lists = connection.subscribe("checklist", MASTER)
-        items = newest(lists, bus)
-        typer.echo("\n".join(lines(items)))
-        while watch:
-            items = _follow(lists, items, bus)
+        items = newest(lists, options.bus)
+        echo("\n".join(lines(items)))
+        while options.watch:
+            items = _follow(lists, items, options.bus)
     except KeyboardInterrupt:
         pass
     finally:
         connection.close()
-    if items:
-        sys.exit(1)
+    return 1 if items else 0
 
 
 def newest(lists: Subscription, where: str) -> tuple[CheckItem, ...]:
@@ -77,5 +56,5 @@ def _follow(lists: Subscription, before: tuple[CheckItem, ...], where: str) -> t
     """Wait for a list; print it where it is another one."""
     items = newest(lists, where)
     if [(one.code, one.subject) for one in items] != [(one.code, one.subject) for one in before]:
-        typer.echo("\n".join(["", *lines(items)]))
+        echo("\n".join(["", *lines(items)]))
     return items

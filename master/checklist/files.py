@@ -67,18 +67,16 @@ def _judge_rig(calibration: Path, name: str, used: Mapping[str, CameraPlan]) -> 
         yield _absent(
             name,
             f"Rig {name}: the places of its cameras are not measured.",
-            "`phalanx-master calibrate stereo`.",
+            "`phalanx calibrate cameras stereo`.",
         )
     for key in ("laser_plane", "T_camera_palm") if rig.kind == "wrist" else ():
         if getattr(rig, key) is None:
-            yield _absent(
-                name, f"Rig {name}: {key} is not measured.", "`phalanx-master calibrate --help`: wrist."
-            )
+            yield _absent(name, f"Rig {name}: {key} is not measured.", "`phalanx calibrate --help`: wrist.")
     if rig.imu is not None and not rig.imu.placed:
         yield _absent(
             rig.imu.name,
             f"IMU {rig.imu.name}: how it is mounted is not known; its orientation is not used.",
-            "`phalanx-master calibrate extrinsics`.",
+            "`phalanx calibrate wrist mounting`.",
         )
     for camera in rig.cameras:
         yield from _judge_camera(calibration, rig, camera, used.get(camera))
@@ -93,7 +91,7 @@ def _judge_camera(
         return
     if file.intrinsics is None:
         yield _absent(
-            name, f"Camera {name}: its lens is not measured.", "`phalanx-master calibrate intrinsics`."
+            name, f"Camera {name}: its lens is not measured.", "`phalanx calibrate cameras intrinsics`."
         )
     if used is not None and (file.width_px, file.height_px) != used.size_px:
         yield _stale(
@@ -108,14 +106,14 @@ def _judge_camera(
             yield _stale(
                 name,
                 f"The lens of camera {name} was measured after {part} of rig {rig.name}, which rest on it.",
-                f"Measure {part} anew: `phalanx-master calibrate --help`.",
+                f"Measure {part} anew: `phalanx calibrate --help`.",
             )
     law = rig.depth_model
     if law != "stereo" and _older(rig.provenance.get(law), rig.provenance.get("T_rig_camera")):
         yield _stale(
             rig.name,
             f"The cameras of rig {rig.name} were placed anew after its depth model was fitted.",
-            "Fit it anew: `phalanx-master calibrate depth`.",
+            "Fit it anew: `phalanx calibrate depth`.",
         )
 
 

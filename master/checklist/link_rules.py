@@ -108,7 +108,7 @@ class LinkRules:
             name,
             unknown_peer is not None,
             f"{name} at {host} speaks wire version {version}, this master {WIRE_VERSION}: neither takes the other.",
-            "Install the same version of Phalanx on both, for example by phalanx deploy.",
+            "Install the same version of Phalanx on both, for example by phalanx fleet deploy.",
         )
         yield Verdict(
             "secret_mismatch",
@@ -116,8 +116,8 @@ class LinkRules:
             sender.unproven is not None,
             f"Somebody at {sender.unproven and sender.unproven.host} says that he is {name}, and has not the secret"
             " that this master has for it.",
-            f"phalanx deploy brings it, device-{name}.secret; both sides need --keys, or both the rig key alone. If"
-            " that machine is not yours: phalanx-master keys revoke.",
+            f"phalanx fleet deploy brings it, device-{name}.secret; both sides need --keys, or both the rig key alone."
+            " If that machine is not yours: phalanx fleet keys --revoke.",
         )
 
         yield Verdict(
@@ -126,8 +126,8 @@ class LinkRules:
             sender.markers is not None,
             f"{name} sends {sender.markers and sender.markers.sent} markers, the rig of this master has"
             f" {sender.markers and sender.markers.expected}: nothing of it is used.",
-            "Give both the same rig file: phalanx deploy brings this one's to the slave; then restart the master if the"
-            " file here has changed since it began.",
+            "Give both the same rig file: phalanx fleet deploy brings this one's to the slave; then restart the master"
+            " if the file here has changed since it began.",
         )
 
     def _is_silent(self, name: str, sender: SenderNow, t_ns: int) -> bool | None:
@@ -184,7 +184,7 @@ class LinkRules:
             name,
             silent,
             f"IMU {name} {'was never received' if never else 'is not received any more'}.",
-            f"Is its slave running (phalanx-slave imu --name {name}), and the IMU plugged in?",
+            f"Is its slave running (phalanx-slave run --name {name} --imu DRIVER), and the IMU plugged in?",
         )
 
     def _slow(self, camera: CameraPlan, reports: SlaveReports | None, t_ns: int) -> Verdict:

@@ -53,5 +53,5 @@ class MovedRule:
 
 
 def _verdict(cameras: tuple[str, ...], wrong: bool | None, sentence: str) -> Verdict:
-    fix = "A camera was knocked, or has another lens: measure the places anew, `phalanx-master calibrate stereo`."
+    fix = "A camera was knocked, or has another lens: measure the places anew, `phalanx calibrate cameras stereo`."
     return Verdict("camera_moved", "-".join(cameras), wrong, sentence, fix, cameras)

@@ -88,8 +88,8 @@ def _settings(name: str, reports: SlaveReports) -> Iterator[Verdict]:
         name,
         bool(wrong),
         f"Camera {name} reads back other settings than it was given: {'; '.join(wrong)}.",
-        f"Something else sets it, or an automatic is on: close other programs that use it, then `phalanx-master"
-        f" camera {name}`, or start its slave anew.",
+        f"Something else sets it, or an automatic is on: close other programs that use it, then"
+        f" `phalanx camera {name}`, or start its slave anew.",
     )
 
 

@@ -59,7 +59,7 @@ def follow(state: ConsoleState, settings: OutputSettings) -> None:
     ours = PROCESS in state.local.running()
     if wanted and not ours and not _of_others(state):
         tree = ["--calibration", str(state.settings.calibration), "--bus", state.settings.bus]
-        state.local.start(PROCESS, [sys.executable, "-m", "master.send", *tree], {})
+        state.local.start(PROCESS, [sys.executable, "-m", "master", "send", *tree], {})
     elif not wanted and ours:
         state.local.stop(PROCESS)
 

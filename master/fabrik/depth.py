@@ -144,7 +144,7 @@ def depth_law(rig: RigCalibration, cameras: Sequence[CameraModel]) -> PowerLaw |
     if law is None:
         raise CalibrationError(
             f"rig {rig.name!r}: depth_model is {model!r} but the key {model!r} is missing: fit it with"
-            " `phalanx-master calibrate depth`, or use 'stereo'"
+            " `phalanx calibrate depth`, or use 'stereo'"
         )
     if crooked := _crooked(*cameras[:2]):
         raise CalibrationError(

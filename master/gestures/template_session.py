@@ -81,7 +81,7 @@ def held(poses: list[HandPose], model: HandModel) -> list[HandFeatures]:
 def what_lacks(frames: list[HandFeatures]) -> str:
     """Why a hold is no example; nothing where it is one."""
     if len(frames) < SHORTEST:
-        return "no hand was seen; is `phalanx-master run` running, on this --bus, with the hand in sight"
+        return "no hand was seen; is `phalanx run` running, on this --bus, with the hand in sight"
     speed = FingerSpeed()
     speeds = sorted(speed.push(one.t_ns, *known_bends(one)) for one in frames)
     middle = speeds[len(speeds) // 2]

@@ -5,7 +5,7 @@ transfer, 8 to 10 ms; and nothing that travels with the frame tells. The tracks 
 
 `ResidualTiming` takes every message and compares a second at once, some frames later, one step of the work with each
 message: most cost no more than being kept, a few in a second a fraction of a millisecond. What it finds is corrected
-nowhere by itself: it is reported, and `phalanx-master calibrate time` writes it into the rig.
+nowhere by itself: it is reported, and `phalanx calibrate time` writes it into the rig.
 """
 
 from collections import deque

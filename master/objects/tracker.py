@@ -63,7 +63,7 @@ class TrackerLine:
             missing = "T_rig_tracking" if rig.T_rig_tracking is None else "T_object_tracker"
             raise CalibrationError(
                 f"object {profile.name!r}: its tracker {profile.tracker!r} is not registered to rig {rig.name!r},"
-                f" {missing} is missing: phalanx-master calibrate tracker {profile.name}"
+                f" {missing} is missing: phalanx calibrate tracker {profile.name}"
             )
         self.name, self.source = profile.name, profile.tracker
         self._T_rig_tracking = np.array(rig.T_rig_tracking, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Publishes what trackers say, on the master's clock, for who registers one: `phalanx-master calibrate tracker --live`.
+"""Publishes what trackers say, on the master's clock, for who registers one: `phalanx calibrate tracker --live`.
 
 A tracker's poses come as datagrams, to the master alone, and mean nothing in the rig until it is registered. So that
 the registration can see them beside the objects' poses without being a master itself, they go on the bus as they came.

@@ -1,4 +1,4 @@
-"""The recorder that `phalanx-master run --record FILE` starts: a process of its own, with an end of its own.
+"""The recorder that `phalanx run --record FILE` starts: a process of its own, with an end of its own.
 
 It is there before the first message is taken, so that a replay is what was told live from the first pose on. Its
 standard input is a pipe from this process: when that closes, because we end it or because we died, it ends its file. It

@@ -1,19 +1,14 @@
-"""`phalanx-master info`."""
+"""`phalanx info`."""
 
-import typer
+from argparse import Namespace
 
 from common.recording import open_messages
-from master.options import MessageFile
+from common.terminal import echo
 from master.recording.lines import events_of, table
 
 
-def info(file: MessageFile) -> None:
-    """Show what is in a recording of messages: streams, rates, length, files, and what happened.
-
-    Examples:
-
-      phalanx-master info out/wave.mcap
-    """
-    recording = open_messages(file)
+def info(options: Namespace) -> None:
+    """Show what is in a recording of messages: streams, rates, length, files, and what happened."""
+    recording = open_messages(options.file)
     events = events_of(recording)
-    typer.echo("\n".join(table(recording, events)))
+    echo("\n".join(table(recording, events)))

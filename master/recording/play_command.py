@@ -1,63 +1,34 @@
-"""`phalanx-master play`."""
+"""`phalanx play`."""
 
 import sys
-from pathlib import Path
-from typing import Annotated
-
-import typer
+from argparse import Namespace
 
 from common.errors import PhalanxError
+from common.terminal import echo
 from master.master_bus import host_bus
-from master.options import HERE_BUS, BusEnd, MessageFile
 from master.recording.lines import ProgressLine, bar
 from master.recording.play import PlaySettings, run_play
 from master.stopping import stop_on_signals
 
 
-def play(
-    file: MessageFile,
-    speed: Annotated[
-        str, typer.Option(help="1: as it was; 0.5: half as fast; max: as fast as it goes.")
-    ] = "1",
-    from_s: Annotated[
-        float | None, typer.Option("--from", help="Begin so many s after the beginning.")
-    ] = None,
-    to_s: Annotated[float | None, typer.Option("--to", help="End so many s after the beginning.")] = None,
-    bus: BusEnd = HERE_BUS,
-    no_bus: Annotated[
-        bool, typer.Option("--no-bus", help="Tell it nobody; with --out, or for the sums.")
-    ] = False,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for poses.npz and what else there is, as of `run --poses`.")
-    ] = None,
-    loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end, until Ctrl-C.")] = False,
-    solved: Annotated[
-        bool, typer.Option("--solved", help="Tell what was told live, instead of solving it again.")
-    ] = False,
-) -> None:
-    """Play a recording: what the master took is solved again, with the files that it carries, and goes to the bus as
-    from a live master. At the end stands a SHA-256 of all poses: it is the same at any speed.
-
-    While it plays, the bus answers the commands pause, resume, seek and speed. After a jump, and with --from, the two
-    seconds before are solved silently, so that filters have settled; what follows is near to that of a whole pass,
-    not equal to it.
-
-    Examples:
-
-      phalanx-master play out/wave.mcap
-
-      phalanx-master play out/wave.mcap --speed max --no-bus --out out/wave
-
-      phalanx-master play out/wave.mcap --speed 0.5 --from 10 --to 20 --loop
-    """
-    settings = PlaySettings(file, _speed(speed), from_s, to_s, out, loop, solved)
+def play(options: Namespace) -> None:
+    """Play a recording."""
+    settings = PlaySettings(
+        options.file,
+        _speed(options.speed),
+        options.from_s,
+        options.to_s,
+        options.out,
+        options.loop,
+        options.solved,
+    )
     stop, line = stop_on_signals(), ProgressLine(sys.stderr, "play")
 
     def show(position_s: float, length_s: float) -> None:
         done = position_s / length_s if length_s > 0.0 else 1.0
         line.show(f"{bar(done)} {position_s:.1f} of {length_s:.1f} s")
 
-    connection = None if no_bus else host_bus(bus)
+    connection = None if options.no_bus else host_bus(options.bus)
     try:
         passed = run_play(settings, connection, stop, _player_status, show)
     finally:
@@ -66,9 +37,9 @@ def play(
     poses = passed.digest.counts["poses"]
     line.end(f"{poses} poses in {passed.seconds:.2f} s, {passed.poses_per_s:.0f} poses/s")
     if not passed.whole:
-        typer.echo("played in part, or with jumps: these are not the sums of the whole recording")
+        echo("played in part, or with jumps: these are not the sums of the whole recording")
     for text in passed.digest.lines():
-        typer.echo(text)
+        echo(text)
 
 
 def _speed(text: str) -> float:
@@ -87,4 +58,4 @@ def _speed(text: str) -> float:
 
 
 def _player_status(line: str) -> None:
-    typer.echo(f"play: {line}")
+    echo(f"play: {line}")

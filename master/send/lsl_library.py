@@ -104,7 +104,7 @@ def load_library(scope: str, bound_scope: str | None) -> Library:
         if bound_scope != scope:
             raise PhalanxError(
                 f"lsl.scope is {scope!r}, but liblsl began with {bound_scope!r} in this process: start"
-                " `phalanx-master send` anew"
+                " `phalanx send` anew"
             )
         return library
     if scope == "machine":

@@ -42,14 +42,14 @@ def claim(folder: Path, rig: RigCalibration) -> None:
 
 
 def detect(folder: Path, camera: str, hand: Path, out: Path) -> None:
-    """Run `phalanx-slave detect` on a recording of a wrist camera, into the folder `out`.
+    """Run `phalanx-slave run -o` on a recording of a wrist camera, into the folder `out`.
 
     Raises:
         PhalanxError: It ended with an error, which the text repeats.
     """
     out.mkdir(parents=True, exist_ok=True)
     file = out / f"detections_{camera}.npz"
-    command = ["detect", str(folder), "--camera", camera, "--hand", str(hand), "-o", str(file)]
+    command = ["run", "--name", camera, "--camera", f"replay:{folder}", "--hand", str(hand), "-o", str(file)]
     # What the slave prints as it goes is not kept; its last lines are.
     with subprocess.Popen(
         [sys.executable, "-m", "slave", *command],
@@ -105,7 +105,7 @@ def write_exact(folder: Path, camera: str, out: Path) -> None:
 
 
 def solved(folder: Path, hand: HandProfile, detections: Path, solver_mode: SolverMode | None) -> Poses:
-    """Solve detections of a recording as `phalanx-master solve` does; poses.npz and summary.json go beside them.
+    """Solve detections of a recording as `phalanx replay` does; poses.npz and summary.json go beside them.
 
     Raises:
         RecordingError: A file is missing or broken, or nothing was seen at all.

@@ -88,7 +88,7 @@ def record_trials(
 
 
 def record_guided(folder: Path, who: Participant, camera: CameraCalibration, count: int, step: int) -> None:
-    """Render the guided motion of `calibrate subject` in `count` triples, evenly over it; arguments as above.
+    """Render the guided motion of `calibrate wrist subject` in `count` triples, evenly over it; arguments as above.
 
     The motion is slow: within a triple the hand is taken to stand still.
 

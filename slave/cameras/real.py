@@ -1,4 +1,4 @@
-"""The real cameras behind `--camera`: their options on the command line, and how they are opened, and opened again."""
+"""The real cameras behind `--camera`: how they are opened, and opened again."""
 
 import argparse
 import threading
@@ -17,7 +17,6 @@ from slave.cameras.source import FrameSource
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
 from slave.service import LOST_PATIENCE_S, ConnectionLost, nobody
 
-CAMERAS = "picamera2[:INDEX] | v4l2[:DEVICE]"
 DRIVERS = ("picamera2", "v4l2")
 # Option -> its driver and the value that means "not given".
 OPTIONS: dict[str, tuple[str, object]] = {
@@ -26,45 +25,6 @@ OPTIONS: dict[str, tuple[str, object]] = {
     "control": ("v4l2", []),
     "allow_missing": ("v4l2", []),
 }
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the real cameras."""
-    parser.add_argument(
-        "--luma",
-        action="store_true",
-        help="wrist device with a colour camera (without infrared filter): its luma in place of grey frames of a "
-        "monochrome sensor; it is not linear in the light",
-    )
-    pi = parser.add_argument_group("Pi camera (picamera2)")
-    pi.add_argument(
-        "--sync",
-        choices=("off", "server", "client"),
-        default="off",
-        help="frames in step with other Pi cameras: one leads, the others follow; start clients first",
-    )
-    pi.add_argument(
-        "--sync-timeout",
-        type=float,
-        default=60.0,
-        metavar="S",
-        help="how long to wait for them (default: %(default)s)",
-    )
-    usb = parser.add_argument_group("USB camera (v4l2)")
-    usb.add_argument(
-        "--control",
-        action="append",
-        default=[],
-        metavar="NAME=N",
-        help="fix a control in codes of its maker, for example gain=32; may be repeated",
-    )
-    usb.add_argument(
-        "--allow-missing",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="exposure | gain | white_balance: the camera lacks this control, and that is known; may be repeated",
-    )
 
 
 def open_real(
@@ -81,7 +41,7 @@ def open_real(
 
     Args:
         driver: The value of `--camera`.
-        options: What `add_options` added.
+        options: Of `run` or `record`.
         camera: The camera file.
         clock: The slave's clock.
         stop: Set when the slave is to end; until then a lost camera is opened again. None: losing it is an error.

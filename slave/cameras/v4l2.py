@@ -13,7 +13,7 @@ How far a stamp scatters. A driver that stamps in its interrupt: 50 us, the late
 reads the clock when it sees the first packet, and it sees packets when their transfer is over: of up to 32 microframes
 of 125 us, so anywhere within 4 ms, 1.2 ms as standard deviation. With `hwtimestamps=1` it follows the camera's own
 clock by USB's frame numbers, one per ms: 0.3 ms. How late *all* frames are, by exposure and by what the camera keeps,
-is no scatter and unknown here: `phalanx-master calibrate time` measures it.
+is no scatter and unknown here: `phalanx calibrate time` measures it.
 
 Its settings, which another thread may change while frames are read, are in `v4l2_settings`.
 """

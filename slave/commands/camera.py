@@ -1,4 +1,4 @@
-"""The camera of `run` and `record`: its options, and how it is opened, with the lights of a wrist device."""
+"""How the camera of `run` and `record` is opened, with the lights of a wrist device."""
 
 import argparse
 import threading
@@ -11,30 +11,13 @@ from common.clock import Clock
 from common.errors import CameraError
 from slave.cameras import real
 from slave.cameras.source import FrameSource
-from slave.commands.options import add_place, add_simulated, epoch_of, number, world_of
-from slave.lights.factory import CHOICES, SYNTHETIC, choose, limits_for, open_guarded
+from slave.commands.options import epoch_of, world_of
+from slave.drivers import CAMERAS
+from slave.lights.factory import SYNTHETIC, choose, limits_for, open_guarded
 from slave.service import ConnectionLost, nobody
 
 if TYPE_CHECKING:
     from slave.cameras.synthetic import LitBy
-
-CAMERAS = f"{real.CAMERAS} | synthetic | replay:FOLDER"
-
-
-def add_camera(command: argparse.ArgumentParser) -> None:
-    """All that opening a camera asks for."""
-    add_place(command, "camera of this slave, a member of the rig")
-    command.add_argument("--camera", required=True, metavar="DRIVER", help=CAMERAS)
-    command.add_argument(
-        "--lights",
-        metavar="DRIVER",
-        help=f"who switches laser and LEDs of a wrist device: {CHOICES} (docs/safety.md); the last two: the camera's "
-        "own strobe output, or another controller. Before a synthetic camera synthetic (default) or camera",
-    )
-    real.add_options(command)
-    sim = command.add_argument_group("synthetic camera")
-    add_simulated(sim.add_argument)
-    sim.add_argument("--start-offset-ms", type=number, default=0.0, metavar="Z", help="its frames come later")
 
 
 def open_lit(
@@ -49,7 +32,7 @@ def open_lit(
     """Open the camera, and the lights of a wrist device, which are dark before it is opened.
 
     Args:
-        options: What `add_camera` added.
+        options: Of `run` or `record`.
         rig: Whose camera it is.
         camera: The camera file.
         clock: The slave's clock.

@@ -1,48 +1,17 @@
-"""`phalanx-slave detect`: what a camera of a recording shows, the same bytes on every run."""
+"""`phalanx-slave run -o`: what a camera of a recording shows, the same bytes on every run."""
 
 import argparse
 from collections.abc import Callable
 from pathlib import Path
 
+from common.command_line import UsageError
 from common.errors import CalibrationError
+from common.terminal import remark
 
-PURPOSE = "detect in a recording"
-EXAMPLES = """\
-  phalanx-slave detect recordings/wave --camera left --calibration calib_json -o detections_left.npz
-        offline: every frame of one camera, the same bytes on every run; of a rig whose objects have tags those, too:
-        tags_left.npz beside it
-  phalanx-slave detect recordings/curl --camera wrist --calibration calib_json -o detections_wrist.npz
-        of a wrist device: laser points and fingertips of every strobed triple; the hand is DIR/hands/RIG'S HAND.json
-"""
 _EVERY = 500  # frames, between two lines that say how far it is
 
 
-def add_options(command: argparse.ArgumentParser) -> None:
-    """The options of `detect`."""
-    command.add_argument(
-        "recording", type=Path, metavar="RECORDING", help="folder with recording.json, frames.csv"
-    )
-    command.add_argument("--camera", required=True, metavar="NAME")
-    command.add_argument(
-        "--calibration",
-        type=Path,
-        metavar="DIR",
-        help="its cameras/NAME.json gives the colours; for a wrist device its hands/ the hand",
-    )
-    command.add_argument(
-        "--scan",
-        choices=("full", "windows"),
-        default="full",
-        help="where markers are looked for: in the full frame, or in windows about where they are expected, as a live "
-        "slave does where full frames do not fit (default: %(default)s; docs/cameras.md)",
-    )
-    command.add_argument("--hand", type=Path, metavar="FILE", help="hand profile, for a wrist device")
-    command.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="FILE", help="detections_NAME.npz"
-    )
-
-
-def run(options: argparse.Namespace, aside: Callable[[str], None]) -> int:
+def detect(options: argparse.Namespace) -> int:
     """Detect markers, or fingers before a wrist device, in every frame.
 
     Raises:
@@ -51,44 +20,56 @@ def run(options: argparse.Namespace, aside: Callable[[str], None]) -> int:
     from common.frame_recording import load_manifest
     from slave.cameras.replay import is_grey
 
+    camera, recording = _source(options)
+
     def progress(done: int, total: int) -> None:
         if done % _EVERY == 0 or done == total:
-            aside(f"{options.camera}: {done} of {total} frames")
+            remark(f"{camera}: {done} of {total} frames")
 
-    if is_grey(load_manifest(options.recording), options.camera):
-        if options.scan != "full":
-            raise CalibrationError(f"--scan: camera {options.camera!r} sees no markers")
-        _detect_fingers(options, progress, aside)
+    if is_grey(load_manifest(recording), camera):
+        if options.scan == "windows":
+            raise CalibrationError(f"--scan: camera {camera!r} sees no markers")
+        _detect_fingers(options, recording, progress)
         return 0
     if options.hand is not None:
-        raise CalibrationError(
-            f"--hand: camera {options.camera!r} sees markers; only a wrist camera knows a hand"
-        )
-    _detect_markers(options, progress)
+        raise CalibrationError(f"--hand: camera {camera!r} sees markers; only a wrist camera knows a hand")
+    _detect_markers(options, recording, progress)
     return 0
 
 
-def _detect_markers(options: argparse.Namespace, progress: Callable[[int, int], None]) -> None:
+def _source(options: argparse.Namespace) -> tuple[str, Path]:
+    """Camera and recording.
+
+    Raises:
+        UsageError: They are not named.
+    """
+    kind, _, folder = str(options.camera).partition(":")
+    if kind != "replay" or not folder:
+        raise UsageError("-o writes what is detected in a recording: --camera replay:FOLDER")
+    return str(options.name), Path(folder)
+
+
+def _detect_markers(
+    options: argparse.Namespace, recording: Path, progress: Callable[[int, int], None]
+) -> None:
     from slave.offline import detect_recording, save_detections, tag_collector
 
-    tags = tag_collector(options.recording, options.camera, options.calibration)
+    tags = tag_collector(recording, options.name, options.calibration)
     windows = options.scan == "windows"
     found = detect_recording(
-        options.recording, options.camera, options.calibration, progress, tags, windows_only=windows
+        recording, options.name, options.calibration, progress, tags, windows_only=windows
     )
     save_detections(options.output, found)
     if tags is not None:
-        save_detections(options.output.parent / f"tags_{options.camera}.npz", tags.all())
+        save_detections(options.output.parent / f"tags_{options.name}.npz", tags.all())
 
 
 def _detect_fingers(
-    options: argparse.Namespace, progress: Callable[[int, int], None], aside: Callable[[str], None]
+    options: argparse.Namespace, recording: Path, progress: Callable[[int, int], None]
 ) -> None:
     from slave.offline import save_detections
     from slave.wrist.offline import detect_wrist_recording
 
-    done = detect_wrist_recording(
-        options.recording, options.camera, options.calibration, options.hand, progress
-    )
-    aside(f"{options.camera}: {done.summary()}")
+    done = detect_wrist_recording(recording, options.name, options.calibration, options.hand, progress)
+    remark(f"{options.name}: {done.summary()}")
     save_detections(options.output, done.detections)

@@ -1,91 +1,37 @@
-"""`phalanx-slave imu`: sends what an IMU measures, or takes in a recording of one."""
+"""`phalanx-slave run --imu` sends what an IMU measures; `record --imu-csv` takes in a table of one."""
 
 import argparse
 import os
-from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from common.clock import SystemClock
 from common.errors import CalibrationError
-from common.imu_csv_columns import ACCEL, GYRO, MAG, TIME, UNITS
-from slave.commands.options import (
-    add_link,
-    add_place,
-    add_simulated,
-    clock_of,
-    epoch_of,
-    positive,
-    rig_of,
-    secrets_of,
-    world_of,
-)
+from common.imu_csv_columns import ACCEL, GYRO, MAG, TIME
+from common.terminal import echo
+from slave.commands.options import clock_of, epoch_of, rig_of, secrets_of, world_of
 from slave.imu import factory
 from slave.service import Service
 from slave.stopping import stop_by_signal
 
 if TYPE_CHECKING:
     from slave.imu.source import ImuSource
-
-PURPOSE = "send what an IMU measures"
-EXAMPLES = """\
-  phalanx-slave imu --name imu --rig wrist --imu synthetic --bind 127.0.0.1 --key-file rig.key
-        waits for the master's start, then sends one sealed datagram per sample: that of the simulated hand; with
-        cameras in other processes, all with the same --scene, --seed and --scene-epoch-ns
-  phalanx-slave imu --list
-        says which serial ports and I2C buses there are, then ends
-  phalanx-slave imu --name imu --rig wrist --imu ximu3:/dev/serial/by-id/PORT --key-file rig.key
-        an x-IMU3 on USB; on the pins of a Pi: ximu3:/dev/serial0@115200; docs/imu.md says what is set and checked
-  phalanx-slave imu --name imu --rig wrist --imu lsm6dsox:1:0x6a --key-file rig.key
-        an LSM6DSOX on I2C bus 1 of a Pi
-  phalanx-slave imu --csv walk.csv --gyro-unit deg/s --out recordings/walk
-        reads a CSV with a header (docs/imu.md), says its rate, gaps, bias and orientation, and writes imu.csv;
-        against a quaternion in it, how right the tilt is. No device, no master
-"""
+USUAL_NAME = "imu"
 
 
-def add_options(command: argparse.ArgumentParser) -> None:
-    """The options of `imu`."""
-    add_place(command, "IMU of this slave, that of the rig (default: imu)", default="imu")
-    factory.add_options(command)
-    _add_csv(command.add_argument_group("a recording (--csv)").add_argument)
-    add_link(command)
-    add_simulated(command.add_argument_group("synthetic IMU").add_argument)
-
-
-def _add_csv(add: Callable[..., argparse.Action]) -> None:
-    add(
-        "--out",
-        "-o",
-        type=Path,
-        metavar="FOLDER",
-        help="where its imu.csv goes (default: it is only looked at)",
-    )
-    for what in (TIME, GYRO, ACCEL, MAG):
-        text = f"unit of {what} where the header does not say it"
-        add(f"--{what}-unit", choices=tuple(UNITS[what]), help=text)
-    add(
-        "--rate-hz",
-        type=positive,
-        metavar="HZ",
-        help="samples per second of a table without a column of time",
-    )
-
-
-def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
-    """Send samples until it is told to end, or take in a recording.
+def send_imu(options: argparse.Namespace) -> int:
+    """Send samples until it is told to end.
 
     Raises:
         PhalanxError: A file, the IMU, a key or the network is not as it must be.
     """
-    if options.csv is not None:
-        return _take_in(options, notify)
     from slave.imu.live import run_live
     from slave.imu.synthetic import SyntheticImu
     from slave.simulated import imu_of
     from slave.uplink import Uplink
 
     rig = rig_of(options)
+    if options.name is None:
+        options.name = USUAL_NAME if rig.imu is None else rig.imu.name
     if rig.imu is None or options.name != rig.imu.name:
         has = "it has none" if rig.imu is None else f"its IMU is {rig.imu.name!r}"
         raise CalibrationError(f"rig {rig.name!r} has no IMU {options.name!r}; {has}")
@@ -95,7 +41,7 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     key, access = secrets_of(options)
 
     def print_line(line: str) -> None:
-        notify(f"{options.name}: {line}")
+        echo(f"{options.name}: {line}")
 
     service = Service(os.environ, noun="samples")
     with stop_by_signal() as stop:
@@ -112,10 +58,16 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     return 0
 
 
-def _take_in(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
+def import_table_of_imu(options: argparse.Namespace) -> int:
+    """Notify what is in the table of an IMU, and write imu.csv if a folder is given.
+
+    Raises:
+        PhalanxError: It is missing or broken.
+    """
     from common.imu_csv import read_csv
     from slave.imu.importing import import_table
 
     units = {what: unit for what in (TIME, GYRO, ACCEL, MAG) if (unit := getattr(options, f"{what}_unit"))}
-    import_table(read_csv(options.csv, units, options.rate_hz), options.name, options.out, notify)
+    table = read_csv(options.imu_csv, units, options.rate_hz)
+    import_table(table, options.name or USUAL_NAME, options.output, echo)
     return 0

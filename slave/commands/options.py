@@ -1,9 +1,7 @@
-"""Options that several commands have, and what they name: numbers, files of calib_json, clocks, keys."""
+"""What the options of several commands name: files of calib_json, clocks, keys."""
 
 import argparse
-import math
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,119 +14,17 @@ if TYPE_CHECKING:
     from common.keys import Access
     from common.link_key import LinkKey
 
-BEACON_PORT = 47800
-BOTH = "grasp | both-poses | both-curl | both-travel | both-moves | gestures"  # the same motion for both kinds of rig
+USUAL_RIG = "desk"
+USUAL_TREE = Path("calib_json")
 
 
-def add_place(command: argparse.ArgumentParser, who: str, default: str | None = None) -> None:
-    """Who this slave is, and whose; without a default it has to be said."""
-    command.add_argument("--name", required=default is None, default=default, help=who)
-    add_rig(command)
-
-
-def add_rig(command: argparse.ArgumentParser, default: str = "desk", with_key: str = "") -> None:
-    """Which rig, and where its files are; `with_key` says what its file must have."""
-    text = f"rig, a file in DIR/rigs{with_key} (default: %(default)s)"
-    command.add_argument("--rig", default=default, help=text)
-    command.add_argument("--calibration", type=Path, default=Path("calib_json"), metavar="DIR")
-
-
-def add_link(command: argparse.ArgumentParser) -> None:
-    """How it finds its master."""
-    command.add_argument(
-        "--beacon-port", type=port, default=BEACON_PORT, metavar="PORT", help="default: %(default)s"
-    )
-    command.add_argument(
-        "--bind", default="0.0.0.0", metavar="ADDRESS", help="own address (default: every network)"
-    )
-    command.add_argument(
-        "--keys",
-        type=Path,
-        metavar="DIR",
-        help="keys folder of this device: rig key and certificate (docs/keys.md); default: environment PHALANX_KEYS",
-    )
-    command.add_argument(
-        "--key-file", type=Path, metavar="FILE", help="rig key alone; default: environment PHALANX_RIG_KEY"
-    )
-    command.add_argument(
-        "--open",
-        action="store_true",
-        help="join the bus of a master that is not encrypted: only in a closed laboratory; also PHALANX_OPEN=1",
-    )
-
-
-def add_simulated(add: Callable[..., argparse.Action]) -> None:
-    """Which scene a simulated sensor senses, and by what clock."""
-    add(
-        "--scene",
-        default="standard",
-        metavar="NAME",
-        help=f"standard | lights | poses | hand-routine | object | leap:FILE.npz | {BOTH} | board | card; before a "
-        f"wrist device standard | curl | subject | poses | spread | random | {BOTH}, each with @dark | @indoor | "
-        "@bright | @sun, or board",
-    )
-    add("--seed", type=int, default=7)
-    add(
-        "--truth",
-        type=Path,
-        metavar="DIR",
-        help="calib_json tree that says how the simulated world is: lenses, places, paints, hand; this slave goes on "
-        "believing --calibration, where they may be unknown (default: it believes the truth)",
-    )
-    add("--truth-rig", metavar="NAME", help="the rig in it, a file in DIR/rigs (default: of the same name)")
-    add("--scene-epoch-ns", type=int, metavar="N", help="CLOCK_MONOTONIC at scene time 0; default: now")
-    add("--clock-offset-ms", type=number, default=0.0, metavar="X", help="this machine's clock is ahead")
-    add("--clock-ppm", type=number, default=0.0, metavar="Y", help="and gains on the true one")
-
-
-def positive(text: str) -> float:
-    """A number above 0."""
-    value = number(text)
-    if not 0.0 < value:
-        raise argparse.ArgumentTypeError(f"{text}: must be positive")
-    return value
-
-
-def port(text: str) -> int:
-    """A port of UDP."""
-    if not text.isdecimal() or not 0 < int(text) < 65536:
-        raise argparse.ArgumentTypeError(f"{text}: must be a port, 1 to 65535")
-    return int(text)
-
-
-def count(text: str) -> int:
-    """A whole number from 1 on."""
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text}: must be a whole number, at least 1")
-    return int(text)
-
-
-def megabytes(text: str) -> float:
-    """A number from 0 on."""
-    value = number(text)
-    if not 0.0 <= value:
-        raise argparse.ArgumentTypeError(f"{text}: must not be negative")
-    return value
-
-
-def number(text: str) -> float:
-    """A finite number."""
-    try:
-        value = float(text)
-    except ValueError as error:  # argparse would tell the name of the function
-        raise argparse.ArgumentTypeError(f"{text}: must be a number") from error
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text}: must be a finite number")
-    return value
-
-
-def rig_of(options: argparse.Namespace) -> RigCalibration:
-    """The rig.
+def rig_of(options: argparse.Namespace, typical: str = USUAL_RIG) -> RigCalibration:
+    """The rig; `typical` if none is named.
 
     Raises:
         CalibrationError: Its file is missing or broken.
     """
-    return load(rig_path(options), RigCalibration)
+    return load(rig_path(options, typical), RigCalibration)
 
 
 def camera_of(options: argparse.Namespace) -> tuple[RigCalibration, CameraCalibration]:
@@ -151,19 +47,22 @@ def objects_of(options: argparse.Namespace, rig: RigCalibration) -> dict[str, Ob
     Raises:
         CalibrationError: A file is missing or broken.
     """
-    return {
-        name: load(options.calibration / "objects" / f"{name}.json", ObjectProfile) for name in rig.objects
-    }
+    return {name: load(tree_of(options) / "objects" / f"{name}.json", ObjectProfile) for name in rig.objects}
 
 
-def rig_path(options: argparse.Namespace) -> Path:
-    """The rig file."""
-    return options.calibration / "rigs" / f"{options.rig}.json"
+def tree_of(options: argparse.Namespace) -> Path:
+    """The calib_json tree."""
+    return options.calibration or USUAL_TREE
+
+
+def rig_path(options: argparse.Namespace, typical: str = USUAL_RIG) -> Path:
+    """The rig file; of the rig `typical` if none is named."""
+    return tree_of(options) / "rigs" / f"{options.rig or typical}.json"
 
 
 def camera_path(options: argparse.Namespace, camera: str) -> Path:
     """The file of a camera."""
-    return options.calibration / "cameras" / f"{camera}.json"
+    return tree_of(options) / "cameras" / f"{camera}.json"
 
 
 def world_of(options: argparse.Namespace, rig: RigCalibration) -> tuple[Path, RigCalibration]:
@@ -174,7 +73,7 @@ def world_of(options: argparse.Namespace, rig: RigCalibration) -> tuple[Path, Ri
     """
     from slave.simulated import world_of as world
 
-    return world(options.calibration, rig, options.truth, options.truth_rig)
+    return world(tree_of(options), rig, options.truth, options.truth_rig)
 
 
 def epoch_of(options: argparse.Namespace, true_clock: Clock) -> int:

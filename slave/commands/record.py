@@ -1,30 +1,26 @@
-"""`phalanx-slave record`: raw frames of one camera to disk, and a real IMU beside it, without master or network."""
+"""`phalanx-slave record`: raw frames of a camera to disk, an IMU beside it; or a recording of what is there already."""
 
 import argparse
 import os
 import sys
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
+
+import cv2
 
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.clock import Clock, SkewedClock, SystemClock
+from common.command_line import UsageError
 from common.errors import CalibrationError, CameraError, PhalanxError
-from slave.commands.camera import add_camera, open_lit
-from slave.commands.options import (
-    camera_of,
-    camera_path,
-    clock_of,
-    count,
-    megabytes,
-    objects_of,
-    positive,
-    skew_of,
-    world_of,
-)
+from common.terminal import echo, remark
+from slave.commands.camera import open_lit
+from slave.commands.importing import import_foreign
+from slave.commands.imu import import_table_of_imu
+from slave.commands.join import join
+from slave.commands.options import camera_of, camera_path, clock_of, objects_of, skew_of, world_of
 from slave.imu import factory
 from slave.stopping import stop_by_signal
 
@@ -32,14 +28,6 @@ if TYPE_CHECKING:
     from common.frame_recording import Manifest
     from slave.imu.recording import ImuRecorder
     from slave.progress import Progress
-
-PURPOSE = "raw frames to disk"
-EXAMPLES = """\
-  phalanx-slave record --name left --rig desk --camera synthetic --seconds 10 -o recordings/wave-left
-        without master or network; one folder per camera
-  phalanx-slave record --name wrist --rig wrist --camera synthetic --imu ximu3:/dev/ttyACM0 --seconds 10 -o out
-        the rig's IMU beside the camera, as imu.csv on the clock of the frames
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,37 +40,28 @@ class _Scene:
     true_clock: Clock
 
 
-def add_options(command: argparse.ArgumentParser) -> None:
-    """The options of `record`."""
-    add_camera(command)
-    command.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="FOLDER", help="new or empty; one per camera"
-    )
-    command.add_argument("--seconds", type=positive, metavar="S", help="default: until Ctrl-C")
-    command.add_argument("--frames", type=count, metavar="N", help="end after so many recorded frames")
-    command.add_argument(
-        "--imu",
-        nargs="?",
-        const="synthetic",
-        metavar="DRIVER",
-        help=f"what the rig's IMU says, too, as imu.csv: {factory.REAL}; without a driver, that of a synthetic camera",
-    )
-    command.add_argument(
-        "--every-frame",
-        action="store_true",
-        help="a synthetic camera does not keep time but draws every frame, however long that takes; all cameras of one "
-        "scene need the same --scene-epoch-ns",
-    )
-    command.add_argument("--note", default="", metavar="TEXT", help="kept in recording.json")
-    command.add_argument(
-        "--reserve-mb", type=megabytes, default=200.0, metavar="MB", help="stay free (default: %(default)g)"
-    )
-    command.add_argument(
-        "--queue-mb", type=megabytes, default=128.0, metavar="MB", help="may wait (default: %(default)g)"
-    )
+def run(options: argparse.Namespace) -> int:
+    """Record a camera, or make a recording of what is there already.
+
+    Raises:
+        UsageError: The folder or the name is missing.
+        PhalanxError: A file, the camera, its lights, the IMU or the disk is not as it must be; no frame came.
+    """
+    if options.imu_csv is not None:
+        return import_table_of_imu(options)
+    if options.output is None:
+        raise UsageError("say where the recording goes: -o FOLDER")
+    if options.join is not None:
+        return join(options)
+    if options.foreign is not None:
+        return import_foreign(options)
+    if options.name is None:
+        raise UsageError("say which camera of the rig this is: --name NAME")
+    cv2.setNumThreads(1)  # small windows are faster on one thread, and the other cores stay free
+    return record_camera(options)
 
 
-def run(options: argparse.Namespace, notify: Callable[[str], None], aside: Callable[[str], None]) -> int:
+def record_camera(options: argparse.Namespace) -> int:
     """Record until the length is reached, or it is told to end.
 
     Raises:
@@ -97,7 +76,7 @@ def run(options: argparse.Namespace, notify: Callable[[str], None], aside: Calla
     imu = None
     if options.imu == "synthetic":
         imu = imu_of(str(options.camera), *world_of(options, scene.rig), options.scene, options.seed)
-    with _imu_recorder(options, scene, aside) as imu_recorder:
+    with _imu_recorder(options, scene) as imu_recorder:
         done, failure = _record(options, scene, manifest, imu_recorder)
         if imu_recorder is not None and done.frames:
             imu_recorder.keep()
@@ -110,7 +89,7 @@ def run(options: argparse.Namespace, notify: Callable[[str], None], aside: Calla
         raise failure
     if not done.frames:
         raise CameraError(f"camera {options.name!r} gave no frame; nothing was recorded")
-    notify(f"{options.name}: recorded in {options.output}")
+    echo(f"{options.name}: recorded in {options.output}")
     return 0
 
 
@@ -180,9 +159,7 @@ def _record(
 
 
 @contextmanager
-def _imu_recorder(
-    options: argparse.Namespace, scene: _Scene, aside: Callable[[str], None]
-) -> "Generator[ImuRecorder | None, None, None]":
+def _imu_recorder(options: argparse.Namespace, scene: _Scene) -> "Generator[ImuRecorder | None, None, None]":
     """A real IMU of the rig that is recorded with a camera, if one is asked for."""
     if options.imu is None or options.imu == "synthetic":
         yield None
@@ -200,4 +177,4 @@ def _imu_recorder(
         yield imu_recorder
     finally:
         counts = imu_recorder.close()
-        aside(", ".join(f"{event} {count}" for event, count in counts.items()))
+        remark(", ".join(f"{event} {count}" for event, count in counts.items()))

@@ -1,52 +1,22 @@
-"""`phalanx-slave tracker`: sends where a tracker on an object is."""
+"""`phalanx-slave run --tracker`: sends where a tracker on an object is."""
 
 import argparse
 import os
 import threading
-from collections.abc import Callable
 
 from common.calibration import RigCalibration
 from common.clock import SkewedClock, SystemClock
 from common.errors import PhalanxError
 from common.object_profile import ObjectProfile
-from slave.commands.options import (
-    add_link,
-    add_rig,
-    add_simulated,
-    clock_of,
-    epoch_of,
-    rig_of,
-    secrets_of,
-    world_of,
-)
+from common.terminal import echo
+from slave.commands.options import clock_of, epoch_of, rig_of, secrets_of, tree_of, world_of
 from slave.objects import factory
 from slave.objects.source import TrackerSource
 from slave.service import ConnectionLost, Service
 from slave.stopping import stop_by_signal
 
-PURPOSE = "send where a Vive tracker is"
-EXAMPLES = """\
-  phalanx-slave tracker tracker --rig desk-tracker --device openvr --key-file rig.key
-        by SteamVR on this PC: needs the extra `vive` and SteamVR running; docs/tracker.md
-  phalanx-slave tracker tracker --rig desk-tracker --device survive --serial LHR-1A2B3C4D --key-file rig.key
-        by libsurvive: starts survive-cli and reads its lines
-  phalanx-slave tracker tracker --rig desk-tracker --device survive:walk.rec.gz --key-file rig.key
-        what survive-cli --record wrote, at its pace
-  phalanx-slave tracker tracker --rig desk-tracker --device synthetic --scene object --bind 127.0.0.1 --key-file rig.key
-        a tracker on the object of the simulated scene
-"""
 
-
-def add_options(command: argparse.ArgumentParser) -> None:
-    """The options of `tracker`."""
-    command.add_argument("name", metavar="NAME", help="the `tracker` of an object of the rig")
-    add_rig(command)
-    factory.add_options(command)
-    add_link(command)
-    add_simulated(command.add_argument_group("synthetic tracker").add_argument)
-
-
-def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
+def send_tracker(options: argparse.Namespace) -> int:
     """Send poses until it is told to end.
 
     Raises:
@@ -56,13 +26,13 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     from slave.uplink import Uplink
 
     rig = rig_of(options)
-    profile = factory.object_with(options.calibration, rig, options.name)
+    profile = factory.object_with(tree_of(options), rig, options.name)
     true_clock = SystemClock()
     clock = clock_of(options, true_clock)
     key, access = secrets_of(options)
 
     def print_line(line: str) -> None:
-        notify(f"{options.name}: {line}")
+        echo(f"{options.name}: {line}")
 
     service = Service(os.environ, noun="poses")
     with stop_by_signal() as stop:
@@ -72,7 +42,7 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
         except PhalanxError:
             source.close()
             raise
-        recorded = options.device.startswith("survive:")
+        recorded = options.tracker.startswith("survive:")
         run_live(options.name, source, uplink, clock, stop, print_line, service, access, recorded)
     return 0
 
@@ -86,8 +56,8 @@ def _open(
     stop: threading.Event,
     connection_lost: ConnectionLost,
 ) -> TrackerSource:
-    if options.device != "synthetic":
-        named = options.device, options.serial, options.program
+    if options.tracker != "synthetic":
+        named = options.tracker, options.serial, options.program
         return factory.open_real(options.name, *named, clock, stop, connection_lost)
     from slave.objects.synthetic import SyntheticTracker
     from slave.simulated import tracker_of

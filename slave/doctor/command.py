@@ -5,26 +5,54 @@ import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from common.command_line import UsageError
+from common.machine import program
+from common.terminal import echo
+from slave.cli.table import PROGRAM
 from slave.doctor.camera import check_camera
 from slave.doctor.clock import check_clock
 from slave.doctor.devices import cameras_of, check_devices, check_groups
-from slave.doctor.finding import Finding, fail, unseen
+from slave.doctor.finding import Finding, as_json, as_text, exit_code, fail, unseen
 from slave.doctor.host import check_host
 from slave.doctor.identity import check_keys, folder_of
 from slave.doctor.master import check_master
 from slave.doctor.programs import check_programs
 from slave.doctor.system import System, pairs
 from slave.doctor.unit import check_unit
+from slave.drivers import SWITCHED_LIGHTS
 
 ETC = "/etc/phalanx"
 PARSER_EXIT = 2
+
+
+def run(options: argparse.Namespace) -> int:
+    """Notify what is well, and what is not; or look at the lights, or list ports; the exit code.
+
+    Raises:
+        UsageError: An option of the lights is given without them.
+        PhalanxError: The lights cannot be looked at or switched.
+    """
+    if options.ports:
+        from slave.imu.factory import places
+
+        echo(places())
+        return 0
+    if options.lights is not None:
+        from slave.commands.lights import look_at_lights
+
+        return look_at_lights(options)
+    if options.blink or options.off:
+        raise UsageError(f"--blink and --off need the lights: --lights {SWITCHED_LIGHTS}")
+    findings = list(examine(options, System.here()))
+    echo(as_json(findings, program()) if options.json else as_text(findings))
+    return exit_code(findings)
 
 
 def examine(options: argparse.Namespace, system: System) -> Iterator[Finding]:
     """All findings: the machine, then each slave.
 
     Args:
-        options: Those of `add_options`.
+        options: Of `phalanx-slave doctor`.
         system: The computer.
     """
     yield from check_host(system)
@@ -56,10 +84,11 @@ def _look(
         yield slave
         return
     yield from check_devices(system, slave)
-    if slave.command == "run":
+    if slave.camera is not None:
         yield from check_camera(slave, unit.runs)
     else:
-        yield unseen("device", f"{slave.command}: whether it answers, the service says")
+        sensor = "IMU" if slave.imu is not None else "tracker"
+        yield unseen("device", f"{sensor}: whether it answers, the service says")
 
 
 def _slave(options: argparse.Namespace, system: System, name: str) -> "argparse.Namespace | Finding":
@@ -74,28 +103,24 @@ def _slave(options: argparse.Namespace, system: System, name: str) -> "argparse.
     if text is None:
         if options.camera is None:
             return unseen("camera", f"no {ETC}/{name}.env: give --camera, and --rig, --calibration")
-        return _parsed(["run", "--name", name, *given], name)
+        return _parsed(["--name", name, *given], name)
     stated = pairs(text)
     try:
         words = shlex.split(stated.get("PHALANX_OPTIONS", ""))
     except ValueError as error:
         return fail(
-            "options", f"{ETC}/{name}.env: PHALANX_OPTIONS: {error}", "phalanx deploy writes it again"
+            "options", f"{ETC}/{name}.env: PHALANX_OPTIONS: {error}", "phalanx fleet deploy writes it again"
         )
-    if stated.get("PHALANX_COMMAND") != "run":
-        given = []
-    return _parsed([stated.get("PHALANX_COMMAND", ""), *words, *given], name)
+    return _parsed([*words, *(given if "--camera" in words else [])], name)
 
 
 def _parsed(words: Sequence[str], name: str) -> "argparse.Namespace | Finding":
-    from slave.arguments import parser  # which knows the doctor's own options
-
     try:
-        return parser().parse_args(words)
+        return PROGRAM.parse(["run", *words])[1]
     except SystemExit as error:
         if error.code == PARSER_EXIT:
             return fail(
-                "options", f"of {name}: see the line above", f"{ETC}/{name}.env: phalanx-slave COMMAND --help"
+                "options", f"of {name}: see the line above", f"{ETC}/{name}.env: phalanx-slave run --help"
             )
         raise
 

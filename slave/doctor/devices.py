@@ -42,7 +42,11 @@ def _places(slave: argparse.Namespace) -> Iterator[tuple[str, str, str]]:
         yield "camera device", path, "plug the camera in; `v4l2-ctl --list-devices` shows where it is"
     kind, _, place = str(getattr(slave, "imu", None) or "").partition(":")
     if kind == "ximu3":
-        yield "IMU device", place.partition("@")[0], "plug it in; `phalanx-slave imu --list` shows the ports"
+        yield (
+            "IMU device",
+            place.partition("@")[0],
+            "plug it in; `phalanx-slave doctor --ports` shows the ports",
+        )
     elif kind == "lsm6dsox":
         yield "IMU bus", f"/dev/i2c-{place.partition(':')[0]}", I2C_ON
     kind, _, place = str(getattr(slave, "lights", None) or "").partition(":")

@@ -16,7 +16,7 @@ from slave.doctor.system import System
 
 FOLDER = "/etc/phalanx/keys"
 SOON = timedelta(days=90)
-MAKE = "on the PC: phalanx-master keys make DIR --device {}, then phalanx deploy"
+MAKE = "on the PC: phalanx fleet keys DIR --make --device {}, then phalanx fleet deploy"
 _PUBLIC = (serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo)
 
 
@@ -89,6 +89,6 @@ def _certificate(system: System, folder: Path, name: str, now: datetime) -> Find
         return warn(
             "certificate",
             f"ends in {(until - now).days} days",
-            "phalanx-master keys renew DIR, then phalanx deploy",
+            "phalanx fleet keys DIR --renew, then phalanx fleet deploy",
         )
     return ok("certificate", f"of {name}, signed by the rig's authority, until {until:%Y-%m-%d}")

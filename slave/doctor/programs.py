@@ -42,7 +42,7 @@ def check_programs(system: System, extra: Sequence[str]) -> Iterator[Finding]:
         yield warn(
             "installed",
             f"no {CURRENT}: it is asked {where}",
-            "phalanx-slave install --master HOST, or phalanx deploy from the PC",
+            "phalanx-slave install --master HOST, or phalanx fleet deploy from the PC",
         )
     names = ("libstdc++", *NEEDED, *extra)
     asked = system.run((str(python), "-c", PROBE, *names), TIMEOUT_S)

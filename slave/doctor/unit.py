@@ -8,9 +8,9 @@ from slave.doctor.system import System, pairs
 ASKED = ("LoadState", "ActiveState", "SubState", "UnitFileState", "NRestarts", "ExecMainStatus", "StatusText")
 # Ends before the program begins (systemd.exec(5)): what is wrong, and what mends it.
 BEFORE = {
-    "203": ("its program cannot be run", "phalanx-slave install, or phalanx deploy"),
+    "203": ("its program cannot be run", "phalanx-slave install, or phalanx fleet deploy"),
     "216": ("a group of the unit is missing", "sudo systemd-sysusers"),
-    "243": ("a key of /etc/phalanx/keys is missing", "phalanx deploy brings the keys"),
+    "243": ("a key of /etc/phalanx/keys is missing", "phalanx fleet deploy brings the keys"),
 }
 
 
@@ -35,7 +35,7 @@ def check_unit(system: System, name: str) -> Unit:
         return Unit(unseen(check, f"{unit}: systemd does not answer here"), False)
     stated = pairs(asked.out)
     if stated.get("LoadState") != "loaded":
-        install = "phalanx-slave install --master HOST, or phalanx deploy from the PC"
+        install = "phalanx-slave install --master HOST, or phalanx fleet deploy from the PC"
         return Unit(warn(check, f"{unit}: not installed", install), False)
     state, status = stated.get("ActiveState", ""), stated.get("ExecMainStatus", "")
     restarts, words = stated.get("NRestarts", "0"), stated.get("StatusText", "")

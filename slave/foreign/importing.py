@@ -208,7 +208,7 @@ def _check_size(source: Source, found: tuple[int, int], size: tuple[int, int], w
         raise RecordingError(
             f"{source.path}: is of {found[0]} x {found[1]} px, the calibration"
             f" {wish.calibration / 'cameras' / source.camera}.json of {size[0]} x {size[1]}: record in the size that"
-            " was calibrated, or calibrate in this one (`phalanx-master calibrate stereo`)"
+            " was calibrated, or calibrate in this one (`phalanx calibrate cameras stereo`)"
         )
 
 

@@ -118,7 +118,9 @@ def rig_for(
     rigs = [load(path, RigCalibration) for path in sorted(folder.glob("*.json"))]
     rigs = [rig for rig in rigs if rig.kind == "markers"]
     if not rigs:
-        raise RecordingError(f"{folder}: no rig of marker cameras; `phalanx calibrate stereo` makes one")
+        raise RecordingError(
+            f"{folder}: no rig of marker cameras; `phalanx calibrate cameras stereo` makes one"
+        )
     wanted = {*named, *(path.stem for path in paths)}
     for fits in (
         [rig for rig in rigs if wanted == set(rig.cameras)],

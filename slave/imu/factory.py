@@ -1,16 +1,14 @@
 """The IMUs behind `--imu`: what they are called, and how they are opened, and opened again."""
 
-import argparse
-import sys
 import threading
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from common.calibration import ImuCalibration
 from common.clock import Clock
 from common.errors import CalibrationError, ImuError
 from common.imu_fusion import OrientationFilter
+from slave.drivers import IMUS
 from slave.imu.reconnecting import ReconnectingImu
 from slave.imu.source import ImuSource
 from slave.service import ConnectionLost, nobody
@@ -18,32 +16,6 @@ from slave.service import ConnectionLost, nobody
 if TYPE_CHECKING:  # the drivers are imported where one is opened: other commands start without them
     from slave.imu.lsm6dsox import I2cPlace
     from slave.imu.ximu3 import SerialPlace
-
-REAL = "ximu3:PORT[@BAUD] | lsm6dsox:BUS[:ADDRESS]"
-IMUS = f"{REAL} | synthetic"
-
-
-class ListPlaces(argparse.Action):
-    """The option that says where an IMU may be, and ends."""
-
-    def __init__(self, option_strings: Sequence[str], dest: str, **others: Any) -> None:
-        """Take no value."""
-        super().__init__(option_strings, dest, nargs=0, default=argparse.SUPPRESS, **others)
-
-    def __call__(self, parser: argparse.ArgumentParser, *_others: object) -> None:
-        """Notify it."""
-        sys.stdout.write(places() + "\n")
-        parser.exit()
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that name an IMU, live or recorded."""
-    which = parser.add_mutually_exclusive_group(required=True)
-    which.add_argument("--imu", metavar="DRIVER", help=IMUS)
-    which.add_argument(
-        "--csv", type=Path, metavar="FILE", help="a recording: a CSV with a header, time, rates, forces"
-    )
-    parser.add_argument("--list", action=ListPlaces, help="say where an IMU may be connected, and end")
 
 
 def orientation_of(imu: ImuCalibration) -> OrientationFilter:

@@ -1,4 +1,4 @@
-"""`phalanx-slave imu --csv FILE`: somebody else's IMU recording becomes an imu.csv, and what is in it is said."""
+"""`phalanx-slave record --imu-csv FILE`: somebody else's IMU table becomes an imu.csv, and what is in it is said."""
 
 from collections.abc import Callable
 from pathlib import Path

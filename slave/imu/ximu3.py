@@ -181,7 +181,7 @@ class Ximu3Imu:
             received = f", though {self._bytes} bytes came" if self._bytes else ""
             raise ImuError(
                 f"{self._place.path}: no x-IMU3 answers{received}: is it switched on, is it another device, or has it "
-                "another baud rate (behind @)? `phalanx-slave imu --list` says what is there"
+                "another baud rate (behind @)? `phalanx-slave doctor --ports` says what is there"
             )
         answer = [str(pong.fields.get(part, "?")) for part in ("name", "sn", "interface")]
         _LOG.info("%s: x-IMU3 %r, serial number %s, over %s", self._place.path, *answer)
@@ -321,13 +321,13 @@ def divisor(rate_hz: float) -> int:
 
 def _why(number: int | None, error: Exception) -> str:
     if number == ENOENT:
-        return "there is no such port; `phalanx-slave imu --list` says which there are"
+        return "there is no such port; `phalanx-slave doctor --ports` says which there are"
     if number == EACCES:
         return "permission denied: `sudo usermod -aG dialout $USER`, then log in again"
     if number in (EBUSY, EWOULDBLOCK):
         return "another program has it open"
     if "configure" in str(error):  # pyserial's word, without a number
-        return f"it is no serial port, or has not this baud rate ({error}); `phalanx-slave imu --list` lists ports"
+        return f"it is no serial port, or has not this baud rate ({error}); `phalanx-slave doctor --ports` lists ports"
     if isinstance(error, ValueError | OverflowError):
         return f"it does not take this baud rate: {error}"
     return str(error)

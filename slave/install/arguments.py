@@ -5,24 +5,23 @@ from pathlib import Path
 
 from slave.install.options import READY_S, SETTLE_S, add_options
 
-PURPOSE = "install it as a service of this machine"
-EXAMPLES = """\
-  sudo phalanx-slave install --master 192.168.1.2 --rig desk --name left --keys keys --calibration calib_json
-        on the Raspberry Pi itself, out of an environment that sees the system's packages (docs/deploy.md); keys and
-        calib_json are copied from the PC. From the PC, for all machines at once: phalanx deploy
-  sudo phalanx-slave install --master 192.168.1.2 --rig wrist --imu lsm6dsox:1:0x6a --lights gpio:0:17,27 --keys keys
-        a wrist device: its camera and its IMU, each a service
-  sudo phalanx-slave install --master 192.168.1.2 --rig desk --name left --dry-run
-        only say what would be changed; the keys that are there stay
-  sudo phalanx-slave install --rollback
-        go back to what was before the last installation
-  sudo phalanx-slave install --uninstall
-        take everything away again but the packages of apt
-"""
-
 
 def add_install(parser: argparse.ArgumentParser) -> None:
-    """All options of `phalanx-slave install`."""
+    """Installs slaves as services of this machine, each with what it needs; as root.
+
+    Examples:
+      sudo phalanx-slave install --master 192.168.1.2 --rig desk --name left --keys keys --calibration calib_json
+            on the Raspberry Pi itself, out of an environment that sees the system's packages (docs/deploy.md); keys and
+            calib_json are copied from the PC. From the PC, for all machines at once: phalanx fleet deploy
+      sudo phalanx-slave install --master 192.168.1.2 --rig wrist --imu lsm6dsox:1 --lights gpio:0:17,27 --keys keys
+            a wrist device: its camera and its IMU, each a service
+      sudo phalanx-slave install --master 192.168.1.2 --rig desk --name left --dry-run
+            only say what would be changed; the keys that are there stay
+      sudo phalanx-slave install --rollback
+            go back to what was before the last installation
+      sudo phalanx-slave install --uninstall
+            take everything away again but the packages of apt
+    """
     add_options(parser)
     parser.add_argument(
         "--keys", type=Path, metavar="DIR", help="keys folder of the PC; default: those that are there stay"

@@ -53,7 +53,7 @@ def keys_of(folder: Path | None) -> dict[str, bytes]:
         return {}
     if not folder.is_dir():
         raise InstallError(
-            f"{folder}: no such folder of keys; make one on the PC: phalanx-master keys make {folder}"
+            f"{folder}: no such folder of keys; make one on the PC: phalanx fleet keys {folder} --make"
         )
     found: dict[str, bytes] = {}
     for path in sorted([*folder.glob("*"), *folder.glob("devices/*")]):

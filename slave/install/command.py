@@ -14,7 +14,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from slave.install import bundle, steps
-from slave.install.arguments import PURPOSE, add_install
+from slave.install.arguments import add_install
 from slave.install.errors import InstallError
 from slave.install.options import READY_S, SETTLE_S, plan_of
 from slave.install.probe import judge, probe
@@ -25,6 +25,16 @@ from slave.install.wanted import ETC
 
 Notify = Callable[[str], None]
 _LEFT_S = 3600.0  # no installation takes so long
+
+
+def run_here(options: argparse.Namespace) -> int:
+    """`phalanx-slave install`: install, take back, or remove; the exit code."""
+
+    def notify(line: str) -> None:
+        sys.stdout.write(line + "\n")
+        sys.stdout.flush()
+
+    return run(options, notify)
 
 
 def run(options: argparse.Namespace, notify: Notify, systemd: Systemd | None = None) -> int:
@@ -163,6 +173,8 @@ def main(arguments: list[str], notify: Notify, systemd: Systemd | None = None) -
     if action != "install":
         sys.stderr.write("python3 -m slave.install install|probe|packages ...; `install --help` says more\n")
         return 0 if action in ("-h", "--help") else 2
-    parser = argparse.ArgumentParser("slave.install", description=PURPOSE)
+    parser = argparse.ArgumentParser(
+        "slave.install", description="Install slaves as services of this machine."
+    )
     add_install(parser)
     return run(parser.parse_args(rest), notify, systemd)

@@ -29,13 +29,11 @@ class Sender:
 
     Attributes:
         name: Camera or IMU, as the rig's file calls it.
-        command: Of `phalanx-slave`: run or imu.
-        options: Of that command.
-        stop_post: Command and options that make the lights dark after it has ended; empty: it has none.
+        options: Of `phalanx-slave run`.
+        stop_post: Command of `phalanx-slave` that makes the lights dark after it has ended; empty: it has none.
     """
 
     name: str
-    command: str
     options: tuple[str, ...]
     stop_post: tuple[str, ...] = ()
 
@@ -48,8 +46,7 @@ class Sender:
     def environment(self) -> str:
         """Text of /etc/phalanx/NAME.env."""
         return (
-            "# Written by the installer of Phalanx; `phalanx deploy` writes it again.\n"
-            f"PHALANX_COMMAND={self.command}\n"
+            "# Written by the installer of Phalanx; `phalanx fleet deploy` writes it again.\n"
             f"PHALANX_OPTIONS={' '.join(self.options)}\n"
             f"PHALANX_STOP_POST={' '.join(self.stop_post)}\n"
         )
@@ -77,7 +74,7 @@ class Plan:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What a machine is to run; the same here and for `phalanx deploy`, which hands it on."""
+    """What a machine is to run; the same here and for `phalanx fleet deploy`, which hands it on."""
     parser.add_argument(
         "--master", metavar="HOST", help="host name or address of the PC, whose clock is followed"
     )
@@ -100,7 +97,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="[NAME=]DRIVER",
         help="as `phalanx-slave run --camera` has it (default: picamera2)",
     )
-    parser.add_argument("--imu", metavar="DRIVER", help="as `phalanx-slave imu --imu` has it")
+    parser.add_argument("--imu", metavar="DRIVER", help="as `phalanx-slave run --imu` has it")
     parser.add_argument("--lights", metavar="DRIVER", help="as `phalanx-slave run --lights` has it")
     parser.add_argument(
         "--options",
@@ -108,7 +105,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="[NAME=]TEXT",
-        help="more options of `phalanx-slave run` or `imu`, of NAME or of all: --options 'left=--sync server'",
+        help="more options of `phalanx-slave run`, of NAME or of all: --options 'left=--sync server'",
     )
     parser.add_argument(
         "--overlay",
@@ -167,19 +164,18 @@ def _sender(name: str, rig: dict[str, Any], options: argparse.Namespace) -> Send
         if is_wrist and options.lights is not None:
             words += ["--lights", options.lights]
             if options.lights.partition(":")[0] in ("gpio", "i2c"):
-                stop_post = ["lights", "--rig", options.rig, "--calibration", CALIBRATION]
+                stop_post = ["doctor", "--rig", options.rig, "--calibration", CALIBRATION]
                 stop_post += ["--lights", options.lights, "--off"]
         elif is_wrist and not camera.startswith(("synthetic", "replay")):
             raise InstallError(
                 f"rig {options.rig!r} is a wrist device: say who switches its lights, --lights DRIVER"
             )
-        command = "run"
     elif name == (rig.get("imu") or {}).get("name"):
         if options.imu is None:
             raise InstallError(
                 f"{name!r} is the IMU of rig {options.rig!r}: say which one it is, --imu DRIVER"
             )
-        command, words = "imu", [*place, "--imu", options.imu]
+        words = [*place, "--imu", options.imu]
     else:
         there = ", ".join(names)
         raise InstallError(f"rig {options.rig!r} has no camera or IMU {name!r}; it has {there}")
@@ -187,7 +183,7 @@ def _sender(name: str, rig: dict[str, Any], options: argparse.Namespace) -> Send
     for word in [*words, *stop_post]:
         if not _UNQUOTED.fullmatch(word):
             raise InstallError(f"{word!r}: blanks and quotes cannot be in an option of a service")
-    return Sender(name, command, tuple(words), tuple(stop_post))
+    return Sender(name, tuple(words), tuple(stop_post))
 
 
 def _split(text: str) -> list[str]:
@@ -260,7 +256,7 @@ def _of_device(keys: Mapping[str, bytes], names: Sequence[str]) -> dict[str, byt
                 found[f"device-{name}.{kind}"] = content
     if missing := [one for one in wanted_keys(names) if one not in found]:
         raise InstallError(
-            f"keys: no {missing[0]}; make them on the PC: phalanx-master keys make DIR --device {names[0]}"
+            f"keys: no {missing[0]}; make them on the PC: phalanx fleet keys DIR --make --device {names[0]}"
         )
     return found
 

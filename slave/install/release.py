@@ -173,7 +173,7 @@ def _install_wheels(fresh: Path, wheels: Path) -> None:
     pips = [wheel for wheel in found if wheel.name.startswith("pip-")]
     if not pips and importlib.util.find_spec("pip") is None:
         raise InstallError(
-            f"{wheels}: no wheel of pip in it, and this system has no pip; on a PC `phalanx wheels DIR` gathers all"
+            f"{wheels}: no wheel of pip in it, and this system has no pip; on a PC `phalanx fleet wheels DIR` has all"
         )
     pip = [sys.executable, str(pips[-1] / "pip")] if pips else [sys.executable, "-m", "pip"]
     python = str(fresh / "bin/python")

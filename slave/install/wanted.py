@@ -108,7 +108,7 @@ def check_keys(keys: Mapping[str, bytes], names: tuple[str, ...]) -> None:
     for file in ("rig.key", *(f"device-{name}.secret" for name in names)):
         if not re.fullmatch(rb"[0-9a-fA-F]{64}\s*", keys[file]):
             raise InstallError(
-                f"keys: {file} is not 64 hexadecimal digits; phalanx-master keys make DIR makes one"
+                f"keys: {file} is not 64 hexadecimal digits; phalanx fleet keys DIR --make makes one"
             )
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     try:
@@ -148,7 +148,7 @@ def _keys(plan: Plan, root: Path) -> dict[str, File | None]:
         return {f"{KEYS}/{name}": File(content, 0o600) for name, content in plan.keys.items()}
     if missing := [one for one in wanted_keys(names) if not (root / KEYS / one).is_file()]:
         raise InstallError(
-            f"/{KEYS}/{missing[0]}: missing; give --keys DIR, made by: phalanx-master keys make DIR"
+            f"/{KEYS}/{missing[0]}: missing; give --keys DIR, made by: phalanx fleet keys DIR --make"
         )
     return {}
 

@@ -3,11 +3,10 @@
 from common.calibration import RigCalibration
 from common.errors import LightsError
 from common.strobe_calibration import StrobeCalibration
+from slave.drivers import LIGHTS, SWITCHED_LIGHTS
 from slave.lights.interlock import Interlock
 
-SWITCHED = "gpio:CHIP:LASER,LED | i2c:BUS[:ADDRESS]"
 ELSEWHERE = ("camera", "external")
-CHOICES = f"{SWITCHED} | camera | external"
 SYNTHETIC = "synthetic"
 
 
@@ -35,18 +34,18 @@ def choose(lights: str | None, rig: RigCalibration, camera: str) -> str | None:
         if kind == SYNTHETIC:
             return SYNTHETIC
         raise LightsError(
-            f"rig {rig.name!r} is a wrist device: say who switches its laser and LEDs, --lights {CHOICES};"
+            f"rig {rig.name!r} is a wrist device: say who switches its laser and LEDs, --lights {LIGHTS};"
             " the last two: the camera's own strobe output, or another controller, within limits of its own"
         )
     name, colon, _ = lights.partition(":")
     if lights in ELSEWHERE:
         return None
     if lights == SYNTHETIC and kind != SYNTHETIC:
-        raise LightsError(f"--lights synthetic: lights nothing before --camera {camera}; there are {CHOICES}")
+        raise LightsError(f"--lights synthetic: lights nothing before --camera {camera}; there are {LIGHTS}")
     if lights != SYNTHETIC and kind == SYNTHETIC:
         raise LightsError(f"--lights {lights}: a simulated hand is lit by synthetic, or by camera")
     if lights != SYNTHETIC and not (colon and name in ("gpio", "i2c")):
-        raise LightsError(f"--lights {lights}: no such lights; there are {CHOICES}")
+        raise LightsError(f"--lights {lights}: no such lights; there are {LIGHTS}")
     return lights
 
 
@@ -80,4 +79,4 @@ def open_guarded(lights: str, rig: RigCalibration) -> Interlock:
         from slave.lights.i2c_led import FlashDriverLights
 
         return Interlock(FlashDriverLights(place, strobe), strobe)
-    raise LightsError(f"--lights {lights}: the slave does not switch these; it does {SWITCHED}")
+    raise LightsError(f"--lights {lights}: the slave does not switch these; it does {SWITCHED_LIGHTS}")

@@ -1,4 +1,4 @@
-"""The budget of a strobe as text, and its lights without a camera: what `phalanx-slave lights` prints and does."""
+"""The budget of a strobe as text, and its lights without a camera: what `doctor --lights` prints and does."""
 
 import threading
 

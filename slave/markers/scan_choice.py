@@ -10,9 +10,9 @@ from statistics import median
 from typing import Literal, TypeAlias
 
 from common.calibration import CameraCalibration
+from slave.drivers import SCANS
 
 Scan: TypeAlias = Literal["auto", "full", "windows"]
-SCANS: tuple[Scan, ...] = ("auto", "full", "windows")
 FULL_SHARE = 0.9  # of the time between two frames: where whole frames take more, they do not fit
 FITS_SHARE = 0.7  # and where they take less again, they do
 JUDGED = 30  # whole frames whose median is judged

@@ -1,6 +1,5 @@
-"""The trackers behind `--device`: what they are called, and how they are opened, and opened again."""
+"""The trackers behind `--tracker`: what they are called, and how they are opened, and opened again."""
 
-import argparse
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -9,26 +8,10 @@ from common.calibration import RigCalibration, load
 from common.clock import Clock
 from common.errors import CalibrationError, TrackerError
 from common.object_profile import ObjectProfile
+from slave.drivers import TRACKERS
 from slave.objects.reconnecting import ReconnectingTracker
 from slave.objects.source import TrackerSource
 from slave.service import ConnectionLost, nobody
-
-REAL = "openvr | survive | survive:FILE"
-DEVICES = f"{REAL} | synthetic"
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of a tracker that is sent live."""
-    parser.add_argument("--device", required=True, metavar="SYSTEM", help=DEVICES)
-    parser.add_argument(
-        "--serial",
-        metavar="SERIAL",
-        help="which device: its serial number (LHR-...), for survive also its name there (WM0, T20); not needed if "
-        "there is one only",
-    )
-    parser.add_argument(
-        "--program", default="survive-cli", metavar="PATH", help="survive-cli (default: that on the path)"
-    )
 
 
 def object_with(calibration: Path, rig: RigCalibration, name: str) -> ObjectProfile:
@@ -57,11 +40,11 @@ def open_real(
     stop: threading.Event,
     connection_lost: ConnectionLost = nobody,
 ) -> TrackerSource:
-    """Open the tracker that `--device` names; one that is no recording is opened again when it was lost.
+    """Open the tracker that `--tracker` names; one that is no recording is opened again when it was lost.
 
     Args:
         name: Of the device in our messages.
-        device: The value of `--device`.
+        device: The value of `--tracker`.
         serial: Which device, if there are several.
         program: survive-cli.
         clock: The slave's clock.
@@ -86,5 +69,5 @@ def open_real(
 
         opener = lambda: OpenVrTracker(name, serial, clock, stop)  # noqa: E731
     else:
-        raise TrackerError(f"--device {device}: no such system; there are {DEVICES}")
+        raise TrackerError(f"--tracker {device}: no such system; there are {TRACKERS}")
     return ReconnectingTracker(name, opener, clock, stop, connection_lost)

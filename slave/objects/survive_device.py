@@ -6,7 +6,7 @@ serial number. Without a choice there must be one device only: with two, a guess
 A stamp is the program's own time when it wrote the line. The clock behind it is this machine's wall clock, which may be
 set or slewed, so stamps become times of the slave's clock as those of any foreign device do (`DeviceClock`): by the
 least delay, whatever jitter and bunches the arrivals have. How late a pose is when its line is written nobody says;
-that is constant, and `phalanx-master calibrate tracker` measures it.
+that is constant, and `phalanx calibrate tracker` measures it.
 """
 
 from collections import Counter

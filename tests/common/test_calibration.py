@@ -410,5 +410,5 @@ def test_a_rig_that_is_still_to_be_measured_has_no_places_and_says_what_measures
         load(ROOT / "calib_json" / "rigs" / "desk.json", RigCalibration), T_rig_camera={}
     )
     calibration.check(rig, "desk.json")
-    with pytest.raises(CalibrationError, match="calibrate stereo"):
+    with pytest.raises(CalibrationError, match="calibrate cameras stereo"):
         rig.camera_pose("left")

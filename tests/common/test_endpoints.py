@@ -22,7 +22,7 @@ def test_what_is_encrypted_or_stays_on_this_machine_is_allowed(endpoint: str) ->
 def test_plain_text_leaves_the_machine_only_when_somebody_says_so(endpoint: str) -> None:
     with pytest.raises(BusError, match="neither encrypted nor authenticated") as refused:
         check(endpoint, open_bus=False)
-    for word in (endpoint, "tls/", "phalanx-master keys make", "--open", "PHALANX_OPEN=1"):
+    for word in (endpoint, "tls/", "phalanx fleet keys DIR --make", "--open", "PHALANX_OPEN=1"):
         assert word in str(refused.value)
     check(endpoint, open_bus=True)
 

@@ -64,7 +64,7 @@ def test_the_rig_key_is_that_of_the_file_then_the_folder_then_the_environment(ke
     assert rig_key(environment, None, keys) == inside
     assert rig_key(environment) == bytes.fromhex(text)
     assert rig_key({"PHALANX_KEYS": str(keys)}) == inside
-    with pytest.raises(PhalanxError, match="keys make DIR"):
+    with pytest.raises(PhalanxError, match="keys DIR --make"):
         rig_key({})
 
 
@@ -89,7 +89,9 @@ def test_the_secrets_are_those_of_the_folder_and_of_the_rig_key_where_that_is_al
 def test_a_folder_without_secrets_makes_no_weaker_rig(keys: Path) -> None:
     (keys / "devices.key").unlink()
     (keys / "devices/left.secret").unlink()
-    with pytest.raises(PhalanxError, match=rf"devices\.key: missing.* keys make {keys} .*phalanx deploy"):
+    with pytest.raises(
+        PhalanxError, match=rf"devices\.key: missing.* fleet keys {keys} --make.*phalanx fleet deploy"
+    ):
         link_key({}, None, keys)
     with pytest.raises(
         PhalanxError, match=r"no secret of 'left' \(devices/left\.secret, device-left\.secret.*--device left"
@@ -144,7 +146,7 @@ def test_a_secret_that_others_can_read_is_refused_but_for_the_mask_of_a_service(
 
 
 def test_what_is_missing_or_broken_is_named_with_the_fix(keys: Path) -> None:
-    with pytest.raises(BusError, match=r"no certificate of 'right' .*keys make .* --device right"):
+    with pytest.raises(BusError, match=r"no certificate of 'right' .*fleet keys .* --make --device right"):
         access_of({}, "right", keys).identity()
     with pytest.raises(BusError, match="give --keys DIR or set PHALANX_KEYS"):
         access_of({}, OPERATOR).identity()

@@ -36,8 +36,8 @@ PERSPECTIVE = ((1.0, 0, 0, 0), (0, 1.0, 0, 0), (0, 0, 1.0, 0), (0, 0, 0.1, 1.0))
     [
         ({"kind": "markers"}, "kind is 'markers'"),
         ({"cameras": ("other",)}, "cameras: other"),
-        ({"laser_plane": None}, "laser_plane is missing, .*calibrate laser-plane"),
-        ({"T_camera_palm": None}, "T_camera_palm is missing, .*calibrate palm"),
+        ({"laser_plane": None}, "laser_plane is missing, .*calibrate wrist laser-plane"),
+        ({"T_camera_palm": None}, "T_camera_palm is missing, .*calibrate wrist palm"),
         ({"T_camera_palm": SHRUNK}, "T_camera_palm: not a rotation"),
         ({"T_camera_palm": MIRRORED}, "T_camera_palm: not a rotation"),
         ({"T_camera_palm": PERSPECTIVE}, "T_camera_palm: not a rotation"),

@@ -1,4 +1,4 @@
-"""`phalanx deploy` as far as it needs no other machine: names of hosts, wheels, what is sent, deadlines, going back."""
+"""`phalanx fleet deploy` where it needs no other machine: names of hosts, wheels, what is sent, deadlines, rollback."""
 
 import json
 import os
@@ -15,19 +15,25 @@ import pytest
 
 from deploy import deployment, sender_check
 from deploy import wheelhouse as wheels_module
-from deploy.__main__ import main
 from deploy.bundle import BUNDLE, bundle, command
 from deploy.deployment import make_keys
-from deploy.fleet import table
 from deploy.keys import prepared_keys
 from deploy.one_host import Host, Wish
 from deploy.remote import Deadline, Remote
 from deploy.sender_check import Ears, Received
 from deploy.targets import DeployError, RigFile, Target, read_rig, targets_of
 from deploy.wheelhouse import own_wheel, wheelhouse
+from master.cli.table import program
+from master.fleet import Device, table
 from master.keys_folder import make
 
 ROOT = Path(__file__).resolve().parents[2]
+
+
+def main(words: list[str]) -> int:
+    return program().main(words)
+
+
 DESK, WRIST = (read_rig(ROOT / "calib_json", name) for name in ("desk", "wrist"))
 
 
@@ -199,7 +205,7 @@ def test_a_host_that_is_not_reached_is_reported_in_one_line_with_what_to_do(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     fake_ssh(f"echo '{output}' >&2; exit 255")
-    assert main(["uninstall", "pi"]) == 1
+    assert main(["fleet", "uninstall", "pi"]) == 1
     error = capsys.readouterr().err
     assert error.startswith("pi: FAILED: ")
     assert expected in error
@@ -316,7 +322,7 @@ def test_wheels_of_another_machine_are_refused_here(tmp_path: Path) -> None:
         assert wheels_module.fits(name, kind) is expected, name
     wrong = tmp_path / "numpy-2.4-cp312-cp312-manylinux_2_27_aarch64.whl"
     wrong.write_bytes(b"")
-    with pytest.raises(DeployError, match=r"phalanx wheels DIR --machine aarch64 --python 3\.13"):
+    with pytest.raises(DeployError, match=r"phalanx fleet wheels DIR --machine aarch64 --python 3\.13"):
         wheelhouse(kind, tmp_path, print)
 
 
@@ -355,9 +361,9 @@ def test_missing_keys_are_made_and_what_is_there_stays(tmp_path: Path) -> None:
 def test_a_table_has_a_dash_where_nothing_is_known() -> None:
     lines = table(
         [
-            {"name": "left", "state": "streaming", "host": "pi-left", "version": "0.1.0", "temperature_c": 51.2,
-             "throttled": False, "rate_hz": 89.96, "offset_us": -12.4, "sigma_us": 8.0},
-            {"name": "right", "state": "unknown"},
+            Device("left", "streaming", host="pi-left", version="0.1.0", temperature_c=51.2,
+                   throttled=False, rate_hz=89.96, offset_us=-12.4, sigma_us=8.0),
+            Device("right", "unknown"),
         ]
     )  # fmt: skip
     assert lines[1].split("  ")[0] == "left"
@@ -377,7 +383,7 @@ def _file(path: Path, content: bytes) -> Path:
     [
         (["--options", "rihgt=--sync client"], "--options 'rihgt=--sync client': rig 'desk' has no 'rihgt'"),
         (["--camera", "up=v4l2"], "--camera 'up=v4l2': rig 'desk' has no 'up'; it has left, right"),
-        (["--wheelhouse", "nowhere"], "--wheelhouse nowhere: no wheels in it; phalanx wheels DIR"),
+        (["--wheelhouse", "nowhere"], "--wheelhouse nowhere: no wheels in it; phalanx fleet wheels DIR"),
         (["--identity", "nokey"], "--identity nokey: no such file"),
     ],
 )
@@ -385,13 +391,23 @@ def test_what_is_mistyped_is_reported_before_a_machine_is_asked(
     words: list[str], output: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tree = str(ROOT / "calib_json")
-    line = ["deploy", "left=a.invalid", "--master", "127.0.0.1", "--dry-run", "--calibration", tree, *words]
+    line = [
+        "fleet",
+        "deploy",
+        "left=a.invalid",
+        "--master",
+        "127.0.0.1",
+        "--dry-run",
+        "--calibration",
+        tree,
+        *words,
+    ]
     assert main(line) == 1
     assert output in capsys.readouterr().err
 
 
 def test_a_fleet_with_a_missing_keys_folder_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["fleet", "--keys", "nokeys"]) == 1
+    assert main(["fleet", "status", "--keys", "nokeys"]) == 1
     assert "--keys nokeys: no such folder" in capsys.readouterr().err
 
 

@@ -11,8 +11,9 @@ from tests.commands import command
 from tests.common.test_frame_recording import ROWS, camera, rig, write
 
 SECRET = "secret-of-another-folder"
-DETECT, REPLAY, JOIN = ("slave", "detect"), ("deploy", "replay"), ("slave", "join")
+DETECT, REPLAY, JOIN = ("slave", "run"), ("master", "replay"), ("slave", "record")
 SOLVE = ("master", "solve")
+NO_NAME = r"recording\.json: .* at `\$\.rig\.cameras\[0\]`"
 
 
 def linked(folder: Path, name: str, target: Path) -> None:
@@ -67,7 +68,7 @@ ATTACKS: dict[str, tuple[Callable[[Path, Path], object], dict[tuple[str, str], s
     ),
     "link of the manifest": (
         lambda folder, outside: linked(folder, "recording.json", outside / "secret"),
-        {DETECT: "recording.json: leads to", REPLAY: "recording.json: .*a link to"},
+        {DETECT: "recording.json: leads to", REPLAY: "recording.json: leads to"},
     ),
     "link to itself": (
         lambda folder, _: linked(folder, "left/0.png", Path("0.png")),
@@ -80,7 +81,7 @@ ATTACKS: dict[str, tuple[Callable[[Path, Path], object], dict[tuple[str, str], s
     "camera outside": (
         lambda folder, _: strange(folder, "../../left"),
         {
-            REPLAY: r"cameras: '\.\./\.\./left': must be letters",
+            REPLAY: NO_NAME,
         },
     ),
     "camera outside, of no rig": (
@@ -89,7 +90,7 @@ ATTACKS: dict[str, tuple[Callable[[Path, Path], object], dict[tuple[str, str], s
     ),
     "camera of NUL": (
         lambda folder, _: strange(folder, "left\0"),
-        {REPLAY: r"cameras: 'left\\x00': must be letters"},
+        {REPLAY: NO_NAME},
     ),
     "camera of NUL, of no rig": (
         lambda folder, _: another(folder, "left\0"),
@@ -99,8 +100,11 @@ ATTACKS: dict[str, tuple[Callable[[Path, Path], object], dict[tuple[str, str], s
         lambda folder, _: strange(folder, ".."),
         {JOIN: r"cameras: '\.\.': must be", REPLAY: r"cameras: '\.\.': must be"},
     ),
-    "camera of an escape": (lambda folder, _: strange(folder, "\x1b[2J"), {REPLAY: r"cameras: '\\x1b"}),
-    "manifest nested": (nested, {REPLAY: "not a recording of raw frames", DETECT: "recording.json"}),
+    "camera of an escape": (
+        lambda folder, _: strange(folder, "\x1b[2J"),
+        {REPLAY: NO_NAME},
+    ),
+    "manifest nested": (nested, {REPLAY: "recording.json: ", DETECT: "recording.json"}),
     "time beyond 64 bits": (
         lambda folder, _: write(folder, rows=("left,0,9999999999999999999,none,left/0.png",)),
         {DETECT: "line 2: t_ns"},
@@ -126,14 +130,14 @@ def test_a_hostile_folder_ends_in_a_line(name: str, wanted: tuple[str, str], tmp
     (outside / "0.png").write_text(SECRET)
     make, output = ATTACKS[name]
     make(folder, outside)
-    module, verb = wanted
+    module = wanted[0]
     arguments = {
-        DETECT: [folder, "--camera", "left", "-o", out / "detections_left.npz"],
-        REPLAY: [folder, "--out", out],
-        JOIN: [folder, folder, "-o", out / "joined"],
-        SOLVE: [folder, "--detections", out, "--out", out],
+        DETECT: ["run", "--name", "left", "--camera", f"replay:{folder}", "-o", out / "detections_left.npz"],
+        REPLAY: ["replay", folder, "--out", out],
+        JOIN: ["record", "--join", folder, folder, "-o", out / "joined"],
+        SOLVE: ["replay", folder, "--detections", out, "--out", out],
     }[wanted]
-    done = command(module, (verb, *map(str, arguments)), outside)
+    done = command(module, [str(one) for one in arguments], outside)
     assert done.code == 1, done.text
     assert "Traceback" not in done.text, done.text
     assert SECRET not in done.text

@@ -203,7 +203,7 @@ class Board:
 
     @property
     def ssh_options(self) -> tuple[str, ...]:
-        """With which `phalanx deploy` reaches it."""
+        """With which `phalanx fleet deploy` reaches it."""
         known = f"UserKnownHostsFile={self.folder}/known_hosts"
         options = (known, "IdentitiesOnly=yes")
         return (

@@ -50,5 +50,5 @@ def rig(fleet: Fleet) -> Iterator[Rig]:
 
 @pytest.fixture(scope="session")
 def deployed(rig: Rig) -> Deployment:
-    """Both hosts as the first `phalanx deploy` of this run left them."""
+    """Both hosts as the first `phalanx fleet deploy` of this run left them."""
     return first_deployment(rig)

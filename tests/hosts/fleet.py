@@ -71,7 +71,7 @@ class Fleet:
 
     @property
     def ssh_options(self) -> tuple[str, ...]:
-        """With which `phalanx deploy` reaches the hosts."""
+        """With which `phalanx fleet deploy` reaches the hosts."""
         known = f"UserKnownHostsFile={self.folder}/known_hosts"
         return ("--identity", str(self.folder / "id"), *_each("--ssh-option", known, "IdentitiesOnly=yes"))
 

@@ -50,7 +50,9 @@ class Rig:
         self.bus = f"tls/{fleet.address}:{BUS_PORT}"
         self.version = version("phalanx-hand")
         self._master: subprocess.Popen[str] | None = None
-        made = self.program("master", "keys", "make", str(self.keys), *_each("--device", fleet.hosts))
+        made = self.program(
+            "master", "fleet", "keys", str(self.keys), "--make", *_each("--device", fleet.hosts)
+        )
         assert made.code == 0, f"no keys: {made}"
 
     def start_master(self) -> None:
@@ -103,29 +105,29 @@ class Rig:
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """Both hosts, as `phalanx deploy` takes them."""
+        """Both hosts, as `phalanx fleet deploy` takes them."""
         return tuple(f"{name}={host.login}" for name, host in self.fleet.hosts.items())
 
     def deploy(self, *more: str, targets: tuple[str, ...] | None = None, timeout_s: float = 240.0) -> Ran:
-        """Run `phalanx deploy` for both hosts, or for some of them, with more options."""
+        """Run `phalanx fleet deploy` for both hosts, or for some of them, with more options."""
         where = ["--master", self.fleet.address, "--rig", "desk", "--calibration", str(self.calibration)]
         what = ["--keys", str(self.keys), "--bus", self.bus, "--camera", "synthetic", "--no-apt"]
         what += ["--beacon", f"{self.fleet.broadcast}:{BEACON_PORT}", *self.fleet.ssh_options]
         hosts = self.targets if targets is None else targets
-        return self.program("deploy", "deploy", *hosts, *where, *what, *more, timeout_s=timeout_s)
+        return self.program("master", "fleet", "deploy", *hosts, *where, *what, *more, timeout_s=timeout_s)
 
     def rollback(self, *more: str) -> Ran:
-        """Run `phalanx rollback` for both hosts."""
+        """Run `phalanx fleet rollback` for both hosts."""
         hosts = [host.login for host in self.fleet.hosts.values()]
-        return self.program("deploy", "rollback", *hosts, *more, *self.fleet.ssh_options)
+        return self.program("master", "fleet", "rollback", *hosts, *more, *self.fleet.ssh_options)
 
     def uninstall(self) -> Ran:
-        """Run `phalanx uninstall` for both hosts."""
+        """Run `phalanx fleet uninstall` for both hosts."""
         hosts = [host.login for host in self.fleet.hosts.values()]
-        return self.program("deploy", "uninstall", *hosts, *self.fleet.ssh_options)
+        return self.program("master", "fleet", "uninstall", *hosts, *self.fleet.ssh_options)
 
     def program(self, package: str, *arguments: str, timeout_s: float = 180.0) -> Ran:
-        """Run `phalanx` (package deploy) or `phalanx-master` (master) as a user would, and wait for its end.
+        """Run `phalanx` (package master) or `phalanx-slave` (slave) as a user would, and wait for its end.
 
         Raises:
             subprocess.TimeoutExpired: It was still running after `timeout_s`, so it has no deadline of its own.
@@ -176,7 +178,7 @@ def changed_wheels(cache: Path, folder: Path, new: str, replaced: dict[str, str]
     """A folder with the wheels that were gathered, ours as another version and with other text in some of its files.
 
     Args:
-        cache: Where `phalanx deploy` gathers them.
+        cache: Where `phalanx fleet deploy` gathers them.
         folder: To be made.
         new: Version of our wheel in it.
         replaced: File of the wheel -> its whole new text.

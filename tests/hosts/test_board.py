@@ -34,7 +34,7 @@ def rig(measured: Measured) -> Iterator[BoardRig]:
 @pytest.fixture(scope="module")
 def deployed(rig: BoardRig, measured: Measured) -> Ran:
     """The deployment; it waits for the first datagram itself, and fails without."""
-    ran = rig.deploy("--ready-s", str(PATIENCE_S / 2), "--hear-s", str(PATIENCE_S / 4), timeout_s=PATIENCE_S)
+    ran = rig.deploy("--ready-s", str(PATIENCE_S / 2), "--wait-s", str(PATIENCE_S / 4), timeout_s=PATIENCE_S)
     measured("deploy to the clean board, nothing loaded before", ran.seconds)
     return ran
 

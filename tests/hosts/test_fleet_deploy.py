@@ -45,7 +45,9 @@ def test_the_same_command_again_changes_nothing(deployed: Deployment, rig: Rig, 
 
 
 def test_the_fleet_is_listed_by_name_and_version(deployed: Deployment, rig: Rig) -> None:
-    output = rig.program("deploy", "fleet", "--bus", rig.bus, "--keys", str(rig.keys), timeout_s=20.0)
+    output = rig.program(
+        "master", "fleet", "status", "--bus", rig.bus, "--keys", str(rig.keys), timeout_s=20.0
+    )
     assert output.code == 0, str(output)
     for name in rig.fleet.hosts:
         line = next((line for line in output.out.splitlines() if name in line), None)

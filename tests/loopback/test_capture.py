@@ -30,6 +30,7 @@ def test_slaves_without_colours_give_the_pictures_for_a_calibration(tmp_path: Pa
         "-m",
         "master",
         "calibrate",
+        "cameras",
         "capture",
         "--views",
         "5",

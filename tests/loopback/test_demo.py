@@ -56,7 +56,7 @@ def _demo(out: Path, seconds: float, *more: str) -> subprocess.Popen[str]:
     command = [
         sys.executable,
         "-m",
-        "deploy",
+        "master",
         "demo",
         "--headless",
         "--seconds",

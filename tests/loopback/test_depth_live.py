@@ -1,4 +1,4 @@
-"""`phalanx-master calibrate depth --live` as a user runs it: a process with a keyboard, two slaves on the wire."""
+"""`phalanx calibrate depth --live` as a user runs it: a process with a keyboard, two slaves on the wire."""
 
 import json
 import os

@@ -109,7 +109,7 @@ def test_a_slave_whose_rig_has_other_markers_is_refused_by_name_with_the_fix(
 def says_which_and_what_to_do(text: str) -> bool:
     """Whether it names the camera, both numbers of markers and the fix."""
     flat = " ".join(text.split())
-    return all(word in flat for word in ("cam02", "8 markers", "6", "phalanx deploy"))
+    return all(word in flat for word in ("cam02", "8 markers", "6", "phalanx fleet deploy"))
 
 
 def test_a_session_that_is_not_the_hellos_and_a_leaping_seq_are_refused(rig: HostileRig) -> None:
@@ -121,7 +121,7 @@ def test_a_session_that_is_not_the_hellos_and_a_leaping_seq_are_refused(rig: Hos
             sender.send_message(MarkerDetections, session=session, seq=MOST * (session % 2))
     assert refused(rise, SESSION) >= 3, rise
     assert refused(rise, SEQUENCE) >= 3, rise
-    for command in (("fleet", "--seconds", "1"), ("check",)):
+    for command in (("fleet", "status", "--seconds", "1", "--json"), ("check",)):
         code, output = rig.command(*command)
         assert code in (0, 1), output
         assert b"Traceback" not in output

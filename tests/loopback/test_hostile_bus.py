@@ -37,8 +37,8 @@ def test_what_a_device_says_of_itself_reaches_no_terminal(rig: HostileRig) -> No
     shown: list[bytes] = []
     commands = (
         ("-m", "master", "check"),
-        ("-m", "master", "fleet", "--seconds", "1"),
-        ("-m", "deploy", "fleet"),
+        ("-m", "master", "fleet", "status", "--seconds", "1", "--json"),
+        ("-m", "master", "fleet", "status"),
     )
     with unharmed(rig), raw_bus(rig.endpoint) as session:
         running = [
@@ -73,7 +73,7 @@ def test_a_device_that_reports_without_end_keeps_nobody_from_being_heard(rig: Ho
         while time.monotonic() < ended:
             session.put("phalanx/health/cam02", body, congestion_control=zenoh.CongestionControl.BLOCK)
         report(session, "cam00", {"version": "heard"})
-        code, output = rig.command("fleet", "--seconds", "1")
+        code, output = rig.command("fleet", "status", "--seconds", "1", "--json")
     assert rise["bus.dropped"] > 0, rise
     assert code == 0, output
 

@@ -51,7 +51,7 @@ def simulated(files: Path, rig: RigCalibration, seed: int) -> SimulatedImu:
 def process(
     files: Path, log: Path, key: str, port: int, *more: str, imu: str = "synthetic"
 ) -> Generator[subprocess.Popen[bytes]]:
-    command = [sys.executable, "-m", "slave", "imu", "--name", "palm-imu", "--rig", "desk-imu"]
+    command = [sys.executable, "-m", "slave", "run", "--name", "palm-imu", "--rig", "desk-imu"]
     command += ["--imu", imu, "--calibration", str(files), "--seed", "5", "--bind", "127.0.0.1"]
     with log.open("w") as out:
         slave = subprocess.Popen(

@@ -55,7 +55,7 @@ class Rig:
         return {line.split()[0]: tuple(line.split()[1:]) for line in done.stdout.splitlines()}
 
     def camera(self, *options: str) -> subprocess.CompletedProcess[str]:
-        """`phalanx-master camera …` as a person types it; once more where a busy master did not answer at once."""
+        """`phalanx camera …` as a person types it; once more where a busy master did not answer at once."""
         command = [PYTHON, "-m", "master", "camera", *options, "--bus", self.endpoint]
         tries: list[subprocess.CompletedProcess[str]] = []
 

@@ -47,13 +47,13 @@ class Building:
         self.near, self.far = tls[:2]
         self.asked: list[Command] = []
         self.masters: dict[str, ZenohBus] = {}
-        self.near_router = self.start("near", "router", "--listen", self.near)
-        self.start("far", "router", "--listen", self.far, "--connect", self.near)
+        self.near_router = self.start("near", "fleet", "relay", "--listen", self.near)
+        self.start("far", "fleet", "relay", "--listen", self.far, "--connect", self.near)
         for site, endpoint in zip(SITES, tls[2:], strict=True):
             self.masters[site] = bus = ZenohBus(endpoint, None, access_of({}, AS_MASTER, self.keys))
             stack.callback(bus.close)
             bus.serve(MASTER, self._obey)
-            self.start(site, "relay", "--bus", endpoint, "--router", self.near, "--site", site)
+            self.start(site, "fleet", "relay", "--bus", endpoint, "--router", self.near, "--site", site)
         self.readers = {site: self.opened(lambda site=site: self.reader(site)) for site in SITES}
         self.received = {site: bus.subscribe("gesture") for site, bus in self.readers.items()}
 
@@ -156,5 +156,5 @@ def test_a_router_that_was_killed_is_found_again_by_relays_routers_and_readers(b
     building.what_comes(READY_S)
     building.near_router.kill()
     building.near_router.wait()
-    building.near_router = building.start("near", "router", "--listen", building.near)
+    building.near_router = building.start("near", "fleet", "relay", "--listen", building.near)
     assert building.what_comes(BACK_S) == {site: {key} for site, key in SITES.items()}

@@ -197,12 +197,12 @@ def test_a_thief_between_both_reads_nothing_and_when_he_is_gone_they_find_each_o
 @pytest.mark.parametrize(
     ("master", "slave", "output"),
     [
-        (LinkKey(KEY, ROOT), KEY, "has the rig key alone: phalanx deploy brings device-left.secret"),
+        (LinkKey(KEY, ROOT), KEY, "has the rig key alone: phalanx fleet deploy brings device-left.secret"),
         (KEY, own("left"), "start the master with --keys DIR, a folder that has devices.key"),
         (
             LinkKey(KEY, ROOT),
             own("right"),
-            "is not the one that the master at 10.0.0.1 has for it: phalanx deploy",
+            "is not the one that the master at 10.0.0.1 has for it: phalanx fleet deploy",
         ),
     ],
 )

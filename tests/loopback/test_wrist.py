@@ -140,7 +140,7 @@ def test_a_slave_sends_cycles_reports_them_and_follows_its_files(tmp_path: Path)
 
 
 def test_the_demo_of_the_device_scores_against_its_truth_and_leaves_its_results(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "deploy", "demo", "--wrist", "--headless", "--seconds", "4"]
+    command = [sys.executable, "-m", "master", "demo", "--wrist", "--headless", "--seconds", "4"]
     done = subprocess.run(
         [*command, "--out", str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=300, check=False
     )

@@ -1,4 +1,4 @@
-"""`phalanx-master camera`: what it tells the slave, what it shows, and what it says when that cannot be."""
+"""`phalanx camera`: what it tells the slave, what it shows, and what it says when that cannot be."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path

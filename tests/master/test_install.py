@@ -1,4 +1,4 @@
-"""`phalanx-master install`: the unit by systemd's own checks, its options, and how the loop shows that it lives."""
+"""`phalanx run --install`: the unit by systemd's own checks, its options, and how the loop shows that it lives."""
 
 import os
 import re
@@ -6,6 +6,7 @@ import shutil
 import socket
 import subprocess
 import sys
+from argparse import Namespace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -13,7 +14,8 @@ import pytest
 
 from common.errors import PhalanxError
 from common.service_manager import ServiceManager
-from master.install_command import command_of, environment_of
+from master.cli.table import program
+from master.install_command import KEPT, ONE_RUN, command_of, environment_of
 from master.keys_folder import make
 from master.loop_monitor import MonitoredLoop
 from master.service_unit import UNIT, unit_text
@@ -36,6 +38,10 @@ def keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     make(tmp_path / "keys", ["left"], datetime.now(UTC))
     monkeypatch.chdir(ROOT)
     return tmp_path / "keys"
+
+
+def options_of(words: list[str]) -> Namespace:
+    return program().parse(["run", *words])[1]
 
 
 def text_of(folder: Path, *words: str) -> str:
@@ -68,7 +74,7 @@ def test_systemd_has_nothing_to_say_about_the_unit(tmp_path: Path) -> None:
         ("WatchdogSec", "WatchdogSek", "Unknown key 'WatchdogSek'"),
         ("MemoryMax=1G", "MemoryMax=1X", "Invalid memory limit"),
         ("MemorySwapMax=0", "MemorySwapMax=none", "Invalid memory limit"),
-        ("phalanx-master run", "phalanx run", "not executable"),
+        ("phalanx-master run", "phalanx-mister run", "not executable"),
     ],
 )
 def test_a_slip_in_the_unit_would_be_said(tmp_path: Path, old: str, new: str, output: str) -> None:
@@ -134,13 +140,19 @@ def test_each_word_is_one_word_to_systemd(tmp_path: Path) -> None:
 
 def test_options_are_those_of_run_with_absolute_paths_and_no_key(keys: Path) -> None:
     words = ["--rig", "desk", "--rig", "wrist", "--keys", os.path.relpath(keys), "--bus", "tls/0.0.0.0:47802"]
-    assert command_of(words) == [
+    assert command_of(options_of(words)) == [
         *(str(PROGRAM), "run", "--rig", "desk", "--rig", "wrist"),
         *("--calibration", str(ROOT / "calib_json"), "--bus", "tls/0.0.0.0:47802"),
     ]
     assert environment_of() == {"PHALANX_KEYS": str(keys)}
-    text = unit_text(command_of(words), ROOT, environment_of())
+    text = unit_text(command_of(options_of(words)), ROOT, environment_of())
     assert (keys / "rig.key").read_text().strip() not in text
+
+
+def test_every_option_of_run_is_kept_or_refused() -> None:
+    once = {"poses", "summary", "record", "install", "uninstall", "dry_run"}
+    assert set(vars(options_of([]))) == {*KEPT, *once}
+    assert set(ONE_RUN) < once
 
 
 @pytest.mark.parametrize(
@@ -164,7 +176,7 @@ def test_what_could_not_run_is_refused_before_anything_is_written(
 ) -> None:
     assert keys.exists()
     with pytest.raises(PhalanxError, match=why):
-        command_of(words)
+        command_of(options_of(words))
 
 
 def test_a_key_of_the_environment_is_not_written_into_the_unit(
@@ -173,7 +185,7 @@ def test_a_key_of_the_environment_is_not_written_into_the_unit(
     assert keys.exists()
     monkeypatch.setenv("PHALANX_RIG_KEY", "ab" * 32)
     with pytest.raises(PhalanxError, match="a key is not written into a unit; give --keys DIR"):
-        command_of(["--rig", "desk"])
+        command_of(options_of(["--rig", "desk"]))
 
 
 def test_where_no_service_manager_answers_it_says_what_to_do(
@@ -214,7 +226,7 @@ def test_the_loop_is_ready_once_and_gives_a_sign_of_life_four_times_in_a_period(
 def test_a_dry_run_prints_the_unit_and_writes_nothing(keys: Path) -> None:
     config = keys.parent / "config"
     done = subprocess.run(
-        [str(PROGRAM), "install", "--rig", "desk", "--keys", str(keys), "--dry-run"],
+        [str(PROGRAM), "run", "--install", "--rig", "desk", "--keys", str(keys), "--dry-run"],
         env=os.environ | {"XDG_CONFIG_HOME": str(config)},
         capture_output=True,
         text=True,

@@ -57,8 +57,8 @@ class Installed:
         )
 
     def install(self, *more: str) -> subprocess.CompletedProcess[str]:
-        """`phalanx-master install` with the options of the rig."""
-        return self.asked(str(PROGRAM), "install", *self.options, *more)
+        """`phalanx run --install` with the options of the rig."""
+        return self.asked(str(PROGRAM), "run", "--install", *self.options, *more)
 
     def ends(self) -> list[str]:
         """How it ended, each time."""
@@ -129,13 +129,13 @@ def test_one_that_is_stopped_stays_so_and_uninstalling_leaves_nothing(installed:
     os.kill(installed.pid(), signal.SIGTERM)
     assert until(lambda: installed.state() == "inactive")
     assert installed.asked("systemctl", "--user", "start", UNIT).returncode == 0
-    assert "would stop" in installed.asked(str(PROGRAM), "install", "--uninstall", "--dry-run").stdout
+    assert "would stop" in installed.asked(str(PROGRAM), "run", "--uninstall", "--dry-run").stdout
     assert installed.state() == "active"
-    assert "removed" in installed.asked(str(PROGRAM), "install", "--uninstall").stdout
+    assert "removed" in installed.asked(str(PROGRAM), "run", "--uninstall").stdout
     assert installed.state() == "inactive"
     config = Path(installed.environment["HOME"]) / ".config"
     assert [path.name for path in config.rglob("*") if not path.is_dir()] == ["test.conf"]
-    assert "nothing to remove" in installed.asked(str(PROGRAM), "install", "--uninstall").stdout
+    assert "nothing to remove" in installed.asked(str(PROGRAM), "run", "--uninstall").stdout
 
 
 def test_an_error_is_named_and_the_service_recovers_by_itself_once_it_is_mended(installed: Installed) -> None:

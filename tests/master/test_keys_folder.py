@@ -5,14 +5,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from common.certificates import shown
 from common.errors import PhalanxError
 from common.keys import link_key, new_key
 from common.link_key import device_secret
-from master.keys_command import keys_app
 from master.keys_folder import certificates_of, devices_of, lacks_secrets, make, renew, renew_device
+from tests.cli import invoke
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 ALL = {
@@ -93,22 +92,22 @@ def test_a_folder_from_before_there_were_secrets_gets_them_for_all_its_devices(k
     }
     for name in files(keys).keys() - old.keys():
         (keys / name).unlink()
-    output = CliRunner().invoke(keys_app(), ["show", str(keys)])
-    assert f"No secret of its own has left, pi.right-2_x: phalanx-master keys make {keys}" in output.output
-    output = CliRunner().invoke(keys_app(), ["make", str(keys)])
+    output = invoke("fleet", "keys", keys)
+    assert f"No secret of its own has left, pi.right-2_x: phalanx fleet keys {keys} --make" in output.output
+    output = invoke("fleet", "keys", keys, "--make")
     assert output.exit_code == 0
     assert "made devices.key, devices/left.secret, devices/pi.right-2_x.secret" in output.output
     assert "deploy again to left, pi.right-2_x; restart the master" in output.output
     assert {name: content for name, content in files(keys).items() if name in old} == old
     assert not lacks_secrets(keys)
-    for command in ("make", "show"):
-        assert "again" not in CliRunner().invoke(keys_app(), [command, str(keys)]).output
+    for more in (("--make",), ()):
+        assert "again" not in invoke("fleet", "keys", keys, *more).output
 
 
 @pytest.mark.parametrize("content", ["", "00", "z" * 64])
 def test_a_broken_root_of_the_secrets_is_named(keys: Path, content: str) -> None:
     (keys / "devices.key").write_text(content)
-    with pytest.raises(PhalanxError, match=r"devices\.key: broken .*keys renew"):
+    with pytest.raises(PhalanxError, match=r"devices\.key: broken .*fleet keys .* --renew"):
         make(keys, [], NOW)
 
 

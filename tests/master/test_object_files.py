@@ -219,9 +219,9 @@ def test_tags_that_do_not_fit_are_named(tmp_path: Path, changes: dict[str, objec
     save_tags(tmp_path, **changes)
     with pytest.raises(RecordingError, match=expected) as error:
         list(recorded_tags(tmp_path, "left"))
-    assert "`phalanx-slave detect` for camera 'left'" in str(error.value)
+    assert "`phalanx-slave run -o` for camera 'left'" in str(error.value)
 
 
 def test_missing_tags_say_which_command_makes_them(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"tags_left\.npz: cannot read.*phalanx-slave detect"):
+    with pytest.raises(RecordingError, match=r"tags_left\.npz: cannot read.*phalanx-slave run -o"):
         list(recorded_tags(tmp_path, "left"))

@@ -24,7 +24,7 @@ def test_a_camera_that_is_mostly_left_out_is_named_once() -> None:
     assert not looks(watch, counts, 30, poses=60, mostly_left_out__top=25)
     [line] = looks(watch, counts, 300, poses=60, mostly_left_out__right=50)
     assert line.startswith("camera right: its rays miss")
-    assert "calibrate stereo" in line
+    assert "calibrate cameras stereo" in line
 
 
 def test_a_master_that_solves_nothing_names_nobody() -> None:

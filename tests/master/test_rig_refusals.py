@@ -1,4 +1,4 @@
-"""Rigs whose depth model or solver does not fit them, as a user meets them: at the start of `phalanx-master run`."""
+"""Rigs whose depth model or solver does not fit them, as a user meets them: at the start of `phalanx run`."""
 
 import json
 from collections.abc import Callable
@@ -34,7 +34,7 @@ def changed(tree: Path, change: Change, name: str = "desk") -> None:
 
 
 def started(tree: Path, *rigs: str) -> Ended:
-    """`phalanx-master run`, which ends by itself only where it refuses."""
+    """`phalanx run`, which ends by itself only where it refuses."""
     key = tree / "rig.key"
     key.write_text(new_key())
     key.chmod(0o600)
@@ -75,7 +75,7 @@ def strange_solver(rig: dict[str, Any]) -> None:
             without_numbers,
             (
                 "desk.json: depth_model is 'power_law' but the key 'power_law' is missing",
-                "set depth_model to 'stereo' until `phalanx-master calibrate depth --use power_law` has fitted it",
+                "set depth_model to 'stereo' until `phalanx calibrate depth --use power_law` has fitted it",
             ),
         ),
         (

@@ -135,7 +135,7 @@ def test_a_missing_file_says_which_command_makes_it(tmp_path: Path, short_run: S
     write_detections(tmp_path, short_run)
     (tmp_path / "detections_right.npz").unlink()
     with pytest.raises(
-        RecordingError, match=r"detections_right\.npz.*`phalanx-slave detect` for camera 'right'"
+        RecordingError, match=r"detections_right\.npz.*`phalanx-slave run -o` for camera 'right'"
     ):
         solve(recording(tmp_path, short_run), short_run.setup, tmp_path, tmp_path)
 

@@ -126,5 +126,5 @@ def test_a_wrist_device_with_the_cameras_changes_nothing_of_the_object(
 
 def test_tags_that_nobody_looked_for_are_asked_for(recorded: FrameRecording, root: Path) -> None:
     (recorded.folder / "tags_right.npz").unlink()
-    with pytest.raises(RecordingError, match=r"tags_right\.npz.*`phalanx-slave detect` for camera 'right'"):
+    with pytest.raises(RecordingError, match=r"tags_right\.npz.*`phalanx-slave run -o` for camera 'right'"):
         solve_hands(recorded, setups_of(recorded, root), recorded.folder, recorded.folder)

@@ -250,7 +250,7 @@ def test_a_broken_file_is_named_with_what_is_wrong_and_what_to_do(
     tmp_path: Path, cycles: list[WristDetections], changes: dict[str, object], message: str
 ) -> None:
     write_detections(tmp_path, cycles, **changes)
-    with pytest.raises(RecordingError, match=rf"detections_wrist\.npz: .*{message}.*phalanx-slave detect"):
+    with pytest.raises(RecordingError, match=rf"detections_wrist\.npz: .*{message}.*phalanx-slave run -o"):
         list(recorded_cycles(tmp_path, "wrist"))
 
 

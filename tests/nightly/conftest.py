@@ -25,7 +25,7 @@ def measured() -> Iterator[Measured]:
 
 @pytest.fixture(scope="session")
 def rig(measured: Measured) -> Iterator[BoardRig]:
-    """The machine, on, with a camera of the kernel and the slave that `phalanx deploy` put there, and a master."""
+    """The machine, on, with a camera of the kernel and the slave that a deployment put there, and a master."""
     with switched_on(AMD64, "PC", measured) as one:
         one.board.run(LOAD)
         file = one.calibration / "cameras/left.json"
@@ -34,7 +34,7 @@ def rig(measured: Measured) -> Iterator[BoardRig]:
         camera["intrinsics"] |= {"cx_px": 0.5 * (WIDTH_PX - 1), "cy_px": 0.5 * (HEIGHT_PX - 1)}
         file.write_text(json.dumps(camera, indent=1))
         one.start_master()
-        slow = ("--ready-s", str(PATIENCE_S / 2), "--hear-s", str(PATIENCE_S / 4))
+        slow = ("--ready-s", str(PATIENCE_S / 2), "--wait-s", str(PATIENCE_S / 4))
         camera = ("--camera", "left=v4l2:/dev/video0", "--options", f"left={VIVID}")
         ran = one.deploy(*camera, *slow, timeout_s=PATIENCE_S)
         assert ran.code == 0, f"{ran}\n{one.board.journal()}"

@@ -39,8 +39,8 @@ class Stub:
         return self.board.try_run(" ".join(line), 600.0)
 
     def lights(self, *words: str) -> "subprocess.CompletedProcess[str]":
-        """Run `phalanx-slave lights` on the stub."""
-        return self.slave("lights", "--rig", "wrist", "--lights", f"i2c:{self.bus}:{LIGHTS:#x}", *words)
+        """Run `phalanx-slave doctor --lights` on the stub."""
+        return self.slave("doctor", "--rig", "wrist", "--lights", f"i2c:{self.bus}:{LIGHTS:#x}", *words)
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_lights_are_set_up_blink_and_end_dark(stub: Stub) -> None:
 
 
 def test_a_bus_without_whole_messages_is_named_by_the_imu(stub: Stub) -> None:
-    words = ("imu", "--name", "imu", "--rig", "wrist", "--imu", f"lsm6dsox:{stub.bus}:{IMU:#x}")
+    words = ("run", "--name", "imu", "--rig", "wrist", "--imu", f"lsm6dsox:{stub.bus}:{IMU:#x}")
     key = "/etc/phalanx/keys/rig.key"
     asked = stub.slave(*words, "--key-file", key)
     assert asked.returncode == 1, asked.stdout + asked.stderr
@@ -88,6 +88,6 @@ def test_a_bus_without_whole_messages_is_named_by_the_imu(stub: Stub) -> None:
 
 
 def test_a_bus_that_is_not_there_is_named(stub: Stub) -> None:
-    asked = stub.slave("lights", "--rig", "wrist", "--lights", "i2c:77", "--off")
+    asked = stub.slave("doctor", "--rig", "wrist", "--lights", "i2c:77", "--off")
     assert asked.returncode == 1
     assert "no /dev/i2c-77" in asked.stderr

@@ -75,7 +75,7 @@ def replays(
 
 
 def replay(root: Path, calibration: Path, recording: Path, out: Path) -> Replay:
-    command(root, "deploy", "replay", str(recording), "--calibration", str(calibration), "--out", str(out))
+    command(root, "master", "replay", str(recording), "--calibration", str(calibration), "--out", str(out))
     return Replay(recording, out)
 
 

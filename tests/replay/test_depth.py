@@ -67,9 +67,16 @@ def sweeps(datasets: Path, root: Path, tmp_path_factory: pytest.TempPathFactory)
         )
         shutil.copytree(colours / "cameras", out[name].tree / "cameras")
         for camera in CAMERAS:
-            arguments = ("--camera", camera, "--calibration", colours)
+            arguments = (
+                "--name",
+                camera,
+                "--camera",
+                f"replay:{recordings / name}",
+                "--calibration",
+                colours,
+            )
             target = out[name].found / f"detections_{camera}.npz"
-            done = run(root, "slave", "detect", recordings / name, *arguments, "-o", target)
+            done = run(root, "slave", "run", *arguments, "-o", target)
             assert done.returncode == 0, done.stderr
     return out
 
@@ -142,4 +149,7 @@ def test_without_detections_the_command_says_how_to_make_them(sweeps: dict[str, 
     recording = sweeps["sweep_paper"].recording
     done = run(sweeps["sweep_paper"].root, "master", "calibrate", "depth", recording)
     assert done.returncode == 1
-    assert f"phalanx-slave detect {recording} --camera right -o DIR/detections_right.npz" in done.stderr
+    assert (
+        f"phalanx-slave run --name right --camera replay:{recording} -o DIR/detections_right.npz"
+        in done.stderr
+    )

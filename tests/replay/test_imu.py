@@ -144,7 +144,7 @@ def test_replay_by_command_uses_the_imu_of_the_recording(
     one = recorded[0]
     command(
         root,
-        "deploy",
+        "master",
         "replay",
         str(one.folder),
         "--calibration",

@@ -47,7 +47,7 @@ def pointing(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Replayed:
     record_scene(folder / "recording", scene, SECONDS, start_s)
     command(
         root,
-        "deploy",
+        "master",
         "replay",
         str(folder / "recording"),
         "--calibration",

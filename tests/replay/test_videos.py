@@ -29,7 +29,7 @@ class Take:
         """Markers (T, M, 3) [m] that a replay of the videos finds, unfiltered; what it printed."""
         videos = [str(self.folder / f"{camera}.avi") for camera in ("left", "right")]
         tree, out = str(self.folder / "calib"), self.folder / "out"
-        output = command("deploy", "replay", *videos, "--calibration", tree, "--out", str(out), *options)
+        output = command("master", "replay", *videos, "--calibration", tree, "--out", str(out), *options)
         with np.load(out / "poses.npz") as poses:
             return poses["markers_raw_m"], output
 

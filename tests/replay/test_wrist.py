@@ -62,7 +62,7 @@ def replays(datasets: Path, root: Path, tmp_path_factory: pytest.TempPathFactory
     for name, hand in HANDS.items():
         recording, profile = datasets / "wrist" / name, datasets / "hands" / f"webxr-{hand}.json"
         out = tmp_path_factory.mktemp(name)
-        command(root, "deploy", "replay", str(recording), "--hand", str(profile), "--out", str(out))
+        command(root, "master", "replay", str(recording), "--hand", str(profile), "--out", str(out))
         done[name] = Replay(recording, profile, out)
     return done
 
@@ -111,7 +111,7 @@ def test_fingertips_are_not_invented(replays: dict[str, Replay], name: str) -> N
 def by_laser_alone(replay: Replay, root: Path, out: Path) -> Replay:
     """The same detections, solved at level fk."""
     files = ["--hand", str(replay.hand), "--detections", str(replay.out), "--out", str(out)]
-    command(root, "master", "solve", str(replay.recording), *files, "--solver-mode", "fk")
+    command(root, "master", "replay", str(replay.recording), *files, "--solver-mode", "fk")
     return replace(replay, out=out)
 
 
@@ -166,7 +166,7 @@ def test_beyond_the_point_where_the_laser_stands_still_the_output_says_so(
 
 def test_another_replay_writes_the_same_bytes(replays: dict[str, Replay], root: Path, tmp_path: Path) -> None:
     first = replays["left_small"]
-    command(root, "deploy", "replay", str(first.recording), "--hand", str(first.hand), "--out", str(tmp_path))
+    command(root, "master", "replay", str(first.recording), "--hand", str(first.hand), "--out", str(tmp_path))
     for name in ("detections_wrist.npz", "poses.npz"):
         assert (tmp_path / name).read_bytes() == (first.out / name).read_bytes()
 

@@ -268,13 +268,13 @@ def test_a_disk_too_small_is_said_before_the_work(tmp_path: Path) -> None:
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     parts = [str(part(tmp_path, "left")), str(part(tmp_path, "right"))]
     out = tmp_path / "wave"
-    assert main(["join", *parts, "-o", str(out)]) == 0
+    assert main(["record", "--join", *parts, "-o", str(out)]) == 0
     assert f"{out}: left 3 frames, right 3 frames" in capsys.readouterr().out
-    assert main(["join", *parts, "-o", str(out)]) == 1
+    assert main(["record", "--join", *parts, "-o", str(out)]) == 1
     assert "wave: holds something already" in capsys.readouterr().err
     shutil.rmtree(out)
     with pytest.raises(SystemExit, match="2"):
-        main(["join", "-o", str(out)])
+        main(["record", "--join", "-o", str(out)])
 
 
 def test_a_frame_that_claims_to_be_huge_is_not_read(tmp_path: Path) -> None:

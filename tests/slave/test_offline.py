@@ -67,7 +67,9 @@ def test_shapes_and_content_are_those_of_the_format(tmp_path: Path) -> None:
 def test_two_runs_of_the_command_write_the_same_bytes(tmp_path: Path) -> None:
     folder = recording(tmp_path)
     for name in ("a.npz", "b.npz"):
-        assert main(["detect", str(folder), "--camera", "left", "-o", str(tmp_path / name)]) == 0
+        assert (
+            main(["run", "--name", "left", "--camera", f"replay:{folder}", "-o", str(tmp_path / name)]) == 0
+        )
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
@@ -88,7 +90,7 @@ def test_without_colours_the_error_names_file_key_and_remedy(
         CalibrationError, match=r"recording\.json: cameras\.left\.markers: missing; give --calib"
     ):
         detect_recording(folder, "left")
-    assert main(["detect", str(folder), "--camera", "left", "-o", str(tmp_path / "d.npz")]) == 1
+    assert main(["run", "--name", "left", "--camera", f"replay:{folder}", "-o", str(tmp_path / "d.npz")]) == 1
     assert "phalanx-slave colours" in capsys.readouterr().err
     (tmp_path / "cameras").mkdir()
     save(tmp_path / "cameras/left.json", msgspec.structs.replace(camera(), markers=None))

@@ -12,10 +12,11 @@ from common.clock import SystemClock
 from common.errors import CameraError
 from slave.cameras import real, reconnecting
 from slave.cameras.grey import Pixels
-from slave.cameras.real import add_options, open_real
+from slave.cameras.real import open_real
 from slave.cameras.reconnecting import ReconnectingCamera
 from slave.cameras.source import FrameSource
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
+from slave.cli.options import add_camera
 from tests.slave.fake_picamera2 import Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice
 
@@ -34,7 +35,7 @@ CALIBRATION = CameraCalibration(
 
 def opened(driver: str, *arguments: str, wrist: bool = False) -> FrameSource | None:
     parser = argparse.ArgumentParser()
-    add_options(parser)
+    add_camera(parser)
     options = parser.parse_args(arguments)
     return open_real(driver, options, CALIBRATION, SystemClock(), threading.Event(), wrist=wrist)
 
@@ -84,7 +85,7 @@ def test_the_camera_of_a_wrist_device_is_grey_and_luma_only_by_name(seen: list[V
 
 def test_without_a_stop_a_lost_camera_is_an_error(seen: list[V4l2Options]) -> None:
     parser = argparse.ArgumentParser()
-    add_options(parser)
+    add_camera(parser)
     options = parser.parse_args(["--control", "gain=32", "--control", "white_balance_temperature=4600"])
     source = open_real("v4l2", options, CALIBRATION, SystemClock(), None)
     assert isinstance(source, V4l2Camera)

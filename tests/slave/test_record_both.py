@@ -28,7 +28,7 @@ def test_marker_camera_and_wrist_device_see_one_hand_at_the_same_times(tmp_path:
     assert record(tmp_path, "left", "desk", *simulated) == 0
     assert record(tmp_path, "wrist", "wrist", *simulated, "--imu") == 0
     parts = [str(tmp_path / name) for name in ("left", "wrist")]
-    assert main(["join", *parts, "-o", str(tmp_path / "both")]) == 0
+    assert main(["record", "--join", *parts, "-o", str(tmp_path / "both")]) == 0
     both = open_recording(tmp_path / "both")
     assert both.manifest.kind == "both"
     assert both.manifest.marker_rig().name == "desk"

@@ -11,8 +11,8 @@ import pytest
 from common.errors import CameraError
 from slave.__main__ import main
 from slave.app import run
-from slave.arguments import parser
 from slave.cameras.source import Frame
+from slave.cli.table import PROGRAM
 from slave.counters import Counters
 from slave.markers.calibrated import CalibratedDetector
 from slave.markers.detector import MarkerDetector
@@ -93,15 +93,10 @@ def test_a_mode_by_name_is_kept_whatever_it_costs(scan: Scan, windows: bool) -> 
 def test_a_name_that_is_none_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ValueError, match="scan 'strips', not one of auto, full, windows"):
         ScanChoice("strips", camera())  # pyright: ignore[reportArgumentType]
-    for command in (
-        ["run", "--name", "left", "--camera", "synthetic", "--scan", "strips"],
-        ["detect", "r", "--camera", "left", "-o", "f.npz", "--scan", "auto"],
-    ):
-        with pytest.raises(SystemExit):
-            main(command)
-        assert "argument --scan: invalid choice" in capsys.readouterr().err
-    assert parser().parse_args(["run", "--name", "left", "--camera", "synthetic"]).scan == "auto"
-    assert parser().parse_args(["detect", "r", "--camera", "left", "-o", "f"]).scan == "full"
+    with pytest.raises(SystemExit):
+        main(["run", "--name", "left", "--camera", "synthetic", "--scan", "strips"])
+    assert "argument --scan: invalid choice" in capsys.readouterr().err
+    assert PROGRAM.parse(["run", "--name", "left", "--camera", "synthetic"])[1].scan == "auto"
 
 
 class Clock:
@@ -187,7 +182,8 @@ def test_a_marker_whose_colour_comes_later_is_found_and_without_any_colour_nothi
 def test_a_recording_gives_the_same_bytes_in_windows(datasets: Path, tmp_path: Path) -> None:
     (tmp_path / "cameras").mkdir()
     calibrate_colours(datasets / "stereo/calib_colors", "left", tmp_path / "cameras/left.json")
-    command = ["detect", str(datasets / "stereo/static"), "--camera", "left", "--calibration", str(tmp_path)]
+    command = ["run", "--name", "left", "--camera", f"replay:{datasets / 'stereo/static'}"]
+    command += ["--calibration", str(tmp_path)]
     for scan in ("full", "windows"):
         assert main([*command, "-o", str(tmp_path / f"{scan}.npz"), "--scan", scan]) == 0
     assert (tmp_path / "full.npz").read_bytes() == (tmp_path / "windows.npz").read_bytes()

@@ -150,7 +150,7 @@ class GuidedCurl:
 
 
 class GuidedSubject:
-    """What `calibrate subject` asks for: flat hand, straight fingers bent at their knuckles and back, fist and back.
+    """What `calibrate wrist subject` asks for: flat hand, straight fingers bent at their knuckles, fist, and back.
 
     Nobody does it exactly: each seed is a person whose flat hand is not quite flat, whose straight fingers follow a
     little, and whose fist has ratios of its own. The state it holds is that person, fixed by the constructor.

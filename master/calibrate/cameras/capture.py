@@ -1,7 +1,7 @@
 """Takes the pictures for a calibration from running slaves: whole frames over the bus, on a person's pace.
 
 While it runs it *is* the rig's master: it gives the start and keeps the clocks, so that slaves need not know that
-nobody tracks. Nothing is calibrated here; the folder it leaves is what `calibrate intrinsics` and `stereo` read.
+nobody tracks. Nothing is calibrated here; its folder is what `calibrate cameras intrinsics` and `stereo` read.
 """
 
 import threading

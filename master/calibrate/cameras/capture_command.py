@@ -1,33 +1,22 @@
-"""`phalanx-master calibrate capture`: pictures of a board from the running slaves, for `intrinsics` and `stereo`."""
+"""`phalanx calibrate cameras capture`: pictures of a board from the running slaves, for `intrinsics` and `stereo`."""
 
 import os
 import threading
+from argparse import Namespace
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.clock import SystemClock
 from common.errors import CalibrationError
 from common.keys import link_key
+from common.terminal import echo
 from master.calibrate.cameras.capture import StillTaker, capture, new_folder
 from master.calibrate.cameras.live_views import LiveViews
-from master.calibrate.cameras.options import Dictionary, MarkerMm, Size, SquareMm, board_of, options_of
+from master.calibrate.cameras.options import board_of, options_of
 from master.ingest import Ingest
 from master.master_bus import host_bus
 from master.options import (
-    CALIB_JSON,
-    HERE_BEACON,
-    HERE_BIND,
-    HERE_BUS,
-    Beacon,
-    Bind,
-    BusEnd,
-    Calibration,
-    KeyFile,
-    Rig,
     address,
 )
 from master.stopping import stop_on_signals
@@ -38,58 +27,39 @@ _POLL_S = 0.2
 _HINT_ROUNDS = 50  # ten seconds
 
 
-def capture_views(
-    out: Annotated[Path, typer.Option(help="New or empty folder for the pictures.")],
-    board: Size = "9x6",
-    square_mm: SquareMm = 25.0,
-    marker_mm: MarkerMm = None,
-    dictionary: Dictionary = "4X4_50",
-    views: Annotated[int, typer.Option(min=FEWEST, max=200, help="Views to keep.")] = 25,
-    rig: Rig = "desk",
-    calibration: Calibration = CALIB_JSON,
-    beacon: Beacon = HERE_BEACON,
-    bind: Bind = HERE_BIND,
-    bus: BusEnd = HERE_BUS,
-    key_file: KeyFile = None,
-) -> None:
-    """Keep a picture whenever the board is held still somewhere new; all running slaves of the rig at once.
-
-    This is the rig's master while it runs: end `phalanx-master run` first. Slaves whose cameras have no colours yet
-    run with `--colours none`. Ctrl-C ends it early; what was kept stays.
-
-    Examples:
-
-      phalanx-master calibrate capture --rig desk --board 9x6 --square-mm 25 --out views
-
-      phalanx-master calibrate stereo views --board 9x6 --square-mm 25 --rig desk --out calib_json      then
-    """
-    ends = address(beacon, "--beacon"), address(bind, "--bind")
-    cameras = cameras_of(calibration, rig)
-    sizes = _sizes(calibration, cameras)
-    live = LiveViews(board_of(board, square_mm, marker_mm, dictionary), cameras)
-    key = link_key(os.environ, key_file)
+def capture_views(options: Namespace) -> None:
+    """Keep a picture whenever the board is held still somewhere new; all running slaves of the rig at once."""
+    ends = address(options.beacon, "--beacon"), address(options.bind, "--bind")
+    cameras = cameras_of(options.calibration, options.rig)
+    sizes = _sizes(options.calibration, cameras)
+    live = LiveViews(
+        board_of(options.board, options.square_mm, options.marker_mm, options.dictionary), cameras
+    )
+    key = link_key(os.environ, options.key_file)
     clock = SystemClock()
-    new_folder(out)
+    new_folder(options.out)
     stop = stop_on_signals()
     with ExitStack() as stack:
-        link = host_bus(bus, live.cameras)
+        link = host_bus(options.bus, live.cameras)
         stack.callback(link.close)
-        ingest = Ingest(live.cameras, key, clock, *ends, bus, _START_S)
+        ingest = Ingest(live.cameras, key, clock, *ends, options.bus, _START_S)
         stack.callback(ingest.close)
         _wait(ingest, live.cameras, stop)
         taker = StillTaker(link, ingest, sizes)
         stack.callback(taker.close)
-        kept = capture(taker.take, live, out, views, stop, typer.echo, live.missing)
+        kept = capture(taker.take, live, options.out, options.views, stop, echo, live.missing)
     if kept < FEWEST:
-        raise CalibrationError(f"{out}: {kept} views kept; a calibration needs {FEWEST}, better {views}")
-    typer.echo(f"{kept} views in {out}; next: phalanx-master calibrate {_next(live, out, rig)}")
+        raise CalibrationError(
+            f"{options.out}: {kept} views kept; a calibration needs {FEWEST}, better {options.views}"
+        )
+    echo(f"{kept} views in {options.out}; next: phalanx calibrate {_next(live, options.out, options.rig)}")
 
 
 def _next(live: LiveViews, out: Path, rig: str) -> str:
     """The command that makes a calibration of what was kept."""
     several = len(live.cameras) > 1
     what, of_rig = ("stereo", f" --rig {rig}") if several else ("intrinsics", "")
-    return f"{what} {out} {options_of(live.board)}{of_rig} --out DIR"
+    return f"cameras {what} {out} {options_of(live.board)}{of_rig} --out DIR"
 
 
 def cameras_of(calibration: Path, rig: str) -> tuple[str, ...]:
@@ -115,11 +85,11 @@ def _wait(ingest: Ingest, cameras: tuple[str, ...], stop: threading.Event) -> No
         here = ingest.connected
         if here != previous:
             absent = ", ".join(name for name in cameras if name not in here)
-            typer.echo(f"waiting for {absent or 'the start'}")
+            echo(f"waiting for {absent or 'the start'}")
             previous = here
         rounds += 1
         if rounds % _HINT_ROUNDS == 0 and not here:
-            typer.echo(
+            echo(
                 "no slave answers: is it running, with the same rig key, and does --beacon reach it? Its log says more"
             )
         if stop.wait(_POLL_S):

@@ -1,15 +1,14 @@
-"""`phalanx-master calibrate intrinsics | stereo`: lenses, and where the cameras stand, from pictures of a board."""
+"""`phalanx calibrate cameras intrinsics | stereo`: lenses, and where the cameras stand, from pictures of a board."""
 
+from argparse import Namespace
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from common.arrays import Float
 from common.calibration import CameraCalibration
 from common.errors import FitError
+from common.terminal import echo
 from master.calibrate.cameras.boards import Board
 from master.calibrate.cameras.files import (
     camera_with_lens,
@@ -25,110 +24,47 @@ from master.calibrate.cameras.files import (
 from master.calibrate.cameras.fit import CamerasFit, fit_cameras
 from master.calibrate.cameras.image_sets import image_sets
 from master.calibrate.cameras.lens_files import lens_of
-from master.calibrate.cameras.options import Dictionary, MarkerMm, Size, SquareMm, board_of
+from master.calibrate.cameras.options import board_of
 from master.calibrate.cameras.report import report_json, report_lines
 from master.calibrate.cameras.result import CamerasResult, result
 from master.calibrate.cameras.views import BoardViews, View, look
-from master.options import CALIB_JSON, Calibration, JsonFile, ResultTree
 from master.summary import write_summary
 
-Source = Annotated[
-    Path,
-    typer.Argument(
-        help="Folder: CAMERA*.png|jpg, or a folder per camera, or a recording.", show_default=False
-    ),
-]
-Cameras = Annotated[
-    list[str] | None,
-    typer.Option("--camera", help="A camera; may be repeated. Default: all that have images."),
-]
-Flat = Annotated[
-    bool,
-    typer.Option(
-        "--flat-board",
-        help="The board is exact and flat (glass, screen): do not estimate its shape. Default: as views held out say.",
-    ),
-]
-Bent = Annotated[
-    bool,
-    typer.Option("--bent-board", help="Estimate the board's own shape. Default: what views held out say."),
-]
-Picture = Annotated[Path | None, typer.Option(help="Write a picture of corners and residuals to this .png.")]
 
-
-def intrinsics(
-    source: Source,
-    board: Size,
-    square_mm: SquareMm,
-    marker_mm: MarkerMm = None,
-    dictionary: Dictionary = "4X4_50",
-    camera: Cameras = None,
-    flat_board: Flat = False,
-    bent_board: Bent = False,
-    calibration: Calibration = CALIB_JSON,
-    out: ResultTree = None,
-    json_file: JsonFile = None,
-    picture: Picture = None,
-) -> None:
-    """Measure the lens of each camera by itself: focal length, centre and distortion, each with its uncertainty.
-
-    Wrong pictures are left out by themselves, each with the reason. Nothing is written without --out.
-
-    Examples:
-
-      phalanx-master calibrate intrinsics views --board 9x6 --square-mm 25 --out calib_json
-
-      phalanx-master calibrate intrinsics views --camera left --board 7x5 --square-mm 30 --marker-mm 22
-    """
-    views = _views(source, board_of(board, square_mm, marker_mm, dictionary), camera)
-    known = _known_cameras(views, calibration, out)
+def intrinsics(options: Namespace) -> None:
+    """Measure the lens of each camera by itself."""
+    views = _views(
+        options.source,
+        board_of(options.board, options.square_mm, options.marker_mm, options.dictionary),
+        options.camera,
+    )
+    known = _known_cameras(views, options.calibration, options.out)
     results: dict[str, CamerasResult] = {}
     for name in views.cameras:
-        fit = fit_cameras(_only(views, name), bent=_bent(flat=flat_board, bent=bent_board))
+        fit = fit_cameras(_only(views, name), bent=_bent(flat=options.flat_board, bent=options.bent_board))
         results[name] = result(fit, {})
         _print_all(report_lines(results[name]))
-        _draw(picture if len(views.cameras) == 1 else _named(picture, name), fit)
+        _draw(options.picture if len(views.cameras) == 1 else _named(options.picture, name), fit)
     files: dict[str, CameraCalibration] = {}
     for name, own in results.items():
-        how = lens_provenance(own, name, "calibrate intrinsics", (_source_name(source),))
+        how = lens_provenance(own, name, "calibrate cameras intrinsics", (_source_name(options.source),))
         lens = own.lenses[name].intrinsics
         files[name] = camera_with_lens(known[name], name, views.sizes_px[name], lens, how)
-    if json_file is not None:
-        write_summary(json_file, {"cameras": {name: report_json(own) for name, own in results.items()}})
-    _written([] if out is None else write_files(out, files, {}), known)
+    if options.json_file is not None:
+        write_summary(
+            options.json_file, {"cameras": {name: report_json(own) for name, own in results.items()}}
+        )
+    _written([] if options.out is None else write_files(options.out, files, {}), known)
 
 
-def stereo(
-    source: Source,
-    board: Size,
-    square_mm: SquareMm,
-    marker_mm: MarkerMm = None,
-    dictionary: Dictionary = "4X4_50",
-    camera: Cameras = None,
-    rig: Annotated[str, typer.Option(help="Name of the rig's file, without .json.")] = "desk",
-    keep_intrinsics: Annotated[
-        bool, typer.Option("--keep-intrinsics", help="Keep the lenses that the camera files have.")
-    ] = False,
-    flat_board: Flat = False,
-    bent_board: Bent = False,
-    calibration: Calibration = CALIB_JSON,
-    out: ResultTree = None,
-    json_file: JsonFile = None,
-    picture: Picture = None,
-) -> None:
-    """Measure where all cameras of a rig stand, and their lenses, in one bundle; two cameras or more.
-
-    Not every camera needs to see every view, as long as shared views link them all. The rig's frame stays that of its
-    file. Nothing is written without --out.
-
-    Examples:
-
-      phalanx-master calibrate stereo views --board 9x6 --square-mm 25 --rig desk --out calib_json
-
-      phalanx-master calibrate stereo views --camera left --camera right --board 9x6 --square-mm 25 --keep-intrinsics
-    """
-    rig_known = known_rig(rig, calibration, out)
-    views = _views(source, board_of(board, square_mm, marker_mm, dictionary), camera)
+def stereo(options: Namespace) -> None:
+    """Measure where all cameras of a rig stand, and their lenses, in one bundle; two cameras or more."""
+    rig_known = known_rig(options.rig, options.calibration, options.out)
+    views = _views(
+        options.source,
+        board_of(options.board, options.square_mm, options.marker_mm, options.dictionary),
+        options.camera,
+    )
     if rig_known is not None:
         order = sorted(views.cameras, key=[*rig_known.cameras, *views.cameras].index)
         views = replace(views, sizes_px={name: views.sizes_px[name] for name in order})
@@ -136,38 +72,38 @@ def stereo(
         raise FitError(
             f"stereo needs at least two cameras; there are images of {', '.join(views.cameras)} only"
         )
-    known = _known_cameras(views, calibration, out)
+    known = _known_cameras(views, options.calibration, options.out)
     held: dict[str, Float] = {}
     for name, file in known.items():
-        if keep_intrinsics and file is not None and file.intrinsics is not None:
+        if options.keep_intrinsics and file is not None and file.intrinsics is not None:
             held[name] = lens_of(file.intrinsics)
-    fit = fit_cameras(views, held, bent=_bent(flat=flat_board, bent=bent_board))
+    fit = fit_cameras(views, held, bent=_bent(flat=options.flat_board, bent=options.bent_board))
     found = result(fit, held)
     _print_all(report_lines(found))
-    _draw(picture, fit)
-    data = (_source_name(source),)
+    _draw(options.picture, fit)
+    data = (_source_name(options.source),)
     files = {
         name: camera_with_lens(
             known[name],
             name,
             views.sizes_px[name],
             found.lenses[name].intrinsics,
-            lens_provenance(found, name, "calibrate stereo", data),
+            lens_provenance(found, name, "calibrate cameras stereo", data),
         )
         for name in views.cameras
         if name not in held
     }
-    how = places_provenance(found, "calibrate stereo", data)
+    how = places_provenance(found, "calibrate cameras stereo", data)
     new, dropped = without_wrong_law(
-        rig_with_places(rig_known, rig, dict(found.T_rig_camera), how), {**known, **files}
+        rig_with_places(rig_known, options.rig, dict(found.T_rig_camera), how), {**known, **files}
     )
-    if json_file is not None:
-        write_summary(json_file, report_json(found) | {"rig": rig})
-    written = [] if out is None else write_files(out, files, {rig: new})
+    if options.json_file is not None:
+        write_summary(options.json_file, report_json(found) | {"rig": options.rig})
+    written = [] if options.out is None else write_files(options.out, files, {options.rig: new})
     if rig_known is None and written:
-        typer.echo(f"rig {rig!r} is new: its hand is 'default-right', its frame that of {views.cameras[0]}")
+        echo(f"rig {options.rig!r} is new: its hand is 'default-right', its frame that of {views.cameras[0]}")
     if dropped and written:
-        typer.echo(dropped)
+        echo(dropped)
     _written(written, known)
 
 
@@ -191,11 +127,11 @@ def _views(source: Path, board: Board, cameras: list[str] | None) -> BoardViews:
         nonlocal done
         done += 1
         if done % 10 == 0 or done == images:
-            typer.echo(f"looking for the {board}: {done} of {images} images", err=True)
+            echo(f"looking for the {board}: {done} of {images} images", error=True)
 
     views = look(board, sets, progress)
     if views.unseen:
-        typer.echo(f"no board in {len(views.unseen)} of {images} images: {', '.join(views.unseen)}")
+        echo(f"no board in {len(views.unseen)} of {images} images: {', '.join(views.unseen)}")
     return views
 
 
@@ -230,17 +166,17 @@ def _draw(picture: Path | None, fit: CamerasFit) -> None:
     from master.calibrate.cameras.picture import draw_views  # matplotlib takes a second to import
 
     draw_views(picture, fit)
-    typer.echo(f"drew {picture}")
+    echo(f"drew {picture}")
 
 
 def _print_all(lines: Iterable[str]) -> None:
     for line in lines:
-        typer.echo(line)
+        echo(line)
 
 
 def _written(paths: list[Path], known: dict[str, CameraCalibration | None]) -> None:
     if not paths:
-        typer.echo("nothing written: give --out DIR")
+        echo("nothing written: give --out DIR")
     for path in paths:
         new = path.parent.name == "cameras" and known.get(path.stem) is None
-        typer.echo(f"wrote {path}{' (new: mode, exposure and gains are neutral values)' * new}")
+        echo(f"wrote {path}{' (new: mode, exposure and gains are neutral values)' * new}")

@@ -128,7 +128,7 @@ def without_wrong_law(
     models = [CameraModel.of(file, rig.camera_pose(file.name)) for file in files if file is not None]
     try:
         wrong = law_contradicts(rig, models)
-        then = f"; `phalanx-master calibrate depth --use {rig.depth_model}` fits it anew"
+        then = f"; `phalanx calibrate depth --use {rig.depth_model}` fits it anew"
     except CalibrationError as error:  # these cameras can have no such law
         wrong, then = str(error), ""
     if not wrong:

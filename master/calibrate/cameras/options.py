@@ -1,23 +1,9 @@
 """How a board is named on the command line."""
 
 import re
-from typing import Annotated
-
-import typer
 
 from common.errors import CalibrationError
 from master.calibrate.cameras.boards import Board, Charuco, Checkerboard
-
-Size = Annotated[
-    str,
-    typer.Option(
-        "--board",
-        help="COLUMNSxROWS: inner corners of a checkerboard, squares of a ChArUco board (--marker-mm).",
-    ),
-]
-SquareMm = Annotated[float, typer.Option(help="Side of a square in mm, measured on the print.")]
-MarkerMm = Annotated[float | None, typer.Option(help="Side of a marker in mm: the board is a ChArUco board.")]
-Dictionary = Annotated[str, typer.Option(help="Family of its markers.")]
 
 
 def board_of(size: str, square_mm: float, marker_mm: float | None, dictionary: str) -> Board:

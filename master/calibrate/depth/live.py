@@ -3,12 +3,11 @@
 import sys
 from pathlib import Path
 
-import typer
-
 from common.arrays import Float
 from common.clock import SystemClock
 from common.errors import CalibrationError
 from common.link_key import LinkKey
+from common.terminal import echo
 from master.calibrate.depth.session import run_session
 from master.calibrate.depth.source import Measured, Pair, straightened
 from master.calibrate.depth.sweep import Sweep
@@ -43,7 +42,7 @@ def sweep_live(
 
     ingest = Ingest(pair.rig.cameras, key, clock, beacon, bind, "")
     try:
-        typer.echo(
+        echo(
             f"listening on {ingest.address[0]}:{ingest.address[1]}; {len(wanted)} distances, marker {marker!r}"
         )
         sweep = run_session(
@@ -68,17 +67,17 @@ def sweep_live(
 
 
 def _ask(prompt: str) -> str | None:
-    typer.echo(prompt, nl=False)
+    echo(prompt, end="")
     line = sys.stdin.readline()
     return line.rstrip("\n") if line else None
 
 
 def _print(line: str) -> None:
     if sys.stderr.isatty():
-        typer.echo("\r\033[K", nl=False, err=True)  # the progress goes
-    typer.echo(line)
+        echo("\r\033[K", end="", error=True)  # the progress goes
+    echo(line)
 
 
 def _progress(share: float) -> None:
     if sys.stderr.isatty():
-        typer.echo(f"\rreading {100 * share:3.0f} % ", nl=False, err=True)
+        echo(f"\rreading {100 * share:3.0f} % ", end="", error=True)

@@ -106,7 +106,7 @@ def by_truth(recording: FrameRecording, pairs: Pairs) -> Sweep | None:
     if strange := [int(seq) for seq in pairs.seq if int(seq) not in number]:
         raise RecordingError(
             f"{recording.folder}: the detections have a frame {strange[0]}, frames.csv has not: they are of another"
-            " recording; run `phalanx-slave detect` again"
+            " recording; run `phalanx-slave run -o` again"
         )
     index = np.array([number[int(seq)] for seq in pairs.seq], np.int64)
     return _single(pairs, depth[index])

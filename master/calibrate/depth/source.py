@@ -165,7 +165,7 @@ def from_recording(
     pair = pair_for(recording)
     if detections is None:
         lines = "; ".join(
-            f"phalanx-slave detect {folder} --camera {camera} -o DIR/detections_{camera}.npz"
+            f"phalanx-slave run --name {camera} --camera replay:{folder} -o DIR/detections_{camera}.npz"
             for camera in pair.cameras
         )
         raise CalibrationError(

@@ -1,21 +1,13 @@
-"""`phalanx-master calibrate verify`: the published table for this rig, measured and predicted."""
+"""`phalanx calibrate verify`: the published table for this rig, measured and predicted."""
 
-from typing import Annotated
+from argparse import Namespace
 
 import numpy as np
-import typer
 
 from common.arrays import Float
 from common.errors import CalibrationError
+from common.terminal import echo
 from master.calibrate.depth.commands import (
-    Calibration,
-    Detections,
-    Distances,
-    FovDeg,
-    Marker,
-    Picture,
-    Source,
-    Target,
     measured_from,
 )
 from master.calibrate.depth.source import Measured, Pair, load_pair, parse_target
@@ -30,58 +22,40 @@ from master.calibrate.depth.verify_report import (
     verified_json,
 )
 from master.fabrik.depth import tolerable_skew_s
-from master.options import CALIB_JSON, JsonFile, RecordingRig
 from master.summary import write_summary
 
 _WANTED = 0.02  # of the depth, as the published rig
 _TABLE = "0.20:1.00:0.10"  # where the budget is printed
 
 
-def verify_command(
-    source: Source = None,
-    detections: Detections = None,
-    marker: Marker = None,
-    distances: Distances = None,
-    rig: RecordingRig = None,
-    calibration: Calibration = CALIB_JSON,
-    target: Target = "75x50",
-    fov_deg: FovDeg = None,
-    sigma_px: Annotated[float, typer.Option(help="Noise of a centroid, one camera, per axis, in px.")] = 0.1,
-    speed_m_s: Annotated[float, typer.Option(help="Sideways speed for the budget, in m/s.")] = 1.0,
-    skew_ms: Annotated[float, typer.Option(help="Uncorrected time between the two exposures, in ms.")] = 0.5,
-    angles: Annotated[
-        str, typer.Option(help="Angles to the side, in degrees, for the off-axis table.")
-    ] = "-20:20:10",
-    json_file: JsonFile = None,
-    picture: Picture = None,
-) -> None:
-    """Report how right a rig is: error of each depth model at known distances, and the budget of what to expect.
-
-    Without a recording or a table only the budget and the off-axis errors of the rig are printed.
-
-    Examples:
-
-      phalanx-master calibrate verify RECORDING --detections DIR --distances 1.00:0.20:-0.05 --rig desk
-
-      phalanx-master calibrate verify --rig desk
-    """
-    noise = _noise(sigma_px, speed_m_s, skew_ms)
+def verify_command(options: Namespace) -> None:
+    """Report how right a rig is: error of each depth model at known distances, and the budget of what to expect."""
+    noise = _noise(options.sigma_px, options.speed_m_s, options.skew_ms)
     numbers: dict[str, object] = {}
     found: Verified | None = None
-    if source is None:
-        pair = load_pair(calibration, rig or "desk", fov_deg)
-        distance = parse_distances(distances or _TABLE)
+    if options.source is None:
+        pair = load_pair(options.calibration, options.rig or "desk", options.fov_deg)
+        distance = parse_distances(options.distances or _TABLE)
     else:
-        outline = parse_target(target)
-        measured = measured_from(source, detections, marker, distances, rig, calibration, fov_deg, outline)
+        outline = parse_target(options.target)
+        measured = measured_from(
+            options.source,
+            options.detections,
+            options.marker,
+            options.distances,
+            options.rig,
+            options.calibration,
+            options.fov_deg,
+            outline,
+        )
         pair = measured.pair
         found = _measured(measured, noise)
         numbers |= verified_json(found)
         distance = parse_distances(_TABLE)
-    numbers |= _expected(pair, distance, _angles(angles), noise)
-    if json_file is not None:
-        write_summary(json_file, numbers)
-    if picture is not None:
+    numbers |= _expected(pair, distance, _angles(options.angles), noise)
+    if options.json_file is not None:
+        write_summary(options.json_file, numbers)
+    if options.picture is not None:
         if found is None:
             raise CalibrationError(
                 "--picture: there are no measured errors to draw; give a recording or a .csv"
@@ -91,7 +65,7 @@ def verify_command(
         errors = {name: found.relative(name) for name in found.error_m}
         title = f"Depth of rig {pair.rig.name if pair.rig is not None else ''!r}"
         d = found.sweep.distance_m
-        draw_errors(picture, title, d, errors, band=found.expected_m / d)
+        draw_errors(options.picture, title, d, errors, band=found.expected_m / d)
 
 
 def _measured(measured: Measured, noise: Noise) -> Verified:
@@ -114,37 +88,33 @@ def _measured(measured: Measured, noise: Noise) -> Verified:
         raise CalibrationError(
             "the stereo model needs the columns v_left_px and v_right_px, and the rig has no law of disparity"
         )
-    typer.echo(measured.about)
+    echo(measured.about)
     rates = ", ".join(f"{file.name} {file.frame_rate_hz:g} Hz" for file in pair.files) or "unknown"
-    typer.echo(f"camera rate: {rates}; processed: {int(found.sweep.frames.sum())} frame pairs")
+    echo(f"camera rate: {rates}; processed: {int(found.sweep.frames.sum())} frame pairs")
     for name in laws:
         known = pair.rig.provenance.get(name) if pair.rig is not None else None
         if known is not None and set(known.data) & set(measured.data):
-            typer.echo(
-                f"{name} was fitted to this very sweep ({known.date}): its error for other places is larger"
-            )
+            echo(f"{name} was fitted to this very sweep ({known.date}): its error for other places is larger")
     for line in measured_lines(found):
-        typer.echo(line)
+        echo(line)
     return found
 
 
 def _expected(pair: Pair, distance: Float, angle: Float, noise: Noise) -> dict[str, object]:
     """Print budget and off-axis table where the cameras are known, and return them as numbers."""
     if pair.models is None or pair.rig is None:
-        typer.echo(
-            "no budget: focal length and baseline are not known (--rig NAME; --fov-deg without intrinsics)"
-        )
+        echo("no budget: focal length and baseline are not known (--rig NAME; --fov-deg without intrinsics)")
         return {}
     expected = budget(pair.models, distance, noise)
     errors = {name: off_axis(law, pair.models, distance, angle) for name, law in laws_of(pair.rig).items()}
     baseline_m = float(np.linalg.norm(pair.models[1].centre - pair.models[0].centre))
     apart_ms = 1e3 * tolerable_skew_s(_WANTED, baseline_m, 1.0)
-    typer.echo(
+    echo(
         f"f = {pair.models[0].matrix[0, 0]:.1f} px, B = {1e3 * baseline_m:.1f} mm (lenses of {pair.origin});"
         f" {100 * _WANTED:g} % at 1 m/s sideways needs exposures within {apart_ms:.2f} ms of each other"
     )
     for line in [*budget_lines(distance, expected, noise), *off_axis_lines(distance, angle, errors)]:
-        typer.echo(line)
+        echo(line)
     return expected_json(distance, expected, noise, angle, errors)
 
 

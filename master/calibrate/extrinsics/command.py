@@ -1,11 +1,11 @@
-"""`phalanx-master calibrate extrinsics`: how a wrist device sits, by what marker rig and device both see."""
+"""`phalanx calibrate wrist mounting`: how a wrist device sits, by what marker rig and device both see."""
 
+from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import numpy as np
-import typer
 
 from common.arrays import Float
 from common.errors import CalibrationError, FitError
@@ -13,8 +13,8 @@ from common.frame_recording import FrameRecording, open_recording
 from common.imu_fusion import OrientationFilter
 from common.imu_recording import IMU, read_imu
 from common.messages import HandPose, ImuSample
+from common.terminal import echo
 from master.calibrate.wrist.device import device_of, print_line, write_device
-from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.recorded import recorded_cycles, recorded_detections
 from master.rig import load_hand
 from master.rig_pipeline import build_pipeline
@@ -25,50 +25,13 @@ from master.summary import write_summary
 if TYPE_CHECKING:
     from master.calibrate.extrinsics.extrinsics import Extrinsics
 
-Recording = Annotated[
-    Path, typer.Argument(help="Folder of a recording of kind `both`: the joint motion.", show_default=False)
-]
-Detections = Annotated[
-    Path,
-    typer.Option(help="Folder with detections_<camera>.npz of all its cameras, from `phalanx-slave detect`."),
-]
-Hand = Annotated[
-    Path | None,
-    typer.Option("--hand", help="Hand file; default: the marker rig's `hand` in CALIBRATION/hands."),
-]
-Picture = Annotated[
-    Path | None, typer.Option(help="Write a picture of what was seen and fitted to this .png.")
-]
 
-
-def extrinsics(
-    recording: Recording,
-    detections: Detections,
-    hand: Hand = None,
-    rig: RecordingRig = None,
-    calibration: Calibration = CALIB_JSON,
-    out: ResultTree = None,
-    json_file: JsonFile = None,
-    picture: Picture = None,
-) -> None:
-    """Measure how the wrist device sits on the forearm, how its IMU lies, and how late both clocks are.
-
-    With the device on, before the marker cameras, for ten seconds, each to and fro about once a second: bend fingers
-    one by one and together, bend the wrist as far one way as the other, and turn the forearm about all its axes. It
-    needs the laser plane, a pose of the palm that is right to a centimetre and ten degrees (the drawing of the
-    device), and the hand file of that hand. Three markers on the back of the hand (rig desk-back3) tell it best.
-    Nothing is written without --out.
-
-    Examples:
-
-      phalanx-slave detect RECORDING --camera wrist --calibration calib_json -o found/detections_wrist.npz
-
-      phalanx-master calibrate extrinsics RECORDING --detections found --out calib_json
-    """
+def extrinsics(options: Namespace) -> None:
+    """Measure how the wrist device sits on the forearm, how its IMU lies, and how late both clocks are."""
     # Imported here: scipy.optimize takes a second.
     from master.calibrate.extrinsics.extrinsics import calibrate_extrinsics
 
-    device = device_of(recording, rig, calibration, out)
+    device = device_of(options.recording, options.rig, options.calibration, options.out)
     if device.rig.T_camera_palm is None:
         raise CalibrationError(
             f"rig {device.file_name!r}: T_camera_palm: a first guess is needed, such as from the drawing of the device"
@@ -77,27 +40,31 @@ def extrinsics(
         raise CalibrationError(
             f"rig {device.file_name!r}: imu: missing; the bend of the wrist is told by it alone"
         )
-    opened = open_recording(recording)
+    opened = open_recording(options.recording)
     markers = opened.manifest.marker_rig()
-    setup = RigSetup.of(markers, dict(opened.manifest.cameras), load_hand(calibration, markers.hand, hand))
-    poses = marker_poses(setup, detections)
+    setup = RigSetup.of(
+        markers, dict(opened.manifest.cameras), load_hand(options.calibration, markers.hand, options.hand)
+    )
+    poses = marker_poses(setup, options.detections)
     samples = imu_samples(opened, device.rig.imu.name, device.rig.imu.rate_hz)
-    cycles = list(recorded_cycles(detections, device.camera.name))
+    cycles = list(recorded_cycles(options.detections, device.camera.name))
     try:
         found = calibrate_extrinsics(
             poses, setup.markers, setup.hand, cycles, samples, device.rig, device.camera, device.source
         )
     except FitError as error:
-        raise FitError(f"{recording}: {error}") from error
+        raise FitError(f"{options.recording}: {error}") from error
     print_line(found.report)
-    if picture is not None:
+    if options.picture is not None:
         from master.calibrate.extrinsics.picture import draw_extrinsics  # matplotlib takes a second to import
 
-        draw_extrinsics(picture, found, device.optics)
-        typer.echo(f"drew {picture}")
-    written = write_device(out, device, found.rig, "T_camera_palm, imu, stamp_offset_us")
-    if json_file is not None:
-        write_summary(json_file, summary(found) | {"written": None if written is None else str(written)})
+        draw_extrinsics(options.picture, found, device.optics)
+        echo(f"drew {options.picture}")
+    written = write_device(options.out, device, found.rig, "T_camera_palm, imu, stamp_offset_us")
+    if options.json_file is not None:
+        write_summary(
+            options.json_file, summary(found) | {"written": None if written is None else str(written)}
+        )
 
 
 def marker_poses(setup: RigSetup, detections: Path) -> list[HandPose]:

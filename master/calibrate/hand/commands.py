@@ -1,10 +1,9 @@
-"""`phalanx-master calibrate hand`: a hand file from its length alone, or from the guided routine."""
+"""`phalanx calibrate hand`: a hand file from its length alone, or from the guided routine."""
 
 import sys
+from argparse import Namespace
 from pathlib import Path
-from typing import Annotated, Literal
 
-import typer
 from msgspec.structs import replace
 
 from common.back_markers import with_three_back_markers
@@ -13,146 +12,82 @@ from common.errors import CalibrationError
 from common.hand_model import HandModel
 from common.hand_profiles import generated_profile, mirrored_profile, scaled_profile
 from common.hand_routine import ROUTINE_S, STEPS
+from common.terminal import echo
 from master.calibrate.hand.live import observe_live
 from master.calibrate.hand.measure import hand_length_of, measure_hand
 from master.calibrate.hand.observed import read_observed
 from master.calibrate.hand.save import measured_profile, quick_profile, report_json, report_lines
 from master.calibrate.tree_files import load_marker_rig, write_hand
-from master.options import CALIB_JSON, HERE_BUS, BusEnd, Calibration, JointNames, JsonFile
 from master.summary import write_summary
-
-PosesPath = Annotated[
-    Path | None, typer.Option("--poses", help="poses.npz of the routine, from `replay` or a running master.")
-]
-Name = Annotated[str, typer.Option(help="Name of the new hand file, without .json.")]
-Side = Annotated[
-    Literal["left", "right"] | None,
-    typer.Option(help="Which hand; default: right, of --from as names or geometry say."),
-]
-Source = Annotated[
-    Path | None,
-    typer.Option(
-        "--from", metavar="FILE", help="Motion capture of the hand's joints: .csv, .tsv, .bvh, .c3d."
-    ),
-]
-Length = Annotated[
-    Literal["m", "cm", "mm"] | None,
-    typer.Option(help="Of length in --from; default: as it says, else by the size of the hand."),
-]
-Rate = Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Of a --from table without times.")]
-LengthMm = Annotated[
-    float | None,
-    typer.Option(
-        help="Millimetres from the wrist crease to the end of the middle finger; alone: a quick start."
-    ),
-]
-Base = Annotated[
-    Path | None, typer.Option("--hand", help="Hand file to begin with: proportions, marker places.")
-]
-RigName = Annotated[str, typer.Option("--rig", help="Rig whose markers the poses have.")]
-DipPerPip = Annotated[
-    float | None,
-    typer.Option(
-        min=0.0, max=2.0, help="How far the last joint bends per middle joint, where it was measured."
-    ),
-]
-ThreeBack = Annotated[
-    bool, typer.Option("--three-back", help="With three markers on the back; only with --length-mm alone.")
-]
-Steps = Annotated[bool, typer.Option("--steps", help="Only tell the steps of the routine.")]
-Live = Annotated[bool, typer.Option("--live", help="Do the routine now, before the running master.")]
-Out = Annotated[Path | None, typer.Option(help="Tree to write hands/NAME.json into.")]
-Picture = Annotated[Path | None, typer.Option(help="Write a picture of lengths and residuals to this .png.")]
 
 _RATIO_SD = 0.03  # of one that was measured, with a goniometer or in a picture
 
 
-def hand_command(
-    poses: PosesPath = None,
-    name: Name = "me",
-    side: Side = None,
-    length_mm: LengthMm = None,
-    base: Base = None,
-    rig: RigName = "desk",
-    calibration: Calibration = CALIB_JSON,
-    dip_per_pip: DipPerPip = None,
-    out: Out = None,
-    json_file: JsonFile = None,
-    picture: Picture = None,
-    three_back: ThreeBack = False,
-    steps: Steps = False,
-    live: Live = False,
-    bus: BusEnd = HERE_BUS,
-    source: Source = None,
-    joints: JointNames = None,
-    unit: Length = None,
-    rate: Rate = None,
-) -> None:
-    """Make a hand file: from the hand's length, measured by a guided routine of 20 s, or from motion capture.
-
-    Examples:
-
-      phalanx-master calibrate hand --length-mm 190 --side right --name me --out calib_json      a quick start
-
-      phalanx-master calibrate hand --steps                                                      what to do for:
-
-      phalanx-master calibrate hand --poses poses.npz --side right --name me --out calib_json
-
-      phalanx-master calibrate hand --live --side right --name me --out calib_json               step by step
-
-      phalanx-master calibrate hand --from me.bvh --side right --name me --out calib_json        joints of others
-    """
-    if steps:
+def hand_command(options: Namespace) -> None:
+    """Make a hand file: from the hand's length, measured by a guided routine of 20 s, or from motion capture."""
+    if options.steps:
         for line in step_lines():
-            typer.echo(line)
+            echo(line)
         return
-    if source is not None:
+    if options.source is not None:
         _check_alone(
-            poses=poses, live=live, length_mm=length_mm, hand=base, dip_per_pip=dip_per_pip, picture=picture
+            poses=options.poses,
+            live=options.live,
+            length_mm=options.length_mm,
+            hand=options.base,
+            dip_per_pip=options.dip_per_pip,
+            picture=options.picture,
         )
         from master.calibrate.hand.motion import hand_from_motion, motion_json, motion_lines
         from master.mocap.read import Reading, read_motion
 
-        made = hand_from_motion(read_motion(source, Reading(joints, unit, side, rate)), name)
+        made = hand_from_motion(
+            read_motion(options.source, Reading(options.joints, options.unit, options.side, options.rate)),
+            options.name,
+        )
         for line in motion_lines(made):
-            typer.echo(line)
-        _finish(out, made.profile, motion_json(made), json_file)
+            echo(line)
+        _finish(options.out, made.profile, motion_json(made), options.json_file)
         return
-    if joints is not None or unit is not None or rate is not None:
+    if options.joints is not None or options.unit is not None or options.rate is not None:
         raise CalibrationError("--joints, --unit and --rate are for --from FILE")
-    side = side or "right"
-    template = template_of(base, side, name)
-    _check_together(poses, live, length_mm, three_back)
-    if poses is None and length_mm is not None and not live:
-        report: dict[str, object] = {"side": side, "hand_length_mm": length_mm, "lengths": {}}
-        scaled = quick(base, template, length_mm)
-        if three_back:
-            scaled = with_three_back_markers(scaled, name)
-        profile = quick_profile(scaled, name, 1e-3 * length_mm)
-        typer.echo(f"{side} hand scaled to {length_mm:g} mm; no bone is measured")
+    side = options.side or "right"
+    template = template_of(options.base, side, options.name)
+    _check_together(options.poses, options.live, options.length_mm, options.three_back)
+    if options.poses is None and options.length_mm is not None and not options.live:
+        report: dict[str, object] = {"side": side, "hand_length_mm": options.length_mm, "lengths": {}}
+        scaled = quick(options.base, template, options.length_mm)
+        if options.three_back:
+            scaled = with_three_back_markers(scaled, options.name)
+        profile = quick_profile(scaled, options.name, 1e-3 * options.length_mm)
+        echo(f"{side} hand scaled to {options.length_mm:g} mm; no bone is measured")
     else:
-        names = load_marker_rig(calibration, rig).markers
+        names = load_marker_rig(options.calibration, options.rig).markers
         model = HandModel.of(template)
-        observed = observe_live(bus, names, model) if poses is None else read_observed(poses, names, model)
-        ratio = None if dip_per_pip is None else (dip_per_pip, _RATIO_SD)
-        length_m = None if length_mm is None else 1e-3 * length_mm
+        observed = (
+            observe_live(options.bus, names, model)
+            if options.poses is None
+            else read_observed(options.poses, names, model)
+        )
+        ratio = None if options.dip_per_pip is None else (options.dip_per_pip, _RATIO_SD)
+        length_m = None if options.length_mm is None else 1e-3 * options.length_mm
         found = measure_hand(observed, template, length_m, ratio, _progress)
         for line in report_lines(found):
-            typer.echo(line)
-        data = "live" if poses is None else poses.name
-        profile, report = measured_profile(found, name, data, dip_per_pip), report_json(found)
-        if picture is not None:
+            echo(line)
+        data = "live" if options.poses is None else options.poses.name
+        profile, report = measured_profile(found, options.name, data, options.dip_per_pip), report_json(found)
+        if options.picture is not None:
             from master.calibrate.hand.picture import draw_hand
 
-            draw_hand(picture, found)
-    _finish(out, profile, report, json_file)
+            draw_hand(options.picture, found)
+    _finish(options.out, profile, report, options.json_file)
 
 
 def _finish(
     out: Path | None, profile: HandProfile, report: dict[str, object], json_file: Path | None
 ) -> None:
     written = None if out is None else write_hand(out, profile)
-    typer.echo("nothing written: give --out DIR" if written is None else f"wrote {written}")
+    echo("nothing written: give --out DIR" if written is None else f"wrote {written}")
     if json_file is not None:
         write_summary(json_file, report | {"written": None if written is None else str(written)})
 
@@ -218,6 +153,6 @@ def quick(base: Path | None, template: HandProfile, length_mm: float) -> HandPro
 
 def _progress(share: float) -> None:
     if sys.stderr.isatty():
-        typer.echo(f"\rfitting {100 * share:3.0f} % ", nl=False, err=True)
+        echo(f"\rfitting {100 * share:3.0f} % ", end="", error=True)
         if share >= 1.0:
-            typer.echo("\r\033[K", nl=False, err=True)
+            echo("\r\033[K", end="", error=True)

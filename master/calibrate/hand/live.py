@@ -1,11 +1,10 @@
 """The routine with the master that runs: opens the bus and a person's terminal."""
 
-import typer
-
 from common.clock import SystemClock
 from common.errors import CalibrationError
 from common.hand_model import HandModel
 from common.messages import HandPose
+from common.terminal import echo
 from master.calibrate.hand.observed import Observed, marker_rows
 from master.calibrate.hand.session import guide
 from master.master_bus import join_bus
@@ -42,7 +41,7 @@ def observe_live(bus: str, names: tuple[str, ...], model: HandModel) -> Observed
                 )
             return message
 
-        track = guide(receive, tips, names, SystemClock(), typer.echo)
+        track = guide(receive, tips, names, SystemClock(), echo)
     finally:
         link.close()
     return Observed.of(*track.arrays(), names, model)

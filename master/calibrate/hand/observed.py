@@ -93,7 +93,7 @@ def read_observed(path: Path, names: Sequence[str], model: HandModel) -> Observe
         RecordingError: The file is missing or broken, or has other markers than the rig.
         CalibrationError, FitError: As `Observed.of`.
     """
-    fix = "write it with `phalanx replay` or `phalanx-master run --poses`"
+    fix = "write it with `phalanx replay` or `phalanx run --poses`"
     arrays = read_npz(path, ("t_ns", "markers_raw_m", "markers_cov_m2"), fix)
     t_ns, points, cov = (arrays[name] for name in ("t_ns", "markers_raw_m", "markers_cov_m2"))
     if points.shape != (len(t_ns), len(names), 3) or cov.shape != (*points.shape, 3):

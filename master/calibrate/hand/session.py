@@ -96,7 +96,7 @@ def unseen(
 ) -> str:
     """What a step lacks, or nothing."""
     if not poses:
-        return f"{step.name}: no pose came; is `phalanx-master run` running, on this --bus, with this hand in sight"
+        return f"{step.name}: no pose came; is `phalanx run` running, on this --bus, with this hand in sight"
     moving = np.any([move.moving.any(axis=1) for move in MOVES if move.step == number], axis=0)
     wanted = [f for f in range(5) if moving[f] or not moving.any()]
     seen = np.isfinite([pose.markers_raw_m[list(tips), 0] for pose in poses]).mean(axis=0)

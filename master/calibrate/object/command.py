@@ -1,15 +1,14 @@
-"""`phalanx-master calibrate object`: where the beads of a new object sit, from its being moved before the cameras."""
+"""`phalanx calibrate object`: where the beads of a new object sit, from its being moved before the cameras."""
 
+from argparse import Namespace
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from common.calibration import RigCalibration, load
 from common.camera_model import CameraModel
 from common.errors import CalibrationError, FitError
 from common.frame_recording import open_recording
 from common.object_profile import ObjectProfile
+from common.terminal import echo
 from master.calibrate.object.measure import measure_object
 from master.calibrate.object.save import (
     add_to_rig,
@@ -21,95 +20,52 @@ from master.calibrate.object.save import (
 from master.calibrate.object.seen import Seen, rows_of, seen_by
 from master.calibrate.time.commands import geometry_of
 from master.calibrate.tree_files import load_marker_rig
-from master.options import CALIB_JSON, HERE_BUS, BusEnd, Calibration, JsonFile, RecordingRig, ResultTree
 from master.recorded import recorded_detections
 from master.summary import write_summary
 
-Name = Annotated[str, typer.Argument(help="Name of the object; its file is objects/NAME.json.")]
-Markers = Annotated[
-    str | None,
-    typer.Option(
-        help="Its beads, with commas; default: those of its file, else all free_markers of the rig."
-    ),
-]
-RadiusMm = Annotated[
-    float | None,
-    typer.Option(min=0.5, max=50.0, help="Radius of the beads; default: as its file has it, else 8."),
-]
-Recording = Annotated[
-    Path | None, typer.Option(help="Folder of a raw-frame recording of the object that moves.")
-]
-Detections = Annotated[Path | None, typer.Option(help="Folder with detections_<camera>.npz of it.")]
-Live = Annotated[bool, typer.Option("--live", help="Do the motion now, before the running master.")]
-Like = Annotated[
-    Path | None,
-    typer.Option(help="Object file whose frame, shape, tags and tracker are kept; default: its own."),
-]
-AddToRig = Annotated[bool, typer.Option("--add-to-rig", help="Name it under objects of the rig in --out.")]
-Seconds = Annotated[float, typer.Option(min=5.0, help="How many seconds a live motion may take at most.")]
-Picture = Annotated[Path | None, typer.Option(help="Write a picture of beads and residuals to this .png.")]
 
-
-def object_command(
-    name: Name,
-    markers: Markers = None,
-    radius_mm: RadiusMm = None,
-    recording: Recording = None,
-    detections: Detections = None,
-    live: Live = False,
-    rig: RecordingRig = None,
-    calibration: Calibration = CALIB_JSON,
-    like: Like = None,
-    add_to_rig: AddToRig = False,
-    seconds: Seconds = 60.0,
-    out: ResultTree = None,
-    json_file: JsonFile = None,
-    picture: Picture = None,
-    bus: BusEnd = HERE_BUS,
-) -> None:
-    """Measure where the beads of a rigid object sit, from fifteen seconds of its being turned before the cameras.
-
-    The rig lists the beads in markers and in free_markers, the camera files have their colours; the object's file is
-    not needed. Its frame is that of --like, or of its own file where there is one; else: origin in the middle of the
-    beads, x from the first to the second, y to the side of the one farthest from that line. Nothing is written without
-    --out.
-
-    Examples:
-
-      phalanx-master calibrate object wand --live --rig desk-wand --markers wand1,wand2,wand3 --radius-mm 9 --out TREE
-
-      phalanx-master calibrate object wand --recording REC --detections DIR --picture wand.png --out TREE --add-to-rig
-    """
-    _check_together(live, recording, detections, rig, add_to_rig, out)
-    base, where = base_of(calibration, name, like)
-    given = None if markers is None else tuple(part.strip() for part in markers.split(",") if part.strip())
-    if live:
-        assert rig is not None
-        used = load_marker_rig(calibration, rig)
+def object_command(options: Namespace) -> None:
+    """Measure where the beads of a rigid object sit."""
+    _check_together(
+        options.live, options.recording, options.detections, options.rig, options.add_to_rig, options.out
+    )
+    base, where = base_of(options.calibration, options.name, options.like)
+    given = (
+        None
+        if options.markers is None
+        else tuple(part.strip() for part in options.markers.split(",") if part.strip())
+    )
+    if options.live:
+        assert options.rig is not None
+        used = load_marker_rig(options.calibration, options.rig)
         names = names_of(given, base, used)
         from master.calibrate.object.live import observe_live
 
-        seen, data = observe_live(bus, used, names, seconds, typer.echo), "live"
+        seen, data = observe_live(options.bus, used, names, options.seconds, echo), "live"
     else:
-        assert recording is not None
-        assert detections is not None
-        used, names, seen = recorded(recording, detections, rig, calibration, given, base)
-        data = recording.resolve().name
+        assert options.recording is not None
+        assert options.detections is not None
+        used, names, seen = recorded(
+            options.recording, options.detections, options.rig, options.calibration, given, base
+        )
+        data = options.recording.resolve().name
     try:
         found = measure_object(seen)
-        profile, misses = measured_profile(found, name, radii(names, radius_mm, base), data, base, where)
+        profile, misses = measured_profile(
+            found, options.name, radii(names, options.radius_mm, base), data, base, where
+        )
     except FitError as error:
         raise FitError(f"{data}: {error}") from error
     for line in report_lines(found, profile, misses):
-        typer.echo(line)
-    if picture is not None:
+        echo(line)
+    if options.picture is not None:
         from master.calibrate.object.picture import draw_object  # matplotlib takes a second to import
 
-        draw_object(picture, found, profile)
-        typer.echo(f"drew {picture}")
-    written = _write(out, profile, rig or used.name, used, add_to_rig)
-    if json_file is not None:
-        write_summary(json_file, report_json(found, profile, misses) | {"written": written})
+        draw_object(options.picture, found, profile)
+        echo(f"drew {options.picture}")
+    written = _write(options.out, profile, options.rig or used.name, used, options.add_to_rig)
+    if options.json_file is not None:
+        write_summary(options.json_file, report_json(found, profile, misses) | {"written": written})
 
 
 def base_of(calibration: Path, name: str, like: Path | None) -> tuple[ObjectProfile | None, str]:
@@ -204,15 +160,15 @@ def _write(
     out: Path | None, profile: ObjectProfile, rig_name: str, rig: RigCalibration, adds: bool
 ) -> list[str]:
     if out is None:
-        typer.echo("nothing written: give --out DIR")
+        echo("nothing written: give --out DIR")
         return []
     written = [str(write_object(out, profile))]
-    typer.echo(f"wrote {written[0]}: markers")
+    echo(f"wrote {written[0]}: markers")
     if adds:
         written.append(str(add_to_rig(out, rig_name, rig, profile.name)))
-        typer.echo(f"wrote {written[1]}: objects")
+        echo(f"wrote {written[1]}: objects")
     elif profile.name not in rig.objects:
-        typer.echo(
+        echo(
             f'to track it: "objects": ["{profile.name}"] in rigs/{rig_name}.json (or again with --add-to-rig)'
         )
     return written

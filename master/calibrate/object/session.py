@@ -53,14 +53,14 @@ def guide(
             continue
         printed_ns = now_ns
         if not poses:
-            notify("no pose comes: is `phalanx-master run` running, on this --bus?")
+            notify("no pose comes: is `phalanx run` running, on this --bus?")
             continue
         line, enough = progress(seen_in(poses, rig, names))
         notify(line)
         if enough:
             break
     if not poses:
-        raise FitError("no pose came: is `phalanx-master run` running, on this --bus?")
+        raise FitError("no pose came: is `phalanx run` running, on this --bus?")
     return seen_in(poses, rig, names)
 
 

@@ -1,60 +1,42 @@
-"""`phalanx-master calibrate time`: from a recording of a moving hand to the offsets of the cameras' stamps."""
+"""`phalanx calibrate time`: from a recording of a moving hand to the offsets of the cameras' stamps."""
 
+from argparse import Namespace
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
 
 import msgspec
-import typer
 
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.frame_recording import FrameRecording, open_recording
+from common.terminal import echo
 from master.calibrate.time.fit import SIGNIFICANT, CameraTime, measure_times
 from master.calibrate.tree_files import load_marker_rig, provenance, rig_in_tree, write_rig
-from master.options import CALIB_JSON, JsonFile, RecordingRig, ResultTree
 from master.recorded import recorded_detections
 from master.summary import write_summary
 
-Recording = Annotated[Path, typer.Argument(help="Folder of a raw-frame recording: a hand that moves.")]
-Detections = Annotated[Path, typer.Option(help="Folder with detections_<camera>.npz of it.")]
-Calibration = Annotated[Path, typer.Option(help="Folder with rigs/ and cameras/, for --rig.")]
 
-
-def time_command(
-    recording: Recording,
-    detections: Detections,
-    rig: RecordingRig = None,
-    calibration: Calibration = CALIB_JSON,
-    out: ResultTree = None,
-    json_file: JsonFile = None,
-) -> None:
-    """Measure how much later a camera's frames are than its stamps say, from a hand that moves.
-
-    Offsets are against the first camera of the rig. The master adds them to the times of every frame.
-
-    Examples:
-
-      phalanx-master calibrate time RECORDING --detections DIR
-
-      phalanx-master calibrate time RECORDING --detections DIR --rig desk --out calib_json
-    """
-    opened = open_recording(recording)
-    used, cameras = geometry_of(opened, rig, calibration)
-    base = rig_in_tree(out, rig or used.name, used)
-    times = measure(opened, used, cameras, detections)
+def time_command(options: Namespace) -> None:
+    """Measure how much later a camera's frames are than its stamps say, from a hand that moves."""
+    opened = open_recording(options.recording)
+    used, cameras = geometry_of(opened, options.rig, options.calibration)
+    base = rig_in_tree(options.out, options.rig or used.name, used)
+    times = measure(opened, used, cameras, options.detections)
     for line in report_lines(used, times):
-        typer.echo(line)
+        echo(line)
     written: Path | None = None
-    if out is None:
-        typer.echo("nothing written: give --out DIR")
+    if options.out is None:
+        echo("nothing written: give --out DIR")
     else:
-        written = write_offsets(out, rig or used.name, base, times, recording.resolve().name)
-        typer.echo(f"wrote {written}: stamp_offset_us")
-    if json_file is not None:
+        written = write_offsets(
+            options.out, options.rig or used.name, base, times, options.recording.resolve().name
+        )
+        echo(f"wrote {written}: stamp_offset_us")
+    if options.json_file is not None:
         write_summary(
-            json_file, report_json(used, times) | {"written": None if written is None else str(written)}
+            options.json_file,
+            report_json(used, times) | {"written": None if written is None else str(written)},
         )
 
 

@@ -56,7 +56,9 @@ class Session:
     def silent(self, now_ns: int) -> str:
         """Who says nothing just now, and what to look at; empty: both speak."""
         if not _recent([one.t_ns for one in self.tracked[-1:]], now_ns):
-            return "no tracker is heard: is `phalanx-slave tracker` running, and does the master know it?"
+            return (
+                "no tracker is heard: is `phalanx-slave run --tracker` running, and does the master know it?"
+            )
         if not np.isfinite([one.position_m for one in self.tracked[-20:]]).any():
             return "the tracker does not know where it is: let it see a base station"
         if not _recent([one.t_ns for one in self.objects[-1:]], now_ns):

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import typer
 
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.camera_model import CameraModel
 from common.errors import CalibrationError, RecordingError
 from common.frame_recording import MANIFEST, open_recording
+from common.terminal import echo
 from master.calibrate.tree_files import rig_in_tree, write_rig
 
 
@@ -67,7 +67,7 @@ def device_of(source: Path, rig_name: str | None, calibration: Path, out: Path |
             raise CalibrationError(f"{source}: no camera {camera.name!r}, which rig {name!r} has")
     if camera.intrinsics is None:
         raise CalibrationError(
-            f"camera {camera.name!r}: intrinsics is missing; measure it with `phalanx-master calibrate intrinsics`"
+            f"camera {camera.name!r}: intrinsics is missing; measure it with `phalanx calibrate cameras intrinsics`"
         )
     optics = CameraModel.of(camera, np.eye(4))
     return Device(rig_in_tree(out, name, rig), name, camera, optics, source.resolve().name)
@@ -76,7 +76,7 @@ def device_of(source: Path, rig_name: str | None, calibration: Path, out: Path |
 def print_line(lines: Iterable[str]) -> None:
     """Lines for a person."""
     for line in lines:
-        typer.echo(line)
+        echo(line)
 
 
 def write_device(out: Path | None, device: Device, rig: RigCalibration, keys: str) -> Path | None:
@@ -86,8 +86,8 @@ def write_device(out: Path | None, device: Device, rig: RigCalibration, keys: st
         CalibrationError: It cannot be written; the old file is untouched.
     """
     if out is None:
-        typer.echo("nothing written: give --out DIR")
+        echo("nothing written: give --out DIR")
         return None
     written = write_rig(out, device.file_name, rig)
-    typer.echo(f"wrote {written}: {keys}")
+    echo(f"wrote {written}: {keys}")
     return written

@@ -1,12 +1,10 @@
-"""`phalanx-master calibrate flat-field`: how the LEDs and the lens of a wrist device light its image."""
+"""`phalanx calibrate wrist flat-field`: how the LEDs and the lens of a wrist device light its image."""
 
+from argparse import Namespace
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 from msgspec.structs import replace
 
 from common.arrays import Float
@@ -14,20 +12,15 @@ from common.calibration import RigCalibration
 from common.camera_model import CameraModel
 from common.errors import FitError
 from common.frame_recording import Illumination
+from common.terminal import echo
 from master.calibrate.cameras.boards import Board
-from master.calibrate.cameras.options import Dictionary, MarkerMm, Size, SquareMm, board_of
+from master.calibrate.cameras.options import board_of
 from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.board_pose import board_pose
 from master.calibrate.wrist.device import Device, device_of, print_line, write_device
 from master.calibrate.wrist.flat_field import FlatFit, WhiteSamples, fit_flat_field, gathered, white_samples
-from master.calibrate.wrist.laser_command import Source
 from master.calibrate.wrist.lit_views import LitView, grouped_by_reason, lit_views
-from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.summary import write_summary
-
-Picture = Annotated[
-    Path | None, typer.Option(help="Write a picture of the flat field and its residuals to this .png.")
-]
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,47 +32,30 @@ class WhiteSeen:
     refused: Mapping[str, str]
 
 
-def flat_field(
-    source: Source,
-    board: Size,
-    square_mm: SquareMm,
-    marker_mm: MarkerMm = None,
-    dictionary: Dictionary = "4X4_50",
-    rig: RecordingRig = None,
-    calibration: Calibration = CALIB_JSON,
-    out: ResultTree = None,
-    json_file: JsonFile = None,
-    picture: Picture = None,
-) -> None:
-    """Measure the flat field of a wrist device's LEDs from twenty views of a board on matt paper.
-
-    Its white squares at known places tell how bright paper looks in every part of the image. Show the board
-    everywhere, in the corners too, its face to the camera, still, in a room that is not too bright. Nothing is written
-    without --out.
-
-    Examples:
-
-      phalanx-master calibrate flat-field RECORDING --board 9x6 --square-mm 15 --rig wrist --out calib_json
-
-      phalanx-master calibrate flat-field images --board 9x6 --square-mm 15 --rig wrist --picture flat.png
-    """
-    device = device_of(source, rig, calibration, out)
-    views = lit_views(source, device.camera.name, Illumination.LED)
+def flat_field(options: Namespace) -> None:
+    """Measure the flat field of a wrist device's LEDs from twenty views of a board on matt paper."""
+    device = device_of(options.source, options.rig, options.calibration, options.out)
+    views = lit_views(options.source, device.camera.name, Illumination.LED)
     leds = np.array(device.rig.led) if device.rig.led else np.zeros((1, 3))
-    seen = white_of(views, board_of(board, square_mm, marker_mm, dictionary), device.optics, leds)
+    seen = white_of(
+        views,
+        board_of(options.board, options.square_mm, options.marker_mm, options.dictionary),
+        device.optics,
+        leds,
+    )
     try:
         fit = fit_flat_field(seen.samples, device.optics)
     except FitError as error:
         reasons = "".join(f"\n  {reason}" for reason in grouped_by_reason(seen.refused))
-        raise FitError(f"{source}: {error}{reasons}") from error
+        raise FitError(f"{options.source}: {error}{reasons}") from error
     print_line(report_lines(fit, seen, len(views), known_leds=bool(device.rig.led)))
-    if picture is not None:
+    if options.picture is not None:
         from master.calibrate.wrist.picture import draw_flat_field  # matplotlib takes a second to import
 
-        draw_flat_field(picture, fit, seen.samples, device.optics)
-        typer.echo(f"drew {picture}")
-    written = write_device(out, device, rig_with_field(device, fit, seen), "flat_field")
-    if json_file is not None:
+        draw_flat_field(options.picture, fit, seen.samples, device.optics)
+        echo(f"drew {options.picture}")
+    written = write_device(options.out, device, rig_with_field(device, fit, seen), "flat_field")
+    if options.json_file is not None:
         report: dict[str, object] = {
             "coefficients": list(fit.field.coefficients),
             "rms_percent": round(100 * fit.rms, 4),
@@ -89,7 +65,7 @@ def flat_field(
             "refused": dict(seen.refused),
             "written": None if written is None else str(written),
         }
-        write_summary(json_file, report)
+        write_summary(options.json_file, report)
 
 
 def white_of(views: tuple[LitView, ...], board: Board, optics: CameraModel, led_m: Float) -> WhiteSeen:
@@ -137,6 +113,6 @@ def rig_with_field(device: Device, fit: FlatFit, seen: WhiteSeen) -> RigCalibrat
         "cross_validated_rms_percent": round(100 * fit.cross_validated_rms, 4),
     }
     note = f"{len(seen.samples.light)} samples of white squares in {seen.views} views"
-    how = provenance("calibrate flat-field", (device.source,), residual, note)
+    how = provenance("calibrate wrist flat-field", (device.source,), residual, note)
     rig = device.rig
     return replace(rig, flat_field=fit.field, provenance=rig.provenance | {"flat_field": how})

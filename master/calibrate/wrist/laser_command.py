@@ -1,39 +1,26 @@
-"""`phalanx-master calibrate laser-plane`: the laser's plane in the wrist camera's frame, from views of a board."""
+"""`phalanx calibrate wrist laser-plane`: the laser's plane in the wrist camera's frame, from views of a board."""
 
+from argparse import Namespace
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 from msgspec.structs import replace
 
 from common.calibration import RigCalibration
 from common.camera_model import CameraModel
 from common.errors import FitError
 from common.frame_recording import Illumination
+from common.terminal import echo
 from master.calibrate.cameras.boards import Board
-from master.calibrate.cameras.options import Dictionary, MarkerMm, Size, SquareMm, board_of
+from master.calibrate.cameras.options import board_of
 from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.board_pose import board_pose
 from master.calibrate.wrist.device import Device, device_of, print_line, write_device
 from master.calibrate.wrist.line import line_on_board
 from master.calibrate.wrist.lit_views import LitView, grouped_by_reason, lit_views
 from master.calibrate.wrist.plane import PlaneFit, ViewLine, fit_plane
-from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.summary import write_summary
-
-Source = Annotated[
-    Path,
-    typer.Argument(
-        help="A recording, or a folder of VIEW_ambient.png, VIEW_laser.png and, if there are, VIEW_led.png.",
-        show_default=False,
-    ),
-]
-Picture = Annotated[
-    Path | None, typer.Option(help="Write a picture of the lines and what is left of them to this .png.")
-]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,47 +31,30 @@ class LinesSeen:
     refused: Mapping[str, str]
 
 
-def laser_plane(
-    source: Source,
-    board: Size,
-    square_mm: SquareMm,
-    marker_mm: MarkerMm = None,
-    dictionary: Dictionary = "4X4_50",
-    rig: RecordingRig = None,
-    calibration: Calibration = CALIB_JSON,
-    out: ResultTree = None,
-    json_file: JsonFile = None,
-    picture: Picture = None,
-) -> None:
-    """Measure the plane of a wrist device's laser, from ten views of a board that the laser crosses.
-
-    Hold the board still for each view, at 15 to 35 cm, near and far and tilted every way, so that the line runs over
-    it. Views with the line elsewhere are left out, each with the reason. Nothing is written without --out.
-
-    Examples:
-
-      phalanx-master calibrate laser-plane RECORDING --board 9x6 --square-mm 15 --rig wrist --out calib_json
-
-      phalanx-master calibrate laser-plane images --board 9x6 --square-mm 15 --rig wrist --picture plane.png
-    """
-    device = device_of(source, rig, calibration, out)
-    views = lit_views(source, device.camera.name, Illumination.LASER)
-    seen = lines_of(views, board_of(board, square_mm, marker_mm, dictionary), device.optics)
+def laser_plane(options: Namespace) -> None:
+    """Measure the plane of a wrist device's laser, from ten views of a board that the laser crosses."""
+    device = device_of(options.source, options.rig, options.calibration, options.out)
+    views = lit_views(options.source, device.camera.name, Illumination.LASER)
+    seen = lines_of(
+        views,
+        board_of(options.board, options.square_mm, options.marker_mm, options.dictionary),
+        device.optics,
+    )
     try:
         fit = fit_plane(seen.lines)
     except FitError as error:
         reasons = "".join(f"\n  {reason}" for reason in grouped_by_reason(seen.refused))
-        raise FitError(f"{source}: {error}{reasons}") from error
+        raise FitError(f"{options.source}: {error}{reasons}") from error
     print_line(report_lines(fit, seen, len(views)))
-    if picture is not None:
+    if options.picture is not None:
         from master.calibrate.wrist.picture import draw_plane  # matplotlib takes a second to import
 
-        draw_plane(picture, fit, seen.lines, device.optics)
-        typer.echo(f"drew {picture}")
-    written = write_device(out, device, rig_with_plane(device, fit), "laser_plane")
-    if json_file is not None:
+        draw_plane(options.picture, fit, seen.lines, device.optics)
+        echo(f"drew {options.picture}")
+    written = write_device(options.out, device, rig_with_plane(device, fit), "laser_plane")
+    if options.json_file is not None:
         report = report_json(fit, seen) | {"written": None if written is None else str(written)}
-        write_summary(json_file, report)
+        write_summary(options.json_file, report)
 
 
 def lines_of(views: tuple[LitView, ...], board: Board, optics: CameraModel) -> LinesSeen:
@@ -158,6 +128,6 @@ def rig_with_plane(device: Device, fit: PlaneFit) -> RigCalibration:
         "offset_sigma_mm": round(1e3 * fit.offset_sigma_m, 4),
     }
     note = f"{int(fit.used.sum())} of {len(fit.used)} views of a board"
-    how = provenance("calibrate laser-plane", (device.source,), residual, note)
+    how = provenance("calibrate wrist laser-plane", (device.source,), residual, note)
     rig = device.rig
     return replace(rig, laser_plane=fit.plane, provenance=rig.provenance | {"laser_plane": how})

@@ -1,10 +1,9 @@
-"""`phalanx-master calibrate palm`: where the palm is before the wrist camera, from a board that lies on it."""
+"""`phalanx calibrate wrist palm`: where the palm is before the wrist camera, from a board that lies on it."""
 
+from argparse import Namespace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 from msgspec.structs import replace
 
 from common.arrays import Float
@@ -15,70 +14,36 @@ from common.geometry import invert
 from common.hand_model import HandModel
 from master.calibrate.cameras.boards import Board
 from master.calibrate.cameras.lens_files import matrix_of
-from master.calibrate.cameras.options import Dictionary, MarkerMm, board_of
+from master.calibrate.cameras.options import board_of
 from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.board_pose import BoardPose, board_pose
 from master.calibrate.wrist.device import Device, device_of, print_line, write_device
 from master.calibrate.wrist.lit_views import grouped_by_reason, lit_views
 from master.calibrate.wrist.palm_board import BoardOffset, PalmFit, palm_from_board
-from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.summary import write_summary
 
-Source = Annotated[
-    Path,
-    typer.Argument(
-        help="A recording of the board on the palm; or images VIEW_ambient.png, VIEW_led.png.",
-        show_default=False,
-    ),
-]
-BoardSize = Annotated[str, typer.Option(help="COLUMNSxROWS: inner corners, columns across the hand.")]
-SquareMm = Annotated[float, typer.Option(help="Side of a square in mm, measured on the print.")]
-WristMm = Annotated[
-    float, typer.Option(help="mm along the hand from the wrist crease to the nearest row of inner corners.")
-]
-AsideMm = Annotated[
-    float, typer.Option(help="mm from the middle finger's line to the board's middle, to the thumb +.")
-]
-DepthMm = Annotated[float, typer.Option(help="mm from the axis of the wrist up to the print.")]
-Hand = Annotated[
-    Path | None, typer.Option("--hand", help="Hand file; default: the rig's `hand` in CALIBRATION/hands.")
-]
 
-
-def palm(
-    source: Source,
-    board: BoardSize,
-    square_mm: SquareMm,
-    wrist_mm: WristMm,
-    depth_mm: DepthMm,
-    marker_mm: MarkerMm = None,
-    dictionary: Dictionary = "4X4_50",
-    aside_mm: AsideMm = 0.0,
-    hand: Hand = None,
-    rig: RecordingRig = None,
-    calibration: Calibration = CALIB_JSON,
-    out: ResultTree = None,
-    json_file: JsonFile = None,
-) -> None:
-    """Measure where the palm is before the wrist camera, by a board that lies on it; without one: calibrate subject.
-
-    The board lies flat on palm and straight fingers, print to the camera, columns along the middle finger. Nothing is
-    written without --out.
-
-    Example:
-
-      phalanx-master calibrate palm RECORDING --board 7x4 --square-mm 10 --wrist-mm 70 --depth-mm 22 --rig wrist
-    """
-    device = device_of(source, rig, calibration, out)
-    model = HandModel.of(load(hand or calibration / "hands" / f"{device.rig.hand}.json", HandProfile))
-    offset = BoardOffset(1e-3 * wrist_mm, 1e-3 * aside_mm, 1e-3 * depth_mm, model.side_sign)
+def palm(options: Namespace) -> None:
+    """Measure where the palm is before the wrist camera."""
+    device = device_of(options.source, options.rig, options.calibration, options.out)
+    model = HandModel.of(
+        load(options.hand or options.calibration / "hands" / f"{device.rig.hand}.json", HandProfile)
+    )
+    offset = BoardOffset(
+        1e-3 * options.wrist_mm, 1e-3 * options.aside_mm, 1e-3 * options.depth_mm, model.side_sign
+    )
     try:
-        fit = _by_board(source, board_of(board, square_mm, marker_mm, dictionary), offset, device)
+        fit = _by_board(
+            options.source,
+            board_of(options.board, options.square_mm, options.marker_mm, options.dictionary),
+            offset,
+            device,
+        )
     except FitError as error:
-        raise FitError(f"{source}: {error}") from error
+        raise FitError(f"{options.source}: {error}") from error
     print_line(report_lines(fit))
-    written = write_device(out, device, rig_with_palm(device, fit), "T_camera_palm")
-    if json_file is not None:
+    written = write_device(options.out, device, rig_with_palm(device, fit), "T_camera_palm")
+    if options.json_file is not None:
         report: dict[str, object] = {
             "T_camera_palm": fit.T_camera_palm.tolist(),
             "rotation_sigma_deg": float(np.degrees(fit.rotation_sigma_rad)),
@@ -86,7 +51,7 @@ def palm(
             "residual": fit.residual,
             "written": None if written is None else str(written),
         }
-        write_summary(json_file, report)
+        write_summary(options.json_file, report)
 
 
 def _by_board(source: Path, board: Board, offset: BoardOffset, device: Device) -> PalmFit:
@@ -123,7 +88,7 @@ def rig_with_palm(device: Device, fit: PalmFit) -> RigCalibration:
         "rotation_sigma_deg": round(float(np.degrees(fit.rotation_sigma_rad)), 4),
         "shift_sigma_mm": round(1e3 * fit.shift_sigma_m, 4),
     }
-    how = provenance("calibrate palm", (device.source,), residual, fit.note)
+    how = provenance("calibrate wrist palm", (device.source,), residual, fit.note)
     rig = device.rig
     return replace(
         rig,

@@ -23,7 +23,7 @@ from master.calibrate.wrist.subject_fit import Fit, ImageObservations, fit_subje
 from master.calibrate.wrist.subject_model import MCP, SubjectModel, Unknown, fitted_profile
 from master.wrist_setup import WristSetup
 
-TOOL = "calibrate subject"
+TOOL = "calibrate wrist subject"
 _NAMES = FINGERS[1:]
 _GUESS = np.radians(5.0), 5e-3  # of a drawing's pose of the palm, standard deviations
 _RULER = np.radians(1.0), 1.5e-3  # of a board's: how it lies on the palm, and what was measured with a ruler
@@ -122,7 +122,7 @@ def _pose_sigma(rig: RigCalibration) -> Float:
         np.radians(stated.get("rotation_sigma_deg", 0.0)),
         1e-3 * stated.get("shift_sigma_mm", 0.0),
     )
-    if how is not None and how.tool == "calibrate palm":
+    if how is not None and how.tool == "calibrate wrist palm":
         return np.repeat([np.hypot(rotation, _RULER[0]), np.hypot(shift, _RULER[1])], 3)
     return np.repeat([rotation, shift] if rotation > 0.0 and shift > 0.0 else _GUESS, 3)
 

@@ -1,87 +1,48 @@
-"""`phalanx-master calibrate subject`: palm pose, knuckles and fingers of who wears the device, from a guided motion."""
+"""`phalanx calibrate wrist subject`: palm pose, knuckles and fingers of who wears the device, from a guided motion."""
 
+from argparse import Namespace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 from msgspec.structs import replace
 
 from common.arrays import Float
 from common.calibration import HandProfile, load
 from common.errors import CalibrationError, FitError
 from common.hand_model import FINGERS
+from common.terminal import echo
 from master.calibrate.tree_files import write_hand
 from master.calibrate.wrist.device import Device, device_of, print_line, write_device
 from master.calibrate.wrist.subject import Subject, calibrate_subject
 from master.calibrate.wrist.subject_model import Unknown
-from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.recorded import recorded_cycles
 from master.summary import write_summary
 
-Recording = Annotated[
-    Path, typer.Argument(help="Folder of a recording: the guided motion.", show_default=False)
-]
-Detections = Annotated[
-    Path, typer.Option(help="Folder with detections_<camera>.npz of it, from `phalanx-slave detect`.")
-]
-Hand = Annotated[
-    Path | None, typer.Option("--hand", help="Hand file; default: the rig's `hand` in CALIBRATION/hands.")
-]
-Name = Annotated[
-    str | None, typer.Option("--name", help="Of the new hand file; default: that of the hand file.")
-]
-Picture = Annotated[
-    Path | None, typer.Option(help="Write a picture of what was seen and fitted to this .png.")
-]
 
-
-def subject(
-    recording: Recording,
-    detections: Detections,
-    hand: Hand = None,
-    name: Name = None,
-    rig: RecordingRig = None,
-    calibration: Calibration = CALIB_JSON,
-    out: ResultTree = None,
-    json_file: JsonFile = None,
-    picture: Picture = None,
-) -> None:
-    """Measure who wears the device: palm pose, knuckles, thickness and lengths of fingers, from sixteen seconds.
-
-    With the device on: open the hand flat; bend the straight fingers at their knuckles towards 90 degrees, and back;
-    open it flat; close it to a fist, and open it again. Three seconds or more for each bend. It needs the laser plane,
-    a pose of the palm that is right to a centimetre and ten degrees (the drawing of the device; a board is better),
-    and a hand file of the user's size. Nothing is written without --out.
-
-    Examples:
-
-      phalanx-slave detect RECORDING --camera wrist --calibration calib_json -o found/detections_wrist.npz
-
-      phalanx-master calibrate subject RECORDING --detections found --rig wrist --name me --out calib_json
-    """
-    device = device_of(recording, rig, calibration, out)
+def subject(options: Namespace) -> None:
+    """Measure who wears the device."""
+    device = device_of(options.recording, options.rig, options.calibration, options.out)
     if device.rig.T_camera_palm is None:
         raise CalibrationError(
             f"rig {device.file_name!r}: T_camera_palm: a first guess is needed, such as from the drawing of the device;"
-            " or lay a board on the palm (calibrate palm)"
+            " or lay a board on the palm (calibrate wrist palm)"
         )
-    profile = load(hand or _hand_of(device.rig.hand, calibration, out), HandProfile)
-    cycles = list(recorded_cycles(detections, device.camera.name))
+    profile = load(options.hand or _hand_of(device.rig.hand, options.calibration, options.out), HandProfile)
+    cycles = list(recorded_cycles(options.detections, device.camera.name))
     try:
         found = calibrate_subject(cycles, device.rig, device.camera, profile, device.source)
     except FitError as error:
-        raise FitError(f"{recording}: {error}") from error
+        raise FitError(f"{options.recording}: {error}") from error
     print_line(found.report)
-    if picture is not None:
+    if options.picture is not None:
         from master.calibrate.wrist.subject_picture import draw_subject  # matplotlib takes a second to import
 
-        draw_subject(picture, found, device.optics)
-        typer.echo(f"drew {picture}")
-    new = replace(found.hand, name=name or profile.name)
-    written = _write(out, device, found, new)
-    if json_file is not None:
-        write_summary(json_file, summary(found) | {"written": written})
+        draw_subject(options.picture, found, device.optics)
+        echo(f"drew {options.picture}")
+    new = replace(found.hand, name=options.name or profile.name)
+    written = _write(options.out, device, found, new)
+    if options.json_file is not None:
+        write_summary(options.json_file, summary(found) | {"written": written})
 
 
 def _hand_of(name: str, calibration: Path, out: Path | None) -> Path:
@@ -97,7 +58,7 @@ def _write(out: Path | None, device: Device, found: Subject, hand: HandProfile) 
     if out is None or rig is None:
         return []
     path = write_hand(out, hand)
-    typer.echo(f"wrote {path}: knuckles, lengths and palmar_scale of index ... little")
+    echo(f"wrote {path}: knuckles, lengths and palmar_scale of index ... little")
     return [str(rig), str(path)]
 
 

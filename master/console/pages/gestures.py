@@ -146,11 +146,11 @@ def _poses(state: ConsoleState) -> None:
         if not _NAME.fullmatch(wanted):
             ui.notify("A name has letters, digits, - and _ only, for example thumbs_up", type="negative")
             return
-        start(command("teach", wanted, "--bus", state.settings.bus))
+        start(command("--teach", wanted, "--bus", state.settings.bus))
 
     def forget() -> None:
         if known.value:
-            start(command("forget", str(known.value)))
+            start(command("--forget", str(known.value)))
 
     def update() -> None:
         names = list(poses_of(state))

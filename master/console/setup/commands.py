@@ -12,7 +12,7 @@ from pathlib import Path
 from common.calibration import RigCalibration, load
 from common.errors import CalibrationError
 from common.keys import ENVIRONMENT, RIG_KEY, keys_folder, rig_key
-from master.calibrate.cli import COMMANDS
+from master.cli.table import CALIBRATIONS
 from master.console.setup.fields import Value, arguments_of, fields_of
 from master.console.setup.files import KEY_FILE, CameraPlan, Plan, key_of
 from master.console.state import ConsoleSettings
@@ -121,7 +121,7 @@ class Commands:
         Raises:
             CalibrationError: A field is empty that is needed, or a number is none.
         """
-        fields = fields_of(COMMANDS[command])
+        fields = fields_of(CALIBRATIONS[command])
         names = {field.name for field in fields}
         known: dict[str, Value] = {
             "calibration": str(work / "tree" if command == "cube" else self.tree),
@@ -137,7 +137,13 @@ class Commands:
         if command == "verify" and not values.get("source"):
             del known["picture"]  # what is to be expected is a table
         merged = {**values, **{name: value for name, value in known.items() if name in names}}
-        return [sys.executable, "-m", "master", "calibrate", command, *arguments_of(fields, merged)]
+        return [
+            sys.executable,
+            "-m",
+            "master",
+            *CALIBRATIONS[command].name.split(),
+            *arguments_of(fields, merged),
+        ]
 
     def _place(self, camera: CameraPlan) -> list[str]:
         return ["--name", camera.name, "--rig", self.plan.rig, "--calibration", str(self.tree)]

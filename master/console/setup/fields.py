@@ -1,15 +1,14 @@
 """Form fields of a calibration, read off the command's own options, so that page and command line cannot differ."""
 
-import inspect
-import types
-from collections.abc import Callable, Mapping
+from argparse import SUPPRESS, Action, ArgumentParser
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, Union, cast, get_args, get_origin, get_type_hints
+from typing import Any, Literal, cast
 
-from typer.models import ArgumentInfo, OptionInfo
-
+from common.command_line import Command
 from common.errors import CalibrationError
+from common.option_types import Number
 
 Shape = Literal["text", "number", "whole", "flag", "choice", "path", "list"]
 Value = str | float | bool | None
@@ -21,7 +20,7 @@ class Field:
     """One option or argument of a command.
 
     Attributes:
-        name: The function's name of it.
+        name: Its name among the options that are read.
         flag: On the command line, such as --square-mm; empty for an argument.
         label: For a person.
         help: What it means.
@@ -44,16 +43,11 @@ class Field:
     high: float | None = None
 
 
-def fields_of(command: Callable[..., None]) -> tuple[Field, ...]:
-    """All options and arguments of one command, arguments first, each as a field.
-
-    Raises:
-        TypeError: The command has a parameter that is neither option nor argument.
-    """
-    hints = cast(dict[str, object], get_type_hints(command, include_extras=True))
-    found = [
-        _field(parameter, hints[name]) for name, parameter in inspect.signature(command).parameters.items()
-    ]
+def fields_of(command: Command) -> tuple[Field, ...]:
+    """All options and arguments of one command, arguments first, each as a field."""
+    declared = _Declared()
+    command.declare(declared)
+    found = [_field(action) for action in declared.actions if action.default is not SUPPRESS]
     return tuple(sorted(found, key=lambda field: field.flag != ""))
 
 
@@ -102,37 +96,40 @@ def _text(field: Field, value: Value) -> str | None:
     return str(value).strip() or None
 
 
-def _field(parameter: inspect.Parameter, hint: object) -> Field:
-    if get_origin(hint) is not Annotated:
-        raise TypeError(f"{parameter.name}: neither a typer option nor an argument")
-    kind, *notes = get_args(hint)
-    info = next((note for note in notes if isinstance(note, (OptionInfo, ArgumentInfo))), None)
-    if info is None:
-        raise TypeError(f"{parameter.name}: neither a typer option nor an argument")
-    # In Annotated the first name of an option stands where its default would: typer's convention.
-    first = (info.default,) if isinstance(info.default, str) else ()
-    declared = (*first, *(info.param_decls or ()))
-    long = next((one for one in declared if one.startswith("--")), f"--{parameter.name.replace('_', '-')}")
-    flag = long if isinstance(info, OptionInfo) else ""
-    default = cast(object, parameter.default)
-    required = default is inspect.Parameter.empty and info.default_factory is None
-    shape, choices = _shape(kind)
+class _Declared(ArgumentParser):
+    """A parser that remembers what is declared, in that order."""
+
+    def __init__(self) -> None:
+        self.actions: list[Action] = []
+        super().__init__(add_help=False)
+
+    def add_argument(self, *names: Any, **how: Any) -> Action:
+        """Declare an option or an argument."""
+        action = super().add_argument(*names, **how)
+        self.actions.append(action)
+        return action
+
+
+def _field(action: Action) -> Field:
+    flag = next((one for one in action.option_strings if one.startswith("--")), "")
+    number = action.type if isinstance(action.type, Number) else None
+    default = cast(object, action.default)
     return Field(
-        parameter.name,
+        action.dest,
         flag,
-        label_of(parameter.name),
-        str(info.help or ""),
-        shape,
-        None if required or default is None or default is inspect.Parameter.empty else _value(default),
-        required,
-        choices,
-        None if info.min is None else float(info.min),
-        None if info.max is None else float(info.max),
+        label_of(action.dest),
+        (action.help or "") % {"default": default},
+        _shape(action),
+        None if action.required or default is None or default == [] else _value(default),
+        action.required,
+        tuple(str(one) for one in action.choices or ()),
+        None if number is None else number.low,
+        None if number is None else number.high,
     )
 
 
 def label_of(name: str) -> str:
-    """A parameter's name for a person: `square_mm` is "Square (mm)"."""
+    """An option's name for a person: `square_mm` is "Square (mm)"."""
     for end, unit in _UNITS.items():
         if name.endswith(end):
             return f"{name.removesuffix(end).replace('_', ' ').capitalize()} ({unit})"
@@ -145,15 +142,14 @@ def _value(default: object) -> Value:
     return str(default)
 
 
-def _shape(kind: object) -> tuple[Shape, tuple[str, ...]]:
-    """How a type is entered, and the choices of a choice."""
-    if get_origin(kind) in (Union, types.UnionType):
-        return _shape(next(part for part in get_args(kind) if part is not type(None)))
-    if hasattr(kind, "__value__"):
-        return _shape(getattr(kind, "__value__", None))
-    if get_origin(kind) is Literal:
-        return "choice", tuple(str(one) for one in get_args(kind))
-    if get_origin(kind) is list:
-        return "list", ()
-    shapes: dict[object, Shape] = {bool: "flag", int: "whole", float: "number", Path: "path"}
-    return shapes.get(kind, "text"), ()
+def _shape(action: Action) -> Shape:
+    """How an option is entered."""
+    if action.nargs == 0:
+        return "flag"
+    if action.choices is not None:
+        return "choice"
+    if isinstance(action.default, list):
+        return "list"
+    if isinstance(action.type, Number):
+        return "whole" if action.type.whole else "number"
+    return "path" if action.type is Path else "text"

@@ -62,7 +62,7 @@ def verdict(job: Job) -> str:
 
 
 def judged(numbers: dict[str, object]) -> str:
-    """The same of the figures of `calibrate stereo --json`."""
+    """The same of the figures of `calibrate cameras stereo --json`."""
     rms = float(cast(float, numbers["rms_px"]))
     pairs = cast(list[dict[str, float]], numbers["pairs"])
     off = [abs(pair["edge_sd_mm"]) / max(abs(pair["edge_mean_mm"]), 1e-9) for pair in pairs]

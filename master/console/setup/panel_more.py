@@ -3,7 +3,7 @@
 from nicegui import ui
 
 from common.errors import PhalanxError
-from master.calibrate.cli import COMMANDS
+from master.cli.table import CALIBRATIONS
 from master.console.setup.fields import Field, Value, fields_of
 from master.console.setup.job_view import job_view
 from master.console.setup.parts import Desk, heading, previews
@@ -80,7 +80,7 @@ class _Form:
     def __init__(self, wizard: Wizard) -> None:
         self._wizard = wizard
         fields = {
-            field.name: field for field in fields_of(COMMANDS[wizard.command]) if field.name not in FILLED
+            field.name: field for field in fields_of(CALIBRATIONS[wizard.command]) if field.name not in FILLED
         }
         self._first = [fields.pop(name) for name in wizard.first if name in fields]
         page = {"board", "cube"} & {wizard.command}

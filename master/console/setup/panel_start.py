@@ -20,7 +20,7 @@ def build(desk: Desk) -> None:
             command_line(f"then on the Pi of {camera.name}: start its slave; it appears below by itself", run)
     if session.state.settings.beacon.startswith("127.") and len(here) < len(session.plan.cameras):
         ui.label(
-            "This console speaks to this computer only. For Pis start it as: phalanx-master console --keys DIR"
+            "This console speaks to this computer only. For Pis start it as: phalanx console --keys DIR"
             " --beacon 192.168.1.255:47800 --bind 0.0.0.0:47801 --bus tls/0.0.0.0:47802"
         ).classes("setup-error")
     view = None

@@ -29,11 +29,9 @@ def progress(lines: Iterable[str]) -> float | None:
 def fault(lines: Iterable[str]) -> str:
     """What a command that failed said last: its error, with what to do, as its author wrote it."""
     printed = [line.strip() for line in lines if line.strip()]
-    prefix = "phalanx-master: "
     for place, line in reversed(list(enumerate(printed))):
-        if line.startswith((prefix, "phalanx-slave: ", "meet: ")):
+        if line.startswith(("phalanx: ", "phalanx-slave: ", "meet: ")):
             return " ".join([line.partition(": ")[2], *printed[place + 1 :]])
-    boxed = [
-        line.strip("│ ").strip() for line in printed if line.startswith("│")
-    ]  # typer draws a box round wrong usage
-    return " ".join(boxed) or (printed[-1] if printed else "it said nothing")
+        if ": error: " in line:  # wrong usage
+            return line.partition(": error: ")[2]
+    return printed[-1] if printed else "it said nothing"

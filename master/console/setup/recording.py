@@ -45,14 +45,14 @@ def recording_stages(
 
     def join() -> Stage:
         folders = [str(raw / camera.name) for camera in cameras]
-        line = [sys.executable, "-m", "slave", "join", *folders, "-o", str(whole)]
+        line = [sys.executable, "-m", "slave", "record", "--join", *folders, "-o", str(whole)]
         return Stage("joining the recordings", {"join": line})
 
     def detect() -> Stage:
         found.mkdir(parents=True, exist_ok=True)
         lines = {
             f"detect {camera.name}": [
-                *(sys.executable, "-m", "slave", "detect", str(whole), "--camera", camera.name),
+                *(sys.executable, "-m", "slave", "run", "--name", camera.name, "--camera", f"replay:{whole}"),
                 *("--calibration", str(commands.tree)),
                 *("-o", str(found / f"detections_{camera.name}.npz")),
             ]

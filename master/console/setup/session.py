@@ -172,7 +172,7 @@ class Session:
         """Pictures of the board from all cameras, then the fit of lenses and places.
 
         Args:
-            values: Fields of `calibrate capture`.
+            values: Fields of `calibrate cameras capture`.
 
         Raises:
             PhalanxError: A field is none; another calibration runs.

@@ -32,7 +32,7 @@ class Wizard:
     """One calibration as a page leads through it.
 
     Attributes:
-        command: Name under `phalanx-master calibrate`.
+        command: Last word of the command of `phalanx calibrate`.
         title: For a person.
         purpose: What is better afterwards.
         needs: What must be there before.

@@ -90,7 +90,7 @@ def _files(*items: CheckItem) -> Callable[[Bench], object]:
 
 
 LENS = CheckItem(
-    "calibration_absent", "left", "Camera left: its lens is not measured.", "calibrate intrinsics"
+    "calibration_absent", "left", "Camera left: its lens is not measured.", "calibrate cameras intrinsics"
 )
 OLD = CheckItem("calibration_stale", "left", "The lens of camera left was measured after.", "calibrate")
 CASES = [
@@ -99,7 +99,7 @@ CASES = [
         "left",
         lambda b: b.away.add("left"),
         lambda b: b.away.clear(),
-        "not received any more",
+        "not heard any more",
         "slave",
     ),
     Case(
@@ -150,7 +150,9 @@ CASES = [
         "colour of marker back",
         "cover it",
     ),
-    Case("calibration_absent", "left", _files(LENS), _files(), "not measured", "calibrate intrinsics"),
+    Case(
+        "calibration_absent", "left", _files(LENS), _files(), "not measured", "calibrate cameras intrinsics"
+    ),
     Case(
         "calibration_absent",
         "left",
@@ -168,7 +170,9 @@ CASES = [
         "1280 x 480",
         "same cameras/left.json",
     ),
-    Case("camera_moved", "left-right", _apart(0.8), _apart(0.0), "miss each other", "calibrate stereo"),
+    Case(
+        "camera_moved", "left-right", _apart(0.8), _apart(0.0), "miss each other", "calibrate cameras stereo"
+    ),
     Case(
         "clock_unsynchronised",
         "right",
@@ -240,14 +244,14 @@ CASES = [
         "imu",
         lambda b: b.away.add("imu"),
         lambda b: b.away.clear(),
-        "not received any more",
-        "phalanx-slave imu",
+        "not heard any more",
+        "phalanx-slave run --name imu",
     ),
     Case(
         "twin_sender",
         "left",
-        _set("duplicate", "left", RejectedPeer("10.0.0.7", 10)),
-        _set("duplicate", "left", None),
+        _set("twin", "left", RejectedPeer("10.0.0.7", 10)),
+        _set("twin", "left", None),
         "the one at 10.0.0.7 is not taken",
         "--name",
     ),
@@ -273,7 +277,7 @@ CASES = [
         _other_rig,
         _same_rig,
         "left sends 8 markers, the rig of this master has 6",
-        "phalanx deploy",
+        "phalanx fleet deploy",
     ),
 ]
 
@@ -308,7 +312,7 @@ def test_who_never_came_is_reported_after_a_grace() -> None:
     shown = bench.seconds(8.0)
     assert not any(items for s, items in shown if s < 5.0)
     assert [(i.code, i.subject) for i in shown[-1][1]] == [("camera_absent", "right"), ("imu_silent", "imu")]
-    assert "never received" in shown[-1][1][0].sentence
+    assert "never heard" in shown[-1][1][0].sentence
 
 
 def test_a_camera_that_gives_no_frames_is_absent_though_its_slave_is_there() -> None:

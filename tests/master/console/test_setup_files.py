@@ -52,14 +52,14 @@ def measured(tree: Path) -> None:
     """As a calibration of lenses and places leaves the files."""
     for name in ("left", "right"):
         path = tree / "cameras" / f"{name}.json"
-        how = provenance("calibrate stereo", ("views",), {"rms_px": 0.1})
+        how = provenance("calibrate cameras stereo", ("views",), {"rms_px": 0.1})
         save(path, replace(load(path, CameraCalibration), intrinsics=LENS, provenance={"intrinsics": how}))
     path = tree / "rigs" / "desk.json"
     places = {
         name: ((1.0, 0.0, 0.0, x), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
         for name, x in (("left", 0.0), ("right", 0.07))
     }
-    how = provenance("calibrate stereo", ("views",), {"rms_px": 0.1})
+    how = provenance("calibrate cameras stereo", ("views",), {"rms_px": 0.1})
     save(path, replace(load(path, RigCalibration), T_rig_camera=places, provenance={"T_rig_camera": how}))
 
 

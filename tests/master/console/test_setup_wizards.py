@@ -6,14 +6,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-import typer
 from msgspec.structs import replace
-from typer.testing import CliRunner
 
 from common.calibration import RigCalibration, load
 from common.errors import CalibrationError
 from common.keys import rig_key
-from master.calibrate.cli import COMMANDS, calibrate_app
+from master.cli.table import CALIBRATIONS
 from master.console.local import LocalProcesses
 from master.console.setup.commands import VIEWS, Commands, epoch_of
 from master.console.setup.fields import arguments_of, fields_of
@@ -24,6 +22,7 @@ from master.console.setup.progress import fault, progress, share_of
 from master.console.setup.wizards import FILLED, WIZARDS
 from master.console.state import ConsoleSettings
 from master.keys_folder import make
+from tests.cli import invoke
 
 WAIT_S = 60.0
 
@@ -33,19 +32,19 @@ def missing_wizards(commands: set[str]) -> set[str]:
 
 
 def test_every_calibration_has_a_wizard() -> None:
-    assert missing_wizards(set(COMMANDS)) == set()
-    assert set(WIZARDS) == set(COMMANDS)
-    assert missing_wizards({*COMMANDS, "new-one"}) == {"new-one"}  # the check sees one that is missing
+    assert missing_wizards(set(CALIBRATIONS)) == set()
+    assert set(WIZARDS) == set(CALIBRATIONS)
+    assert missing_wizards({*CALIBRATIONS, "new-one"}) == {"new-one"}  # the check sees one that is missing
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", CALIBRATIONS)
 def test_a_form_has_every_option_of_its_command_with_its_help(command: str) -> None:
-    fields = {field.name: field for field in fields_of(COMMANDS[command])}
+    fields = {field.name: field for field in fields_of(CALIBRATIONS[command])}
     wizard = WIZARDS[command]
     assert set(wizard.first) <= set(fields) - FILLED
     assert set(wizard.defaults) <= set(fields) - FILLED
     assert all(field.help for field in fields.values())
-    output = CliRunner().invoke(calibrate_app(), [command, "--help"], env={"COLUMNS": "300", "NO_COLOR": "1"})
+    output = invoke(*CALIBRATIONS[command].name.split(), "--help")
     for field in fields.values():
         assert field.flag in output.output
     # What is required and the page does not fill in by itself is shown at once.
@@ -54,7 +53,7 @@ def test_a_form_has_every_option_of_its_command_with_its_help(command: str) -> N
 
 
 def test_values_become_the_command_line() -> None:
-    fields = fields_of(COMMANDS["stereo"])
+    fields = fields_of(CALIBRATIONS["stereo"])
     values = {
         "source": "views",
         "board": "9x6",
@@ -70,7 +69,7 @@ def test_values_become_the_command_line() -> None:
         arguments_of(fields, {"board": "9x6", "square_mm": 25.0})
     with pytest.raises(CalibrationError, match=r"Square \(mm\): 'wide' is no number"):
         arguments_of(fields, {**values, "square_mm": "wide"})
-    views = fields_of(COMMANDS["capture"])
+    views = fields_of(CALIBRATIONS["capture"])
     with pytest.raises(CalibrationError, match="Views: 3 is not in 5 to 200"):
         arguments_of(views, {"out": "x", "views": 3})
 
@@ -84,14 +83,14 @@ def test_lines_show_the_progress() -> None:
 
 
 def test_what_went_wrong_is_the_commands_own_sentence() -> None:
-    lines = ["reading", "phalanx-master: views: 2 views kept; a calibration needs 5"]
+    lines = ["reading", "phalanx: views: 2 views kept; a calibration needs 5"]
     assert fault(lines) == "views: 2 views kept; a calibration needs 5"
-    assert "Missing argument" in fault(_boxed())
+    assert fault(_wrong_usage()).startswith("the following arguments are required: SOURCE, --board")
     assert fault([]) == "it said nothing"
 
 
-def _boxed() -> list[str]:
-    return CliRunner().invoke(calibrate_app(), ["stereo"]).output.splitlines()
+def _wrong_usage() -> list[str]:
+    return invoke("calibrate", "cameras", "stereo").output.splitlines()
 
 
 @pytest.fixture(name="tree")
@@ -137,10 +136,10 @@ def test_a_job_runs_its_stages_and_its_result_is_taken_over_once(tree: Path) -> 
 def test_a_job_that_fails_says_why_and_what_follows_does_not_run(tree: Path) -> None:
     local = LocalProcesses()
     try:
-        failing = "import sys; print('phalanx-master: no board; show one'); sys.exit(1)"
+        failing = "import sys; print('phalanx: no board; show one'); sys.exit(1)"
         job = job_of(tree, local, failing, "print('never')")
         assert job.wait(WAIT_S) is JobState.FAILED
-        assert (job.error, job.text) == ("no board; show one", ["phalanx-master: no board; show one"])
+        assert (job.error, job.text) == ("no board; show one", ["phalanx: no board; show one"])
         with pytest.raises(CalibrationError, match="no result to use"):
             job.use()
     finally:
@@ -196,9 +195,10 @@ def test_command_lines_are_ones_that_the_programs_take(tree: Path) -> None:
     copy, run = Commands(ConsoleSettings(tree), pi).pi(pi.cameras[0])
     assert copy == f"rsync -a {tree.resolve()}/ pi@left.local:calib_json/"
     assert run.startswith("phalanx-slave run --name left --rig desk --camera picamera2")
-    for command in COMMANDS:
-        values = {field.name: "1" for field in fields_of(COMMANDS[command]) if field.required}
-        assert commands.calibrate(command, values, tree / "work", live=False)[4:5] == [command]
+    for command in CALIBRATIONS:
+        values = {field.name: "1" for field in fields_of(CALIBRATIONS[command]) if field.required}
+        words = CALIBRATIONS[command].name.split()
+        assert commands.calibrate(command, values, tree / "work", live=False)[3:][: len(words)] == words
     assert set(VIEWS) >= {"board", "still", "standard"}
 
 
@@ -248,4 +248,3 @@ def test_residuals_in_words() -> None:
 
 def test_a_rig_file_of_the_set_up_is_one(tree: Path) -> None:
     assert load(tree / "rigs" / "desk.json", RigCalibration).cameras == ("left", "right")
-    assert isinstance(calibrate_app(), typer.Typer)

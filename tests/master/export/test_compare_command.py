@@ -6,13 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from common.errors import CalibrationError, FitError, PhalanxError, RecordingError
 from common.hand_model import JOINTS
-from master.export.command import export as export_command
 from master.mocap.joint_motion import MARKERS
+from tests.cli import invoke
 from tests.master.export.test_export_command import recording_of
 from tests.master.export.test_export_tables import run_of
 from tests.master.mocap.moved import RIGHT, ROTATION, SHIFT, hand_at, poses_of, write_table
@@ -23,9 +21,7 @@ SIGMA_M = 2e-3
 
 
 def run(*options: str) -> str:
-    app = typer.Typer()
-    app.command()(export_command)
-    result = CliRunner().invoke(app, [*options], catch_exceptions=False)
+    result = invoke("export", *options)
     assert result.exit_code == 0, result.output
     return result.output
 

@@ -5,7 +5,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from common.arrays import Float
 from common.calibration import HandProfile, load, save
@@ -13,12 +12,13 @@ from common.errors import FitError, PhalanxError
 from common.gesture_settings import GestureSettings, default_gestures
 from common.hand_model import HandModel
 from common.messages import HandPose
-from master.gestures.command import gestures_app, seconds_of, with_pose
+from master.gestures.command import seconds_of, with_pose
 from master.gestures.features import FeatureExtractor, HandFeatures
 from master.gestures.poses import PoseRecogniser
 from master.gestures.template_session import template_session, what_lacks
 from master.gestures.templates import Example, learn
 from master.outputs.files import PosesFile
+from tests.cli import invoke
 from tests.hand_helpers import RIGHT
 from tests.master.gestures.shown_hands import FRAME_NS, OPEN, PINCH, POINT, SMALL, posture, shown
 
@@ -178,22 +178,22 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, HandModel]:
 def test_the_commands_teach_from_a_file_read_it_list_and_forget(
     run: tuple[Path, HandModel], tmp_path: Path
 ) -> None:
-    mine, runner = tmp_path / "mine.json", CliRunner()
+    mine = tmp_path / "mine.json"
     save(mine, msgspec.structs.replace(SETTINGS, name="mine"))
     given = ["--settings", str(mine), "--calibration", str(CALIB_JSON)]
     ranges = ["--range", "0.2-0.9", "--range", "2.2-2.9", "--range", "4.2-4.9", "--range", "6.2-6.9"]
-    templates = runner.invoke(gestures_app(), ["teach", "horns", "--poses", str(run[0]), *ranges, *given])
+    templates = invoke("gestures", "--teach", "horns", "--poses", run[0], *ranges, *given)
     assert templates.exit_code == 0, templates.output
     assert "from pointing" in templates.output
     written = load(mine, GestureSettings)
     assert written.provenance["horns"].residual["examples"] == 4.0
-    read = runner.invoke(gestures_app(), ["read", str(run[0]), *given])
+    read = invoke("gestures", "--poses", run[0], *given)
     assert read.exit_code == 0, read.output
     names = [line.split(" pose ")[1].split()[0] for line in read.output.splitlines() if " pose " in line]
     assert names == ["horns", "open_palm"] * 4
-    listed = runner.invoke(gestures_app(), ["list", *given])
+    listed = invoke("gestures", *given)
     assert "horns (taught" in listed.output
-    gone = runner.invoke(gestures_app(), ["forget", "horns", *given])
+    gone = invoke("gestures", "--forget", "horns", *given)
     assert gone.exit_code == 0
     assert load(mine, GestureSettings).poses == SETTINGS.poses
 
@@ -204,9 +204,8 @@ def test_a_refused_pose_leaves_the_file_as_it_was(run: tuple[Path, HandModel], t
     before = mine.read_bytes()
     ranges = [part for second in (1, 3, 5) for part in ("--range", f"{second}.2-{second}.9")]
     given = ["--settings", str(mine), "--calibration", str(CALIB_JSON), "--poses", str(run[0])]
-    refused = CliRunner().invoke(gestures_app(), ["teach", "palm", *ranges, *given])
-    assert isinstance(refused.exception, FitError)
-    assert "too like 'open_palm'" in str(refused.exception)
+    with pytest.raises(FitError, match="too like 'open_palm'"):
+        invoke("gestures", "--teach", "palm", *ranges, *given)
     assert mine.read_bytes() == before
 
 

@@ -108,7 +108,7 @@ def test_nobody_on_the_network_is_asked_or_heard(pylsl: ModuleType) -> None:
     assert after - before <= {socket.inet_aton("127.0.0.1")[::-1].hex().upper()}
     assert joined is joined_before
     sink.close()
-    with pytest.raises(PhalanxError, match=r"lsl\.scope is 'network'.*start `phalanx-master send` anew"):
+    with pytest.raises(PhalanxError, match=r"lsl\.scope is 'network'.*start `phalanx send` anew"):
         LslSink(LslOutput(scope="network"), MasterTimes())
 
 

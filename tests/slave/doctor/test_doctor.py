@@ -17,7 +17,7 @@ from common.keys import new_key
 from common.machine import ROOT, Program
 from master.link import MasterLink
 from slave.__main__ import main
-from slave.arguments import parser
+from slave.cli.table import PROGRAM
 from slave.doctor.clock import check_clock
 from slave.doctor.command import examine
 from slave.doctor.devices import check_devices, check_groups
@@ -331,11 +331,11 @@ def test_what_is_installed_is_looked_at_by_itself(tmp_path: Path) -> None:
     etc = tmp_path / "etc/phalanx"
     etc.mkdir()
     (etc / "left.env").write_text(
-        "# Written by the installer\nPHALANX_COMMAND=run\n"
+        "# Written by the installer\n"
         f"PHALANX_OPTIONS=--name left --rig desk --camera picamera2 --calibration {CALIBRATION}\n"
     )
-    (etc / "imu.env").write_text("PHALANX_COMMAND=imu\nPHALANX_OPTIONS=--name imu --imu lsm6dsox:1\n")
-    found = by_check(list(examine(parser().parse_args(["doctor"]), system)))
+    (etc / "imu.env").write_text("PHALANX_OPTIONS=--name imu --imu lsm6dsox:1\n")
+    found = by_check(list(examine(PROGRAM.parse(["doctor"])[1], system)))
     assert found["left: service"].text == "60 frames/s"
     assert found["left: camera file"].verdict is Verdict.OK
     assert found["left: camera"].verdict is Verdict.UNSEEN  # the running service has it

@@ -1,4 +1,4 @@
-"""`phalanx-slave import` and `colours` of videos: what a stranger types, and what it says."""
+"""`phalanx-slave record --from` and `colours` of videos: what a stranger types, and what it says."""
 
 import json
 from pathlib import Path
@@ -46,8 +46,8 @@ def test_colours_of_a_video_by_clicks_find_its_markers(
     painted: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tree, video, made = str(painted / "calib"), str(painted / "left.avi"), painted / "made/cameras/left.json"
-    assert main(["import", video, "--calibration", tree, "-o", str(painted / "recording")]) == 0
-    fix = ["detect", str(painted / "recording"), "--camera", "left", "--calibration", tree]
+    assert main(["record", "--from", video, "--calibration", tree, "-o", str(painted / "recording")]) == 0
+    fix = ["run", "--name", "left", "--camera", f"replay:{painted / 'recording'}", "--calibration", tree]
     assert main([*fix, "-o", str(painted / "d.npz")]) == 1
     output = capsys.readouterr().err
     assert "cameras/left.json: markers: missing; make them: phalanx-slave colours" in output
@@ -91,10 +91,11 @@ def test_a_click_that_is_none_is_wrong_usage(capsys: pytest.CaptureFixture[str])
 def test_import_says_what_it_made_of_what(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tree, out = write_tree(tmp_path / "calib"), tmp_path / "out"
     first, second = (write_video(tmp_path / name) for name in ("GOPR0012.mp4", "GOPR0944.mp4"))
-    named = ["--camera", f"right={first}", "--camera", f"left={second}"]
-    assert main(["import", *named, "--calibration", str(tree), "-o", str(out)]) == 0
+    named = [f"right={first}", f"left={second}"]
+    assert main(["record", "--from", *named, "--calibration", str(tree), "-o", str(out)]) == 0
     output = capsys.readouterr().out
     assert f"right: {first}: {COUNT} frames in 0.44 s" in output
     assert f"recording in {out}" in output
-    assert main(["import", "--calibration", str(tree), "-o", str(out)]) == 1
-    assert "name a video or a folder of pictures for each camera" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["record", "--calibration", str(tree), "-o", str(out), "--from"])
+    assert "argument --from: expected at least one argument" in capsys.readouterr().err

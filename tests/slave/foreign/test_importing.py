@@ -212,7 +212,7 @@ def _text(tmp_path: Path) -> list[Path]:
     [
         (
             _small,
-            r"left\.avi: is of 64 x 48 px, the calibration .*cameras/left\.json of 96 x 64: .*calibrate stereo",
+            r"left\.avi: is of 64 x 48 px, the calibration .*cameras/left\.json of 96 x 64: .*calibrate cameras stereo",
         ),
         (
             _one_strange,

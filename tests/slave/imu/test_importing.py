@@ -36,7 +36,7 @@ def test_it_says_what_is_in_it_and_writes_our_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = rested(tmp_path / "foreign.csv", off_deg=1.0)
-    assert main(["imu", "--csv", str(path), "--out", str(tmp_path / "taken"), "--name", "device"]) == 0
+    assert main(["record", "--imu-csv", str(path), "-o", str(tmp_path / "taken"), "--name", "device"]) == 0
     output = capsys.readouterr().out
     assert "Timestamp (ms) in ms (header)" in output
     assert "gx_dps, gy_dps, gz_dps in deg/s (header)" in output
@@ -64,8 +64,8 @@ def test_what_is_there_is_not_written_over(tmp_path: Path) -> None:
 
 def test_it_is_a_device_or_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        main(["imu", "--csv", "a.csv", "--imu", "synthetic"])
-    assert main(["imu", "--csv", str(tmp_path / "none.csv")]) == 1
+        main(["record", "--imu-csv", "a.csv", "--camera", "synthetic"])
+    assert main(["record", "--imu-csv", str(tmp_path / "none.csv")]) == 1
     assert "none.csv: there is no such file" in capsys.readouterr().err
 
 

@@ -211,6 +211,6 @@ def test_what_it_cannot_be_is_said_at_the_start(
         save(files / f"rigs/{name}.json", msgspec.structs.replace(rig, name=name, imu=imu))
         for kept in ("hands", "cameras"):
             (files / kept).symlink_to(ROOT / "calib_json" / kept)
-    command = ["imu", "--rig", "wrist", "--imu", "synthetic", "--calibration", str(files)]
+    command = ["run", "--rig", "wrist", "--imu", "synthetic", "--calibration", str(files)]
     assert main([*command, *option, "--bind", "127.0.0.1"]) == 1
     assert expected in capsys.readouterr().err

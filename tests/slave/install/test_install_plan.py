@@ -43,8 +43,9 @@ def plan(*words: str) -> Plan:
 
 def test_a_wrist_device_is_two_services_and_its_lights_go_dark() -> None:
     camera, imu = plan(*WRIST).senders
-    assert (camera.name, camera.command, imu.name, imu.command) == ("wrist", "run", "imu", "imu")
-    assert "PHALANX_STOP_POST=lights --rig wrist --calibration" in camera.environment
+    assert (camera.name, imu.name) == ("wrist", "imu")
+    assert ("--camera" in camera.options, "--imu" in imu.options) == (True, True)
+    assert "PHALANX_STOP_POST=doctor --rig wrist --calibration" in camera.environment
     assert camera.environment.endswith("--lights gpio:0:17,27 --off\n")
     assert imu.environment.endswith("PHALANX_STOP_POST=\n")
     assert plan(*WRIST).boot == ("camera_auto_detect=1", "dtparam=i2c_arm=on")
@@ -120,7 +121,7 @@ def test_keys_that_others_can_read_and_keys_that_are_missing_are_refused(board: 
     (board.keys / "devices/left.secret").chmod(0o600)
     (board.keys / "devices/left.key").unlink()
     with pytest.raises(
-        InstallError, match=r"no device-left.key; make them on the PC: phalanx-master keys make"
+        InstallError, match=r"no device-left.key; make them on the PC: phalanx fleet keys DIR --make"
     ):
         board.install(site)
     with pytest.raises(InstallError, match=r"/etc/phalanx/keys/rig.key: missing; give --keys DIR"):

@@ -29,7 +29,6 @@ def test_a_clean_machine_gets_all_of_it(board: Board, site: Path) -> None:
     assert (root / "opt/phalanx/current").readlink() == Path(f"releases/{outcome.release}")
     assert outcome.release.startswith("1.0-")
     lines = (root / "etc/phalanx/left.env").read_text().splitlines()
-    assert "PHALANX_COMMAND=run" in lines
     assert (
         "PHALANX_OPTIONS=--name left --rig desk --calibration /var/lib/phalanx/calib_json --camera synthetic"
         in lines

@@ -59,7 +59,7 @@ def test_systemd_has_nothing_to_say_about_the_unit(tmp_path: Path) -> None:
         ("char-i2c", "chor-i2c", "chor-i2c"),
         ("MemoryMax=70%", "MemoryMax=170%", "Invalid memory limit"),
         ("MemorySwapMax=0", "MemorySwapMax=none", "Invalid memory limit"),
-        ("current/bin/phalanx-slave $PHALANX_COMMAND", "current/bin/phalanx", "not executable"),
+        ("current/bin/phalanx-slave run", "current/bin/phalanx", "not executable"),
     ],
 )
 def test_a_slip_in_the_unit_would_be_said(tmp_path: Path, old: str, new: str, output: str) -> None:

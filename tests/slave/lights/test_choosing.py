@@ -86,7 +86,7 @@ def test_an_exposure_that_cannot_be_lit_is_refused_at_the_start(
 
 
 def test_the_budget_is_printed_with_every_limit(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["lights", "--rig", "wrist", "--calibration", str(ROOT / "calib_json")]) == 0
+    assert main(["doctor", "--lights", "--rig", "wrist", "--calibration", str(ROOT / "calib_json")]) == 0
     output = capsys.readouterr().out
     for line in (
         "30.0 triples/s, exposure 2000 us",
@@ -114,7 +114,7 @@ def test_the_budget_is_printed_with_every_limit(capsys: pytest.CaptureFixture[st
 def test_the_command_says_what_is_wrong(
     arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["lights", "--calibration", str(ROOT / "calib_json"), *arguments]) == 1
+    assert main(["doctor", "--lights", "--calibration", str(ROOT / "calib_json"), *arguments]) == 1
     assert expected in capsys.readouterr().err
 
 
@@ -125,7 +125,7 @@ def test_a_rig_that_may_do_too_much_is_refused_by_every_command(
     copytree(ROOT / "calib_json", tree)
     path = tree / "rigs/wrist.json"
     path.write_text(path.read_text().replace('"power_w": 0.01', '"power_w": 0.2'))
-    assert main(["lights", "--calibration", str(tree)]) == 1
+    assert main(["doctor", "--lights", "--calibration", str(tree)]) == 1
     output = capsys.readouterr().err
     assert str(path) in output
     assert "laser.power_w" in output

@@ -261,7 +261,7 @@ def test_what_cannot_be_opened_says_why(
 def test_the_command_blinks_within_the_limits_and_ends_dark(
     kernel: FakeGpio, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["lights", "--calibration", str(ROOT / "calib_json"), "--lights", "gpio:0:17,27"]
+    command = ["doctor", "--calibration", str(ROOT / "calib_json"), "--lights", "gpio:0:17,27"]
     kernel.level[17] = 1
     assert main([*command, "--off"]) == 0
     assert (kernel.level[17], kernel.level[27]) == (0, 0)

@@ -170,13 +170,14 @@ def test_the_command_says_in_one_line_what_is_missing(
 ) -> None:  # fmt: skip
     monkeypatch.setenv("PHALANX_RIG_KEY", KEY)
     arguments = [
-        "tracker",
+        "run",
+        "--name",
         name,
         "--rig",
         "desk-cube",
         "--calibration",
         str(tree(tmp_path)),
-        "--device",
+        "--tracker",
         device,
     ]
     assert main([*arguments, "--program", str(tmp_path / "survive-cli"), "--bind", "127.0.0.1"]) == code

@@ -49,7 +49,7 @@ def curl(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_there_is_a_row_for_every_cycle_and_it_is_what_a_live_slave_sends(curl: Path, tmp_path: Path) -> None:
-    command = ["detect", str(curl), "--camera", "wrist", "--calibration", str(TREE)]
+    command = ["run", "--name", "wrist", "--camera", f"replay:{curl}", "--calibration", str(TREE)]
     for name in ("a.npz", "b.npz"):
         assert main([*command, "-o", str(tmp_path / name)]) == 0
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
@@ -86,7 +86,7 @@ def test_labels_that_disagree_are_counted_and_said_and_change_nothing(
         for frame in strobed("curl", 10)
     ]
     folder = recording(tmp_path / "rec", lying)
-    command = ["detect", str(folder), "--camera", "wrist", "--hand", str(HAND_FILE), "-o"]
+    command = ["run", "--name", "wrist", "--camera", f"replay:{folder}", "--hand", str(HAND_FILE), "-o"]
     assert main([*command, str(tmp_path / "d.npz")]) == 0
     assert "1 frames lit otherwise than frames.csv says" in capsys.readouterr().err
     honest = detect_wrist_recording(curl, "wrist", TREE)
@@ -98,7 +98,7 @@ def test_labels_that_disagree_are_counted_and_said_and_change_nothing(
 def test_without_a_hand_the_error_names_the_fix(
     curl: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["detect", str(curl), "--camera", "wrist", "-o", str(tmp_path / "d.npz")]
+    command = ["run", "--name", "wrist", "--camera", f"replay:{curl}", "-o", str(tmp_path / "d.npz")]
     assert main(command) == 1
     error = capsys.readouterr().err
     assert "recording.json" in error
@@ -159,7 +159,17 @@ def test_hand_is_an_option_of_wrist_cameras_only(tmp_path: Path, capsys: pytest.
     rig = load(TREE / "rigs/desk.json", type(RIG))
     cameras = {name: load(TREE / f"cameras/{name}.json", type(CAMERA)) for name in rig.cameras}
     save(tmp_path / "recording.json", Manifest(version=1, kind="markers", cameras=cameras, rig=rig))
-    command = ["detect", str(tmp_path), "--camera", "left", "--hand", str(HAND_FILE), "-o", "d.npz"]
+    command = [
+        "run",
+        "--name",
+        "left",
+        "--camera",
+        f"replay:{tmp_path}",
+        "--hand",
+        str(HAND_FILE),
+        "-o",
+        "d.npz",
+    ]
     assert main(command) == 1
     assert "only a wrist camera knows a hand" in capsys.readouterr().err
     assert HAND.name == RIG.hand

@@ -7,7 +7,6 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from common.calibration import CameraCalibration, PowerLawCalibration, RigCalibration, load, save
 from common.camera_model import CameraModel
@@ -17,7 +16,7 @@ from master.calibrate.cameras.boards import Checkerboard, grid_edges
 from master.calibrate.cameras.detect import find_board
 from master.calibrate.cameras.files import without_wrong_law, write_files
 from master.calibrate.cameras.image_sets import image_sets
-from master.calibrate.cli import calibrate_app
+from tests.cli import calibrate
 from tests.hand_helpers import camera_file, rig_file
 from tests.master.calibrate.cameras.board_images import render
 from tests.master.calibrate.cameras.board_scenes import scene
@@ -32,11 +31,8 @@ def run(*arguments: object) -> str:
     Raises:
         PhalanxError: What it refuses.
     """
-    done = CliRunner().invoke(calibrate_app(), [str(a) for a in arguments])
-    if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception
-    assert done.exit_code == 0, done.output
-    return done.output
+    name, *words = map(str, arguments)
+    return calibrate(name, *words)
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +108,7 @@ def test_files_carry_provenance_and_say_what_is_not_measured(
     out, _, output = written
     camera = load(out / "cameras" / "left.json", CameraCalibration)
     how = camera.provenance["intrinsics"]
-    assert how.tool == "calibrate stereo"
+    assert how.tool == "calibrate cameras stereo"
     assert how.data == ("opencv_stereo",)
     assert "neutral" in how.note
     assert "neutral" in output
@@ -170,7 +166,7 @@ def test_a_law_that_new_places_contradict_is_to_be_fitted_anew(k_m: float, kept:
     new, output = without_wrong_law(rig, cameras)
     assert new.depth_model == ("power_law" if kept else "stereo")
     assert new.power_law == rig.power_law
-    again = "depth_model is 'stereo' now; `phalanx-master calibrate depth --use power_law` fits it anew"
+    again = "depth_model is 'stereo' now; `phalanx calibrate depth --use power_law` fits it anew"
     assert output == "" if kept else again in output
     assert without_wrong_law(rig, {**cameras, "left": None}) == (rig, "")
 

@@ -6,7 +6,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from common.calibration import (
     AffineDisparityCalibration,
@@ -19,9 +18,9 @@ from common.calibration import (
 from common.camera_model import CameraModel
 from common.errors import CalibrationError, FitError, PhalanxError
 from common.geometry import axis_rotation, rigid
-from master.calibrate.cli import calibrate_app
 from master.calibrate.depth.source import load_pair
 from master.fabrik.depth import AffineDisparity
+from tests.cli import calibrate
 from tests.hand_helpers import camera_file, rig_file
 
 RIG = AffineDisparity(37.3, 2.64)
@@ -30,9 +29,8 @@ STEPS = np.arange(1.0, 0.19, -0.05)
 
 def run(*arguments: object) -> str:
     """What the command prints; what it raises is raised."""
-    result = CliRunner().invoke(calibrate_app(), [str(a) for a in arguments], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
+    name, *words = map(str, arguments)
+    return calibrate(name, *words)
 
 
 def tree(tmp_path: Path, rig: RigCalibration | None = None) -> Path:
@@ -260,7 +258,9 @@ def test_a_nominal_view_stands_in_for_intrinsics(tmp_path: Path) -> None:
 
 def test_a_camera_file_made_for_its_colours_does_not_replace_the_recorded_lens(tmp_path: Path) -> None:
     calib = tree(tmp_path)
-    measured = Provenance(date="2026-01-01T00:00:00Z", tool="calibrate intrinsics", data=(), residual={})
+    measured = Provenance(
+        date="2026-01-01T00:00:00Z", tool="calibrate cameras intrinsics", data=(), residual={}
+    )
     files = {name: camera_file(name) for name in ("left", "right")}
     recorded = {name: msgspec.structs.replace(file, exposure_us=1.0) for name, file in files.items()}
     for name, expected in (("left", 1.0), ("right", 4000.0)):  # one measured lens is not a pair

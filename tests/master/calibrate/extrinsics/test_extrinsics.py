@@ -19,6 +19,7 @@ from master.calibrate.extrinsics.report import refuse
 from master.calibrate.extrinsics.seen import Fit
 from master.calibrate.extrinsics.unknown import UNKNOWN
 from master.rig_setup import RigSetup
+from tests.cli import calibrate
 from tests.master.calibrate.extrinsics.moved import CAMERA_LATE_NS, IMU_LATE_NS, Moved, moved
 from tests.master.test_solve_both import write_detections
 
@@ -79,7 +80,8 @@ def test_the_command_writes_the_true_extrinsics_into_a_tree(
     monkeypatch.setattr(fit, "_COARSE_ROUNDS", (3,))
     monkeypatch.setattr(fit, "_ROUNDS", (4, 3))
     folder, tree, picture = recorded(seen, tmp_path), tmp_path / "tree", tmp_path / "mounting.png"
-    command.extrinsics(folder, folder, out=tree, picture=picture, json_file=tmp_path / "found.json")
+    files = ("--out", tree, "--picture", picture, "--json", tmp_path / "found.json")
+    calibrate("mounting", folder, "--detections", folder, *files)
 
     rotation_deg, shift_mm, imu_deg, camera_ms, imu_ms = errors(found[0], seen.both).tolist()
     assert rotation_deg < 2.0  # of which most is that nobody knows when a wrist is straight

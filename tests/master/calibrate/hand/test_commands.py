@@ -1,25 +1,22 @@
-"""`phalanx-master calibrate hand` as a user runs it."""
+"""`phalanx calibrate hand` as a user runs it."""
 
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from common.calibration import HandProfile, load, save
 from common.errors import CalibrationError, PhalanxError, RecordingError
 from common.hand_model import HandModel
 from common.hand_profiles import generated_profile
 from common.npz import write_npz
-from master.calibrate.cli import calibrate_app
+from tests.cli import calibrate
 from tests.master.calibrate.hand.routines import routine
 
 
 def run(*options: str) -> str:
-    result = CliRunner().invoke(calibrate_app(), ["hand", *options], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
+    return calibrate("hand", *options)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])

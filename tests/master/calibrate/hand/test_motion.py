@@ -5,18 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from common.arrays import Float
 from common.calibration import HandProfile, load
 from common.errors import CalibrationError, FitError, RecordingError
 from common.hand_model import CHAINS, JOINTS, HandModel, couplings_of
 from common.hand_posture import joint_angles
-from master.calibrate.cli import calibrate_app
 from master.calibrate.hand.motion import hand_from_motion, motion_lines
 from master.calibrate.hand.motion_couplings import Ratio, motion_couplings
 from master.calibrate.hand.palm import find_palm
 from master.mocap.joint_motion import Side
+from tests.cli import calibrate
 from tests.master.mocap.moved import LEFT, RIGHT, ROTATION, SHIFT, hand_at, motion_of, ns, write_table
 
 T_S = np.arange(900) / 30.0
@@ -25,9 +24,7 @@ MODELS: dict[Side, HandModel] = {"right": RIGHT, "left": LEFT}
 
 
 def run(*options: str) -> str:
-    result = CliRunner().invoke(calibrate_app(), ["hand", *options], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
+    return calibrate("hand", *options)
 
 
 @pytest.mark.parametrize("without", [(), BASES, ("palm", *BASES)])

@@ -163,7 +163,7 @@ def test_a_person_is_warned_that_nothing_comes() -> None:
     output: list[str] = []
     with pytest.raises(Exception, match="no pose came"):
         guide(lambda wait_s: None, RIG, BEADS, Clock(), output.append, 3.0)
-    assert any("phalanx-master run" in line for line in output[1:])
+    assert any("phalanx run" in line for line in output[1:])
 
 
 def test_progress_counts_ways_of_turning_and_names_what_is_not_seen() -> None:

@@ -6,15 +6,14 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from common.calibration import RigCalibration, load, save
-from common.errors import CalibrationError
+from common.errors import CalibrationError, PhalanxError
 from common.frame_recording import Manifest
 from common.messages import MarkerDetections
-from master.calibrate.cli import calibrate_app
 from master.calibrate.time.fit import measure_times, shifted
 from tests import timing_scenes as scenes
+from tests.cli import invoke
 from tests.hand_helpers import camera_file, rig_file
 from tests.timing_scenes import Motion, cameras, recorded
 
@@ -52,9 +51,10 @@ def write_recording(folder: Path, messages: list[MarkerDetections], *, continuou
 
 
 def run(*arguments: str | Path) -> tuple[int, str]:
-    result = CliRunner().invoke(calibrate_app(), ["time", *map(str, arguments)])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        return 1, str(result.exception)
+    try:
+        result = invoke("calibrate", "time", *arguments)
+    except PhalanxError as error:
+        return 1, str(error)
     return result.exit_code, result.output
 
 

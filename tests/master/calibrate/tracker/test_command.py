@@ -51,12 +51,11 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Run:
     """The command, by its exit code."""
 
     def command(*arguments: object) -> int:
-        monkeypatch.setattr(sys, "argv", ["phalanx-master", "calibrate", "tracker", *map(str, arguments)])
+        monkeypatch.setattr(sys, "argv", ["phalanx", "calibrate", "tracker", *map(str, arguments)])
         try:
-            main()
+            return main()
         except SystemExit as end:
             return int(end.code or 0)
-        return 0
 
     return command
 

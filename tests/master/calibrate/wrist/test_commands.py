@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from typer.testing import CliRunner
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load, save
 from common.errors import CalibrationError, FitError, PhalanxError, RecordingError
@@ -19,9 +18,9 @@ from common.npz import write_npz
 from common.sim.wrist.scene import WristScene
 from common.sim.wrist_board import WristBoardScene, record_wrist_board
 from master.calibrate.cameras.boards import Checkerboard
-from master.calibrate.cli import calibrate_app
 from master.calibrate.wrist.palm_board import BoardOffset
 from master.wrist_setup import WristSetup
+from tests.cli import calibrate
 from tests.conftest import ROOT
 from tests.master.calibrate.wrist.devices import CAMERA, RIG, angle_deg, plane_of, scene_of
 
@@ -47,11 +46,8 @@ def run(*arguments: object) -> str:
     Raises:
         PhalanxError: What it refuses.
     """
-    done = CliRunner().invoke(calibrate_app(), [str(a) for a in arguments])
-    if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception
-    assert done.exit_code == 0, done.output
-    return done.output
+    name, *words = map(str, arguments)
+    return calibrate(name, *words)
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +86,7 @@ def test_a_recording_gives_the_plane_that_the_master_then_uses(
     assert angle_deg(setup.normal, np.array(true.normal)) < 0.1
     assert 1e3 * abs(setup.offset_m - true.offset_m) < 0.1
     how = rig.provenance["laser_plane"]
-    assert (how.tool, how.data) == ("calibrate laser-plane", ("boards",))
+    assert (how.tool, how.data) == ("calibrate wrist laser-plane", ("boards",))
     assert {"rms_mm", "normal_sigma_deg", "offset_sigma_mm"} == how.residual.keys()
     assert rig.T_camera_palm == RIG.T_camera_palm
     assert "± " in output
@@ -158,7 +154,7 @@ def test_the_palm_from_a_board_that_lies_on_it(tree: Path, tmp_path: Path) -> No
     )
     np.testing.assert_allclose(np.array(rig_of(tree).T_camera_palm), np.array(RIG.T_camera_palm), atol=2e-3)
     assert "mm above the wrist joint" in output
-    assert rig_of(tree).provenance["T_camera_palm"].tool == "calibrate palm"
+    assert rig_of(tree).provenance["T_camera_palm"].tool == "calibrate wrist palm"
 
 
 @pytest.fixture(scope="module")
@@ -256,9 +252,9 @@ def test_broken_recordings_say_what_is_wrong(
         (
             ("subject", "nowhere", "--detections", "x", "--rig", "wrist"),
             RecordingError,
-            "phalanx-slave detect",
+            "phalanx-slave run -o",
         ),
-        (("curl", "nowhere", "--detections", "x", "--rig", "wrist"), RecordingError, "phalanx-slave detect"),
+        (("curl", "nowhere", "--detections", "x", "--rig", "wrist"), RecordingError, "phalanx-slave run -o"),
     ],
 )
 def test_wrong_calls_name_file_key_and_remedy(
@@ -273,8 +269,8 @@ def test_a_device_without_intrinsics_or_plane_says_what_measures_them(
 ) -> None:
     shutil.copytree(tree, tmp_path / "tree")
     save(tmp_path / "tree/rigs/wrist.json", replace(RIG, laser_plane=None))
-    with pytest.raises(CalibrationError, match=r"laser_plane is missing.*calibrate laser-plane"):
+    with pytest.raises(CalibrationError, match=r"laser_plane is missing.*calibrate wrist laser-plane"):
         run("curl", curled, "--detections", curled, "--rig", "wrist", "--calibration", tmp_path / "tree")
     save(tmp_path / "tree/cameras/wrist.json", replace(CAMERA, intrinsics=None))
-    with pytest.raises(CalibrationError, match=r"intrinsics is missing.*calibrate intrinsics"):
+    with pytest.raises(CalibrationError, match=r"intrinsics is missing.*calibrate cameras intrinsics"):
         run("curl", curled, "--detections", curled, "--rig", "wrist", "--calibration", tmp_path / "tree")

@@ -6,7 +6,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import typer
 from msgspec.structs import replace
 
 from bench.wrist_subjects import CALIB, Person, knuckles
@@ -19,13 +18,13 @@ from common.messages import WristDetections
 from common.npz import write_npz
 from common.palmar_surface import PalmarSurface
 from master.calibrate.cameras.lens_files import matrix_of
-from master.calibrate.cli import calibrate_app
 from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.guided import FLAT, guided
 from master.calibrate.wrist.subject import Subject, calibrate_subject
 from master.calibrate.wrist.subject_fit import fists_of
 from master.calibrate.wrist.subject_model import UNKNOWN, SubjectModel, Unknown, fitted_profile
 from master.wrist_setup import WristSetup
+from tests.cli import calibrate
 
 ANGLES = np.radians(
     [[[2.0, 0.0, 0.0]] * 4, [[0.0, 50.0, 4.0]] * 4, [[-3.0, 85.0, 0.0]] * 4, [[1.0, 30.0, 60.0]] * 4]
@@ -72,7 +71,7 @@ def test_knuckles_5_mm_off_and_a_palm_askew_are_found_within_stated_sigma(
     # About y and z the palm is told by where fingers go aside, about x by the flat hand alone.
     assert np.linalg.norm(rotation[1:]) < max(2.5, np.linalg.norm(rotation_before[1:]))
     assert abs(rotation[0]) < 3.0 * np.degrees(np.sqrt(found.fit.covariance[0, 0]))
-    assert found.rig.provenance["T_camera_palm"].tool == "calibrate subject"
+    assert found.rig.provenance["T_camera_palm"].tool == "calibrate wrist subject"
     assert {"knuckles", "palmar_scale"} <= found.hand.provenance.keys()
     # What is written is what was fitted.
     written = transform(np.array(found.rig.T_camera_palm), knuckles(found.hand))
@@ -87,7 +86,7 @@ def test_what_the_laser_does_not_constrain_keeps_its_prior_and_is_reported(
     assert shrunk.knuckle_m[:, 0].max() < 0.7  # across
     assert shrunk.thick.min() > 0.8  # a thicker finger looks like a knuckle farther away
     # With a palm that a board has placed, knuckles are known better.
-    rig = replace(person.true_rig, provenance={"T_camera_palm": provenance("calibrate palm", (), {})})
+    rig = replace(person.true_rig, provenance={"T_camera_palm": provenance("calibrate wrist palm", (), {})})
     placed = calibrate_subject(cycles, rig, person.camera, person.hand)
     surer = Unknown.of(np.sqrt(np.diag(placed.fit.covariance)) / placed.fit.prior_sigma)
     assert (surer.knuckle_m[:, :2] < shrunk.knuckle_m[:, :2]).all()  # across and up
@@ -248,8 +247,7 @@ def test_the_command_writes_rig_and_hand_and_draws(
         tmp_path / "tree",
     ]
     options += ["--name", "me", "--out", out, "--picture", picture, "--json", tmp_path / "report.json"]
-    app = typer.main.get_command(calibrate_app())
-    app.main(["subject", str(tmp_path / "guided"), *map(str, options)], standalone_mode=False)
+    calibrate("subject", tmp_path / "guided", *options)
     rig = load(out / "rigs" / f"{person.rig.name}.json", RigCalibration)
     hand = load(out / "hands" / "me.json", HandProfile)
     assert rig.hand == hand.name == "me"

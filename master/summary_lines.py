@@ -41,8 +41,8 @@ def summary_lines(summary: Mapping[str, object]) -> list[str]:
         if key in summary
     ]
     if "gestures_made" in summary:
-        recognised = f"{summary['gestures_right']}/{summary['gestures_made']}"
-        lines.append(f"{'gestures recognised':34s} {recognised:>9} ({summary['gestures_false']} false)")
+        told = f"{summary['gestures_right']}/{summary['gestures_made']}"
+        lines.append(f"{'gestures recognised':34s} {told:>9} ({summary['gestures_false']} false)")
     made = summary.get("gestures")
     if isinstance(made, dict):
         counts = cast(dict[str, int], made)

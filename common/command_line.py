@@ -1,0 +1,239 @@
+"""A program of several commands: a table of names, and modules that are imported when a command is asked for.
+
+Each command has two functions, named as `module:function`. One adds its options to a parser; its docstring is the help,
+with the examples behind a line `Examples:`. It is imported for the help and to read the options, so its module imports
+nothing heavy. The other does the work: it takes the options, and returns the exit code, or None for 0.
+"""
+
+import difflib
+import logging
+import os
+import re
+import sys
+from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from textwrap import dedent
+from typing import Any, NoReturn, cast
+
+from common.errors import PhalanxError
+from common.service_manager import ServiceManager, one_line
+from common.supervisor import supervised_threads
+from common.terminal import echo
+
+DONE, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
+_EXAMPLES = "Examples:"
+_HELP = ("-h", "--help")
+_OURS = frozenset({"common", "deploy", "master", "slave"})
+_LOG = "%(levelname)s %(name)s: %(message)s"
+
+
+class Parser(ArgumentParser):
+    """A parser for which all that begins as a negative number is a value: `--angles -20:20:10`."""
+
+    def __init__(self, program: str, about: str, examples: str) -> None:
+        super().__init__(
+            prog=program,
+            description=about,
+            epilog=f"examples:\n{examples}" if examples else None,
+            formatter_class=RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+        self._negative_number_matcher = re.compile(r"-[.\d]")
+
+
+class UsageError(Exception):
+    """The options do not fit to each other; the program ends as it does for an unknown option."""
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A command.
+
+    Attributes:
+        name: Its words, as `fleet deploy`.
+        group: Heading that it stands under in the help of the program.
+        purpose: What it is for, in a line.
+        options: `module:function` that adds its options.
+        work: `module:function` that does it.
+    """
+
+    name: str
+    group: str
+    purpose: str
+    options: str
+    work: str
+
+    def parser(self, program: str) -> ArgumentParser:
+        """The parser of its options."""
+        about, examples = help_of(_function(self.options))
+        parser = Parser(f"{program} {self.name}", about, examples)
+        self.declare(parser)
+        return parser
+
+    def declare(self, parser: ArgumentParser) -> None:
+        """Add its options to a parser."""
+        _function(self.options)(parser)
+
+
+@dataclass(frozen=True, slots=True)
+class Family:
+    """Commands that share their first words.
+
+    Attributes:
+        name: These words.
+        group: Heading that it stands under in the help of the program.
+        purpose: What they are for, in a line.
+    """
+
+    name: str
+    group: str
+    purpose: str
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """A program.
+
+    Attributes:
+        name: As a user types it.
+        about: Its help, in front of the table of commands.
+        table: Commands and families, in the order of the help.
+        missing: What to do where a package is missing that a command needs.
+        log: Format of the lines of the log.
+    """
+
+    name: str
+    about: str
+    table: tuple[Command | Family, ...]
+    missing: str
+    log: str = _LOG
+
+    @property
+    def commands(self) -> tuple[Command, ...]:
+        """The commands alone."""
+        return tuple(entry for entry in self.table if isinstance(entry, Command))
+
+    def main(self, words: Sequence[str] | None = None) -> int:
+        """Run one command; return the exit code: 0 done, 1 something the user can mend, 2 wrong usage, 130 interrupted.
+
+        Raises:
+            SystemExit: With code 0 after a help, 2 for wrong usage, 70 if a thread or the command itself failed.
+        """
+        given = sys.argv[1:] if words is None else list(words)
+        logging.basicConfig(level=logging.INFO, format=self.log, stream=sys.stderr)
+        with supervised_threads():
+            try:
+                return self._run(given)
+            except PhalanxError as error:
+                ServiceManager(os.environ).send(f"STATUS=failed: {one_line(str(error))}")
+                echo(f"{self.name}: {error}", error=True)
+                return FAILED
+            except ModuleNotFoundError as error:
+                if (error.name or "").split(".")[0] in _OURS:
+                    raise
+                echo(f"{self.name}: {error.name} is missing: {self.missing}", error=True)
+                return FAILED
+            except KeyboardInterrupt:
+                echo(f"\n{self.name}: interrupted", error=True)
+                return INTERRUPTED
+            except BrokenPipeError:  # whoever read the output has ended
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                return FAILED
+
+    def parse(self, words: Sequence[str]) -> tuple[Command, Namespace]:
+        """Read a command line.
+
+        Raises:
+            SystemExit: With code 0 after a help, 2 for wrong usage.
+            PhalanxError: The value of an option is refused.
+        """
+        command, rest = self._find(words)
+        return command, command.parser(self.name).parse_args(rest)
+
+    def _run(self, words: Sequence[str]) -> int:
+        command, options = self.parse(words)
+        try:
+            return int(_function(command.work)(options) or DONE)
+        except UsageError as error:
+            command.parser(self.name).error(str(error))
+
+    def _find(self, words: Sequence[str]) -> tuple[Command, Sequence[str]]:
+        """The command that the first words name, and the other words."""
+        known = {entry.name: entry for entry in self.table}
+        name = ""
+        for place, word in enumerate(words):
+            if word in _HELP:
+                echo(self.help(name))
+                raise SystemExit(DONE)
+            entry = known.get(f"{name} {word}".strip())
+            if isinstance(entry, Command):
+                return entry, words[place + 1 :]
+            if entry is None:
+                self._refuse(name, word)
+            name = entry.name
+        echo(self.help(name), error=True)
+        raise SystemExit(WRONG_USAGE)
+
+    def _refuse(self, family: str, word: str) -> NoReturn:
+        there = [entry.name.rpartition(" ")[2] for entry in self._members(family)]
+        near = difflib.get_close_matches(word, there, 1)
+        advice = f"did you mean {near[0]}?" if near else f"there are {', '.join(there)}"
+        echo(f"{f'{self.name} {family}'.strip()}: no command {word!r}: {advice}", error=True)
+        raise SystemExit(WRONG_USAGE)
+
+    def _members(self, family: str) -> list[Command | Family]:
+        return [entry for entry in self.table if entry.name.rpartition(" ")[0] == family]
+
+    def help(self, family: str = "") -> str:
+        """The help of the program, or of a family of its commands."""
+        members = self._members(family)
+        title = f"{self.name} {family}".strip()
+        wide = max(len(entry.name.rpartition(" ")[2]) for entry in members)
+        about = self.about
+        if family:
+            purpose = next(entry.purpose for entry in self.table if entry.name == family)
+            about = f"{purpose[0].upper()}{purpose[1:]}."
+        lines = [f"usage: {title} COMMAND ...", "", about]
+        group = ""
+        for entry in members:
+            if entry.group != group:
+                group = entry.group
+                lines += ["", f"{group}:"]
+            lines.append(f"  {entry.name.rpartition(' ')[2]:{wide}}  {entry.purpose}")
+        if examples := self._examples(members) if family else "":
+            lines += ["", "examples:", examples]
+        return "\n".join([*lines, "", f"`{title} COMMAND --help` shows its options and examples."])
+
+    def _examples(self, members: Sequence[Command | Family]) -> str:
+        """The first example of each command."""
+        found: list[str] = []
+        for entry in members:
+            first = entry if isinstance(entry, Command) else self._first(entry)
+            examples = help_of(_function(first.options))[1].splitlines()
+            own = next((line for line in examples if line.startswith(f"  {self.name} {first.name} ")), "")
+            found += [own] if own else []
+        return "\n".join(found)
+
+    def _first(self, family: Family) -> Command:
+        return next(one for one in self.commands if one.name.startswith(f"{family.name} "))
+
+
+def defaults_of(declare: Callable[[ArgumentParser], None]) -> Namespace:
+    """The options that `declare` adds, as they are if nothing is said. None of them may be required."""
+    parser = ArgumentParser()
+    declare(parser)
+    return parser.parse_args([])
+
+
+def help_of(declare: Callable[..., object]) -> tuple[str, str]:
+    """Description and examples of a command, from the docstring of the function that declares its options."""
+    first, _, rest = (declare.__doc__ or "").strip().partition("\n")
+    about, _, examples = f"{first}\n{dedent(rest)}".partition(f"\n{_EXAMPLES}\n")
+    return about.strip(), examples.rstrip()
+
+
+def _function(place: str) -> Callable[..., Any]:
+    module, _, name = place.partition(":")
+    return cast("Callable[..., Any]", getattr(import_module(module), name))

@@ -1,0 +1,296 @@
+"""The table of `phalanx`, which is also called `phalanx-master` where it runs as a service."""
+
+import sys
+from pathlib import Path
+
+from common.command_line import Command, Family, Program
+
+NAMES = ("phalanx", "phalanx-master")
+_TRY, _SET_UP, _RUN, _LOOK = "try", "set up", "run", "look"
+_RECORD, _SEND, _FLEET = "record", "send", "fleet"
+_CAMERAS, _WRIST = "cameras", "wrist device"
+
+TABLE: tuple[Command | Family, ...] = (
+    Command(
+        "demo",
+        _TRY,
+        "everything on this machine, without hardware",
+        "deploy.arguments:add_demo",
+        "deploy.commands:demo",
+    ),
+    Command(
+        "replay",
+        _TRY,
+        "recorded frames or your own videos to hands, offline",
+        "master.cli.run:replay",
+        "master.replay_command:replay",
+    ),
+    Family("calibrate", _SET_UP, "measure cameras, hand, wrist device, object or tracker"),
+    Command(
+        "camera",
+        _SET_UP,
+        "see how a running camera is set, and set it otherwise",
+        "master.cli.set_up:camera",
+        "master.camera_command:camera",
+    ),
+    Command(
+        "gestures",
+        _SET_UP,
+        "teach a pose of the hand, forget one, or list them",
+        "master.cli.set_up:gestures",
+        "master.gestures.command:gestures",
+    ),
+    Command(
+        "run",
+        _RUN,
+        "track live, or install that as a service",
+        "master.cli.run:run",
+        "master.run_command:run",
+    ),
+    Command(
+        "view",
+        _LOOK,
+        "a running master in the Rerun viewer",
+        "master.cli.look:view",
+        "master.view_command:view",
+    ),
+    Command(
+        "console",
+        _LOOK,
+        "watch, tune, record and set up in a browser",
+        "master.cli.look:console",
+        "master.console_command:console",
+    ),
+    Command(
+        "check",
+        _LOOK,
+        "what of a running rig is not as it should be",
+        "master.cli.look:check",
+        "master.checklist.command:check",
+    ),
+    Command(
+        "info",
+        _LOOK,
+        "what is in a recording of messages",
+        "master.cli.look:info",
+        "master.recording.info_command:info",
+    ),
+    Command(
+        "record",
+        _RECORD,
+        "what a running master takes and solves, to a file",
+        "master.cli.record:record",
+        "master.recording.record_command:record",
+    ),
+    Command(
+        "play",
+        _RECORD,
+        "such a file again, as from a live master",
+        "master.cli.record:play",
+        "master.recording.play_command:play",
+    ),
+    Command(
+        "export",
+        _RECORD,
+        "recorded hands for other tools: CSV, Parquet, BVH, glTF, Rerun",
+        "master.cli.record:export",
+        "master.export.command:export",
+    ),
+    Command(
+        "send",
+        _SEND,
+        "live hands to other programs: OSC, VMC, ROS 2, LSL, WebSocket",
+        "master.cli.record:send",
+        "master.send.command:send",
+    ),
+    Family("fleet", _FLEET, "slaves on their machines, their keys, and masters of several sites"),
+    Command(
+        "calibrate board",
+        _CAMERAS,
+        "print a board",
+        "master.cli.calibrate:board",
+        "master.calibrate.cameras.board_command:board",
+    ),
+    Family("calibrate cameras", _CAMERAS, "lenses, and where the cameras stand, by pictures of a board"),
+    Command(
+        "calibrate cameras capture",
+        _CAMERAS,
+        "pictures of the board from the running slaves",
+        "master.cli.calibrate:capture",
+        "master.calibrate.cameras.capture_command:capture_views",
+    ),
+    Command(
+        "calibrate cameras intrinsics",
+        _CAMERAS,
+        "the lens of each camera by itself",
+        "master.cli.calibrate:intrinsics",
+        "master.calibrate.cameras.commands:intrinsics",
+    ),
+    Command(
+        "calibrate cameras stereo",
+        _CAMERAS,
+        "where all cameras of a rig stand, and their lenses",
+        "master.cli.calibrate:stereo",
+        "master.calibrate.cameras.commands:stereo",
+    ),
+    Command(
+        "calibrate depth",
+        _CAMERAS,
+        "depth by disparity, from a target at known distances",
+        "master.cli.calibrate:depth",
+        "master.calibrate.depth.commands:depth",
+    ),
+    Command(
+        "calibrate verify",
+        _CAMERAS,
+        "how right the depth of a rig is, measured and expected",
+        "master.cli.calibrate:verify",
+        "master.calibrate.depth.verify_command:verify_command",
+    ),
+    Command(
+        "calibrate time",
+        _CAMERAS,
+        "how late the frames of each camera are",
+        "master.cli.calibrate:time",
+        "master.calibrate.time.commands:time_command",
+    ),
+    Command(
+        "calibrate hand",
+        "hand",
+        "bone lengths of your hand",
+        "master.cli.calibrate:hand",
+        "master.calibrate.hand.commands:hand_command",
+    ),
+    Family("calibrate wrist", "hand", "a wrist device: laser, light, how it sits, who wears it"),
+    Command(
+        "calibrate wrist laser-plane",
+        _WRIST,
+        "the plane of the laser",
+        "master.cli.calibrate_wrist:laser_plane",
+        "master.calibrate.wrist.laser_command:laser_plane",
+    ),
+    Command(
+        "calibrate wrist flat-field",
+        _WRIST,
+        "how the LEDs and the lens light the image",
+        "master.cli.calibrate_wrist:flat_field",
+        "master.calibrate.wrist.flat_command:flat_field",
+    ),
+    Command(
+        "calibrate wrist curl",
+        _WRIST,
+        "along which line the laser point of each finger moves",
+        "master.cli.calibrate_wrist:curl",
+        "master.calibrate.wrist.curl_command:curl",
+    ),
+    Command(
+        "calibrate wrist palm",
+        _WRIST,
+        "where the palm is, by a board that lies on it",
+        "master.cli.calibrate_wrist:palm",
+        "master.calibrate.wrist.palm_command:palm",
+    ),
+    Command(
+        "calibrate wrist subject",
+        _WRIST,
+        "who wears it: palm pose, knuckles, thickness and lengths of fingers",
+        "master.cli.calibrate_wrist:subject",
+        "master.calibrate.wrist.subject_command:subject",
+    ),
+    Command(
+        "calibrate wrist mounting",
+        _WRIST,
+        "how it sits, how its IMU lies, and its clocks, before marker cameras",
+        "master.cli.calibrate_wrist:mounting",
+        "master.calibrate.extrinsics.command:mounting",
+    ),
+    Command(
+        "calibrate object",
+        "object",
+        "where the beads of an object sit",
+        "master.cli.calibrate_object:object_options",
+        "master.calibrate.object.command:object_command",
+    ),
+    Command(
+        "calibrate cube",
+        "object",
+        "print a box of tags",
+        "master.cli.calibrate_object:cube",
+        "master.calibrate.object.cube_command:cube",
+    ),
+    Command(
+        "calibrate tracker",
+        "object",
+        "where a tracking system (Lighthouse) lies in the rig",
+        "master.cli.calibrate_object:tracker",
+        "master.calibrate.tracker.command:tracker",
+    ),
+    Command(
+        "fleet deploy",
+        "machines",
+        "slaves to their machines by ssh",
+        "deploy.arguments:add_deploy",
+        "deploy.commands:deploy_slaves",
+    ),
+    Command(
+        "fleet status",
+        "machines",
+        "how each process of the rig is, or whether it is heard",
+        "master.cli.fleet:status",
+        "master.fleet:status",
+    ),
+    Command(
+        "fleet rollback",
+        "machines",
+        "machines back to what they had before the last deployment",
+        "deploy.arguments:add_rollback",
+        "deploy.commands:rollback",
+    ),
+    Command(
+        "fleet uninstall",
+        "machines",
+        "slaves from their machines again",
+        "deploy.arguments:add_uninstall",
+        "deploy.commands:uninstall_slaves",
+    ),
+    Command(
+        "fleet wheels",
+        "machines",
+        "all that a slave needs, as files, for machines without a network",
+        "deploy.arguments:add_wheels",
+        "deploy.commands:wheels",
+    ),
+    Command(
+        "fleet keys",
+        "keys and sites",
+        "rig key, secrets and certificates: show, make, renew, revoke",
+        "master.cli.fleet:keys",
+        "master.keys_command:keys",
+    ),
+    Command(
+        "fleet relay",
+        "keys and sites",
+        "several masters, seen from one place",
+        "master.cli.fleet:relay",
+        "master.relay_command:relay",
+    ),
+)
+# The calibrations by their last word, which is theirs alone.
+CALIBRATIONS = {
+    entry.name.rpartition(" ")[2]: entry
+    for entry in TABLE
+    if isinstance(entry, Command) and entry.name.startswith("calibrate ")
+}
+_ABOUT = """\
+Hand tracking from cameras that anyone can buy: detections of cameras, or of a wrist device, become a hand of 26 joints.
+
+  phalanx demo                        without hardware: two simulated cameras and the master
+  phalanx run --rig desk              the master of a rig whose slaves run
+  phalanx console                     set a rig up from nothing, in a browser"""
+
+
+def program() -> Program:
+    """The program, under the name that it was started by."""
+    called = Path(sys.argv[0]).name
+    name = called if called in NAMES else NAMES[0]
+    return Program(name, _ABOUT, TABLE, "install the master's packages, pip install '.[master]'")

@@ -1,0 +1,50 @@
+"""The table of `phalanx-slave`."""
+
+from common.command_line import Command, Program
+
+ABOUT = """\
+The slave stands beside a camera: it finds the painted markers, or the fingers before a wrist device, and sends where
+they are. It also sends what an IMU measures, and where a tracker is. Images leave it only as small previews, on
+request, while somebody looks.
+
+  phalanx-slave run --name left --rig desk --camera picamera2 --keys keys
+  sudo phalanx-slave doctor           what of this device is well, and what is not"""
+PROGRAM = Program(
+    "phalanx-slave",
+    ABOUT,
+    (
+        Command(
+            "run", "run", "detect or measure live, and send", "slave.cli.run:run", "slave.commands.run:run"
+        ),
+        Command(
+            "record",
+            "record",
+            "raw frames to disk; or a recording of several, or of your own videos",
+            "slave.cli.record:record",
+            "slave.commands.record:run",
+        ),
+        Command(
+            "colours",
+            "set up",
+            "colours of the markers of a camera, from a recording",
+            "slave.cli.colours:colours",
+            "slave.commands.colours:run",
+        ),
+        Command(
+            "doctor",
+            "set up",
+            "what of this device is well, and what is not; test of its lights",
+            "slave.cli.doctor:doctor",
+            "slave.doctor.command:run",
+        ),
+        Command(
+            "install",
+            "set up",
+            "install it as a service of this machine",
+            "slave.install.arguments:add_install",
+            "slave.install.command:run_here",
+        ),
+    ),
+    "install it: pip install '.[wrist,fast,vive]' has what lights, numba and trackers need",
+    "%(asctime)s %(name)s: %(message)s",
+)
