@@ -1,4 +1,4 @@
-"""What laser and LEDs of a wrist device are and how long they may shine: the key `strobe` of its rig file, checked.
+"""Laser and LEDs of a wrist device and their limits: the key `strobe` of a rig.
 
 The limits on pulse and duty are the user's; here they are held against those of the eye (`common.eye_safety`) and of
 the supply. `docs/safety.md` says what that covers, and what not. It is no certificate.
@@ -67,7 +67,7 @@ class StrobeCalibration(Part, frozen=True):
         max_duty: Nor for a larger share of any second; of each light.
         lead_us: How much before an exposure a light goes on; what is late by more than that is left out [us].
         others_w: What the device draws besides: camera, IMU [W].
-        max_electrical_w: What all of it may draw in the mean [W]; 0.4 by row D1.
+        max_electrical_w: What all of it may draw in the mean [W]; 0.4 in Kim et al. 2012.
     """
 
     laser: LaserLight

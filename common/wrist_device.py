@@ -1,4 +1,4 @@
-"""A wrist device with its hand as arrays, checked: what its slave and the master know alike before the first frame.
+"""A wrist device with its hand as arrays, checked; slave and master share it.
 
 Everything is in the frame of the wrist camera. The device is strapped to the forearm and the palm pose is calibrated:
 so the palm stands still in the image, and the roots of the fingers are known pixels.
@@ -62,8 +62,9 @@ class WristDevice:
         return WristDevice(optics, model, palm, normal, offset_m)
 
     def on_plane(self, uv: Float) -> Float:
-        """Where the rays through pixels (..., 2) meet the laser plane (..., 3) [m] (D7).
+        """Intersect the rays of pixels (..., 2) with the laser plane: (..., 3) [m].
 
+        Triangulation by one camera and a plane of light (Kim et al. 2012).
         NaN where the pixel is, and where the plane is behind the camera or along the ray.
         """
         return intersect_plane(_ORIGIN, self.optics.ray(uv), self.normal, self.offset_m)

@@ -1,17 +1,30 @@
 """The documents agree with the code where a machine can tell."""
 
 import re
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
 import pytest
 
+from bench.__main__ import SECTIONS
 from common.calibration import HandProfile, RigCalibration, parse
 from common.hand_model import FINGERS, JOINTS, HandModel
 from common.hand_profiles import generated_profile
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted({*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "calib_json").rglob("*.md")})
+FOLDERS = (".ci", "bench", "calib_json", "common", "deploy", "docs", "master", "slave", "tests")
+TEXTS = {".c", ".css", ".html", ".js", ".json", ".md", ".py", ".scad", ".toml", ".txt", ".yml"}
+
+# Row numbers of a list that no reader has, of three letters with 33, 25 and 18 rows. In quotes it is a value.
+ROW = re.compile(r'(?<!["\w])(?:K(?:3[0-3]|[12]\d|[1-9])|D(?:2[0-5]|1\d|[1-9])|I(?:1[0-8]|[1-9]))(?!["\w])')
+
+SOURCES = ROOT / "docs" / "theory" / "sources.md"
+DATA = ("exact", "simulated", "rendered", "stand-in", "emulated", "real recordings", "not built")
 
 
 def broken_links(page: Path, text: str) -> list[str]:
@@ -72,3 +85,144 @@ def test_the_examples_of_a_hand_profile_load() -> None:
     assert [model.dip_per_pip for model in models] == [0.84, 0.6667, 2 / 3]
     assert [model.neighbours for model in models] == [True, False, True]
     assert models[2].spread_at_full_flexion.tolist() == [0.625] * 5
+
+
+def texts() -> Iterator[Path]:
+    """Every text file of the project."""
+    yield from (path for path in ROOT.iterdir() if path.suffix in TEXTS or path.name == "Makefile")
+    for folder in FOLDERS:
+        yield from (
+            path
+            for path in (ROOT / folder).rglob("*")
+            if path.is_file() and (path.suffix in TEXTS or folder == ".ci")
+        )
+
+
+def row_references(text: str) -> list[str]:
+    """References to rows of a list that the reader does not have."""
+    return ROW.findall(text)
+
+
+def test_papers_are_cited_by_name_and_not_by_row() -> None:
+    found = {
+        path.relative_to(ROOT).as_posix(): rows
+        for path in texts()
+        if (rows := row_references(path.read_text(errors="replace")))
+    }
+    assert found == {}
+
+
+def test_the_row_check_sees_a_planted_reference() -> None:
+    planted = [f"row D{16}", f"(K{11})", f"rows I{5}, D{7}."]
+    assert [row_references(text) for text in planted] == [["D16"], ["K11"], ["I5", "D7"]]
+    assert row_references('illuminant D65, I2C, preset K, the byte "D1", SD1') == []
+
+
+def paths_named(text: str) -> list[str]:
+    """Files and folders of the project that stand between backticks, commands aside."""
+    return [
+        span
+        for span in re.findall(r"`([^`]+)`", text)
+        if " " not in span and span.split("/")[0] in FOLDERS and "/" in span
+    ]
+
+
+def missing_paths(text: str) -> list[str]:
+    return [path for path in paths_named(text) if not (ROOT / path).exists()]
+
+
+def commands_named(text: str) -> list[str]:
+    """Commands that stand between backticks."""
+    return [
+        span
+        for span in re.findall(r"`([^`]+)`", text)
+        if span.split()[0] in ("pytest", "python", "make", "phalanx", "phalanx-master", "phalanx-slave")
+        and span not in ("pytest FILE",)
+    ]
+
+
+def unknown_in(command: str) -> list[str]:
+    """The words of a command that name nothing: test files, sections, modules, targets, options."""
+    program, *rest = command.split()
+    if program == "pytest":
+        return [path for path in rest if not (ROOT / path).exists()]
+    if program == "make":
+        targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+        return [target for target in rest if target not in targets]
+    if program == "python":
+        module, *sections = rest[1:]
+        if module == "bench":
+            return [name for name in sections if name not in SECTIONS]
+        return [] if (ROOT / f"{module.replace('.', '/')}.py").exists() else [module]
+    verbs = [word for word in rest if word.islower() and not word.startswith("-")][:1]
+    known = help_of(program, *verbs)
+    return [word for word in rest if word.startswith("-") and word not in known] if known else verbs
+
+
+def help_of(program: str, *verbs: str) -> str:
+    """What a command prints as its help; empty where it is unknown."""
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    module, name = scripts[program].split(":")
+    code = f"import sys; from {module} import {name}; sys.exit({name}())"
+    run = subprocess.run(
+        [sys.executable, "-c", code, *verbs, "--help"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    return run.stdout if run.returncode == 0 else ""
+
+
+def test_what_the_page_of_sources_names_exists() -> None:
+    text = SOURCES.read_text()
+    commands = sorted(set(commands_named(text)))
+    assert len(commands) > 50
+    assert len(paths_named(text)) > 100
+    assert missing_paths(text) == []
+    assert {command: bad for command in commands if (bad := unknown_in(command))} == {}
+
+
+def test_the_check_of_names_sees_what_does_not_exist() -> None:
+    assert missing_paths("`master/none.py`, `master/fabrik`, `one word`, `f(x)`") == ["master/none.py"]
+    planted = {
+        "pytest tests/none.py tests/test_docs.py": ["tests/none.py"],
+        "python -m bench depth none": ["none"],
+        "python -m bench.none": ["bench.none"],
+        "make none": ["none"],
+        "phalanx demo --none": ["--none"],
+        "phalanx none": ["none"],
+    }
+    assert {command: unknown_in(command) for command in planted} == planted
+    assert commands_named("`make test`, `none`, `phalanx demo --wrist`") == [
+        "make test",
+        "phalanx demo --wrist",
+    ]
+
+
+def rows_of(text: str) -> list[list[str]]:
+    """Cells of each capability and slip."""
+    return [
+        [cell.strip() for cell in line.strip("|").split(" | ")]
+        for line in text.splitlines()
+        if line.startswith('| <a id="')
+    ]
+
+
+def test_every_source_has_module_command_and_data() -> None:
+    rows = rows_of(SOURCES.read_text())
+    assert len(rows) == 77  # 34 and 25 capabilities, 18 slips
+    for title, paper, phalanx, command, *data in rows:
+        assert paper, title
+        assert paths_named(phalanx), title
+        assert commands_named(command), title
+        assert all(cell.startswith(DATA) for cell in data), title
+
+
+def test_every_reference_to_a_source_has_its_anchor() -> None:
+    anchors = re.findall(r'<a id="([^"]+)">', SOURCES.read_text())
+    assert len(set(anchors)) == len(anchors)
+    own = set(re.findall(r"\]\(#([^)]+)\)", SOURCES.read_text()))
+    others = {
+        name
+        for path in texts()
+        for name in re.findall(r"sources\.md#([\w-]+)", path.read_text(errors="replace"))
+    }
+    assert others
+    assert (own | others) - set(anchors) == set()

@@ -1,4 +1,4 @@
-"""How a hand closes round a bar: where the bar lies, and the angles at which each finger meets it.
+"""Close a hand round a bar: the bar's place and the angles of each finger.
 
 The bar lies in the hooked fingers, across the hand and a little aslant, as that of a bucket or a drawer. Index to
 little finger close as fingers do, the knuckle by a fixed share of the middle joint, until the first of their bones
@@ -13,7 +13,7 @@ from common.geometry import rigid
 from common.hand_model import CHAINS, MIDDLE_PROXIMAL, HandModel
 from common.sim.motion import angles_of
 
-MCP_PER_PIP = 0.54  # Kamper's ratio, row D8
+MCP_PER_PIP = 0.54  # Kamper's ratio, in Kim et al. 2012
 ALONG_HAND = 1.04  # how far the bar's middle is from the wrist, against the middle knuckle
 BELOW_KNUCKLES = 0.92  # how far its back lies below that, in lengths of the middle finger's first phalanx
 ASLANT = np.radians(15.0)  # further from the wrist on the side of the thumb

@@ -1,4 +1,6 @@
-"""Motions that a marker rig and a wrist device see alike: what fusion is measured on, and mounting calibrated from.
+"""Motions that a marker rig and a wrist device see together.
+
+Fusion is measured on them, and extrinsics are calibrated from them.
 
 All of them are pure in time, smooth (C2) and closed over their period, and the wrist bends in all of them, since the
 device sits on the forearm (`common.wrist_joint`; limits of the bend as flexion / deviation):
@@ -36,7 +38,8 @@ from common.sim.poses import StudyPoses
 
 TOGETHER = ("grasp", "both-poses", "both-curl", "both-travel", "both-moves", "gestures")
 TYPICAL_FLEXION_DEG = np.array([8.0, 5.0])
-CURL_S, STRAIGHT_DEG, CURL_PIP_DEG, MCP_PER_PIP = 10.0, 4.0, 101.0, 0.54  # Kamper's ratio, row D8
+CURL_S, STRAIGHT_DEG, CURL_PIP_DEG = 10.0, 4.0, 101.0
+MCP_PER_PIP = 0.54  # Kamper's ratio, in Kim et al. 2012
 _CURL_LAG_RAD = np.array([0.3, 0.0, 0.1, 0.2, 0.3])  # no finger follows another at once
 _CURL_SPREAD_DEG = np.array([8.0, 4.0, 0.0, -4.0, -8.0])
 _THUMB_DEG = np.array([[14.0, -6.0, 0.0], [6.0, 26.0, 26.0]])  # open, closed

@@ -1,8 +1,10 @@
-"""Where the laser's fan meets the skin of a finger, and which of that the camera sees: the forward function of a pose.
+"""Intersect the laser's fan with the skin of a finger, as the camera sees it.
 
-The skin (`common.palmar_surface`) is cut by a fan of rays from the laser; each lights what it meets first (row D17: the
-nearest intersection). What of the line the camera sees is kept, and its centroid in the image is put back on the
-plane: that is what the sensing calls the laser point. Other fingers, which may cover it, are left out.
+This is the forward function of a pose.
+
+The skin (`common.palmar_surface`) is cut by a fan of rays from the laser; each lights what it meets first, the
+nearest intersection of Kim et al. 2012. What of the line the camera sees is kept, and its centroid in the image is
+put back on the plane: that is what the sensing calls the laser point. Other fingers, which may cover it, are left out.
 
 **Smooth.** Whoever inverts it follows the point over hundredths of a degree, so nothing may jump by a ray. The fan ends
 at the two tangents of the finger and its rays are densest there (Chebyshev's nodes): a grazing ray moves along the

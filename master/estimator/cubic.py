@@ -1,4 +1,6 @@
-"""The law printed in the paper: PIP [deg] = -0.0003 d^3 + 0.059 d^2 - 4.07 d + 119.75, d in mm (Digits, UIST 2012).
+"""The printed cubic: PIP by the distance of the laser point (Kim et al. 2012).
+
+    PIP [deg] = -0.0003 d^3 + 0.059 d^2 - 4.07 d + 119.75        d in mm
 
 It needs no bones: d is how far the laser point is from where that finger's point comes nearest to the device (the
 paper takes that for the knuckle), along the finger's principal axis of motion. So it runs from 119.75 degrees at d = 0

@@ -1,4 +1,4 @@
-"""The principal axis along which the laser point of one finger moves while it bends (Digits, UIST 2012).
+"""Principal axis of the motion of a finger's laser point (Kim et al. 2012).
 
 The laser draws its points on a plane, and a finger that bends moves its point along a nearly straight line in it,
 towards the device; the thumb's runs diagonally. A guided curl measures this line and how far the points go. Along it a

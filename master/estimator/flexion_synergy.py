@@ -1,4 +1,4 @@
-"""Fingers that close naturally: joints that bend together, as Digits takes them (UIST 2012, section 4.1).
+"""Flexion synergy: the joints of a finger bend together (Kim et al. 2012).
 
 The MCP of a finger is 0.54 of its PIP and the DIP 0.84 (Kamper et al. 2003); a hand file that states couplings has its
 own. A thumb closes in proportion, from one end of its limits to the other.

@@ -1,1 +1,4 @@
-"""The paper's study (Digits, UIST 2012) repeated: twelve simulated people, six poses, three blocks; open loop."""
+"""Repeat the user study of Digits (Kim et al. 2012) with simulated people.
+
+Twelve people, six poses, three blocks; open loop.
+"""

@@ -1,4 +1,6 @@
-"""What the paper reports of its study (Digits, UIST 2012): twelve people, three blocks, six poses; row D23.
+"""Published figures of the user study of Digits (Kim et al. 2012).
+
+Twelve people made six poses in three blocks.
 
 Only what its text gives as figures: PIP errors as ranges of means over the poses, and the repeatability of each
 finger. The participants of the paper were shown their tracked hand while they posed (closed loop); ours are not.

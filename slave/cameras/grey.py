@@ -1,7 +1,7 @@
-"""Grey frames of 8 bits, from whatever a camera delivers: monochrome sensors of 8 to 16 bits, luma of colour cameras.
+"""Convert frames of monochrome sensors, or luma of colour ones, to 8-bit grey.
 
 The camera of a wrist device has a monochrome sensor. Its values are linear in the light, which differences of frames
-(row D2) and the fall-off of the LEDs (I15) need, and they stay so: the highest 8 bits are taken, black level and
+(Kim et al. 2012) and the fall-off of the LEDs need, and they stay so: the highest 8 bits are taken, black level and
 saturation stay where the sensor has them. Byte orders are those of the kernel's documentation (media/uapi/v4l,
 pixfmt-yuv-luma): Y10 and Y12 in the low bits of a 16-bit word, little-endian; Y10P and Y12P four pixels in five bytes,
 two in three, first the highest 8 bits of each; Y16 with the sensor's bits on top, as Raspberry Pi's receivers put them.

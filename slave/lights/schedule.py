@@ -1,4 +1,6 @@
-"""When the next exposures of a camera are, and what is to light each: from the stamps of the frames so far (row D2).
+"""Predict the next exposures of a camera, and which light each one gets.
+
+The strobe is that of Kim et al. 2012: ambient, laser, LED in turn.
 
 The stamps of a camera that runs freely lie on a line: mid-exposure = first + number x period. A line is fitted to the
 last ones by least squares, numbers counted by time alone (so that lost frames and drivers that number only what they

@@ -1,4 +1,4 @@
-"""What the device's own light adds to a frame: the frame minus the ambient one of the same triple."""
+"""Subtract the ambient frame of a triple: the device's own light is left."""
 
 import cv2
 import numpy as np
@@ -21,7 +21,7 @@ def lit_line(frame: Image, ambient: Image) -> Image:
 
 
 def lit(frame: Image, ambient: Image) -> Image:
-    """The light of the laser or the LEDs alone: a saturating difference, never below 0 (row D2).
+    """Subtract the ambient frame; the difference saturates at 0 (Kim et al. 2012).
 
     The black level cancels. Where the ambient frame is saturated nothing can be told of the light that was added, and
     the difference is 0 there by itself.

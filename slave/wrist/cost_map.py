@@ -1,4 +1,4 @@
-"""What a seam between fingers costs at a pixel: little in a valley, much on the skin of a finger (row D4)."""
+"""Energy of a seam at each pixel: low in a valley, high on the skin of a finger."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,6 @@
-"""How long each finger's laser line is and where its middle lies, from the pieces between runs side by side (D5).
+"""Measure length and centroid of each finger's laser line.
+
+A line is made of the pieces between runs of adjacent columns (laser segments of Kim et al. 2012).
 
 A finger's centroid weighs its line by length in the image, not by columns: at the sides of a finger the line falls
 steeply, the last of it in less than a column.

@@ -1,4 +1,6 @@
-"""Which finger a pixel of the LED image belongs to: seams between neighbouring fingers, which never cross (D4).
+"""Separate the fingers of the LED image by seams, which never cross.
+
+Seams of least energy by dynamic programming, as in Kim et al. 2012.
 
 How the palm lies in the image is calibrated, and seen where the wrist is bent (`slave.wrist.palm_pose`), so what the
 fingers of this hand can do says in which corridor each of the four seams runs (`slave.wrist.search_bands`). Along the

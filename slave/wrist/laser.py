@@ -1,4 +1,4 @@
-"""Where the laser meets each finger: the line in the laser image, cut between fingers, its centroid by length (D5).
+"""Find the laser segment of each finger and its centroid (Kim et al. 2012).
 
 The line runs from side to side, so each column of the image holds it as short bright runs (`slave.wrist.runs`), one
 per surface. The seams say whose a line is; where they cut one, the cut is moved to the crease. What is left to each

@@ -1,4 +1,6 @@
-"""How far away what the LEDs light is, as far as its brightness tells: relative depth (D13, I15).
+"""Estimate relative depth from the fall-off of the LED light.
+
+Kim et al. 2012 take sqrt(I) for distance; docs/theory/sources.md#nearness-and-distance has the correction.
 
 Light from beside the lens falls with the square of the distance and comes back once: the root of the intensity is
 *nearness*, not distance. With alpha the angle of the ray off the optical axis,

@@ -1,4 +1,6 @@
-"""The bright runs of a laser image's columns, to parts of a pixel, and the lines they make with those beside them (D5).
+"""Find the bright runs in the columns of a laser image, and join them to lines.
+
+Rows are known to parts of a pixel. Lines are the laser segments of Kim et al. 2012.
 
 A run's row is its centre of mass above a share of its own peak: a line that saturates has a flat top and a glow on
 either side of it, and only the flanks of the top tell where it is. Runs of adjacent columns are one line where they

@@ -1,4 +1,6 @@
-"""Which frame is which: ambient, laser or LED, told from what the frames show, and joined to triples (row D2).
+"""Recognise ambient, laser and LED frames by content, and join them to triples.
+
+The strobe is that of Kim et al. 2012.
 
 Three frames are a triple if
 

@@ -1,6 +1,6 @@
-"""Which part of the thumb's laser line lies beyond its ball (thenar), as far as that is known, and where its middle is.
+"""Separate the thumb's laser line from that of its ball (thenar).
 
-The two run into each other; the plane that halves the angle of the MCP parts them (D5). When the metacarpal stands
+The two run into each other; the plane that halves the angle of the MCP parts them. When the metacarpal stands
 across the laser's plane, a millimetre decides whether all of the line is the thumb's or none: so the centroid is taken
 for borders from near to far, each as likely as the next, and their mean and spread are what is known.
 """

@@ -1,4 +1,4 @@
-"""All that the fingers of a hand can do, as points along their bones: what a device knows beforehand is made of it."""
+"""Sample the workspace of the fingers of a hand as points along their bones."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from slave.wrist.view import WristView
 
 PER_BONE = 6  # points along each bone
 NEAREST_M = 0.03  # what is nearer to the camera is not seen as a finger
-_DIP_PER_PIP = 0.84  # of natural flexion (D8)
+_DIP_PER_PIP = 0.84  # of natural flexion (Kim et al. 2012)
 _PIP, _DIP = 2, 3
 
 

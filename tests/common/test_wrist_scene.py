@@ -303,7 +303,7 @@ def test_the_device_is_one_that_could_be_built() -> None:
         assert laser is not None
         assert laser.origin is not None
         assert plane.offset_m == pytest.approx(np.dot(plane.normal, laser.origin), abs=1e-6)
-        assert laser.baseline == pytest.approx(0.030, abs=0.001)  # row D1
+        assert laser.baseline == pytest.approx(0.030, abs=0.001)  # Kim et al. 2012: 3 cm, 105 degrees
         assert laser.fan_rad == pytest.approx(np.radians(105.0))
         optics = CameraModel.of(CAMERAS["wrist"], np.eye(4))
         assert (optics.width_px, optics.height_px, CAMERAS["wrist"].frame_rate_hz) == (640, 480, 90.0)

@@ -47,7 +47,7 @@ def test_ideal_pair_by_hand() -> None:
     assert 62.5 / 640 == pytest.approx(0.0977, abs=5e-5)
 
 
-def test_one_pixel_costs_what_i4_says() -> None:
+def test_one_pixel_of_disparity_costs_its_share_of_the_budget() -> None:
     law = ideal_law(0.075, FOV_RAD, 640)
     at_one = error_budget(law, 1.0, 0.075, sigma_px=0.1, speed_m_s=1.0, skew_s=0.0)
     at_half = error_budget(law, 0.5, 0.075, sigma_px=0.1, speed_m_s=1.0, skew_s=0.0167)

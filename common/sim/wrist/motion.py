@@ -1,4 +1,4 @@
-"""How the fingers move before the wrist camera: guided curls, study poses, spreads, and a minute of everything.
+"""Finger motions before the wrist camera: curls, study poses, spreads, and all.
 
 A motion of stations goes from posture to posture (C2), holds each for a while and drifts all the time, as a hand in
 the air does. The wrist stays straight in all of them: the palm pose of a state is that of the forearm in the room, and
@@ -30,7 +30,7 @@ from common.wrist_joint import STRAIGHT, forearm_palm
 MOVE_S = 0.8  # at most: the way from one posture to the next
 CURL_S = 10.0  # there and back
 CURL_PIP_DEG = 110.0
-MCP_PER_PIP, DIP_PER_PIP = 0.54, 0.84  # row D8, Kamper's ratios
+MCP_PER_PIP, DIP_PER_PIP = 0.54, 0.84  # Kamper's ratios, in Kim et al. 2012
 SUBJECT_S = 16.0
 KNUCKLES_S, FIST_S = (0.8, 7.2), (8.8, 15.2)  # of the two bends within it, there and back
 WOBBLE = np.radians(1.0)
@@ -126,7 +126,10 @@ class Stations:
 
 
 class GuidedCurl:
-    """All fingers curl slowly from straight to PIP 110 degrees and back, in the natural ratios of row D8."""
+    """All fingers curl slowly from straight to PIP 110 degrees and back.
+
+    MCP and DIP follow the PIP by the ratios of Kim et al. 2012.
+    """
 
     def __init__(self, model: HandModel) -> None:
         """Of one hand; its limits do not cut what the ratios say."""

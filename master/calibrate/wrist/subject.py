@@ -1,4 +1,6 @@
-"""Who wears the device: palm pose, knuckles and fingers from one guided motion before it (row D18).
+"""Measure palm pose, knuckles and fingers of a subject from one guided motion.
+
+Kim et al. 2012 read the knuckles off the laser at its smallest extent.
 
 The place of a knuckle is told by the laser where its finger is bent most: there the line lies beside it. One motion
 shows that, and the flat hand, from which everything is counted, and a fist, in which fingertips are seen. What is

@@ -251,7 +251,7 @@ def test_a_nominal_view_stands_in_for_intrinsics(tmp_path: Path) -> None:
     assert "no budget" in out
     run("verify", "--calibration", calib, "--rig", "desk", "--fov-deg", "62.5", "--json", numbers)
     rows = json.loads(numbers.read_text())["budget"]["rows"]
-    # Row I4: one pixel of disparity is 2.53 cm at 1 m and 0.63 cm at 50 cm.
+    # One pixel of disparity is 2.53 cm at 1 m and 0.63 cm at 50 cm (docs/theory/sources.md#pixel-of-disparity).
     assert rows[-1]["one_pixel_mm"] == pytest.approx(25.3, abs=0.05)
     assert rows[3]["one_pixel_mm"] == pytest.approx(6.3, abs=0.05)
 
