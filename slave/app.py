@@ -13,9 +13,9 @@ import numpy as np
 
 from common.arrays import Image
 from common.messages import MarkerDetections, Message, TagDetections
-from slave.cameras.source import Frame, FrameSource
 from slave.counters import Counters
 from slave.markers.detector import Detections
+from slave.sources import Frame, FrameSource
 from slave.wrist.detector import WristFound
 
 

@@ -7,8 +7,8 @@ from typing import Protocol
 import numpy as np
 
 from common.arrays import Float
-from slave.cameras.source import Frame
 from slave.markers.colour_monitor import ColourWarning
+from slave.sources import Frame
 
 LOG_EVERY_NS = 10_000_000_000  # the same subject is logged no more often
 NAME = 64  # characters of a name in `Health`

@@ -14,7 +14,6 @@ from common.hand_model import FINGERS
 from common.keys import Access
 from common.zenoh_bus import ZenohBus
 from slave.app import run, run_wrist, wait_for_start
-from slave.cameras.source import FrameSource
 from slave.colour_sampler import ColourSampler
 from slave.counters import Counters
 from slave.light_report import LightReport
@@ -31,6 +30,7 @@ from slave.preview import Previews
 from slave.raw import RawFrames, RawSettings
 from slave.report import Numbers, Reporter
 from slave.service import Service
+from slave.sources import FrameSource
 from slave.tags.live import LiveTags, finder_of
 from slave.tuning import CameraFiles, CameraTuning, Prepare
 from slave.uplink import Uplink

@@ -12,9 +12,9 @@ import numpy as np
 
 from common.arrays import Float, Image
 from common.calibration import HsvRange
-from slave.cameras.source import Frame
 from slave.markers.classify import HUES
 from slave.markers.reloadable import ReloadableDetector
+from slave.sources import Frame
 from slave.wrist.detector import WristDetector
 
 TINT = 0.7  # of the tint in a tinted pixel: what lies below stays to be seen

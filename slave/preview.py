@@ -22,9 +22,9 @@ from common.clock import Clock
 from common.errors import BusError, CalibrationError
 from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Preview, Still
 from common.preview_wish import PreviewWish
-from slave.cameras.source import Frame
 from slave.failures import Failures
 from slave.overlay import Overlay
+from slave.sources import Frame
 
 PERIOD_NS = 100_000_000
 POLL_NS = 3_000_000_000

@@ -26,8 +26,8 @@ from common.errors import RecordingError
 from common.frame_recording import Illumination, Manifest, RecordedClock
 from common.frame_writing import RecordingWriter, encode_png
 from slave.cameras.replay import is_grey
-from slave.cameras.source import Frame, FrameSource
 from slave.progress import Length, Progress, megabytes
+from slave.sources import Frame, FrameSource
 
 RESERVE_BYTES = 200_000_000  # a system without any room left cannot even be logged in to
 QUEUE_BYTES = 128_000_000  # a quarter of the smallest slave's memory; at 640x480, 90 Hz it bridges 1.5 s

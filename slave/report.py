@@ -87,7 +87,7 @@ class Tuned(Protocol):
         """Event of it -> how often."""
         ...
 
-    def figures(self) -> Mapping[str, float]:
+    def metrics(self) -> Mapping[str, float]:
         """What it has now."""
         ...
 
@@ -203,7 +203,7 @@ class Reporter:
         self._leave()
 
     def _figures(self) -> dict[str, float]:
-        own = {name: value for part in self._parts for name, value in part.figures().items()}
+        own = {name: value for part in self._parts for name, value in part.metrics().items()}
         return own | self._machine.metrics()
 
     def _follow(self, endpoint: str | None) -> None:

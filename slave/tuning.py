@@ -34,8 +34,8 @@ from common.camera_settings import (
 from common.errors import CalibrationError, PhalanxError
 from common.file_monitor import MonitoredFiles
 from common.object_profile import ObjectProfile
-from slave.cameras.settings import Tunable
 from slave.colours_in_use import in_use
+from slave.sources import Tunable
 
 _ALL = "give all processes of the rig the same files, then restart them"
 _LOG = logging.getLogger(__name__)
@@ -162,14 +162,14 @@ class CameraTuning:
     def counts(self) -> dict[str, int]:
         """`reload.applied`, `reload.refused`: changed files; and the events of the camera."""
         own = {"reload.applied": self._applied, "reload.refused": self._refused}
-        return own if self._source is None else own | self._source.counts()
+        return own if self._source is None else {**own, **self._source.counts()}
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """What the camera has and does now, and what the content in use says of settings, size and colours."""
         used = self._used
         stated = {WANTED + name: value for name, value in figures(used.camera).items()}
         stated |= in_use(used.camera, used.rig.markers)
-        return stated if self._source is None else self._source.figures() | stated
+        return stated if self._source is None else {**self._source.metrics(), **stated}
 
     def look(self) -> None:
         """Apply the files if they were changed; where that fails, say so once and go on as before."""
@@ -190,7 +190,7 @@ class CameraTuning:
         if body:
             raise CalibrationError("settings: takes no body")
         used = self._used
-        return self.figures() | range_figures(used.camera, used.rig.markers)
+        return self.metrics() | range_figures(used.camera, used.rig.markers)
 
     def _set(self, body: str) -> dict[str, float]:
         with self._lock:

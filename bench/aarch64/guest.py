@@ -25,11 +25,11 @@ from bench.aarch64.parts import counted_parts
 from common.messages import Message, WristDetections, encode
 from master.link import MasterLink
 from slave.app import run
-from slave.cameras.source import Frame
 from slave.counters import Counters
 from slave.link import SlaveLink
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.engine import engine_named
+from slave.sources import Frame
 from slave.wrist import engine as wrist_engine
 from slave.wrist.detector import WristDetector
 from slave.wrist.view import WristView

@@ -40,7 +40,7 @@ from slave.cameras.picamera2_settings import (
 from slave.cameras.picamera2_streams import Streams
 from slave.cameras.picamera2_sync import SyncMonitor, wait_in_step
 from slave.cameras.settings import as_values, change, demand, differences
-from slave.cameras.source import Frame
+from slave.sources import Frame
 
 BUFFERS = 6  # picamera2's own number for video: the pipeline never starves while one frame is held
 TIMEOUT_S = 2.0  # libcamera itself gives a silent sensor up after 1 s
@@ -171,11 +171,11 @@ class Picamera2Camera:
         change(self._apply, self._calibration, camera)
         self._calibration = camera
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """Settings as the metadata of the last frame has them, and whether it runs in step."""
         metadata = self._metadata.newest
         found = {} if metadata is None else read_figures(metadata)
-        return found if self._sync is None else found | self._sync.figures()
+        return found if self._sync is None else found | self._sync.metrics()
 
     def counts(self) -> dict[str, int]:
         """`camera.out_of_step`, where it is to be in step."""

@@ -63,7 +63,7 @@ class SyncMonitor:
             _LOG.warning("%s: no longer in step with the others: %s", self._where, self._why(metadata))
         self._was_locked = self.locked
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """`sync_locked` 0 or 1; of a client also `sync_error_us`, the last correction: 0 is below 50 us."""
         found = {"sync_locked": float(self.locked)}
         return found | {"sync_error_us": self.error_us} if self._client else found

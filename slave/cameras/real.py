@@ -13,9 +13,9 @@ from slave.cameras.grey import Pixels
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
 from slave.cameras.reconnecting import ReconnectingCamera
-from slave.cameras.source import FrameSource
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
 from slave.service import LOST_PATIENCE_S, ConnectionLost, nobody
+from slave.sources import FrameSource
 
 CAMERAS = "picamera2[:INDEX] | v4l2[:DEVICE]"
 DRIVERS = ("picamera2", "v4l2")

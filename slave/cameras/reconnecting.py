@@ -12,16 +12,16 @@ new stamps measures nothing: the copies are left out, and after a second of them
 import threading
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from common.calibration import CameraCalibration
 from common.clock import Clock
 from common.errors import CameraError
 from slave.cameras.repeated import RepeatedPictures
-from slave.cameras.settings import Tunable
-from slave.cameras.source import Frame, FrameSource
 from slave.failures import Failures
 from slave.service import ConnectionLost, nobody
+from slave.sources import Frame, FrameSource, Tunable
 
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 1.0  # what is plugged in again tracks within two seconds
@@ -116,10 +116,10 @@ class ReconnectingCamera:
             raise CameraError(f"camera {camera.name!r}: its settings cannot be changed: {why}") from error
         self._camera = camera
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """Those of the open camera; none while it is away, or does not tell them."""
         source = self._source
-        return self._failures.ask(source.figures) if isinstance(source, Tunable) else {}
+        return self._failures.ask(source.metrics) if isinstance(source, Tunable) else {}
 
     def counts(self) -> dict[str, int]:
         """Event -> how often, of this camera and of all that were opened.

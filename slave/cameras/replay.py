@@ -11,7 +11,7 @@ from common.errors import CameraError, PictureError, RecordingError
 from common.frame_pictures import FramePictures
 from common.frame_recording import FrameRow, Manifest, open_recording
 from common.pictures import decode, read_picture
-from slave.cameras.source import Frame
+from slave.sources import Frame
 
 GAP_NS = 600_000_000_000  # longer than that it does not wait for the next frame
 STEP_S = 0.05  # longest sleep at a time, so that a signal ends a wait soon
@@ -86,7 +86,7 @@ class ReplayCamera:
             "recording has no exposure or gain to change; only the colours of markers can be loaded"
         )
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """The settings that the recording was made with."""
         return figures(self._calibration)
 

@@ -7,32 +7,9 @@ got and what to do; nothing is taken on trust.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 from common.calibration import CameraCalibration
 from common.errors import CameraError
-
-
-@runtime_checkable
-class Tunable(Protocol):
-    """A camera that tells what it has, and whose settings may be changed by another thread while it is read."""
-
-    def tune(self, camera: CameraCalibration) -> None:
-        """Take exposure, gains and rate of `camera`; its size is that it was opened with.
-
-        Raises:
-            CameraError: Refused, or not taken. The text names setting, wanted and got; the old settings are back, or
-                the text says that they are not.
-        """
-        ...
-
-    def figures(self) -> dict[str, float]:
-        """What the camera has and does now, read back; names of `common.camera_settings`, and others."""
-        ...
-
-    def counts(self) -> dict[str, int]:
-        """Events of the camera -> how often since it was first opened."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,9 +32,9 @@ from common.sim.scene import Scene
 from common.sim.scenes import renderer_of
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
-from slave.cameras.source import Frame
 from slave.lights.schedule import CYCLE as STROBE
 from slave.lights.synthetic import Lit
+from slave.sources import Frame
 
 WHOLE = 0.999  # of an exposure; what lit that much lit all of it
 STEP_S = 0.05  # longest sleep at a time, so that a signal ends a wait soon
@@ -161,7 +161,7 @@ class SyntheticCamera:
         gains_bgr = _sensitivity(camera) / _sensitivity(self._lit_for)
         self._camera, self._renderer = camera, self._renderer.exposed(camera.exposure_us, gains_bgr)
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """Its settings."""
         return figures(self._camera)
 

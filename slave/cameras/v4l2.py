@@ -38,10 +38,10 @@ from slave.cameras import v4l2_abi as abi
 from slave.cameras.frame_observer import FrameObserver
 from slave.cameras.grey import Pixels
 from slave.cameras.settings import change
-from slave.cameras.source import Frame
 from slave.cameras.stamps import ForeignClock, clock_of, system_clock
 from slave.cameras.v4l2_formats import Layout, Offer, choose_offer, read_offers, set_format
 from slave.cameras.v4l2_settings import SETTLE_FRAMES, TIMEOUT_S, V4l2Settings
+from slave.sources import Frame
 
 BUFFERS = 4
 RATE_SHARE = (
@@ -203,9 +203,9 @@ class V4l2Camera:
                 f"{self._where}: {failed}; and the settings before did not come back: {error}"
             ) from error
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """Settings as the camera has them now, and the rate measured at the start; nothing where it is gone."""
-        found = {} if self._settings is None else self._settings.figures()
+        found = {} if self._settings is None else self._settings.metrics()
         return found | {"frame_rate_hz": self._rate_hz} if found else found
 
     def counts(self) -> dict[str, int]:

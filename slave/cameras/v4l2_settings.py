@@ -105,7 +105,7 @@ class V4l2Settings:
             raise CameraError("exposure_us cannot be changed: the camera has no control for it")
         change(lambda camera: self._apply(camera, frames), old, new)
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """Exposure and codes as the camera has them now; nothing where it is gone."""
         shown = [setting for setting in self._wanted if setting.name not in AUTOMATICS]
         try:

@@ -10,10 +10,10 @@ from common.calibration import CameraCalibration, RigCalibration
 from common.clock import Clock
 from common.errors import CameraError
 from slave.cameras import real
-from slave.cameras.source import FrameSource
 from slave.commands.options import add_place, add_simulated, epoch_of, number, world_of
 from slave.lights.factory import CHOICES, SYNTHETIC, choose, limits_for, open_guarded
 from slave.service import ConnectionLost, nobody
+from slave.sources import FrameSource
 
 if TYPE_CHECKING:
     from slave.cameras.synthetic import LitBy

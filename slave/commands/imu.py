@@ -25,7 +25,7 @@ from slave.service import Service
 from slave.stopping import stop_by_signal
 
 if TYPE_CHECKING:
-    from slave.imu.source import ImuSource
+    from slave.sources import ImuSource
 
 PURPOSE = "send what an IMU measures"
 EXAMPLES = """\

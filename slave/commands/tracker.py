@@ -20,8 +20,8 @@ from slave.commands.options import (
     world_of,
 )
 from slave.objects import factory
-from slave.objects.source import TrackerSource
 from slave.service import ConnectionLost, Service
+from slave.sources import TrackerSource
 from slave.stopping import stop_by_signal
 
 PURPOSE = "send where a Vive tracker is"

@@ -7,7 +7,7 @@ from typing import Protocol
 from common.arrays import Float
 from common.messages import ImuSample
 from slave.counters import Counters
-from slave.imu.source import Reporting
+from slave.sources import Reporting
 
 
 class Orientation(Protocol):

@@ -12,8 +12,8 @@ from common.clock import Clock
 from common.errors import CalibrationError, ImuError
 from common.imu_fusion import OrientationFilter
 from slave.imu.reconnecting import ReconnectingImu
-from slave.imu.source import ImuSource
 from slave.service import ConnectionLost, nobody
+from slave.sources import ImuSource
 
 if TYPE_CHECKING:  # the drivers are imported where one is opened: other commands start without them
     from slave.imu.lsm6dsox import I2cPlace

@@ -11,9 +11,9 @@ from common.keys import Access
 from common.zenoh_bus import ZenohBus
 from slave.app import Barrier, Sender, nothing
 from slave.imu.counters import Orientation, SampleCounters
-from slave.imu.source import ImuSource
 from slave.report import Reporter
 from slave.service import Service
+from slave.sources import ImuSource
 from slave.uplink import Uplink
 
 CHECK_S = 0.5e-3  # between two samples it is looked whether the master has started

@@ -15,8 +15,8 @@ from msgspec.structs import replace
 from common.clock import Clock
 from common.messages import ImuSample
 from slave.failures import Failures
-from slave.imu.source import ImuSource, Reporting
 from slave.service import ConnectionLost, nobody
+from slave.sources import ImuSource, Reporting
 
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 1.0  # what is plugged in again tracks within two seconds

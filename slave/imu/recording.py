@@ -9,7 +9,7 @@ from typing import TextIO
 from common.errors import ImuError, PhalanxError, RecordingError
 from common.imu_recording import HEADERS, IMU, row
 from slave.imu.counters import Orientation, SampleCounters
-from slave.imu.source import ImuSource
+from slave.sources import ImuSource
 
 
 class ImuRecorder:

@@ -7,9 +7,8 @@ from msgspec.structs import replace
 from common.calibration import CameraCalibration, RigCalibration
 from common.errors import CalibrationError, CameraError
 from common.strobe_calibration import StrobeCalibration
-from slave.cameras.settings import Tunable
-from slave.cameras.source import Frame, FrameSource
 from slave.lights.schedule import CYCLE, INTERLOCK_NS, StrobeSchedule
+from slave.sources import Frame, FrameSource, Tunable
 
 
 class Controller(Protocol):
@@ -93,14 +92,14 @@ class StrobedCamera:
         finally:
             self._controller.expose(_exposed_us(self._camera))
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """Those of the camera."""
-        return self._source.figures() if isinstance(self._source, Tunable) else {}
+        return dict(self._source.metrics()) if isinstance(self._source, Tunable) else {}
 
     def counts(self) -> dict[str, int]:
         """Those of the camera, and `lights.<event>`."""
-        own = self._source.counts() if isinstance(self._source, Tunable) else {}
-        return own | self._controller.counts()
+        own = self._source.counts() if isinstance(self._source, Tunable) else dict[str, int]()
+        return {**own, **self._controller.counts()}
 
 
 def schedule_of(rig: RigCalibration, camera: CameraCalibration) -> StrobeSchedule:

@@ -4,7 +4,7 @@ import numpy as np
 
 from common.messages import TrackerPose
 from slave.counters import Counters
-from slave.imu.source import Reporting
+from slave.sources import Reporting
 
 
 class PoseCounters:

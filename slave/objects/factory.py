@@ -10,8 +10,8 @@ from common.clock import Clock
 from common.errors import CalibrationError, TrackerError
 from common.object_profile import ObjectProfile
 from slave.objects.reconnecting import ReconnectingTracker
-from slave.objects.source import TrackerSource
 from slave.service import ConnectionLost, nobody
+from slave.sources import TrackerSource
 
 REAL = "openvr | survive | survive:FILE"
 DEVICES = f"{REAL} | synthetic"

@@ -11,9 +11,9 @@ from common.keys import Access
 from common.zenoh_bus import ZenohBus
 from slave.app import POLL_S, Barrier, Sender, nothing
 from slave.objects.counters import PoseCounters
-from slave.objects.source import TrackerSource
 from slave.report import Reporter
 from slave.service import Service
+from slave.sources import TrackerSource
 from slave.uplink import Uplink
 
 CHECK_S = 0.5e-3  # between two poses it is looked whether the master has started

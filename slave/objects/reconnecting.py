@@ -18,9 +18,8 @@ from common.clock import Clock
 from common.errors import TrackerChoiceError
 from common.messages import TrackerPose
 from slave.failures import Failures
-from slave.imu.source import Reporting
-from slave.objects.source import TrackerSource
 from slave.service import ConnectionLost, nobody
+from slave.sources import Reporting, TrackerSource
 
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 10.0  # each try leaves 100 kB in openvr (ValveSoftware/openvr, issue 1221)

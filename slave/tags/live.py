@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from common.calibration import CameraCalibration
 from common.messages import TagDetections
 from common.object_profile import ObjectProfile
-from slave.cameras.source import Frame
+from slave.sources import Frame
 from slave.tags.pace import Pace
 
 if TYPE_CHECKING:

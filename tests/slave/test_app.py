@@ -1,18 +1,18 @@
 import threading
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from common.bus import LoopbackBus
 from common.clock import SystemClock
 from common.errors import BusError, CameraError
 from common.messages import Command, Health, MarkerDetections, Message
 from slave.app import run, wait_for_start
-from slave.cameras.source import Frame
 from slave.counters import Counters
 from slave.markers.detector import MarkerDetector
 from slave.report import ALONE_AT, Reporter
+from slave.sources import Frame
 from tests.slave.painted import CENTRES, NAMES, camera, hand, render
 
 DETECTOR = MarkerDetector(camera(), NAMES)

@@ -16,7 +16,6 @@ from common.errors import CameraError, FitError
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from common.srgb import gain_tables
-from slave.cameras.source import Frame
 from slave.colour_sampler import ColourSampler
 from slave.markers.calibrated import CalibratedDetector
 from slave.markers.classify import in_range
@@ -26,6 +25,7 @@ from slave.markers.detector import MarkerDetector
 from slave.markers.light_adaptive import LightAdaptiveDetector
 from slave.markers.reloadable import ReloadableDetector, marker_changes
 from slave.markers.workers import Inline
+from slave.sources import Frame
 from slave.tuning import CameraTuning
 from tests.slave import painted
 from tests.slave.painted import HUE, NAMES

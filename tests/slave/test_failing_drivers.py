@@ -22,7 +22,6 @@ from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
 from slave.cameras.reconnecting import ReconnectingCamera
 from slave.cameras.repeated import CONTRAST, RepeatedPictures
-from slave.cameras.source import Frame, FrameSource
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
 from slave.counters import Counters
 from slave.failures import LOG_EVERY_NS, Failures
@@ -36,6 +35,7 @@ from slave.objects import live as objects_live
 from slave.objects import reconnecting as objects_reconnecting
 from slave.objects.counters import PoseCounters
 from slave.objects.reconnecting import ReconnectingTracker
+from slave.sources import Frame, FrameSource
 from slave.wrist.null_detector import NullWristDetector
 from tests.slave.fake_picamera2 import OV7251, Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice
@@ -137,7 +137,7 @@ def test_a_pi_library_that_raises_something_of_its_own_costs_no_process(
     assert len(sensor.opened) == 2
 
 
-@pytest.mark.parametrize("where", ["open", "close", "counts", "figures", "tune"])
+@pytest.mark.parametrize("where", ["open", "close", "counts", "metrics", "tune"])
 def test_nothing_else_that_a_driver_raises_ends_the_slave(where: str) -> None:
     class Faulty(V4l2Camera):
         pass
@@ -168,7 +168,7 @@ def test_nothing_else_that_a_driver_raises_ends_the_slave(where: str) -> None:
     if where == "tune":
         with pytest.raises(CameraError, match="its settings cannot be changed: KeyError"):
             source.tune(FILE)
-    assert source.figures().keys() >= (set() if where == "figures" else {"exposure_us"})
+    assert source.metrics().keys() >= (set() if where == "metrics" else {"exposure_us"})
     assert source.counts()["camera.lost"] == 1
     assert source.counts()["camera.raised"] >= 1
     source.close()

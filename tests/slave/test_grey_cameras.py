@@ -251,7 +251,7 @@ def test_settings_of_a_grey_pi_camera_are_read_back_and_change_live(monkeypatch:
         loop.join()
         camera.close()
     assert exposures[-1] == 1600.0
-    assert camera.figures()["exposure_us"] == 1600.0
+    assert camera.metrics()["exposure_us"] == 1600.0
 
 
 def test_a_pi_camera_with_colours_is_refused_until_luma_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from slave.cameras.source import Frame
 from slave.light_report import LightReport
 from slave.markers.colour_monitor import ColourWarning
+from slave.sources import Frame
 
 SECOND = 1_000_000_000
 IMAGE = np.zeros((2, 2, 3), np.uint8)

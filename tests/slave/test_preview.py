@@ -15,11 +15,11 @@ from common.errors import BusError
 from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Command, Message, Preview, Still
 from slave import preview
 from slave.app import run
-from slave.cameras.source import Frame
 from slave.counters import Counters
 from slave.markers.detector import MarkerDetector
 from slave.preview import PERIOD_NS, POLL_NS, Gate, Previews, small_jpeg, whole_jpeg
 from slave.report import Reporter
+from slave.sources import Frame
 from tests.network_helpers import ManualClock, until
 from tests.slave.painted import NAMES, camera, hand, render
 from tests.slave.test_app import Source, Wire

@@ -21,13 +21,13 @@ from common.raw_wish import RawWish, raw_name
 from slave import raw
 from slave.__main__ import main
 from slave.app import run
-from slave.cameras.source import Frame
 from slave.counters import Counters
 from slave.join import join_recordings
 from slave.markers.null_detector import NullDetector
 from slave.offline import detect_recording
 from slave.raw import RawFrames, RawSettings
 from slave.report import Reporter
+from slave.sources import Frame
 from slave.tuning import CameraFiles
 from tests.common.test_frame_writing import check_whole
 from tests.network_helpers import until
@@ -199,7 +199,7 @@ def test_it_ends_when_nobody_is_left_who_could_end_it(
     with slave(calibration, tmp_path) as left:
 
         def ends(name: str) -> bool:
-            over = until(lambda: left.raw.figures()["raw.on"] == 0.0)
+            over = until(lambda: left.raw.metrics()["raw.on"] == 0.0)
             left.ask("raw_stop")
             return over and check_whole(tmp_path / name) == 6
 

@@ -14,8 +14,8 @@ from slave.cameras import real, reconnecting
 from slave.cameras.grey import Pixels
 from slave.cameras.real import add_options, open_real
 from slave.cameras.reconnecting import ReconnectingCamera
-from slave.cameras.source import FrameSource
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
+from slave.sources import FrameSource
 from tests.slave.fake_picamera2 import Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice
 

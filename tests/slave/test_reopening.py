@@ -9,8 +9,8 @@ from common.calibration import CameraCalibration
 from common.errors import CameraError
 from slave import failures
 from slave.cameras.reconnecting import LONGEST_WAIT_S, ReconnectingCamera
-from slave.cameras.source import Frame
 from slave.failures import LOG_EVERY_NS
+from slave.sources import Frame
 
 CALIBRATION = CameraCalibration(
     version=1,

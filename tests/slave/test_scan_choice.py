@@ -12,13 +12,13 @@ from common.errors import CameraError
 from slave.__main__ import main
 from slave.app import run
 from slave.arguments import parser
-from slave.cameras.source import Frame
 from slave.counters import Counters
 from slave.markers.calibrated import CalibratedDetector
 from slave.markers.detector import MarkerDetector
 from slave.markers.reloadable import ReloadableDetector
 from slave.markers.scan_choice import JUDGED, PROBE_EVERY, PROBES, Scan, ScanChoice
 from slave.offline import calibrate_colours
+from slave.sources import Frame
 from tests.slave.painted import NAMES, RANGES, camera, hand, render
 from tests.slave.test_app import Source, Wire, frame
 

@@ -12,10 +12,10 @@ import pytest
 
 from common.messages import Message
 from slave.app import run, wait_for_start
-from slave.cameras.source import Frame
 from slave.counters import Counters
 from slave.markers.detector import Detections
 from slave.service import LOST_PATIENCE_S, WAITING, Service
+from slave.sources import Frame
 
 PERIOD_US = 4_000_000
 QUARTER_NS = 1_000_000_000

@@ -31,7 +31,7 @@ COUNTS = {"frames", "uncalibrated", *(kind + marker for kind in (SEEN, AMBIGUOUS
 class Camera(Knobs):
     """It has what it was told."""
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return figures((self.tuned or [FILE])[-1])
 
 

@@ -20,7 +20,6 @@ from common.sim.motion import HandState
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from slave.app import run
-from slave.cameras.source import Frame
 from slave.cameras.synthetic import SyntheticCamera
 from slave.counters import Counters
 from slave.markers.light_adaptive import detector_for
@@ -28,6 +27,7 @@ from slave.markers.reloadable import ReloadableDetector, marker_changes
 from slave.markers.scan_choice import Scan, ScanChoice
 from slave.markers.workers import Inline
 from slave.report import Reporter
+from slave.sources import Frame
 from slave.tuning import CameraFiles, CameraTuning
 from tests.network_helpers import until
 
@@ -74,7 +74,7 @@ class Knobs:
             raise CameraError("exposure_us: wanted 9000 us, got 8000 us; the settings before are back")
         self.tuned.append(camera)
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {"exposure_us": (self.tuned or [FILE])[-1].exposure_us}
 
     def counts(self) -> dict[str, int]:

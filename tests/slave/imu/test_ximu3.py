@@ -12,9 +12,9 @@ from common.clock import SystemClock
 from common.errors import ImuError
 from common.messages import ImuSample
 from slave.imu.reconnecting import ReconnectingImu
-from slave.imu.source import ImuSource, Reporting
 from slave.imu.ximu3 import SerialPlace, Ximu3Imu, divisor, open_port
 from slave.imu.ximu3_protocol import Kind
+from slave.sources import ImuSource, Reporting
 from tests.slave.imu.fake_ximu3 import FakeXimu3
 
 CLOCK = SystemClock()

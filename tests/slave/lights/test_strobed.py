@@ -6,8 +6,8 @@ import pytest
 
 from common.calibration import CameraCalibration
 from common.errors import CameraError, LightsError
-from slave.cameras.source import Frame
 from slave.lights.strobed import StrobedCamera
+from slave.sources import Frame
 from tests.slave.lights.stage import CAMERA, RIG
 
 
@@ -31,7 +31,7 @@ class Source:
             raise CameraError("not taken")
         self.output.append(("camera", camera.exposure_us))
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {"exposure_us": 1.0}
 
     def counts(self) -> dict[str, int]:

@@ -17,9 +17,9 @@ from common.frame_recording import FrameRow, Illumination
 from common.messages import MarkerDetections, Message, TagDetections
 from common.object_profile import ObjectProfile, Tag, Tags
 from slave.app import run
-from slave.cameras.source import Frame
 from slave.counters import Counters
 from slave.markers.null_detector import NullDetector
+from slave.sources import Frame
 from slave.tags.live import LiveTags, finder_of
 from slave.tags.offline import TagCollector, tagged_objects
 from slave.tags.pace import SHARE, Pace

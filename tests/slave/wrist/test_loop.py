@@ -10,8 +10,8 @@ from common.hand_model import FINGERS
 from common.messages import Message, WristDetections
 from slave.__main__ import main
 from slave.app import DARK_AFTER, run_wrist
-from slave.cameras.source import Frame
 from slave.counters import Counters
+from slave.sources import Frame
 from slave.wrist.detector import WristDetector, WristFound
 from slave.wrist.fingertips import Fingertips
 from slave.wrist.laser import LaserLines
