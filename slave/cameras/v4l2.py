@@ -70,6 +70,11 @@ class V4l2Options:
     pixels: Pixels = Pixels.COLOUR
 
 
+def device_path(place: str) -> Path:
+    """The device of a number or a path; empty: the first one."""
+    return Path(f"/dev/video{place or '0'}" if place.isdecimal() or not place else place)
+
+
 class V4l2Camera:
     """A `FrameSource`. Holds the device, its buffers and the last number; `broken` counts damaged frames."""
 

@@ -9,16 +9,15 @@ from typing import TYPE_CHECKING
 from common.calibration import CameraCalibration, RigCalibration
 from common.clock import Clock
 from common.errors import CameraError
-from slave.cameras import real
+from slave import devices
+from slave.commands.device_options import add_camera_options
 from slave.commands.options import add_place, add_simulated, epoch_of, number, world_of
-from slave.lights.factory import CHOICES, SYNTHETIC, choose, limits_for, open_guarded
+from slave.drivers import CAMERAS, LIGHTS
 from slave.service import ConnectionLost, nobody
 from slave.sources import FrameSource
 
 if TYPE_CHECKING:
     from slave.cameras.synthetic import LitBy
-
-CAMERAS = f"{real.CAMERAS} | synthetic | replay:FOLDER"
 
 
 def add_camera(command: argparse.ArgumentParser) -> None:
@@ -28,10 +27,10 @@ def add_camera(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--lights",
         metavar="DRIVER",
-        help=f"who switches laser and LEDs of a wrist device: {CHOICES} (docs/safety.md); the last two: the camera's "
+        help=f"who switches laser and LEDs of a wrist device: {LIGHTS} (docs/safety.md); the last two: the camera's "
         "own strobe output, or another controller. Before a synthetic camera synthetic (default) or camera",
     )
-    real.add_options(command)
+    add_camera_options(command)
     sim = command.add_argument_group("synthetic camera")
     add_simulated(sim.add_argument)
     sim.add_argument("--start-offset-ms", type=number, default=0.0, metavar="Z", help="its frames come later")
@@ -63,19 +62,21 @@ def open_lit(
         LightsError: The lights are not said, do not fit, or cannot be opened.
         CalibrationError: A file of the simulated world is missing or broken.
     """
-    lights = choose(options.lights, rig, str(options.camera))
-    if lights is None or (lights == SYNTHETIC and options.scene == "board"):  # a simulated board is not lit
+    lights = devices.choose_lights(options.lights, rig, str(options.camera))
+    if lights is None or (
+        lights == devices.SYNTHETIC and options.scene == "board"
+    ):  # a simulated board is not lit
         return _open(options, rig, camera, clock, true_clock, stop, connection_lost)
     from slave.lights.controller import StrobeController
     from slave.lights.simulated import SimulatedStrobe
     from slave.lights.strobed import StrobedCamera, schedule_of
 
-    limits, schedule = limits_for(lights, rig), schedule_of(rig, camera)
-    if lights == SYNTHETIC:
+    limits, schedule = devices.light_limits(lights, rig), schedule_of(rig, camera)
+    if lights == devices.SYNTHETIC:
         strobe = SimulatedStrobe(schedule, limits)
         source = _open(options, rig, camera, clock, true_clock, stop, nobody, strobe)
         return StrobedCamera(source, camera, rig, strobe)
-    interlock = open_guarded(lights, rig)
+    interlock = devices.open_lights(lights, rig)
     try:
         source = _open(options, rig, camera, clock, true_clock, stop, connection_lost)
     except Exception:
@@ -94,7 +95,7 @@ def _open(
     connection_lost: ConnectionLost,
     lights: "LitBy | None" = None,
 ) -> FrameSource:
-    found = real.open_real(
+    found = devices.open_camera(
         options.camera,
         options,
         camera,
@@ -145,7 +146,7 @@ def _open_synthetic(
 
     frozen = Frozen()
 
-    return real.persistent(
+    return devices.reconnecting_camera(
         lambda file: FaultyCamera(draw(file), file, options.faults, frozen),
         camera,
         clock,

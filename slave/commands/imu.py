@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 from common.clock import SystemClock
 from common.errors import CalibrationError
 from common.imu_csv_columns import ACCEL, GYRO, MAG, TIME, UNITS
+from slave import devices
+from slave.commands.device_options import add_imu_options
 from slave.commands.options import (
     add_link,
     add_place,
@@ -20,7 +22,6 @@ from slave.commands.options import (
     secrets_of,
     world_of,
 )
-from slave.imu import factory
 from slave.service import Service
 from slave.stopping import stop_by_signal
 
@@ -47,7 +48,7 @@ EXAMPLES = """\
 def add_options(command: argparse.ArgumentParser) -> None:
     """The options of `imu`."""
     add_place(command, "IMU of this slave, that of the rig (default: imu)", default="imu")
-    factory.add_options(command)
+    add_imu_options(command)
     _add_csv(command.add_argument_group("a recording (--csv)").add_argument)
     add_link(command)
     add_simulated(command.add_argument_group("synthetic IMU").add_argument)
@@ -89,7 +90,7 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     if rig.imu is None or options.name != rig.imu.name:
         has = "it has none" if rig.imu is None else f"its IMU is {rig.imu.name!r}"
         raise CalibrationError(f"rig {rig.name!r} has no IMU {options.name!r}; {has}")
-    orientation = factory.orientation_of(rig.imu)
+    orientation = devices.orientation_of(rig.imu)
     true_clock = SystemClock()
     clock = clock_of(options, true_clock)
     key, access = secrets_of(options)
@@ -104,7 +105,7 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
             imu = imu_of(options.imu, *world_of(options, rig), options.scene, options.seed)
             source: ImuSource = SyntheticImu(imu, epoch_ns, clock, stop)
         else:
-            source = factory.open_real(
+            source = devices.open_imu(
                 options.name, options.imu, rig.imu.rate_hz, clock, stop, service.connection_lost
             )
         uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)

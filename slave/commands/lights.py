@@ -6,7 +6,8 @@ from collections.abc import Callable
 from common.calibration import CameraCalibration, load
 from common.errors import LightsError
 from slave.commands.options import add_rig, camera_path, positive, rig_of
-from slave.lights.factory import SWITCHED, open_guarded
+from slave.devices import open_lights
+from slave.drivers import SWITCHED_LIGHTS
 from slave.stopping import stop_by_signal
 
 PURPOSE = "budget and test of laser and LEDs"
@@ -23,7 +24,7 @@ EXAMPLES = """\
 def add_options(command: argparse.ArgumentParser) -> None:
     """The options of `lights`."""
     add_rig(command, "wrist", ", with the key strobe")
-    command.add_argument("--lights", metavar="DRIVER", help=SWITCHED)
+    command.add_argument("--lights", metavar="DRIVER", help=SWITCHED_LIGHTS)
     act = command.add_mutually_exclusive_group()
     act.add_argument(
         "--blink", type=positive, metavar="S", help="laser and LEDs in turn, for so many seconds"
@@ -45,9 +46,9 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
         notify(budget(rig, camera))
         return 0
     if options.lights is None:
-        raise LightsError(f"--blink and --off need the lights: --lights {SWITCHED}")
+        raise LightsError(f"--blink and --off need the lights: --lights {SWITCHED_LIGHTS}")
     with stop_by_signal() as stop:
-        interlock = open_guarded(options.lights, rig)  # dark from here on
+        interlock = open_lights(options.lights, rig)  # dark from here on
         try:
             if options.blink:
                 notify(budget(rig, camera))

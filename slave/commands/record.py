@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.clock import Clock, SkewedClock, SystemClock
 from common.errors import CalibrationError, CameraError, PhalanxError
+from slave import devices
 from slave.commands.camera import add_camera, open_lit
 from slave.commands.options import (
     camera_of,
@@ -25,7 +26,7 @@ from slave.commands.options import (
     skew_of,
     world_of,
 )
-from slave.imu import factory
+from slave.drivers import REAL_IMUS
 from slave.stopping import stop_by_signal
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
         nargs="?",
         const="synthetic",
         metavar="DRIVER",
-        help=f"what the rig's IMU says, too, as imu.csv: {factory.REAL}; without a driver, that of a synthetic camera",
+        help=f"what the rig's IMU says, too, as imu.csv: {REAL_IMUS}; without a driver, that of a synthetic camera",
     )
     command.add_argument(
         "--every-frame",
@@ -192,9 +193,9 @@ def _imu_recorder(
     imu = scene.rig.imu
     if imu is None:
         raise CalibrationError(f"rig {scene.rig.name!r}: imu: missing; there is none to record")
-    orientation, stop = factory.orientation_of(imu), threading.Event()
+    orientation, stop = devices.orientation_of(imu), threading.Event()
     imu_recorder = ImuRecorder(
-        factory.open_real(imu.name, options.imu, imu.rate_hz, scene.clock, stop), orientation, stop
+        devices.open_imu(imu.name, options.imu, imu.rate_hz, scene.clock, stop), orientation, stop
     )
     try:
         yield imu_recorder

@@ -9,6 +9,8 @@ from common.calibration import RigCalibration
 from common.clock import SkewedClock, SystemClock
 from common.errors import PhalanxError
 from common.object_profile import ObjectProfile
+from slave import devices
+from slave.commands.device_options import add_tracker_options
 from slave.commands.options import (
     add_link,
     add_rig,
@@ -19,7 +21,6 @@ from slave.commands.options import (
     secrets_of,
     world_of,
 )
-from slave.objects import factory
 from slave.service import ConnectionLost, Service
 from slave.sources import TrackerSource
 from slave.stopping import stop_by_signal
@@ -41,7 +42,7 @@ def add_options(command: argparse.ArgumentParser) -> None:
     """The options of `tracker`."""
     command.add_argument("name", metavar="NAME", help="the `tracker` of an object of the rig")
     add_rig(command)
-    factory.add_options(command)
+    add_tracker_options(command)
     add_link(command)
     add_simulated(command.add_argument_group("synthetic tracker").add_argument)
 
@@ -56,7 +57,7 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     from slave.uplink import Uplink
 
     rig = rig_of(options)
-    profile = factory.object_with(options.calibration, rig, options.name)
+    profile = devices.object_with(options.calibration, rig, options.name)
     true_clock = SystemClock()
     clock = clock_of(options, true_clock)
     key, access = secrets_of(options)
@@ -88,7 +89,7 @@ def _open(
 ) -> TrackerSource:
     if options.device != "synthetic":
         named = options.device, options.serial, options.program
-        return factory.open_real(options.name, *named, clock, stop, connection_lost)
+        return devices.open_tracker(options.name, *named, clock, stop, connection_lost)
     from slave.objects.synthetic import SyntheticTracker
     from slave.simulated import tracker_of
 

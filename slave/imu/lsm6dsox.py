@@ -60,6 +60,24 @@ class I2cPlace:
     bus: int
     address: int = ADDRESS
 
+    @classmethod
+    def of(cls, text: str) -> "I2cPlace":
+        """BUS or BUS:ADDRESS, numbers; the address in C's notation.
+
+        Raises:
+            ImuError: Neither, or no address of a part.
+        """
+        bus, _, address = text.partition(":")
+        try:
+            place = cls(int(bus), int(address, 0) if address else ADDRESS)
+        except ValueError:
+            place = None
+        if place is None or place.bus < 0 or not 0x08 <= place.address <= 0x77:
+            raise ImuError(
+                f"--imu lsm6dsox:{text}: write lsm6dsox:BUS or lsm6dsox:BUS:ADDRESS, for example lsm6dsox:1:0x6b"
+            )
+        return place
+
     def __str__(self) -> str:
         """For people."""
         return f"I2C bus {self.bus}, address {self.address:#04x}"

@@ -78,6 +78,22 @@ class SerialPlace:
     path: str
     baud: int | None = None
 
+    @classmethod
+    def of(cls, text: str) -> "SerialPlace":
+        """PORT or PORT@BAUD.
+
+        Raises:
+            ImuError: Neither.
+        """
+        path, at, baud = text.rpartition("@")
+        if not at:
+            return cls(text)
+        if not path or not baud.isdecimal() or int(baud) < 1:
+            raise ImuError(
+                f"--imu ximu3:{text}: write ximu3:PORT or ximu3:PORT@BAUD, for example /dev/serial0@115200"
+            )
+        return cls(path, int(baud))
+
 
 def open_port(place: SerialPlace) -> Port:
     """Open the port for this program alone.

@@ -12,9 +12,9 @@ from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
 from common.frame_recording import Illumination, open_recording
+from slave import devices
 from slave.__main__ import main
 from slave.app import run_wrist
-from slave.cameras import real
 from slave.cameras import v4l2_abi as abi
 from slave.cameras.grey import GREY_FORMATS, Pixels, grey, luma
 from slave.cameras.picamera2 import Picamera2Camera
@@ -300,7 +300,7 @@ def test_a_real_wrist_camera_is_recorded_grey(tmp_path: Path, monkeypatch: pytes
     def fake(file: CameraCalibration, asked: V4l2Options, clock: Any) -> V4l2Camera:
         return V4l2Camera(file, asked, clock, lambda _path: FakeDevice(strobed_camera()))
 
-    monkeypatch.setattr(real, "V4l2Camera", fake)
+    monkeypatch.setattr(devices, "V4l2Camera", fake)
     out = tmp_path / "rec"
     command = [
         "record",

@@ -12,11 +12,11 @@ import pytest
 from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
-from slave.cameras import frame_observer, picamera2, reconnecting, v4l2_settings
+from slave.cameras import frame_observer, picamera2, v4l2_settings
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
-from slave.cameras.reconnecting import ReconnectingCamera
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
+from slave.reconnect import Backoff, ReconnectingCamera
 from slave.sources import FrameSource
 from tests.network_helpers import until
 from tests.slave.fake_picamera2 import Sensor, install
@@ -237,12 +237,15 @@ def test_without_a_loop_that_reads_frames_nothing_can_be_verified(monkeypatch: p
         source.close()
 
 
-def test_a_camera_that_comes_back_has_the_settings_it_was_given_last(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reconnecting, "FIRST_WAIT_S", 0.001)
+def test_a_camera_that_comes_back_has_the_settings_it_was_given_last() -> None:
     first, second = Camera(damaged=frozenset({20, 21})), Camera(damaged=frozenset({13}))
     plugged = [first, second]
     source = ReconnectingCamera(
-        lambda file: usb(plugged.pop(0), file), FILE, SystemClock(), threading.Event()
+        lambda file: usb(plugged.pop(0), file),
+        FILE,
+        SystemClock(),
+        threading.Event(),
+        backoff=Backoff(first_s=0.001),
     )
     with reading(source):
         source.tune(changed(exposure_us=9000.0))
@@ -251,6 +254,7 @@ def test_a_camera_that_comes_back_has_the_settings_it_was_given_last(monkeypatch
         assert until(lambda: source.counts()["camera.broken"] == 3)
         assert source.counts() == {
             "camera.lost": 1,
+            "camera.back": 1,
             "camera.frozen": 0,
             "camera.raised": 0,
             "camera.broken": 3,
@@ -264,7 +268,7 @@ def test_a_camera_that_is_away_cannot_be_changed() -> None:
     source.close()
     with pytest.raises(CameraError, match="camera 'left' is away"):
         source.tune(changed(exposure_us=9000.0))
-    assert source.metrics() == {}
+    assert source.metrics() == {"camera.away_s": 0.0}
 
 
 def test_a_late_watcher_sees_only_the_newest() -> None:

@@ -160,7 +160,7 @@ def test_in_real_time_its_stamps_are_on_the_slaves_clock(tmp_path: Path) -> None
     [
         ("tracker", "survive", 1, "cannot start"),
         ("tracker", "survive:nowhere.rec", 1, "nowhere.rec: cannot read"),
-        ("tracker", "magic", 1, "no such system; there are openvr | survive | survive:FILE | synthetic"),
+        ("tracker", "magic", 1, "no such driver; there are openvr | survive | survive:FILE | synthetic"),
         ("somebody", "survive", 1, "no object has the tracker 'somebody'; there is 'tracker' on cube"),
     ],
 )
@@ -185,7 +185,7 @@ def test_the_command_says_in_one_line_what_is_missing(
 
 
 def test_an_object_without_a_tracker_is_said_to_have_none() -> None:
-    from slave.objects.factory import object_with
+    from slave.devices import object_with
 
     rig = load(CALIB / "rigs" / "desk-wand.json", RigCalibration)
     with pytest.raises(CalibrationError, match="no object has the tracker 'tracker'; there is none"):
