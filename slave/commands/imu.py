@@ -81,8 +81,8 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     """
     if options.csv is not None:
         return _take_in(options, notify)
-    from slave.imu.live import run_live
     from slave.imu.synthetic import SyntheticImu
+    from slave.sender import Sender, send_imu
     from slave.simulated import imu_of
     from slave.uplink import Uplink
 
@@ -109,7 +109,8 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
                 options.name, options.imu, rig.imu.rate_hz, clock, stop, service.connection_lost
             )
         uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
-        run_live(options.name, source, orientation, uplink, clock, stop, tell, service, access)
+        sender = Sender(options.name, uplink, clock, stop, tell, service, access)
+        send_imu(sender, source, orientation)
     return 0
 
 

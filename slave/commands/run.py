@@ -108,8 +108,9 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
         PhalanxError: A file, the camera, its lights, a key or the network is not as it must be.
     """
     # Imported here: `detect` and `colours` need neither sockets nor zenoh, and start twice as fast.
-    from slave.live import run_live
+    from slave.live import send_camera
     from slave.markers import engine as marker_engine
+    from slave.sender import Sender
     from slave.uplink import Uplink
     from slave.wrist import engine as wrist_engine
 
@@ -128,21 +129,8 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     def tell(line: str) -> None:
         notify(f"{options.name}: {line}")
 
-    run_live(
-        options.name,
-        files,
-        source,
-        uplink,
-        clock,
-        options.colours,
-        options.scan,
-        engine,
-        stop,
-        tell,
-        service,
-        access,
-        raw,
-    )
+    sender = Sender(options.name, uplink, clock, stop, tell, service, access)
+    send_camera(sender, files, source, options.colours, options.scan, engine, raw)
     return 0
 
 

@@ -53,7 +53,7 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     Raises:
         PhalanxError: A file, the tracker, a key or the network is not as it must be.
     """
-    from slave.objects.live import run_live
+    from slave.sender import Sender, send_poses
     from slave.uplink import Uplink
 
     rig = rig_of(options)
@@ -74,7 +74,8 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
             source.close()
             raise
         recorded = options.device.startswith("survive:")
-        run_live(options.name, source, uplink, clock, stop, tell, service, access, recorded)
+        sender = Sender(options.name, uplink, clock, stop, tell, service, access)
+        send_poses(sender, source, recorded)
     return 0
 
 

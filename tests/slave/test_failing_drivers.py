@@ -15,17 +15,17 @@ from common.clock import SystemClock
 from common.errors import CameraError
 from common.messages import MarkerDetections, Message
 from slave import failures
-from slave.app import run, run_wrist
 from slave.cameras.grey import Pixels
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
 from slave.cameras.repeated import CONTRAST, RepeatedPictures
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
-from slave.counters import Counters
+from slave.counters import DetectionCounters
 from slave.failures import LOG_EVERY_NS, Failures
 from slave.markers.detector import Detections
 from slave.markers.null_detector import NullDetector
 from slave.reconnect import Backoff, ReconnectingCamera
+from slave.sender import MarkerPipeline, WristPipeline, run
 from slave.sources import Frame, FrameSource
 from slave.wrist.null_detector import NullWristDetector
 from tests.slave.fake_picamera2 import OV7251, Sensor, install
@@ -86,7 +86,13 @@ def tracked(
     stop = threading.Event()
     source = camera_of(opener, stop)
     wire, shown = Wire(stop, most), list[Frame]()
-    run(source, NullDetector(6), wire, "left", Counters(("a",) * 6), stop, shown.append)
+    run(
+        source,
+        MarkerPipeline(
+            "left", wire.session, wire.send, NullDetector(6).push, DetectionCounters(("a",) * 6), shown.append
+        ),
+        stop,
+    )
     source.close()
     seqs = [one.seq for one in wire.sent if isinstance(one, MarkerDetections)]
     assert len(seqs) == len(shown) == most
@@ -175,8 +181,19 @@ def test_a_camera_that_stays_frozen_is_never_measured_again() -> None:
         return usb(opened[-1], file)
 
     source = camera_of(opener, stop)
-    counters = Counters(())
-    run_wrist(source, NullWristDetector(), Wire(stop, 1), "left", counters, stop, lambda _frame: stop.set())
+    counters = DetectionCounters(())
+    run(
+        source,
+        WristPipeline(
+            "left",
+            77,
+            Wire(stop, 1).send,
+            NullWristDetector().push,
+            counters,
+            lambda _frame: stop.set(),
+        ),
+        stop,
+    )
     source.close()
     assert counters.counts()["frames"] == 1, "its first picture, and no other"
     assert source.counts()["camera.lost"] >= 3
@@ -240,8 +257,13 @@ class Failing(NullDetector):
 def test_a_frame_that_the_detector_fails_of_is_dropped_and_counted(caplog: pytest.LogCaptureFixture) -> None:
     stop, alive = threading.Event(), list[int]()
     source = usb(Camera(formats=GREY), FILE)
-    wire, counters = Wire(stop, 20), Counters(("a",))
-    run(source, Failing(frozenset({3, 4, 9})), wire, "left", counters, stop, alive=lambda: alive.append(1))
+    wire, counters = Wire(stop, 20), DetectionCounters(("a",))
+    run(
+        source,
+        MarkerPipeline("left", wire.session, wire.send, Failing(frozenset({3, 4, 9})).push, counters),
+        stop,
+        lambda: alive.append(1),
+    )
     source.close()
     counts = counters.counts()
     assert (counts["frames"], counts["failed"], counts["dropped"]) == (20, 3, 3)
@@ -255,8 +277,8 @@ def test_what_shows_or_finds_tags_costs_no_detection() -> None:
 
     stop = threading.Event()
     source = usb(Camera(formats=GREY), FILE)
-    wire, counters = Wire(stop, 10), Counters(("a",))
-    run(source, NullDetector(1), wire, "left", counters, stop, fail)
+    wire, counters = Wire(stop, 10), DetectionCounters(("a",))
+    run(source, MarkerPipeline("left", wire.session, wire.send, NullDetector(1).push, counters, fail), stop)
     source.close()
     counts = counters.counts()
     assert (counts["frames"], counts["failed"], len(wire.sent)) == (10, 10, 10)

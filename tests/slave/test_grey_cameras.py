@@ -14,14 +14,14 @@ from common.errors import CameraError
 from common.frame_recording import Illumination, open_recording
 from slave import devices
 from slave.__main__ import main
-from slave.app import run_wrist
 from slave.cameras import v4l2_abi as abi
 from slave.cameras.grey import GREY_FORMATS, Pixels, grey, luma
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
-from slave.counters import Counters
+from slave.counters import DetectionCounters
 from slave.preview import small_jpeg, whole_jpeg
+from slave.sender import WristPipeline, run
 from slave.wrist.detector import WristDetector
 from tests.slave.fake_picamera2 import OV7251, OV9281, Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice, colour, level, row_bytes, webcam_knobs
@@ -286,7 +286,11 @@ def test_a_hand_before_a_real_camera_is_found_as_in_the_same_pictures_of_8_bits(
     source, wire = usb(strobed_camera()), Wire()
     detector = WristDetector(VIEW, RATE_HZ)
     taken = (frame for _ in range(12) if (frame := source.read()) is not None)
-    run_wrist(Source(list(taken)), detector, wire, "wrist", Counters(NAMES), threading.Event())
+    run(
+        Source(list(taken)),
+        WristPipeline("wrist", wire.session, wire.send, detector.push, DetectionCounters(NAMES)),
+        threading.Event(),
+    )
     source.close()
     assert detector.counts["cycles"] >= 3
     plain = WristDetector(VIEW, RATE_HZ)
