@@ -3,8 +3,8 @@
 Settings are part of the configuration, so the first frames already have them. libcamera takes some frames until what
 it reports is what was asked for; then exposure, gains, frame duration and focus of three frames in a row must be
 those of the camera file. Image and metadata always come from the same captured request, which is released whatever
-happens. When a frame was taken, and its number, are in `picamera2_frames`; whether cameras run in step, in
-`picamera2_sync`, which streams there are in `picamera2_streams`.
+happens. When a frame was taken, its number, and whether cameras run in step, are in `picamera2_timing`; modes and
+streams in `picamera2_streams`.
 
 Exposure, gains and rate can be changed while frames are read: another thread writes the controls and watches the
 metadata of the frames that the loop reads, until three in a row show them. The mode stays, so a rate may not be above
@@ -23,11 +23,8 @@ from common.arrays import Image
 from common.calibration import CameraCalibration
 from common.clock import Clock
 from common.errors import CameraError
-from slave.cameras.frame_observer import FrameObserver
 from slave.cameras.grey import Pixels
-from slave.cameras.picamera2_frames import Timeline
 from slave.cameras.picamera2_library import open_library
-from slave.cameras.picamera2_modes import choose_mode, choose_raw_mode, read_modes, view_text
 from slave.cameras.picamera2_settings import (
     LIVE_CONTROLS,
     RATE_CONTROL,
@@ -37,9 +34,9 @@ from slave.cameras.picamera2_settings import (
     read_figures,
     wanted_settings,
 )
-from slave.cameras.picamera2_streams import Streams
-from slave.cameras.picamera2_sync import SyncMonitor, wait_in_step
-from slave.cameras.settings import as_values, change, demand, differences
+from slave.cameras.picamera2_streams import Streams, choose_mode, choose_raw_mode, read_modes, view_text
+from slave.cameras.picamera2_timing import SyncMonitor, Timeline, wait_in_step
+from slave.cameras.settings import FrameObserver, as_values, change, demand, differences
 from slave.sources import Frame
 
 BUFFERS = 6  # picamera2's own number for video: the pipeline never starves while one frame is held

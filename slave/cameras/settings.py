@@ -1,12 +1,14 @@
-"""Camera settings: what was asked for, what the camera says it has, and whether that is the same.
+"""Settings of a camera: what was asked for, what it reports, whether that is the same; and the frames that show it.
 
 A camera rounds: exposure to whole rows, gain to whole register codes. So every setting carries how far the value
 read back may be from the value wanted, and why. Whatever is further off is an error that names setting, wanted,
 got and what to do; nothing is taken on trust.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from common.calibration import CameraCalibration
 from common.errors import CameraError
@@ -109,3 +111,49 @@ def _number(value: float) -> str:
 
 def _space(unit: str) -> str:
     return f" {unit}" if unit else ""
+
+
+T = TypeVar("T")
+
+
+class FrameObserver(Generic[T]):
+    """Holds the newest of what went by, and how many there were."""
+
+    def __init__(self) -> None:
+        """Nothing went by yet."""
+        self._changed = threading.Condition()
+        self._newest: T | None = None
+        self._count = 0
+
+    @property
+    def newest(self) -> T | None:
+        """What went by last, if anything."""
+        return self._newest
+
+    def put(self, item: T) -> None:
+        """The loop has read `item`. Never waits longer than a look at it takes."""
+        with self._changed:
+            self._newest = item
+            self._count += 1
+            self._changed.notify_all()
+
+    def following(self, count: int, timeout_s: float) -> Iterator[T]:
+        """Wait for `count` items that go by from now on.
+
+        A watcher who is late misses some; those do not count.
+
+        Raises:
+            CameraError: None came for `timeout_s` [s].
+        """
+        return self._after(self._count, count, timeout_s)
+
+    def _after(self, last: int, count: int, timeout_s: float) -> Iterator[T]:
+        for _ in range(count):
+            with self._changed:
+                if not self._changed.wait_for(lambda seen=last: self._count > seen, timeout_s):
+                    raise CameraError(
+                        f"no frame was read for {timeout_s:g} s: the camera is away, or the slave waits for a master"
+                    )
+                last, item = self._count, self._newest
+            assert item is not None  # it was counted
+            yield item

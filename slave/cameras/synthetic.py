@@ -33,7 +33,7 @@ from common.sim.scenes import renderer_of
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from slave.lights.schedule import CYCLE as STROBE
-from slave.lights.synthetic import Lit
+from slave.lights.simulated import Lit
 from slave.sources import Frame
 
 WHOLE = 0.999  # of an exposure; what lit that much lit all of it

@@ -35,9 +35,8 @@ from common.camera_settings import same_exposed
 from common.clock import Clock
 from common.errors import CameraError
 from slave.cameras import v4l2_abi as abi
-from slave.cameras.frame_observer import FrameObserver
 from slave.cameras.grey import Pixels
-from slave.cameras.settings import change
+from slave.cameras.settings import FrameObserver, change
 from slave.cameras.stamps import ForeignClock, clock_of, system_clock
 from slave.cameras.v4l2_formats import Layout, Offer, choose_offer, read_offers, set_format
 from slave.cameras.v4l2_settings import SETTLE_FRAMES, TIMEOUT_S, V4l2Settings

@@ -10,9 +10,8 @@ from typing import TypeVar
 
 from common.calibration import CameraCalibration
 from common.errors import CameraError
-from slave.cameras.frame_observer import FrameObserver
 from slave.cameras.grey import Pixels
-from slave.cameras.settings import change, demand, differences
+from slave.cameras.settings import FrameObserver, change, demand, differences
 from slave.cameras.v4l2_abi import Device
 from slave.cameras.v4l2_controls import (
     AUTOMATICS,

@@ -24,8 +24,7 @@ from typing import BinaryIO, cast
 from common.clock import Clock
 from common.errors import TrackerError
 from common.messages import TrackerPose
-from slave.objects.survive_device import SurviveDevice
-from slave.objects.survive_lines import LineDecoder, Pose, Serial
+from slave.objects.survive_lines import LineDecoder, Pose, Serial, SurviveDevice
 
 PROGRAM = "survive-cli"
 OPTIONS = ("--record-stdout", "1", "--record-rawlight", "0", "--record-imu", "0", "--record-angle", "0")

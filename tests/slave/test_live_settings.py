@@ -12,9 +12,10 @@ import pytest
 from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
-from slave.cameras import frame_observer, picamera2, v4l2_settings
+from slave.cameras import picamera2, v4l2_settings
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
+from slave.cameras.settings import FrameObserver
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
 from slave.reconnect import Backoff, ReconnectingCamera
 from slave.sources import FrameSource
@@ -272,7 +273,7 @@ def test_a_camera_that_is_away_cannot_be_changed() -> None:
 
 
 def test_a_late_watcher_sees_only_the_newest() -> None:
-    frames = frame_observer.FrameObserver[int]()
+    frames = FrameObserver[int]()
     assert frames.newest is None
     frames.put(1)
     seen = frames.following(2, 5.0)

@@ -10,7 +10,7 @@ import pytest
 from common.clock import SystemClock
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
-from slave.cameras.picamera2_sync import MOST_OFF_US, PERIOD_FRAMES, SILENT_FRAMES, SyncMonitor
+from slave.cameras.picamera2_timing import MOST_OFF_US, PERIOD_FRAMES, SILENT_FRAMES, SyncMonitor
 from tests.slave.fake_picamera2 import Sensor, install
 from tests.slave.test_live_settings import FILE
 

@@ -20,9 +20,8 @@ from slave.counters import DetectionCounters
 from slave.markers.null_detector import NullDetector
 from slave.sender import MarkerPipeline, run
 from slave.sources import Frame
-from slave.tags.live import LiveTags, finder_of
+from slave.tags.live import SHARE, LiveTags, Pace, finder_of
 from slave.tags.offline import TagCollector, tagged_objects
-from slave.tags.pace import SHARE, Pace
 
 ROOT = Path(__file__).resolve().parents[3]
 FILE = load(ROOT / "calib_json/cameras/left.json", CameraCalibration)
