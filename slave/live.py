@@ -25,7 +25,7 @@ from slave.raw import RawFrames, RawSettings
 from slave.sender import MarkerPipeline, Sender, WristPipeline
 from slave.sources import FrameSource
 from slave.tags.live import LiveTags, finder_of
-from slave.tuning import CameraFiles, CameraTuning, Prepare
+from slave.tuning import CameraFiles, CameraTuning, Prepare, Sample
 from slave.wrist.detector import WristDetector
 from slave.wrist.engine import Engine as WristEngine
 from slave.wrist.null_detector import NullWristDetector
@@ -76,7 +76,7 @@ def send_camera(
     else:
         line = _marker_line(sender, files, colours, scan, engine, workers)
     counters = line.pipeline.counters
-    tuning = CameraTuning(files, source, line.prepare, lambda: counters.total > 0, line.sampler)
+    tuning = CameraTuning(files, source, line.prepare, lambda: counters.total > 0, line.sample)
     sender.send(
         raw.reading(source),
         line.pipeline,
@@ -95,14 +95,14 @@ class _Line:
         pipeline: Detects in a frame and sends.
         previews: Shows them.
         prepare: How changed files reach it; None: it uses none of them.
-        sampler: Makes a colour of a click; None: it uses none.
+        sample: Makes a colour of a click; None: it uses none.
         reported: What the reports have in place of the counters; None: those.
     """
 
     pipeline: MarkerPipeline | WristPipeline
     previews: Previews
     prepare: Prepare | None = None
-    sampler: ColourSampler | None = None
+    sample: Sample | None = None
     reported: LightReport | None = None
 
 
@@ -144,7 +144,7 @@ def _marker_line(
         MarkerPipeline(name, uplink.session, uplink.send, detector.push, counters, show, tags.push),
         previews,
         _both(marker_changes(detector, make), _tag_changes(tags)),
-        ColourSampler(detector, previews.shown, rig.markers),
+        ColourSampler(detector, previews.shown, rig.markers).pick,
         light,
     )
 

@@ -5,7 +5,6 @@ found in its last frames.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -24,26 +23,6 @@ WHITE, BLACK = (255, 255, 255), (0, 0, 0)
 LASER, TIP = (60, 60, 255), (80, 255, 80)
 
 
-class Overlay(Protocol):
-    """What is drawn over the pictures of one camera."""
-
-    @property
-    def markers(self) -> tuple[str, ...]:
-        """Those whose pixels can be tinted."""
-        ...
-
-    def draw(self, small: Image, frame: Frame, mask: Sequence[str], found: bool) -> Image:
-        """A new picture (h, w, 3).
-
-        Args:
-            small: (h, w, 3) BGR or (h, w) grey: the frame shrunk.
-            frame: The frame itself.
-            mask: Markers to tint.
-            found: Whether to cross what was found in that frame.
-        """
-        ...
-
-
 class MarkerOverlay:
     """Overlay of a camera that looks for markers, by the detector in use. Holds nothing of its own."""
 
@@ -57,7 +36,14 @@ class MarkerOverlay:
         return self._markers
 
     def draw(self, small: Image, frame: Frame, mask: Sequence[str], found: bool) -> Image:
-        """Tint by the colour table in use, which follows the light; cross the centroids."""
+        """A new picture (h, w, 3): tinted by the colour table in use, which follows the light; centroids crossed.
+
+        Args:
+            small: (h, w, 3) BGR or (h, w) grey: the frame shrunk.
+            frame: The frame itself.
+            mask: Markers to tint.
+            found: Whether to cross what was found in that frame.
+        """
         drawn, plain = small.copy(), self._detector.plain
         if mask and plain is not None:
             height, width = small.shape[:2]
@@ -83,7 +69,7 @@ class WristOverlay:
         return ()
 
     def draw(self, small: Image, frame: Frame, mask: Sequence[str], found: bool) -> Image:
-        """Cross the laser points red and the fingertips green."""
+        """A new picture with the laser points crossed red and the fingertips green; as of `MarkerOverlay`."""
         del mask
         drawn = (
             np.asarray(cv2.cvtColor(small, cv2.COLOR_GRAY2BGR), np.uint8) if small.ndim == 2 else small.copy()

@@ -23,7 +23,7 @@ from common.errors import BusError, CalibrationError
 from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Preview, Still
 from common.preview_wish import PreviewWish
 from slave.failures import Failures
-from slave.overlay import Overlay
+from slave.overlay import MarkerOverlay, WristOverlay
 from slave.sources import Frame
 
 PERIOD_NS = 100_000_000
@@ -69,7 +69,9 @@ class Previews:
     one, and how many pictures went out.
     """
 
-    def __init__(self, camera: str, clock: Clock, overlay: Overlay | None = None) -> None:
+    def __init__(
+        self, camera: str, clock: Clock, overlay: MarkerOverlay | WristOverlay | None = None
+    ) -> None:
         """Start the thread; nothing is published before `use` and `ask`.
 
         Args:

@@ -1,15 +1,25 @@
-"""What a simulated sensor beside this slave senses: the scene before its camera, and the IMU on the hand in it; and the
-time of a scene that waits for whoever draws it."""
+"""What simulated sensors beside this slave measure: the scene before its camera, the IMU on the hand, the tracker.
 
+A simulated IMU or tracker is the first-class stand-in for hardware. It measures item k when its own oscillator, which
+is the slave's (perhaps skewed) clock, says `epoch + k periods`, and hands it over then. A process too slow for its rate
+leaves items out, seen as gaps in `seq`, and never works off a backlog.
+"""
+
+import threading
+from collections.abc import Callable
 from pathlib import Path
+from typing import Generic, TypeVar
 
+import numpy as np
 from msgspec.structs import replace
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.clock import SkewedClock
 from common.errors import CalibrationError, CameraError, TrackerError
 from common.frame_recording import open_recording
+from common.geometry import matrix_to_quaternion
 from common.imu_recording import write_imu
+from common.messages import ImuSample, TrackerPose
 from common.object_profile import ObjectProfile
 from common.sim.board import BoardScene
 from common.sim.imu import SimulatedImu
@@ -17,6 +27,9 @@ from common.sim.scene import Scene
 from common.sim.scenes import view_by_name
 from common.sim.tracker import SimulatedTracker
 from common.sim.wrist.scene import WristScene
+
+ItemT = TypeVar("ItemT", ImuSample, TrackerPose)
+TRACKER_HZ = 100.0  # poses per second of the simulated tracker
 
 
 class FrameClock:
@@ -33,6 +46,61 @@ class FrameClock:
     def sleep(self, seconds: float) -> None:
         """Let so many seconds be over."""
         self._now_ns += round(seconds * 1e9)
+
+
+class SyntheticSensor(Generic[ItemT]):
+    """A `Source` that measures the scene of the synthetic cameras. Holds the number of the next item."""
+
+    def __init__(
+        self,
+        measure: Callable[[int, float, int], ItemT],
+        rate_hz: float,
+        epoch_ns: int,
+        clock: SkewedClock,
+        stop: threading.Event,
+    ) -> None:
+        """Get ready. The sensor may join at any time: `seq` counts from the epoch.
+
+        Args:
+            measure: Item by number, at a time of the scene [s], and with a stamp [ns].
+            rate_hz: Items per second.
+            epoch_ns: Scene time 0, on the true clock [ns].
+            clock: The slave's clock; stamps are on it, and its rate is that of the items.
+            stop: Ends the stream, also while an item is waited for.
+        """
+        self._measure, self._rate_hz = measure, rate_hz
+        self._epoch_ns, self._clock, self._stop = epoch_ns, clock, stop
+        self._first_ns = clock.from_true(epoch_ns)
+        self._next = 0
+        self._started = self._closed = False
+
+    def read(self) -> ItemT | None:
+        """Measure the next item, wait until it is due, hand it over; None once closed or stopped."""
+        seq = self._due_next()
+        t_ns = self._measured_ns(seq)
+        item = self._measure(seq, (self._clock.to_true(t_ns) - self._epoch_ns) * 1e-9, t_ns)
+        while not (self._closed or self._stop.is_set()):
+            if (left_ns := t_ns - self._clock.now_ns()) <= 0:
+                self._next, self._started = seq + 1, True
+                return item
+            self._stop.wait(left_ns * 1e-9)
+        return None
+
+    def close(self) -> None:
+        """End the stream."""
+        self._closed = True
+
+    def _due_next(self) -> int:
+        """Number of the next item: the one after the last, or the first to come where that is half a period late."""
+        late_ns = self._clock.now_ns() - self._measured_ns(self._next)
+        period_ns = 1e9 / self._rate_hz
+        if late_ns <= (0.5 * period_ns if self._started else 0.0):
+            return self._next
+        return self._next + int(late_ns // period_ns) + 1
+
+    def _measured_ns(self, seq: int) -> int:
+        """When item `seq` is measured, own clock [ns]."""
+        return self._first_ns + round(seq * 1e9 / self._rate_hz)
 
 
 def world_of(
@@ -107,6 +175,18 @@ def tracker_of(
     if not isinstance(scene, Scene):
         raise TrackerError(f"--scene {name}: there is no object in it that a tracker could sit on")
     return SimulatedTracker.of(scene, profile, seed)
+
+
+def poses_of(name: str, tracker: SimulatedTracker) -> Callable[[int, float, int], TrackerPose]:
+    """What a `SyntheticSensor` measures of a tracker that our messages call `name`; NaN where it is lost."""
+
+    def measure(seq: int, t_s: float, t_ns: int) -> TrackerPose:
+        pose = tracker.pose(t_s)
+        if pose is None:
+            return TrackerPose(name, 0, seq, t_ns, np.full(3, np.nan), np.full(4, np.nan))
+        return TrackerPose(name, 0, seq, t_ns, pose[:3, 3], matrix_to_quaternion(pose[:3, :3]))
+
+    return measure
 
 
 def add_imu(folder: Path, imu: SimulatedImu, epoch_ns: int, clock: SkewedClock) -> None:

@@ -16,7 +16,7 @@ import threading
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 from msgspec import structs
 
@@ -96,18 +96,8 @@ def object_paths(rig_path: Path, rig: RigCalibration) -> tuple[Path, ...]:
 Prepare: TypeAlias = Callable[[CameraFiles, CameraFiles], Callable[[], None] | None]
 
 
-class Sampler(Protocol):
-    """What makes a colour of a click; a `slave.colour_sampler.ColourSampler`."""
-
-    def pick(
-        self, wish: ColourPick, camera: CameraCalibration
-    ) -> tuple[CameraCalibration, Mapping[str, float]]:
-        """The camera file with the colour, and gauges that say how good it is.
-
-        Raises:
-            PhalanxError: There is none, or no frame.
-        """
-        ...
+# Makes the colour that a click shows: the camera file with it, and how good it is. Raises `PhalanxError`.
+Sample: TypeAlias = Callable[[ColourPick, CameraCalibration], tuple[CameraCalibration, Mapping[str, float]]]
 
 
 class CameraTuning:
@@ -123,7 +113,7 @@ class CameraTuning:
         source: object,
         prepare: Prepare | None,
         running: Callable[[], bool],
-        sampler: Sampler | None = None,
+        sample: Sample | None = None,
     ) -> None:
         """Tune a camera.
 
@@ -132,11 +122,11 @@ class CameraTuning:
             source: The camera; a `Tunable`, or nothing can be changed but what senses.
             prepare: Makes what senses for other files; None: nobody senses.
             running: Whether frames are read: before, no change can be verified.
-            sampler: Makes a colour of a click; None: no markers are sought.
+            sample: Makes a colour of a click; None: no markers are sought.
         """
         self._used = self._on_disk = files
         self._source = source if isinstance(source, Tunable) else None
-        self._prepare, self._running, self._sampler = prepare, running, sampler
+        self._prepare, self._running, self._sample = prepare, running, sample
         self._lock = threading.Lock()
         self._monitored = MonitoredFiles()
         self._applied = self._refused = 0
@@ -205,12 +195,12 @@ class CameraTuning:
     def _pick(self, body: str) -> dict[str, float]:
         with self._lock:
             wish = parse(body.encode(), ColourPick, "pick")
-            if self._sampler is None:
+            if self._sample is None:
                 raise CalibrationError(
                     "pick: this slave seeks no markers: the camera of a wrist device, or started with --colours none"
                 )
             refuse_strange((wish.marker,), self._used.rig.markers, "pick: marker")
-            camera, told = self._sampler.pick(wish, self._used.camera)
+            camera, told = self._sample(wish, self._used.camera)
             self._apply(replace(self._used, camera=_told(camera, "pick", (wish.marker,))))
         return self._settings("") | dict(told)
 

@@ -16,7 +16,6 @@ and gains, at the start or later, make the picture brighter or darker against th
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -24,7 +23,7 @@ import numpy as np
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration
 from common.camera_settings import figures
-from common.clock import Clock
+from common.clock import Clock, SkewedClock
 from common.errors import CalibrationError, CameraError
 from common.frame_recording import Illumination
 from common.sim.board import BoardScene
@@ -33,28 +32,11 @@ from common.sim.scenes import renderer_of
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from slave.lights.schedule import CYCLE as STROBE
-from slave.lights.simulated import Lit
+from slave.lights.simulated import SimulatedStrobe
 from slave.sources import Frame
 
 WHOLE = 0.999  # of an exposure; what lit that much lit all of it
 STEP_S = 0.05  # longest sleep at a time, so that a signal ends a wait soon
-
-
-@runtime_checkable
-class _Skewed(Protocol):
-    """A clock that can be told apart from true time."""
-
-    def to_true(self, t_ns: int) -> int: ...
-
-    def from_true(self, t_ns: int) -> int: ...
-
-
-class LitBy(Protocol):
-    """What lights the scene; a `SimulatedStrobe`."""
-
-    def during(self, start_ns: int, stop_ns: int) -> Lit:
-        """How much of an exposure [ns] each light was on; exposures are asked for one after another."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +63,7 @@ class SyntheticCamera:
         start_offset_ns: int,
         true_clock: Clock,
         sleep: Callable[[float], None] = time.sleep,
-        lights: LitBy | None = None,
+        lights: SimulatedStrobe | None = None,
         *,
         live: bool = False,
     ) -> None:
@@ -183,7 +165,7 @@ class SyntheticCamera:
         return image, Illumination.AMBIENT
 
     def _draw_lit(
-        self, renderer: WristRenderer, t_s: float, t_ns: int, lights: LitBy
+        self, renderer: WristRenderer, t_s: float, t_ns: int, lights: SimulatedStrobe
     ) -> tuple[Image, Illumination]:
         """What the lights had on during the exposure; a light that was on for a part of it adds that part."""
         half_ns = round(self._camera.exposure_us * 500.0)
@@ -226,10 +208,10 @@ class SyntheticCamera:
         return self._pace.exposed_ns(seq)
 
     def _own(self, t_ns: int) -> int:
-        return self._clock.from_true(t_ns) if isinstance(self._clock, _Skewed) else t_ns
+        return self._clock.from_true(t_ns) if isinstance(self._clock, SkewedClock) else t_ns
 
     def _true_ns(self, t_ns: int) -> int:
-        return self._clock.to_true(t_ns) if isinstance(self._clock, _Skewed) else t_ns
+        return self._clock.to_true(t_ns) if isinstance(self._clock, SkewedClock) else t_ns
 
 
 def _refuse_other_size(camera: CameraCalibration, true: CameraCalibration) -> None:

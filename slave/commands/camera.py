@@ -17,7 +17,7 @@ from slave.service import ConnectionLost, nobody
 from slave.sources import FrameSource
 
 if TYPE_CHECKING:
-    from slave.cameras.synthetic import LitBy
+    from slave.lights.simulated import SimulatedStrobe
 
 
 def add_camera(command: argparse.ArgumentParser) -> None:
@@ -93,7 +93,7 @@ def _open(
     true_clock: Clock,
     stop: threading.Event | None,
     connection_lost: ConnectionLost,
-    lights: "LitBy | None" = None,
+    lights: "SimulatedStrobe | None" = None,
 ) -> FrameSource:
     found = devices.open_camera(
         options.camera,
@@ -124,7 +124,7 @@ def _open_synthetic(
     true_clock: Clock,
     stop: threading.Event | None,
     connection_lost: ConnectionLost,
-    lights: "LitBy | None",
+    lights: "SimulatedStrobe | None",
 ) -> FrameSource:
     from slave.cameras.synthetic import SyntheticCamera
     from slave.simulated import FrameClock, scene_of

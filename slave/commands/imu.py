@@ -81,9 +81,8 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
     """
     if options.csv is not None:
         return _take_in(options, notify)
-    from slave.imu.synthetic import SyntheticImu
     from slave.sender import Sender, send_imu
-    from slave.simulated import imu_of
+    from slave.simulated import SyntheticSensor, imu_of
     from slave.uplink import Uplink
 
     rig = rig_of(options)
@@ -103,7 +102,7 @@ def run(options: argparse.Namespace, notify: Callable[[str], None]) -> int:
         if options.imu == "synthetic":
             epoch_ns = epoch_of(options, true_clock)
             imu = imu_of(options.imu, *world_of(options, rig), options.scene, options.seed)
-            source: ImuSource = SyntheticImu(imu, epoch_ns, clock, stop)
+            source: ImuSource = SyntheticSensor(imu.sample, imu.rate_hz, epoch_ns, clock, stop)
         else:
             source = devices.open_imu(
                 options.name, options.imu, rig.imu.rate_hz, clock, stop, service.connection_lost

@@ -91,9 +91,8 @@ def _open(
     if options.device != "synthetic":
         named = options.device, options.serial, options.program
         return devices.open_tracker(options.name, *named, clock, stop, connection_lost)
-    from slave.objects.synthetic import SyntheticTracker
-    from slave.simulated import tracker_of
+    from slave.simulated import TRACKER_HZ, SyntheticSensor, poses_of, tracker_of
 
     epoch_ns = epoch_of(options, true_clock)
     tracker = tracker_of(*world_of(options, rig), options.scene, options.seed, profile)
-    return SyntheticTracker(options.name, tracker, epoch_ns, clock, stop)
+    return SyntheticSensor(poses_of(options.name, tracker), TRACKER_HZ, epoch_ns, clock, stop)

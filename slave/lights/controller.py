@@ -102,60 +102,80 @@ class Strober:
             _LOG.warning("lights: %s", error)
 
 
-def told(interlock: Interlock, strober: Strober, schedule: StrobeSchedule) -> dict[str, int]:
-    """`lights.<event>` -> how often, of all three."""
-    own = {**interlock.events(), **strober.counts, "restarts": schedule.restarts}
-    return {f"lights.{event}": count for event, count in own.items()}
-
-
-class StrobeController:
-    """Keeps a camera lit, on a thread of its own. Holds the strober and its schedule under one lock."""
+class Strobe:
+    """Keeps a camera lit: the schedule of its exposures, the lights, and the strober between them."""
 
     def __init__(self, schedule: StrobeSchedule, interlock: Interlock, clock: Clock) -> None:
-        """Start the thread.
+        """Begin dark.
 
         Args:
             schedule: Fed by `push`.
-            guard: The lights; closed by `close`.
+            interlock: The lights; closed by `close`.
             clock: That of the frames' stamps.
         """
         self._schedule, self._interlock, self._clock = schedule, interlock, clock
         self._strober = Strober(schedule, interlock, clock)
+
+    def push(self, seq: int, t_ns: int) -> None:
+        """A frame came; its mid-exposure [ns]."""
+        if self._schedule.push(seq, t_ns):
+            self._strober.renumber()
+
+    def expose(self, exposure_us: float) -> None:
+        """The camera exposes for so long from now on [us]."""
+        self._schedule.expose(exposure_us)
+
+    def stalled(self) -> None:
+        """There are no frames any more: go dark, and know nothing."""
+        self._schedule.forget()
+        self._strober.renumber()
+        self._strober.dark()
+
+    def counts(self) -> dict[str, int]:
+        """`lights.<event>` -> how often, of lights, strober and schedule."""
+        own = {**self._interlock.events(), **self._strober.counts, "restarts": self._schedule.restarts}
+        return {f"lights.{event}": count for event, count in own.items()}
+
+    def close(self) -> None:
+        """Go dark, give the lights back. Safe to call twice.
+
+        Raises:
+            LightsError: The lights could not be darkened.
+        """
+        self._strober.dark()
+        self._interlock.close()
+
+
+class StrobeController(Strobe):
+    """A strobe that works on a thread of its own. Holds the strober and its schedule under one lock."""
+
+    def __init__(self, schedule: StrobeSchedule, interlock: Interlock, clock: Clock) -> None:
+        """Start the thread; arguments as of `Strobe`."""
+        super().__init__(schedule, interlock, clock)
         self._news = threading.Condition()
         self._closed = False
         self._thread = threading.Thread(target=self._work, name="strobe", daemon=True)
         self._thread.start()
 
     def push(self, seq: int, t_ns: int) -> None:
-        """A frame came; its mid-exposure [ns]."""
+        """As of `Strobe`."""
         with self._news:
-            if self._schedule.push(seq, t_ns):
-                self._strober.renumber()
+            super().push(seq, t_ns)
             self._news.notify_all()
 
     def expose(self, exposure_us: float) -> None:
-        """The camera exposes for so long from now on [us]."""
+        """As of `Strobe`."""
         with self._news:
-            self._schedule.expose(exposure_us)
+            super().expose(exposure_us)
 
     def stalled(self) -> None:
-        """There are no frames any more: go dark, and know nothing."""
+        """As of `Strobe`."""
         with self._news:
-            self._schedule.forget()
-            self._strober.renumber()
-            self._strober.dark()
+            super().stalled()
             self._news.notify_all()
 
-    def counts(self) -> dict[str, int]:
-        """`lights.<event>` -> how often."""
-        return told(self._interlock, self._strober, self._schedule)
-
     def close(self) -> None:
-        """Go dark, end the thread, give the lights back. Safe to call twice.
-
-        Raises:
-            LightsError: The lights could not be darkened.
-        """
+        """Go dark, end the thread, give the lights back; as of `Strobe`."""
         with self._news:
             self._closed = True
             self._strober.dark()

@@ -1,45 +1,20 @@
 """A camera whose frames are lit by a strobe: every frame's stamp goes to the controller on its way to the detector."""
 
-from typing import Protocol
-
 from msgspec.structs import replace
 
 from common.calibration import CameraCalibration, RigCalibration
 from common.errors import CalibrationError, CameraError
 from common.strobe_calibration import StrobeCalibration
+from slave.lights.controller import Strobe
 from slave.lights.schedule import CYCLE, INTERLOCK_NS, StrobeSchedule
 from slave.sources import Frame, FrameSource, Tunable
-
-
-class Controller(Protocol):
-    """What keeps a camera lit: a `StrobeController`, or that of the simulation."""
-
-    def push(self, seq: int, t_ns: int) -> None:
-        """A frame came; its mid-exposure [ns]."""
-        ...
-
-    def expose(self, exposure_us: float) -> None:
-        """The camera exposes for so long from now on [us]."""
-        ...
-
-    def stalled(self) -> None:
-        """There are no frames any more: dark at once."""
-        ...
-
-    def counts(self) -> dict[str, int]:
-        """`lights.<event>` -> how often."""
-        ...
-
-    def close(self) -> None:
-        """Dark for good. Safe to call twice."""
-        ...
 
 
 class StrobedCamera:
     """A `FrameSource` around one, `Tunable` where that is. Closes camera and lights. Holds the exposure limit."""
 
     def __init__(
-        self, source: FrameSource, camera: CameraCalibration, rig: RigCalibration, controller: Controller
+        self, source: FrameSource, camera: CameraCalibration, rig: RigCalibration, controller: Strobe
     ) -> None:
         """Begin dark; light comes once the stamps are understood.
 

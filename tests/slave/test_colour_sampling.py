@@ -171,7 +171,7 @@ def test_from_no_colour_at_all_to_a_slave_that_follows_the_light(tmp_path: Path)
     knobs = Knobs()
     shown: dict[int, Frame] = {}
     sampler = ColourSampler(detector, shown.get, NAMES)
-    tuning = CameraTuning(files, knobs, marker_changes(detector, make), lambda: True, sampler)
+    tuning = CameraTuning(files, knobs, marker_changes(detector, make), lambda: True, sampler.pick)
     commands = tuning.commands()
 
     def sample(name: str, t_ns: int | None = None) -> dict[str, float]:

@@ -51,7 +51,7 @@ def test_a_slave_tells_what_the_checklist_judges(tmp_path: Path) -> None:
     with ThreadPoolExecutor(1) as workers:
         line = live._marker_line(sender, files, "follow", "full", NUMPY, workers)
     assert line.reported is not None
-    tuning = CameraTuning(files, Camera(), line.prepare, lambda: True, line.sampler)
+    tuning = CameraTuning(files, Camera(), line.prepare, lambda: True, line.sample)
     reporter = Reporter(
         "left", uplink, line.reported, clock, lambda _: LoopbackBus(), stop.set, 0.01, parts=(tuning,)
     )

@@ -17,9 +17,8 @@ from common.object_profile import ObjectProfile
 from common.sim.tracker import SET_UP_TRACKER, SET_UP_TRACKING, SimulatedTracker
 from slave.__main__ import main
 from slave.counters import pose_counters
-from slave.objects.synthetic import SyntheticTracker
 from slave.sender import PosePipeline, run, skip_one, wait_for_start
-from slave.simulated import tracker_of
+from slave.simulated import TRACKER_HZ, SyntheticSensor, poses_of, tracker_of
 
 CALIB = Path(__file__).resolve().parents[3] / "calib_json"
 KEY = "11" * 32
@@ -142,7 +141,7 @@ def test_in_real_time_its_stamps_are_on_the_slaves_clock(tmp_path: Path) -> None
     true_clock = SystemClock()
     epoch_ns = true_clock.now_ns()
     clock = SkewedClock(5_000_000_000, 40.0, true_clock)
-    source = SyntheticTracker("tracker", tracker, epoch_ns, clock, threading.Event())
+    source = SyntheticSensor(poses_of("tracker", tracker), TRACKER_HZ, epoch_ns, clock, threading.Event())
     poses = [one for one in (source.read() for _ in range(12)) if one is not None]
     source.close()
     assert source.read() is None
