@@ -20,10 +20,11 @@ from common.strobe_calibration import StrobeCalibration
 from slave.cameras.grey import Pixels
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
+from slave.cameras.reconnecting import ReconnectingCamera
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options, device_path
 from slave.drivers import IMUS, LIGHTS, REAL_IMUS, REAL_TRACKERS, SWITCHED_LIGHTS, TRACKERS
 from slave.lights.interlock import Interlock
-from slave.reconnect import ReconnectingCamera, ReconnectingDriver, ReconnectingTracker
+from slave.reconnect import ReconnectingDriver, ReconnectingTracker
 from slave.service import LOST_PATIENCE_S, ConnectionLost, nobody
 from slave.sources import FrameSource, ImuSource, TrackerSource
 

@@ -9,8 +9,6 @@ from slave.markers.colour_monitor import ColourWarning
 from slave.markers.reloadable import ReloadableDetector
 from slave.sources import Frame, Reporting
 
-LOG_EVERY_NS = 10_000_000_000  # the same subject is logged no more often
-NAME = 64  # characters of a name in `Health`
 ALL = "light"  # the subject of what concerns every marker
 _LOG = logging.getLogger(__name__)
 
@@ -49,7 +47,7 @@ class LightReport:
         for warning in warnings:
             subject = ALL if warning.marker is None else warning.marker
             last_ns = self._logged_ns.get(subject)
-            if last_ns is None or frame.t_ns - last_ns >= LOG_EVERY_NS:
+            if last_ns is None or frame.t_ns - last_ns >= 10_000_000_000:  # the same one no more often
                 self._logged_ns[subject] = frame.t_ns
                 _LOG.warning("%s: %s", self._name, warning.text)
 
@@ -73,8 +71,7 @@ class LightReport:
 
 
 def _ambiguous(warnings: list[ColourWarning]) -> dict[str, float]:
+    # A name in `Health` has 64 characters
     return {
-        f"twins.{one.marker}..{one.ambiguous}"[:NAME]: one.hues
-        for one in warnings
-        if one.ambiguous is not None
+        f"twins.{one.marker}..{one.ambiguous}"[:64]: one.hues for one in warnings if one.ambiguous is not None
     }

@@ -17,14 +17,12 @@ from typing import Generic, TypeVar
 import numpy as np
 from msgspec.structs import replace
 
-from common.calibration import CameraCalibration
 from common.clock import Clock
-from common.errors import CameraError, TrackerChoiceError
+from common.errors import TrackerChoiceError
 from common.messages import ImuSample, TrackerPose
-from slave.cameras.repeated import RepeatedPictures
 from slave.failures import Failures
 from slave.service import ConnectionLost, nobody
-from slave.sources import Frame, FrameSource, Reporting, Source, Tunable
+from slave.sources import Frame, Reporting, Source
 
 ItemT = TypeVar("ItemT", Frame, ImuSample, TrackerPose)
 
@@ -212,93 +210,6 @@ class ReconnectingDriver(Generic[ItemT]):
         seq = item.seq + self._offset
         self._last = (seq, item.t_ns)
         return item if self._offset == 0 else replace(item, seq=seq)
-
-
-class ReconnectingCamera(ReconnectingDriver[Frame]):
-    """A camera that is opened again with the settings it was given last.
-
-    A camera that repeats one picture with new stamps measures nothing: the copies are left out, and after a second of
-    them it is opened again as one that is lost. Holds its settings, its pictures, and since when it repeats one.
-    """
-
-    def __init__(
-        self,
-        opener: Callable[[CameraCalibration], FrameSource],
-        camera: CameraCalibration,
-        clock: Clock,
-        stop: threading.Event,
-        connection_lost: ConnectionLost = nobody,
-        *,
-        backoff: Backoff | None = None,
-        frozen_s: float = 1.0,
-    ) -> None:
-        """Open the camera; see `ReconnectingDriver`.
-
-        Args:
-            opener: Opens the camera with these settings.
-            camera: Its settings at first. Its rate counts the frames of an absence.
-            clock, stop, connection_lost, backoff: As there.
-            frozen_s: One that repeats a picture for so long is lost [s].
-
-        Raises:
-            CameraError: The camera is not there or refused a setting.
-        """
-        self._camera = camera
-        super().__init__(
-            "camera",
-            lambda: opener(self._camera),
-            clock,
-            stop,
-            connection_lost,
-            rate_hz=camera.frame_rate_hz,
-            backoff=backoff,
-            prefix="camera.",
-        )
-        self._pictures = RepeatedPictures()
-        self._frozen_s = frozen_s
-        self._frozen_ns: int | None = None  # since when it repeats one
-        self._counts["frozen"] = 0  # frames that were copies of the one before
-
-    def tune(self, camera: CameraCalibration) -> None:
-        """Change the settings of the open camera, and of every one that is opened from now on.
-
-        Raises:
-            CameraError: It is away, or did not take them.
-        """
-        source = self._source
-        if not isinstance(source, Tunable):
-            raise CameraError(f"camera {camera.name!r} is away: its settings can be changed when it is back")
-        try:
-            source.tune(camera)
-        except CameraError:
-            raise
-        except Exception as error:
-            why = self._failures.log("its settings cannot be changed", error)
-            raise CameraError(f"camera {camera.name!r}: its settings cannot be changed: {why}") from error
-        self._camera, self._rate_hz = camera, camera.frame_rate_hz
-
-    def _is_measured(self, item: Frame) -> bool:
-        """Whether a frame has another picture than the one before.
-
-        Raises:
-            CameraError: All have had the same one for too long.
-        """
-        if not self._pictures.push(item.image):
-            self._frozen_ns = None
-            return True
-        self._counts["frozen"] += 1
-        now_ns = self._clock.now_ns()
-        if self._frozen_ns is None:
-            self._frozen_ns = now_ns
-        if now_ns - self._frozen_ns >= self._frozen_s * 1e9:
-            raise CameraError(
-                "it has repeated one picture, with new stamps, for a second: it is opened again"
-            )
-        return False
-
-    def _drop(self) -> None:
-        self._frozen_ns = None
-        super()._drop()
 
 
 class ReconnectingTracker(ReconnectingDriver[TrackerPose]):

@@ -20,7 +20,6 @@ from common.json_file import decode_json
 from slave.cameras.synthetic import SyntheticCamera
 from slave.sources import Frame
 
-POLL_NS = 100_000_000
 _LOG = logging.getLogger(__name__)
 Byte = Annotated[int, Meta(ge=0, le=255)]
 
@@ -108,7 +107,7 @@ class FaultyCamera:
             RuntimeError: Its driver is to raise something that no driver of ours raises.
         """
         while (frame := self._source.read()) is not None:
-            if frame.ready_t_ns - self._looked_ns >= POLL_NS:
+            if frame.ready_t_ns - self._looked_ns >= 100_000_000:  # the file is looked at ten times a second
                 self._looked_ns = frame.ready_t_ns
                 try:
                     self._look()

@@ -43,9 +43,6 @@ BUFFERS = 6  # picamera2's own number for video: the pipeline never starves whil
 TIMEOUT_S = 2.0  # libcamera itself gives a silent sensor up after 1 s
 SETTLE_FRAMES = 60  # sensors apply exposure and gain 2-3 frames late, the pipeline adds its own depth: ample
 GOOD_FRAMES = 3
-INSIST_FRAMES = 20  # ample for one writing to show
-SYNC_MARGIN = 1.05  # a client catches up by shorter frames, so the mode must be faster than the rig
-GIVE_BACK_S = 5.0
 _LOG = logging.getLogger(__name__)
 
 
@@ -147,7 +144,7 @@ class Picamera2Camera:
         # In a thread, because a camera whose cable is loose can block `close` for ever (picamera2 issue 1264).
         thread = threading.Thread(target=give_back, name="camera close", daemon=True)
         thread.start()
-        thread.join(GIVE_BACK_S)
+        thread.join(5.0)  # seconds: ample for a camera that lets itself be closed
         if thread.is_alive():
             raise CameraError(f"{self._where}: libcamera does not let it go; restart the slave")
         if failure:
@@ -197,7 +194,7 @@ class Picamera2Camera:
         takes the controls, then makes an empty set of them).
         """
         for count, metadata in enumerate(self._metadata.following(SETTLE_FRAMES, TIMEOUT_S)):
-            if count % INSIST_FRAMES == 0:
+            if count % 20 == 0:  # frames: ample for one writing to show
                 try:
                     self._library.set_controls(live)
                 except RuntimeError as error:
@@ -207,7 +204,8 @@ class Picamera2Camera:
     def _start(self) -> None:
         camera, library = self._calibration, self._library
         size = (camera.width_px, camera.height_px)
-        need_hz = camera.frame_rate_hz * (1.0 if self._options.sync == "off" else SYNC_MARGIN)
+        # A client catches up by shorter frames, so the mode must be faster than the rig
+        need_hz = camera.frame_rate_hz * (1.0 if self._options.sync == "off" else 1.05)
         try:
             modes = read_modes(library.sensor_modes)
             choose = choose_raw_mode if self._options.pixels is Pixels.GREY else choose_mode

@@ -35,7 +35,7 @@ from math import hypot
 
 from common.clock import Clock
 from common.errors import CameraError
-from slave.cameras.stamps import ForeignClock, clock_of, system_clock
+from slave.clocks import ForeignClock, clock_of, system_clock
 
 SIGMA_NS: Mapping[str, float] = {"SensorTimestamp": 50e3, "FrameWallClock": 1e6}  # standard deviations
 MICROSECONDS_BELOW = 10**17  # wall clock: such a number of ns would be 1973, so it is in us
@@ -103,8 +103,6 @@ SILENT_FRAMES = (
     10 * PERIOD_FRAMES
 )  # some are lost on a wireless network; crystals drift 0.25 ms in 300 frames
 MOST_OFF_US = 1000.0  # further off in one correction, and it had not been in step
-LEAST_US = 50.0  # what libcamera corrects
-LOG_FRAMES = 120
 _LOG = logging.getLogger(__name__)
 
 
@@ -167,7 +165,7 @@ class SyncMonitor:
         if duration == last:
             typical = float(duration)
         off_us = typical - duration if typical else 0.0
-        if abs(off_us) >= LEAST_US:
+        if abs(off_us) >= 50.0:  # us: less libcamera does not correct
             self.error_us, self._since_error = off_us, 0
         self._durations = (float(duration), typical)
 
@@ -221,6 +219,6 @@ def wait_in_step(
                 "Exactly one camera of the rig is the server, all have the same frame_rate_hz, clients start "
                 "first, and UDP multicast 239.255.255.250:10000 must pass between the machines"
             )
-        if count % LOG_FRAMES == 0:
+        if count % 120 == 0:  # frames, two seconds at 60 Hz
             _LOG.info("%s: --sync %s: waiting for %s, timer %s us", where, role, other, timer)
         count += 1

@@ -35,9 +35,6 @@ from slave.lights.schedule import CYCLE as STROBE
 from slave.lights.simulated import SimulatedStrobe
 from slave.sources import Frame
 
-WHOLE = 0.999  # of an exposure; what lit that much lit all of it
-STEP_S = 0.05  # longest sleep at a time, so that a signal ends a wait soon
-
 
 @dataclass(frozen=True, slots=True)
 class _Pace:
@@ -114,7 +111,8 @@ class SyntheticCamera:
         self._next = seq + 1
         due = self._true_ns(t_ns + self._readout_ns)
         while (left_s := (due - self._true.now_ns()) * 1e-9) > 0.0:
-            self._sleep(min(left_s, STEP_S))
+            # 0.05 s at most at a time, so that a signal ends a wait soon
+            self._sleep(min(left_s, 0.05))
         return Frame(seq, t_ns, self._clock.now_ns(), image, lit, exposure_us=self._camera.exposure_us)
 
     def close(self) -> None:
@@ -171,7 +169,8 @@ class SyntheticCamera:
         half_ns = round(self._camera.exposure_us * 500.0)
         lit = lights.during(t_ns - half_ns, t_ns + half_ns)
         shares = {Illumination.LASER: lit.laser, Illumination.LED: lit.led}
-        if all(share <= 0.0 or share >= WHOLE for share in shares.values()) and lit.laser * lit.led == 0.0:
+        # What lit 0.999 of an exposure lit all of it
+        if all(share <= 0.0 or share >= 0.999 for share in shares.values()) and lit.laser * lit.led == 0.0:
             return renderer.render(t_s, lit.mostly), lit.mostly
         ambient = renderer.render(t_s, Illumination.AMBIENT).astype(np.float32)
         image = ambient.copy()

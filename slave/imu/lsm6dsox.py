@@ -21,8 +21,8 @@ from smbus2 import SMBus, i2c_msg
 from common.clock import Clock
 from common.errors import ImuError
 from common.messages import ImuSample
+from slave.clocks import ClockSteppedError, DeviceClock
 from slave.imu import lsm6dsox_fifo as chip
-from slave.imu.device_clock import ClockSteppedError, DeviceClock
 from slave.imu.lsm6dsox_fifo import Rate, Register
 
 ADDRESS = 0x6A  # its pin SA0 to ground; 0x6B: to the supply

@@ -32,7 +32,7 @@ from serial.tools import list_ports
 from common.clock import Clock
 from common.errors import ImuError
 from common.messages import ImuSample
-from slave.imu.device_clock import ClockSteppedError, DeviceClock
+from slave.clocks import ClockSteppedError, DeviceClock
 from slave.imu.ximu3_protocol import Answer, Data, Decoder, Fault, Kind, encode, plain
 
 SAMPLE_RATE_HZ = 400.0  # of the inertial sensor, whatever of it is sent

@@ -16,8 +16,6 @@ from slave.lights.interlock import Interlock
 from slave.lights.schedule import Pulse, StrobeSchedule
 
 FAILED_NS = 500_000_000  # after a driver has failed, no light for so long; then it is tried again
-IDLE_S = 0.5  # without frames
-LOG_EVERY_NS = 10_000_000_000
 EVENTS = ("skipped", "late")
 _LOG = logging.getLogger(__name__)
 
@@ -97,7 +95,7 @@ class Strober:
         self._number = -1
 
     def _log_fault(self, now_ns: int, error: LightsError) -> None:
-        if self._logged_ns is None or now_ns - self._logged_ns >= LOG_EVERY_NS:
+        if self._logged_ns is None or now_ns - self._logged_ns >= 10_000_000_000:  # one line in ten seconds
             self._logged_ns = now_ns
             _LOG.warning("lights: %s", error)
 
@@ -189,7 +187,7 @@ class StrobeController(Strobe):
                 while not self._closed:
                     again_ns = self._strober.step()
                     if again_ns is None:
-                        self._news.wait(IDLE_S)
+                        self._news.wait(0.5)  # there are no frames
                     elif (left_s := (again_ns - self._clock.now_ns()) * 1e-9) > 0.0:
                         self._news.wait(left_s)
             finally:

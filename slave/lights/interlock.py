@@ -20,7 +20,6 @@ from common.frame_recording import Illumination
 from common.strobe_calibration import StrobeCalibration
 
 WINDOW_NS = 1_000_000_000  # over which the duty is reckoned; any second, not every second
-RETRY_S = 0.01  # between attempts to darken a driver that fails
 EVENTS = ("pulses", "refused", "off_by_watchdog", "failed")
 _SHINING = (Illumination.LASER, Illumination.LED)
 _LOG = logging.getLogger(__name__)
@@ -142,7 +141,7 @@ class Interlock:
             except LightsError as error:
                 if not was_failing:
                     _LOG.error("laser or LEDs cannot be switched off: %s", error)
-                return RETRY_S
+                return 0.01  # seconds between attempts to darken a driver that fails
             return None
 
     def close(self) -> None:

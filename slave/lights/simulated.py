@@ -19,8 +19,6 @@ from slave.lights.controller import Strobe
 from slave.lights.interlock import Interlock
 from slave.lights.schedule import StrobeSchedule
 
-KEPT = 512  # switchings; four per cycle of the strobe, so some seconds
-
 
 @dataclass(frozen=True, slots=True)
 class Lit:
@@ -43,7 +41,8 @@ class Timeline:
     def __init__(self) -> None:
         """Begin dark."""
         self._lock = threading.Lock()
-        self._switched: deque[tuple[int, Illumination]] = deque(maxlen=KEPT)
+        # Four switchings per cycle of the strobe, so some seconds
+        self._switched: deque[tuple[int, Illumination]] = deque(maxlen=512)
 
     def add(self, t_ns: int, lit: Illumination) -> None:
         """From `t_ns` on this is on; times rise."""

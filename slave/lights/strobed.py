@@ -6,7 +6,7 @@ from common.calibration import CameraCalibration, RigCalibration
 from common.errors import CalibrationError, CameraError
 from common.strobe_calibration import StrobeCalibration
 from slave.lights.controller import Strobe
-from slave.lights.schedule import CYCLE, INTERLOCK_NS, StrobeSchedule
+from slave.lights.schedule import CYCLE, MARGIN_NS, StrobeSchedule
 from slave.sources import Frame, FrameSource, Tunable
 
 
@@ -101,7 +101,7 @@ def check_pulses(rig: RigCalibration, camera: CameraCalibration) -> StrobeCalibr
         )
     strobe, where = rig.strobe, f"camera {camera.name!r}: exposure_us {camera.exposure_us:g}"
     period_us = 1e6 / camera.frame_rate_hz
-    pulse_us = strobe.lead_us + _exposed_us(camera) + INTERLOCK_NS * 1e-3
+    pulse_us = strobe.lead_us + _exposed_us(camera) + MARGIN_NS * 1e-3
     if pulse_us > period_us:
         raise CalibrationError(
             f"{where} and row_time_us {camera.row_time_us:g} ({_rows_us(camera):.0f} us for all rows): with"

@@ -32,11 +32,9 @@ import numpy as np
 
 from common.errors import TrackerChoiceError
 from common.messages import TrackerPose
-from slave.imu.device_clock import ClockSteppedError, DeviceClock
+from slave.clocks import ClockSteppedError, DeviceClock
 
 LONGEST = 1 << 17  # bytes; the longest lines are CONFIG, some 10 kB
-UNIT_WITHIN = 1e-3  # six decimals are within 3e-6; a component that lost its last digits is not
-FARTHEST_M = 100.0  # no base station reaches so far
 _SERIAL = re.compile(rb'"device_serial_number"\s*:\s*"([^"]{1,64})"')
 _DEVICE = re.compile(rb"[A-Za-z0-9_.-]{1,32}")
 _SIZE = 7  # numbers of a pose
@@ -130,9 +128,10 @@ def _pose(device: str, stamp: bytes, rest: bytes) -> Pose | Fault:
     x, y, z, *quaternion = values
     place, (qw, qx, qy, qz) = (x, y, z), quaternion
     length = math.hypot(*quaternion)
-    if abs(length - 1.0) > UNIT_WITHIN:
+    # Six decimals are within 3e-6 of length 1; a component that lost its last digits is not within 1e-3
+    if abs(length - 1.0) > 1e-3:
         return Fault.QUATERNION
-    if math.hypot(*place) > FARTHEST_M:
+    if math.hypot(*place) > 100.0:  # m: no base station reaches so far
         return Fault.PLACE
     return Pose(device, t_s, place, (qw / length, qx / length, qy / length, qz / length))
 

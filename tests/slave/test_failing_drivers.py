@@ -18,13 +18,13 @@ from slave import failures
 from slave.cameras.grey import Pixels
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
-from slave.cameras.repeated import CONTRAST, RepeatedPictures
+from slave.cameras.reconnecting import CONTRAST, ReconnectingCamera, RepeatedPictures
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
 from slave.counters import DetectionCounters
 from slave.failures import LOG_EVERY_NS, Failures
 from slave.markers.detector import Detections
 from slave.markers.null_detector import NullDetector
-from slave.reconnect import Backoff, ReconnectingCamera
+from slave.reconnect import Backoff
 from slave.sender import MarkerPipeline, WristPipeline, run
 from slave.sources import Frame, FrameSource
 from slave.wrist.null_detector import NullWristDetector

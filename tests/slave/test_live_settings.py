@@ -15,9 +15,10 @@ from common.errors import CameraError
 from slave.cameras import picamera2, v4l2_settings
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
+from slave.cameras.reconnecting import ReconnectingCamera
 from slave.cameras.settings import FrameObserver
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
-from slave.reconnect import Backoff, ReconnectingCamera
+from slave.reconnect import Backoff
 from slave.sources import FrameSource
 from tests.network_helpers import until
 from tests.slave.fake_picamera2 import Sensor, install

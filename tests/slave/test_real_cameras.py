@@ -12,9 +12,10 @@ from common.clock import SystemClock
 from common.errors import CameraError
 from slave import devices
 from slave.cameras.grey import Pixels
+from slave.cameras.reconnecting import ReconnectingCamera
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
 from slave.commands.device_options import add_camera_options
-from slave.reconnect import Backoff, ReconnectingCamera
+from slave.reconnect import Backoff
 from slave.sources import FrameSource
 from tests.slave.fake_picamera2 import Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice

@@ -13,8 +13,9 @@ from common.calibration import CameraCalibration
 from common.errors import CameraError, ImuError, PhalanxError, TrackerChoiceError, TrackerError
 from common.messages import ImuSample, TrackerPose
 from slave import failures
+from slave.cameras.reconnecting import ReconnectingCamera
 from slave.failures import LOG_EVERY_NS
-from slave.reconnect import Backoff, ReconnectingCamera, ReconnectingDriver, ReconnectingTracker
+from slave.reconnect import Backoff, ReconnectingDriver, ReconnectingTracker
 from slave.sources import Frame
 
 CALIBRATION = CameraCalibration(
