@@ -1,4 +1,4 @@
-"""Time stamps of devices, brought to the slave's clock: by reading both clocks, or from arrivals alone.
+"""Bring time stamps of devices to the slave's clock.
 
 A driver of a camera stamps its frames on a clock of its own choice: monotonic, since boot, or the wall clock. Two
 clocks are compared by reading the slave's clock, then the other one, then the slave's again (`ForeignClock`): the other
@@ -57,7 +57,7 @@ class ForeignClock:
 
     @property
     def sigma_ns(self) -> float:
-        """Standard deviation of the last conversion [ns]: anywhere in its sandwich is as likely."""
+        """Standard deviation of the last conversion [ns], uniform in its sandwich."""
         return self._width_ns / sqrt(12.0)
 
     def to_own(self, stamp_ns: int) -> int:
@@ -74,7 +74,7 @@ class ForeignClock:
         return t_ns
 
     def _pair(self) -> tuple[int, int]:
-        """Time on the slave's clock, and foreign minus own [ns], from the narrowest sandwich."""
+        """Own time, and foreign minus own [ns], from the narrowest sandwich."""
         best: tuple[int, int, int] | None = None
         for _ in range(TRIES):
             first_ns = self._own.now_ns()
@@ -97,7 +97,7 @@ def system_clock(name: str) -> Callable[[], int]:
 
 
 def clock_of(stamp_ns: int) -> str | None:
-    """Name of the clock that a stamp taken a moment ago is on, or None if no clock fits.
+    """Name of the clock that a stamp taken just now is on; None: no clock fits.
 
     On a machine that never slept, monotonic and boot are the same and the first one is named. After a sleep of
     more than the age of a frame only one of them makes the frame neither old nor from the future.
@@ -118,7 +118,10 @@ class ClockSteppedError(Exception):
 
 
 class DeviceClock:
-    """Push machine. Holds the least lag of each half second of the last minute, and the line below them."""
+    """Push machine that fits offset and rate of a sensor's clock.
+
+    Holds the least lag of each half second of the last minute, and the line below them.
+    """
 
     def __init__(self, rate_error: float, least_delay_ns: int = 0) -> None:
         """Begin without any stamp.
@@ -137,7 +140,9 @@ class DeviceClock:
         self._suspects = 0
 
     def observe(self, stamp_ns: int, arrival_ns: int) -> bool:
-        """Learn from one stamp; of stamps that came together, all before the first is turned into a time.
+        """Learn from one stamp.
+
+        Of stamps that came together all are learned from before the first becomes a time.
 
         Args:
             stamp_ns: What the sensor said, later than the last time [ns].
@@ -177,7 +182,7 @@ class DeviceClock:
         return self._foot[1] + self._slope * (stamp_ns - self._foot[0])
 
     def _fit(self) -> None:
-        """The edge of the lower hull over the mean stamp; no steeper than two clocks can differ."""
+        """Fit the edge of the lower hull, no steeper than two clocks can differ."""
         origin_ns, origin_lag = self._least[0]
         x = np.array([stamp - origin_ns for stamp, _ in self._least], float)
         y = np.array([lag - origin_lag for _, lag in self._least], float)

@@ -1,4 +1,7 @@
-"""Count what a sender does, for `Health`: items, gaps, failures, what was detected, and what its device reports."""
+"""Count what a sender does, for `Health`.
+
+Items, gaps, failures, what was detected, and what its device reports.
+"""
 
 import threading
 import time
@@ -47,7 +50,10 @@ class Counters:
         self.found = False
 
     def item(self, seq: int, found: bool = True) -> None:
-        """Count one item, and what its number leaves out; `found`: whether there is anything in it."""
+        """Count one item, and what its number leaves out.
+
+        `found`: whether there is anything in it.
+        """
         with self._lock:
             if self._last_seq is not None and seq > self._last_seq + 1:
                 self._missing += seq - self._last_seq - 1
@@ -76,7 +82,7 @@ class Counters:
         return f"{self._count} {self._items}{empty}"
 
     def counts(self) -> dict[str, int]:
-        """Event -> how often since the start: items, gaps, failed, empty ones, and the others."""
+        """Event -> how often: items, gaps, failed, empty ones, and the others."""
         with self._lock:
             counts = {self._items: self._count, self._gaps: self._missing, "failed": self._failed}
             if self._empty:
@@ -114,14 +120,16 @@ class DetectionCounters(Counters):
         counts: Callable[[], Mapping[str, int]] = dict[str, int],
         metrics: Callable[[], Mapping[str, float]] = dict[str, float],
     ) -> None:
-        """Count for the markers `names`, or whatever else is detected; the rest as of `Counters`."""
+        """Count for the markers `names`, or other things; the rest as `Counters`."""
         super().__init__(counts=counts, metrics=metrics)
         self._names, self._seen = names, np.zeros(len(names), np.int64)
         self._searched = self._empty_frames = 0
         self._detect_us = self._worst_us = 0.0
 
     def frame(self, seq: int, detect_ns: int, uv: Float) -> None:
-        """Count one frame in which was searched; one that is a part of a strobe cycle is counted by `item`.
+        """Count one frame in which was searched.
+
+        One that is a part of a strobe cycle is counted by `item`.
 
         Args:
             seq: Camera's frame counter.
@@ -151,7 +159,7 @@ class DetectionCounters(Counters):
 
 
 def imu_counters(source: object, orientation: OrientationFilter | None = None) -> Counters:
-    """Counters of samples, with what the IMU and the filter of its orientation report."""
+    """Counters of samples, with what the IMU and its orientation filter report."""
 
     def counts() -> dict[str, int]:
         own = dict(source.counts()) if isinstance(source, Reporting) else {}
@@ -170,7 +178,10 @@ def imu_counters(source: object, orientation: OrientationFilter | None = None) -
 
 
 def pose_counters(source: object) -> Counters:
-    """Counters of poses, those of NaN as `nowhere`, with what the tracker reports, and `tracked` (1: yes)."""
+    """Counters of poses, those of NaN as `nowhere`.
+
+    With what the tracker reports, and `tracked` (1: yes).
+    """
 
     def metrics() -> dict[str, float]:
         own = dict(source.metrics()) if isinstance(source, Reporting) else {}

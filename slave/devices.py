@@ -1,4 +1,4 @@
-"""Open the device that an option names: a camera, an IMU, a tracker, or the lights of a wrist device.
+"""Open the device that an option names: camera, IMU, tracker or lights.
 
 None is chosen silently: a name that is not in `slave.drivers`, or a place that is not of its form, is an error that
 lists what there is. A driver is imported where it is opened, so other commands start without its library. What
@@ -123,7 +123,9 @@ def reconnecting_camera(
     stop: threading.Event | None,
     connection_lost: ConnectionLost,
 ) -> FrameSource:
-    """Open a camera that is opened again whenever it is lost, until `stop` is set; None: losing it is an error.
+    """Open a camera that is opened again whenever it is lost.
+
+    That lasts until `stop` is set; None: losing it is an error.
 
     Raises:
         CameraError: It cannot be opened the first time.
@@ -141,7 +143,9 @@ def open_imu(
     stop: threading.Event,
     connection_lost: ConnectionLost = nobody,
 ) -> ImuSource:
-    """Open the IMU that `--imu` names; until `stop` is set, it is opened again when it was lost.
+    """Open the IMU that `--imu` names.
+
+    Until `stop` is set, it is opened again when it was lost.
 
     Args:
         name: The rig's IMU.
@@ -174,7 +178,7 @@ def open_imu(
 
 
 def imu_places() -> str:
-    """Where an IMU may be: the serial ports and I2C buses of this machine, as text for people."""
+    """Where an IMU may be: serial ports and I2C buses, as text for people."""
     from slave.imu import lsm6dsox, ximu3
 
     ports = [f"  ximu3:{line}" for line in ximu3.ports()] or ["  none"]
@@ -205,7 +209,9 @@ def open_tracker(
     stop: threading.Event,
     connection_lost: ConnectionLost = nobody,
 ) -> TrackerSource:
-    """Open the tracker that `--device` names; one that is no recording is opened again when it was lost.
+    """Open the tracker that `--device` names.
+
+    One that is no recording is opened again when it was lost.
 
     Args:
         name: Of the device in our messages.

@@ -1,4 +1,4 @@
-"""Send what a camera shows: detector, settings, previews and reports around one camera."""
+"""Send what a camera shows: detector, settings and previews around it."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -52,7 +52,7 @@ def send_camera(
     engine: Engine | WristEngine,
     raw_frames: RawSettings | None = None,
 ) -> None:
-    """Detect in the frames of a camera and send, until the slave is told to stop or the source ends.
+    """Detect in the frames of a camera and send, until told to stop.
 
     Args:
         sender: The process; its name is that of the camera.
@@ -207,7 +207,7 @@ def _uncalibrated(missing: Sequence[str]) -> dict[str, int]:
 def _maker(
     files: CameraFiles, colours: Colours, engine: Engine, workers: ThreadPoolExecutor
 ) -> Callable[[CameraCalibration, RigCalibration], AnyDetector]:
-    """What makes a detector for given content of the files, now and whenever it changes."""
+    """What makes a detector for the content of files, now and when it changes."""
 
     def make(camera: CameraCalibration, rig: RigCalibration) -> AnyDetector:
         if missing := [name for name in rig.markers if name not in (camera.markers or {})]:

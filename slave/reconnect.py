@@ -1,4 +1,4 @@
-"""Reconnect a device that was unplugged, without restarting the slave: one driver around those of all devices.
+"""Reconnect a device that was unplugged, without restarting the slave.
 
 An error at the first opening is an error. Later, losing the device is an event: its driver is closed, and opened again
 after 0.2 s, 0.4 s ... until the device is there or the slave ends. Every opening asks who is there and writes all
@@ -89,7 +89,9 @@ class ReconnectingDriver(Generic[ItemT]):
         self._failures = Failures(device, clock.now_ns)
 
     def read(self) -> ItemT | None:
-        """Next item; waits for a lost device. None at the end of the stream, when stopped, or once closed.
+        """Next item; waits for a lost device.
+
+        None at the end of the stream, when stopped, or once closed.
 
         Raises:
             TrackerChoiceError: As the driver.
@@ -120,7 +122,10 @@ class ReconnectingDriver(Generic[ItemT]):
         return None
 
     def close(self) -> None:
-        """Give the device back. Safe to call twice, and from another thread that ends a wait."""
+        """Give the device back.
+
+        Safe to call twice, and from another thread that ends a wait.
+        """
         self._closed.set()
         self._drop()
 
@@ -137,14 +142,14 @@ class ReconnectingDriver(Generic[ItemT]):
         return dict(counts)
 
     def metrics(self) -> dict[str, float]:
-        """`away_s`, for how long it has been lost, 0: it is there; and those of the open driver."""
+        """`away_s`, how long it has been lost, 0: it is there; those of the driver."""
         source, away_ns = self._source, self._away_ns
         away_s = 0.0 if away_ns is None else (self._clock.now_ns() - away_ns) * 1e-9
         own = {f"{self._prefix}away_s": away_s}
         return own | (self._failures.ask(source.metrics) if isinstance(source, Reporting) else {})
 
     def _wait(self) -> ItemT | None:
-        """Wait until the next try; return what stands for an item meanwhile, if anything does."""
+        """Wait until the next try; return a stand-in for an item, if there is one."""
         self._stop.wait(self._left_s)
         self._left_s = 0.0
         return None
@@ -181,7 +186,7 @@ class ReconnectingDriver(Generic[ItemT]):
         return self._failures.ask(source.counts) if isinstance(source, Reporting) else {}
 
     def _reconnected(self) -> Source[ItemT] | None:
-        """The driver, opened again where a try is due; None: not yet, or the device is not there."""
+        """The driver, opened again if a try is due; None: not yet, or not there."""
         if self._left_s > 0.0:
             return None
         self._connection_lost(f"{self._device} away: {self._why}")
@@ -213,7 +218,10 @@ class ReconnectingDriver(Generic[ItemT]):
 
 
 class ReconnectingTracker(ReconnectingDriver[TrackerPose]):
-    """A tracker in place of which poses of NaN come, four a second, while its system is away. Holds its name."""
+    """Gives poses of NaN, four a second, while the tracker's system is away.
+
+    Holds its name.
+    """
 
     def __init__(
         self,

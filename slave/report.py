@@ -1,4 +1,4 @@
-"""Report how the slave is: `Health` twice a second and on command, on a thread of its own.
+"""Report how the slave is: `Health` twice a second, and on command.
 
 The sender loop never waits for the bus: this thread opens it when the uplink has learned where the master's
 bus is, opens it anew when another master takes over, and lives on without it when there is none.
@@ -77,7 +77,7 @@ class Reporter:
         self._thread.start()
 
     def health(self, now: Mapping[str, float] | None = None) -> Health:
-        """The report of this moment, with the metrics of the last period, or `now` in their place."""
+        """The report of this moment, with the metrics of the last period, or `now`."""
         counts = {**self._counters.counts(), **self._uplink.counts}
         for part in self._parts:
             counts |= part.counts()
@@ -159,12 +159,12 @@ class Reporter:
 
 
 def _short(value: float) -> str:
-    """Three digits at least, and no exponent for microseconds: a gain of 0.83 is not 1."""
+    """Three digits at least, and no exponent: a gain of 0.83 is not 1."""
     return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
 
 
 def _why_alone(counts: Mapping[str, int]) -> str:
-    """What to look at when no master has answered, from the reasons of what was refused."""
+    """What to look at when no master has answered, by what was refused."""
     if counts.get("refused.foreign", 0):
         return "a master is heard, but of another rig key (or another program): compare the key files of both sides"
     if counts.get("refused.version", 0):

@@ -1,4 +1,4 @@
-"""Send what a device measures: one loop for cameras, IMUs and trackers, and what stands around it.
+"""Send what a device measures: one loop for cameras, IMUs and trackers.
 
     Source ── item ──▶ pipeline: detect or orient, send, count ──▶ uplink
 
@@ -48,10 +48,13 @@ def nothing(*_arguments: object) -> None:
 
 
 class Pipeline(Generic[ItemT]):
-    """What is done with every item of a device: detect or orient, send, count. Holds its counters."""
+    """What is done with an item: detect or orient, send, count.
+
+    Holds its counters.
+    """
 
     def __init__(self, session: int, send: Send, counters: Counters) -> None:
-        """Send in the name of this process, whose random id is `session`; `send` never waits."""
+        """Send in the name of the process with id `session`; `send` never waits."""
         self._session, self._send, self.counters = session, send, counters
 
     def push(self, item: ItemT) -> None:
@@ -63,7 +66,10 @@ class Pipeline(Generic[ItemT]):
 
 
 class MarkerPipeline(Pipeline[Frame]):
-    """Detects the markers of a frame and sends them, then its tags. A frame without any marker is sent as well."""
+    """Detects the markers of a frame and sends them, then its tags.
+
+    A frame without any marker is sent as well.
+    """
 
     def __init__(
         self,
@@ -118,7 +124,9 @@ class MarkerPipeline(Pipeline[Frame]):
 
 
 class WristPipeline(Pipeline[Frame]):
-    """Detects fingers where a frame completes a strobe cycle, and sends them, also where there are none.
+    """Detects fingers where a frame completes a strobe cycle, and sends them.
+
+    A cycle without any finger is sent as well.
 
     Holds how long the last frames took, and how many there were since the last cycle.
     """
@@ -162,7 +170,10 @@ class WristPipeline(Pipeline[Frame]):
 
 
 class ImuPipeline(Pipeline[ImuSample]):
-    """Sends samples with the orientation of a filter, or else the sensor's own; rates and forces as measured."""
+    """Sends samples with the orientation of a filter, or the sensor's own.
+
+    Rates and forces stay as they were measured.
+    """
 
     def __init__(
         self,
@@ -202,7 +213,9 @@ def wait_for_start(
     alive: Callable[[], None] = nothing,
     skip: Callable[[], bool] | None = None,
 ) -> bool:
-    """Wait for the master as long as it takes; False if told to stop before, or the source has ended.
+    """Wait for the master as long as it takes.
+
+    False if told to stop before, or the source has ended.
 
     Args:
         started: Waits for the start at most so many seconds; whether it has come.
@@ -242,7 +255,9 @@ def run(
     stop: threading.Event,
     alive: Callable[[], None] = nothing,
 ) -> None:
-    """Push every item until the source ends or `stop` is set; `alive` is called after each.
+    """Push every item until the source ends or `stop` is set.
+
+    `alive` is called after each.
 
     What the pipeline raises costs that item alone; it is counted and logged.
 
@@ -259,7 +274,7 @@ def run(
 
 @dataclass(frozen=True, slots=True)
 class Sender:
-    """One sending process: its name, its link to the master, and who stops and supervises it.
+    """One sending process: its name, its link, and who stops and supervises it.
 
     Attributes:
         name: Camera, IMU or tracker, as the rig's files call it.
@@ -290,7 +305,9 @@ class Sender:
         parts: "Sequence[CameraTuning | RawFrames]" = (),
         close: Sequence[Callable[[], None]] = (),
     ) -> None:
-        """Wait for the master, then push items until `stop` is set or the source ends; closes source and uplink.
+        """Wait for the master, then push items; close source and uplink.
+
+        It ends when `stop` is set or the source ends.
 
         Args:
             source: The open device.
@@ -336,7 +353,7 @@ class Sender:
 
 
 def send_imu(sender: Sender, source: ImuSource, orientation: OrientationFilter | None) -> None:
-    """Send what an IMU measures, with the orientation of a filter; None: with its own.
+    """Send what an IMU measures, with a filter's orientation; None: its own.
 
     Raises:
         ImuError: The IMU is gone.

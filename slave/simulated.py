@@ -1,4 +1,4 @@
-"""What simulated sensors beside this slave measure: the scene before its camera, the IMU on the hand, the tracker.
+"""Simulate sensors: the scene of a camera, the IMU on a hand, a tracker.
 
 A simulated IMU or tracker is the first-class stand-in for hardware. It measures item k when its own oscillator, which
 is the slave's (perhaps skewed) clock, says `epoch + k periods`, and hands it over then. A process too slow for its rate
@@ -33,7 +33,10 @@ TRACKER_HZ = 100.0  # poses per second of the simulated tracker
 
 
 class FrameClock:
-    """The time of a scene that waits: it goes on only where somebody sleeps in it. Holds the time."""
+    """The time of a scene that goes on only where somebody sleeps in it.
+
+    Holds the time.
+    """
 
     def __init__(self, start_ns: int) -> None:
         """Begin at a time [ns]."""
@@ -49,7 +52,10 @@ class FrameClock:
 
 
 class SyntheticSensor(Generic[ItemT]):
-    """A `Source` that measures the scene of the synthetic cameras. Holds the number of the next item."""
+    """A `Source` that measures the scene of the synthetic cameras.
+
+    Holds the number of the next item.
+    """
 
     def __init__(
         self,
@@ -75,7 +81,10 @@ class SyntheticSensor(Generic[ItemT]):
         self._started = self._closed = False
 
     def read(self) -> ItemT | None:
-        """Measure the next item, wait until it is due, hand it over; None once closed or stopped."""
+        """Measure the next item and wait until it is due.
+
+        None once closed or stopped.
+        """
         seq = self._due_next()
         t_ns = self._measured_ns(seq)
         item = self._measure(seq, (self._clock.to_true(t_ns) - self._epoch_ns) * 1e-9, t_ns)
@@ -91,7 +100,10 @@ class SyntheticSensor(Generic[ItemT]):
         self._closed = True
 
     def _due_next(self) -> int:
-        """Number of the next item: the one after the last, or the first to come where that is half a period late."""
+        """Number of the next item.
+
+        That after the last, or the first to come where that is half a period late.
+        """
         late_ns = self._clock.now_ns() - self._measured_ns(self._next)
         period_ns = 1e9 / self._rate_hz
         if late_ns <= (0.5 * period_ns if self._started else 0.0):
@@ -106,7 +118,7 @@ class SyntheticSensor(Generic[ItemT]):
 def world_of(
     believed: Path, rig: RigCalibration, truth: Path | None, name: str | None
 ) -> tuple[Path, RigCalibration]:
-    """Folder and rig that say how the simulated world is: those that the slave believes, unless it is told otherwise.
+    """Folder and rig of the simulated world: the slave's own, unless given.
 
     Args:
         believed: The calib_json tree of the slave.
@@ -136,7 +148,7 @@ def world_of(
 
 
 def scene_of(calibration: Path, rig: RigCalibration, name: str, seed: int) -> Scene | BoardScene | WristScene:
-    """The scene `name` before the cameras of a rig, from the files of a calib_json tree.
+    """The scene `name` before a rig's cameras, from files of a calib_json tree.
 
     Raises:
         PhalanxError: As `view_by_name`; a file is missing or broken.
@@ -148,7 +160,7 @@ def scene_of(calibration: Path, rig: RigCalibration, name: str, seed: int) -> Sc
 
 
 def imu_of(camera: str, calibration: Path, rig: RigCalibration, name: str, seed: int) -> SimulatedImu:
-    """The IMU on the hand that a camera, given by its driver, sees in the scene `name`.
+    """The IMU on the hand that a camera, by its driver, sees in a scene.
 
     Raises:
         CameraError: The camera is not synthetic, or there is no hand before it.
@@ -178,7 +190,10 @@ def tracker_of(
 
 
 def poses_of(name: str, tracker: SimulatedTracker) -> Callable[[int, float, int], TrackerPose]:
-    """What a `SyntheticSensor` measures of a tracker that our messages call `name`; NaN where it is lost."""
+    """What a `SyntheticSensor` measures of a tracker; NaN where it is lost.
+
+    Our messages call it `name`.
+    """
 
     def measure(seq: int, t_s: float, t_ns: int) -> TrackerPose:
         pose = tracker.pose(t_s)
@@ -190,7 +205,9 @@ def poses_of(name: str, tracker: SimulatedTracker) -> Callable[[int, float, int]
 
 
 def add_imu(folder: Path, imu: SimulatedImu, epoch_ns: int, clock: SkewedClock) -> None:
-    """Write into a recording what the IMU said meanwhile, on the clock of the frames; scene time 0 is at `epoch_ns`.
+    """Write into a recording what the IMU measured meanwhile.
+
+    It is on the clock of the frames; scene time 0 is at `epoch_ns`.
 
     Raises:
         RecordingError: The recording is broken, or the file cannot be written.

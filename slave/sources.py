@@ -1,4 +1,6 @@
-"""The seam between the slave and its devices: what a driver has to be. Nothing behind it can tell which one it is.
+"""The seam between the slave and its devices: what a driver has to be.
+
+Nothing behind it can tell which device it is.
 
 A driver opens its device in its constructor. It may also have counts and metrics, and a camera settings that change.
 """
@@ -72,7 +74,10 @@ class Reporting(Protocol):
         ...
 
     def metrics(self) -> Mapping[str, float]:
-        """Quantity with its unit -> value now; settings of a camera by the names of `common.camera_settings`."""
+        """Quantity with its unit -> value now.
+
+        Settings of a camera have the names of `common.camera_settings`.
+        """
         ...
 
 

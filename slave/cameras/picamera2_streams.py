@@ -1,4 +1,4 @@
-"""Which mode of a Pi camera's sensor is used, which streams it is configured with, and the image of a captured request.
+"""Choose mode and streams of a Pi camera, and take the image of a request.
 
 A sensor offers a few modes, each with its own crop of the pixel array and its own highest rate. Faster modes often
 see less: the same lens then has a longer focal length in pixels, and a calibration made in another mode is wrong.
@@ -69,7 +69,7 @@ class SensorMode:
 
 
 def read_modes(modes: Sequence[Mapping[str, Any]]) -> tuple[SensorMode, ...]:
-    """Modes from `Picamera2.sensor_modes`; a camera without raw modes (USB) gives none."""
+    """Modes from `Picamera2.sensor_modes`; none of a camera without raw modes."""
     return tuple(
         SensorMode(
             tuple(mode["size"]),
@@ -84,7 +84,7 @@ def read_modes(modes: Sequence[Mapping[str, Any]]) -> tuple[SensorMode, ...]:
 
 
 def choose_mode(modes: Sequence[SensorMode], rate_hz: float, size: tuple[int, int]) -> SensorMode:
-    """Mode with the widest view among those that reach `rate_hz` and are no smaller than `size`.
+    """Mode with the widest view among those fast and large enough.
 
     Of modes with the same view the one with the fewest pixels is taken (binned: less noise, less to read out), then
     the one with the most bits. Where every fast enough mode is smaller than `size` the image would be blown up, so
@@ -115,7 +115,7 @@ def choose_mode(modes: Sequence[SensorMode], rate_hz: float, size: tuple[int, in
 
 
 def choose_raw_mode(modes: Sequence[SensorMode], rate_hz: float, size: tuple[int, int]) -> SensorMode:
-    """Mode of a monochrome sensor whose values are the image: of exactly this size [px], and fast enough.
+    """Mode of a monochrome sensor of exactly this size [px], and fast enough.
 
     Of modes with the widest view that of fewest bits, but no fewer than 8: a frame has 8 bits, and the rest would be
     read out for nothing.
@@ -244,7 +244,7 @@ class Streams:
 
 
 def without_padding(image: npt.NDArray[Any], width: int, height: int) -> Image:
-    """Planar YUV420 (3 height / 2, width) uint8 from an array whose rows are padded to the stride.
+    """Planar YUV420 (3 height / 2, width) uint8 without the padding of rows.
 
     picamera2 hands out (3 height / 2, stride): rows of Y, then those of U and of V, two of which lie in one row of
     the array, each half a stride long (`CompletedRequest.save` in picamera2 0.3.38).

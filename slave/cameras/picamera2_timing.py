@@ -1,4 +1,4 @@
-"""When a frame of a Pi camera was taken, its number, and whether cameras run in step.
+"""Date and number the frames of a Pi camera; see whether cameras are in step.
 
 libcamera documents `SensorTimestamp` as the time at which row 0 is exposed, on the boot clock. The kernel's receivers
 (bcm2835-unicam, rp1-cfe) take it, with `ktime_get_ns`, the monotonic clock, when the frame starts to arrive: a row is
@@ -60,7 +60,9 @@ class Timeline:
         return 0.0 if self._stamps is None else hypot(SIGMA_NS[self._stamps[0]], self._stamps[1].sigma_ns)
 
     def place(self, metadata: Mapping[str, object]) -> tuple[int, int] | None:
-        """Number, and middle of the exposure of row 0 [ns], of the next frame; None for a frame without a time.
+        """Number, and middle of the exposure of row 0 [ns], of the next frame.
+
+        None for a frame without a time.
 
         Raises:
             CameraError: Its time is on no clock of this machine.
@@ -107,7 +109,10 @@ _LOG = logging.getLogger(__name__)
 
 
 class SyncMonitor:
-    """Push machine for a camera's metadata. Holds whether it is in step, and how far off the last message found it."""
+    """Push machine for a camera's metadata: whether it is in step.
+
+    Holds that, and how far off the last message found it.
+    """
 
     def __init__(self, where: str, *, client: bool) -> None:
         """Watch a client, or the server. `where` names the camera in the log."""
@@ -140,7 +145,10 @@ class SyncMonitor:
         self._was_locked = self.locked
 
     def metrics(self) -> dict[str, float]:
-        """`sync_locked` 0 or 1; of a client also `sync_error_us`, the last correction: 0 is below 50 us."""
+        """`sync_locked` 0 or 1; of a client also `sync_error_us`.
+
+        That is the last correction: 0 is below 50 us.
+        """
         found = {"sync_locked": float(self.locked)}
         return found | {"sync_error_us": self.error_us} if self._client else found
 

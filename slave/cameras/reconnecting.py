@@ -1,4 +1,4 @@
-"""A camera that is opened again when it was lost, with its settings, or when it repeats one picture.
+"""Reconnect a camera that was lost, or that repeats one picture.
 
 Some cameras send one picture, or a few in turn, again and again with new stamps. Two pictures of a real sensor are
 never equal: of a million pixels the noise of reading changes many. So a picture that
@@ -30,7 +30,9 @@ CONTRAST = 8  # levels in a channel, above what JPEG makes of an even picture
 
 
 class RepeatedPictures:
-    """Holds the last picture, to which nobody writes any more, and check sums of those before.
+    """Finds repeated pictures.
+
+    Holds the last picture, to which nobody writes any more, and check sums of those before.
 
     The sums: shape, that of a few rows, and that of the whole where such rows had been there before.
     """
@@ -42,7 +44,7 @@ class RepeatedPictures:
         self._sums: deque[tuple[tuple[int, ...], int, int | None]] = deque(maxlen=8)
 
     def push(self, image: Image) -> bool:
-        """Whether a picture, (H, W, 3) or (H, W), is the one before, or one of those in turn, over again."""
+        """Whether a picture, (H, W, 3) or (H, W), is one of the last ones again."""
         last, self._last = self._last, image
         # Four rows are compared first; where one of their values differs, nothing else is
         step = max(1, len(image) // 4)
@@ -53,7 +55,7 @@ class RepeatedPictures:
         return self._was_before(image, zlib.crc32(rows.data)) and _has_contrast(image)
 
     def _was_before(self, image: Image, rows: int) -> bool:
-        """Whether a picture whose rows have this sum was there twice already, among the last ones."""
+        """Whether a picture whose rows have this sum was there twice already."""
         key = image.shape, rows
         wholes = [whole for shape, before, whole in reversed(self._sums) if (shape, before) == key]
         whole = zlib.crc32(np.ascontiguousarray(image).data) if wholes else None
@@ -114,7 +116,7 @@ class ReconnectingCamera(ReconnectingDriver[Frame]):
         self._counts["frozen"] = 0  # frames that were copies of the one before
 
     def tune(self, camera: CameraCalibration) -> None:
-        """Change the settings of the open camera, and of every one that is opened from now on.
+        """Change the settings of the camera, now and whenever it is opened again.
 
         Raises:
             CameraError: It is away, or did not take them.

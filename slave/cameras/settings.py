@@ -1,8 +1,9 @@
-"""Settings of a camera: what was asked for, what it reports, whether that is the same; and the frames that show it.
+"""Compare the settings of a camera with what was asked for.
 
 A camera rounds: exposure to whole rows, gain to whole register codes. So every setting carries how far the value
 read back may be from the value wanted, and why. Whatever is further off is an error that names setting, wanted,
-got and what to do; nothing is taken on trust.
+got and what to do; nothing is taken on trust. What changes settings of a running camera watches its frames go by
+(`FrameObserver`), without holding them up.
 """
 
 import threading

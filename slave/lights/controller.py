@@ -1,4 +1,4 @@
-"""Switches ambient -> laser -> LED in step with a camera: the push machine, and the thread that lives by it.
+"""Switch ambient -> laser -> LED in step with a camera.
 
 `Strober.step` does what is due and says when to come again; it never waits. The thread does nothing but wait and step.
 A light goes on a lead before its exposure and off right after it. Whoever comes too late for the beginning of an
@@ -21,7 +21,9 @@ _LOG = logging.getLogger(__name__)
 
 
 class Strober:
-    """Makes the light of each frame. Holds the pulse that is on, and the last frame that was seen to.
+    """Makes the light of each frame.
+
+    Holds the pulse that is on, and the number of the last frame that was lit or left out.
 
     Attributes:
         counts: Event -> how often.
@@ -101,7 +103,7 @@ class Strober:
 
 
 class Strobe:
-    """Keeps a camera lit: the schedule of its exposures, the lights, and the strober between them."""
+    """Keeps a camera lit: schedule of exposures, strober, lights."""
 
     def __init__(self, schedule: StrobeSchedule, interlock: Interlock, clock: Clock) -> None:
         """Begin dark.
@@ -145,7 +147,10 @@ class Strobe:
 
 
 class StrobeController(Strobe):
-    """A strobe that works on a thread of its own. Holds the strober and its schedule under one lock."""
+    """A strobe that works on a thread of its own.
+
+    Holds the strober and its schedule under one lock.
+    """
 
     def __init__(self, schedule: StrobeSchedule, interlock: Interlock, clock: Clock) -> None:
         """Start the thread; arguments as of `Strobe`."""

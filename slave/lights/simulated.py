@@ -1,4 +1,4 @@
-"""Light a simulated wrist device: the strobe of real lights, in the time of the frames.
+"""Light a simulated wrist device by the strobe of real lights.
 
 The camera waits for the strobe: before a frame is drawn, everything that the strobe would have done up to the end of
 its exposure is done, each at the moment it asked for, or later where lateness is part of the simulation. A thread
@@ -36,7 +36,10 @@ class Lit:
 
 
 class Timeline:
-    """What was on when. Holds the last switchings; written by the lights, read by the camera, from any thread."""
+    """What was on when, from any thread.
+
+    Holds the last switchings; written by the lights, read by the camera.
+    """
 
     def __init__(self) -> None:
         """Begin dark."""
@@ -99,7 +102,10 @@ class _SetClock:
 
 
 class SimulatedStrobe(Strobe):
-    """Keeps a synthetic camera lit, without a thread. Holds the time up to which all is done."""
+    """Keeps a synthetic camera lit, without a thread.
+
+    Holds the time up to which all is done.
+    """
 
     def __init__(
         self, schedule: StrobeSchedule, strobe: StrobeCalibration, late_ns: Callable[[], int] = lambda: 0
@@ -117,7 +123,10 @@ class SimulatedStrobe(Strobe):
         self._again_ns: int | None = None
 
     def during(self, start_ns: int, stop_ns: int) -> Lit:
-        """What is on from `start_ns` to `stop_ns` [ns], which is not before the times asked for until now."""
+        """What is on from `start_ns` to `stop_ns` [ns].
+
+        That is not before the times asked for until now.
+        """
         while self._again_ns is not None and self._again_ns <= stop_ns:
             self._monitored(self._again_ns)
             self._set_clock.t_ns = max(self._again_ns, self._set_clock.t_ns)

@@ -1,4 +1,4 @@
-"""libsurvive's lines: bytes in, poses of one device on the slave's clock out, no input or output of its own.
+"""Decode libsurvive's lines to poses of one device on the slave's clock.
 
 Every line that --record-stdout or --record writes begins with the program's time [s since its start], then who, then
 what (src/survive_recording.c of https://github.com/collabora/libsurvive, read at the versions of 2019 to 2025):
@@ -41,7 +41,10 @@ _SIZE = 7  # numbers of a pose
 
 
 class Pose(NamedTuple):
-    """Where a device is: time [s] of the program, place [m], quaternion wxyz. NaN: it does not know."""
+    """Where a device is: time [s] of the program, place [m], quaternion wxyz.
+
+    NaN: it does not know.
+    """
 
     device: str
     t_s: float
@@ -83,7 +86,7 @@ class LineDecoder:
         self._rest = b""
 
     def push(self, data: bytes) -> Iterator[Found]:
-        """What the lines say that end in `data`, in order; lines about other things say nothing."""
+        """What the lines say that end in `data`, in order; other lines: nothing."""
         lines = (self._rest + data).split(b"\n")
         self._rest = lines.pop()
         if len(self._rest) > LONGEST:
@@ -148,7 +151,10 @@ SLEWED = 600e-6  # at most 500 ppm by NTP, and the crystals
 
 
 class SurviveDevice:
-    """Push machine. Holds who is there, the clock of the program, and number and time of the newest pose."""
+    """Push machine that dates the poses of one device.
+
+    Holds who is there, the clock of the program, and number and time of the newest pose.
+    """
 
     def __init__(self, name: str, wanted: str | None) -> None:
         """Begin with a program that was just started.
@@ -167,7 +173,7 @@ class SurviveDevice:
         self._counts: Counter[str] = Counter()
 
     def push(self, data: bytes, arrival_ns: int) -> list[TrackerPose]:
-        """Take bytes that were there at `arrival_ns`, slave's clock; return the poses that they complete.
+        """Take bytes that were there at `arrival_ns`; return the poses in them.
 
         Raises:
             TrackerChoiceError: A second device has poses, and nobody said which one is meant.
@@ -198,7 +204,10 @@ class SurviveDevice:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Lines by what was wrong with them (`broken.`), `clock_steps`, `gone`, poses of other devices (`others`)."""
+        """Events: `broken.` lines by reason, `clock_steps`, `gone`.
+
+        `others`: poses of other devices.
+        """
         return self._counts
 
     def there(self) -> str:

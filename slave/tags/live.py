@@ -1,4 +1,4 @@
-"""The tags of a live slave: searched once a frame's markers are sent, as often as time allows, and replaced with files.
+"""Detect the tags of frames once their markers are sent, as time allows.
 
 Nothing of it is loaded where no object has tags.
 """
@@ -22,7 +22,9 @@ LONGEST_NS = 250_000_000  # without a search: half of what an object is held for
 
 
 class Pace:
-    """Grants searches out of the time that frames leave. Holds what is left [ns], what a search takes [ns], and the
+    """Grants searches out of the time that frames leave.
+
+    Holds what is left [ns], what a search takes [ns], and the
     times of the last frame and the last search.
 
     What a frame leaves of its share of the time since the frame before is saved until a search fits into it, and no
@@ -44,7 +46,7 @@ class Pace:
         return self._takes_ns
 
     def grants(self, t_ns: int, spent_ns: int) -> bool:
-        """Whether tags may be sought in a frame of time `t_ns`, whose markers took `spent_ns`."""
+        """Whether tags may be searched in a frame whose markers took `spent_ns`."""
         since_ns = (
             self._period_ns if self._frame_ns is None else max(float(t_ns - self._frame_ns), self._period_ns)
         )
@@ -109,7 +111,7 @@ class LiveTags:
         self._finder = finder
 
     def counts(self) -> dict[str, int]:
-        """`tags.searched`, `tags.skipped` frames, `tags.found` in all; nothing where there are no tags."""
+        """`tags.searched`, `tags.skipped` frames, `tags.found`; none without tags."""
         if self._finder is None and not self._searched:
             return {}
         return {
