@@ -9,10 +9,10 @@ from bench.played import START_NS, message_of, times_of
 from common.arrays import Bool, Float
 from common.sim.render import Renderer
 from common.sim.wrist.render import WristRenderer
-from slave.cameras.source import Frame
 from slave.cameras.synthetic import STROBE
 from slave.markers.light_adaptive import detector_for
 from slave.markers.workers import Inline
+from slave.sources import Frame
 from slave.wrist.detector import WristDetector
 from slave.wrist.view import WristView
 

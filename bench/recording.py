@@ -16,9 +16,9 @@ from common.frame_recording import Illumination, Manifest
 from common.frame_writing import RecordingWriter, encode_png
 from common.sim.render import Renderer
 from common.sim.scene import Scene
-from slave.cameras.source import Frame
 from slave.progress import Length
 from slave.recorder import Recorder
+from slave.sources import Frame
 
 CALIBRATION = Path(__file__).resolve().parents[1] / "calib_json"
 SIZES = ((640, 480), (1456, 1088))

@@ -29,8 +29,8 @@ from master.estimator.wrist_pipeline import WristPipeline
 from master.stages import StageTimes
 from master.wrist_setup import WristSetup
 from slave.cameras.replay import read_png
-from slave.cameras.source import Frame
 from slave.cameras.synthetic import STROBE
+from slave.sources import Frame
 from slave.wrist.background import lit
 from slave.wrist.detector import WristFound, find
 from slave.wrist.engine import NUMPY, Engine, engine_named

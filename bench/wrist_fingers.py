@@ -31,8 +31,8 @@ from common.sim.wrist.scene import AMBIENTS, WristScene
 from master.estimator.wrist_pipeline import WristPipeline
 from master.wrist_setup import WristSetup
 from slave.cameras.replay import read_png
-from slave.cameras.source import Frame
 from slave.cameras.synthetic import STROBE
+from slave.sources import Frame
 from slave.wrist.detector import find
 from slave.wrist.strobe import StrobeCycle
 from slave.wrist.view import WristView

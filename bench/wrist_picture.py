@@ -17,8 +17,8 @@ from common.sim.wrist.scene import WristScene
 from master.estimator.wrist_pipeline import WristPipeline
 from master.stages import StageTimes
 from master.wrist_setup import WristSetup
-from slave.cameras.source import Frame
 from slave.cameras.synthetic import STROBE
+from slave.sources import Frame
 from slave.wrist.background import lit
 from slave.wrist.detector import find
 from slave.wrist.fingers import separate

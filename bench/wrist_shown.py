@@ -13,7 +13,7 @@ from common.calibration import HandProfile, RigCalibration, load
 from common.frame_recording import open_recording
 from common.npz import read_npz
 from slave.cameras.replay import read_png
-from slave.cameras.source import Frame
+from slave.sources import Frame
 from slave.wrist.background import lit
 from slave.wrist.strobe import StrobeCycle
 from slave.wrist.view import WristView

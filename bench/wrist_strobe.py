@@ -17,7 +17,7 @@ from common.frame_recording import Illumination, open_recording
 from common.sim.wrist.record import ORDER, with_faults
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import AMBIENTS, WristScene
-from slave.cameras.source import Frame
+from slave.sources import Frame
 from slave.wrist.strobe import Strobe
 
 _ROOT = Path(__file__).resolve().parents[1]

@@ -8,9 +8,9 @@ from common.arrays import Image
 from common.calibration import CameraCalibration
 from common.camera_settings import ColourPick
 from common.errors import CameraError
-from slave.cameras.source import Frame
 from slave.markers.colour_sampling import SampledColours
 from slave.markers.reloadable import ReloadableDetector
+from slave.sources import Frame
 
 
 class ColourSampler:

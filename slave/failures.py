@@ -8,7 +8,7 @@ it is counted, and logged with its traceback.
 
 import logging
 from collections.abc import Callable, Mapping
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from common.clock import now_ns
 from common.errors import PhalanxError
@@ -17,14 +17,6 @@ LOG_EVERY_NS = 10_000_000_000
 _LOG = logging.getLogger(__name__)
 
 ValueT = TypeVar("ValueT", int, float)
-
-
-class Closing(Protocol):
-    """A device that is open."""
-
-    def close(self) -> None:
-        """Give it back."""
-        ...
 
 
 class Failures:
@@ -73,13 +65,10 @@ class Failures:
             self.log("does not say how it is", error)
             return {}
 
-    def close(self, source: Closing) -> None:
-        """Give a device back, whether or not it lets itself be given back.
-
-        One that does not is opened again nevertheless, or is not there.
-        """
+    def close(self, close: Callable[[], None]) -> None:
+        """Close a driver; one that cannot be closed is opened again nevertheless."""
         try:
-            source.close()
+            close()
         except Exception as error:  # noqa: BLE001 - as above
             self.log("could not be given back", error)
 

@@ -1,60 +1,16 @@
 """Say what the light does to the colours: counts, gauges, and a log line before it costs a marker."""
 
 import logging
-from collections.abc import Callable, Mapping
-from typing import Protocol
+from collections.abc import Callable
 
 import numpy as np
 
-from common.arrays import Float
-from slave.cameras.source import Frame
 from slave.markers.colour_monitor import ColourWarning
+from slave.markers.reloadable import ReloadableDetector
+from slave.sources import Frame, Reporting
 
-LOG_EVERY_NS = 10_000_000_000  # the same subject is logged no more often
-NAME = 64  # characters of a name in `Health`
 ALL = "light"  # the subject of what concerns every marker
 _LOG = logging.getLogger(__name__)
-
-
-class LightAdaptive(Protocol):
-    """What is reported on: a `ReloadableDetector`."""
-
-    @property
-    def adapts(self) -> bool:
-        """Whether the light is followed at present."""
-        ...
-
-    @property
-    def warnings(self) -> list[ColourWarning]:
-        """What is to be warned of as of the last frame."""
-        ...
-
-    @property
-    def log_gains(self) -> Float:
-        """Log gains (3,) of the light, blue, green, red."""
-        ...
-
-    @property
-    def refused(self) -> int:
-        """Frames in which nothing was reported."""
-        ...
-
-    @property
-    def tables(self) -> int:
-        """Colour tables made."""
-        ...
-
-
-class Numbers(Protocol):
-    """Counts and gauges of something else; a `Counters`."""
-
-    def counts(self) -> Mapping[str, int]:
-        """Event -> how often."""
-        ...
-
-    def metrics(self) -> Mapping[str, float]:
-        """Quantity with unit -> value."""
-        ...
 
 
 class LightReport:
@@ -67,8 +23,8 @@ class LightReport:
     def __init__(
         self,
         name: str,
-        detector: LightAdaptive,
-        others: Numbers,
+        detector: ReloadableDetector,
+        others: Reporting,
         markers: tuple[str, ...],
         show: Callable[[Frame], None] = lambda _frame: None,
     ) -> None:
@@ -91,7 +47,7 @@ class LightReport:
         for warning in warnings:
             subject = ALL if warning.marker is None else warning.marker
             last_ns = self._logged_ns.get(subject)
-            if last_ns is None or frame.t_ns - last_ns >= LOG_EVERY_NS:
+            if last_ns is None or frame.t_ns - last_ns >= 10_000_000_000:  # the same one no more often
                 self._logged_ns[subject] = frame.t_ns
                 _LOG.warning("%s: %s", self._name, warning.text)
 
@@ -115,8 +71,7 @@ class LightReport:
 
 
 def _ambiguous(warnings: list[ColourWarning]) -> dict[str, float]:
+    # A name in `Health` has 64 characters
     return {
-        f"twins.{one.marker}..{one.ambiguous}"[:NAME]: one.hues
-        for one in warnings
-        if one.ambiguous is not None
+        f"twins.{one.marker}..{one.ambiguous}"[:64]: one.hues for one in warnings if one.ambiguous is not None
     }

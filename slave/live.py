@@ -1,22 +1,15 @@
-"""A live slave: detector, settings, previews and reports around one camera, and the loop, until it is told to stop."""
+"""Send what a camera shows: detector, settings and previews around it."""
 
-import gc
 import logging
-import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal
 
 from common.calibration import CameraCalibration, RigCalibration
-from common.clock import Clock
 from common.hand_model import FINGERS
-from common.keys import Access
-from common.zenoh_bus import ZenohBus
-from slave.app import run, run_wrist, wait_for_start
-from slave.cameras.source import FrameSource
 from slave.colour_sampler import ColourSampler
-from slave.counters import Counters
+from slave.counters import DetectionCounters
 from slave.light_report import LightReport
 from slave.markers.ambiguity import ambiguity_counts, ambiguity_gauges
 from slave.markers.calibrated import CalibratedDetector
@@ -29,11 +22,10 @@ from slave.markers.scan_choice import Scan, ScanChoice
 from slave.overlay import MarkerOverlay, WristOverlay
 from slave.preview import Previews
 from slave.raw import RawFrames, RawSettings
-from slave.report import Numbers, Reporter
-from slave.service import Service
+from slave.sender import MarkerPipeline, Sender, WristPipeline
+from slave.sources import FrameSource
 from slave.tags.live import LiveTags, finder_of
-from slave.tuning import CameraFiles, CameraTuning, Prepare
-from slave.uplink import Uplink
+from slave.tuning import CameraFiles, CameraTuning, Prepare, Sample
 from slave.wrist.detector import WristDetector
 from slave.wrist.engine import Engine as WristEngine
 from slave.wrist.null_detector import NullWristDetector
@@ -51,79 +43,48 @@ NO_COLOUR = (
 _LOG = logging.getLogger(__name__)
 
 
-def run_live(
-    name: str,
+def send_detections(
+    sender: Sender,
     files: CameraFiles,
     source: FrameSource,
-    uplink: Uplink,
-    clock: Clock,
     colours: Colours,
     scan: Scan,
     engine: Engine | WristEngine,
-    stop: threading.Event,
-    notify: Callable[[str], None],
-    service: Service,
-    access: Access,
     raw_frames: RawSettings | None = None,
 ) -> None:
-    """Wait for the master, then detect and send until `stop` is set or the source ends; closes source and uplink.
+    """Detect in the frames of a camera and send, until told to stop.
 
     Args:
-        name: Camera, a member of the rig.
-        files: Its file and the rig's; followed when they change.
+        sender: The process; its name is that of the camera.
+        files: The camera's file and the rig's; monitored for changes.
         source: The open camera.
-        uplink: Where detections go.
-        clock: The slave's clock.
         colours: Whether those of markers follow the light, stay fixed, or nothing is detected at all.
         scan: Whether whole frames are scanned for markers, or windows (`scan_choice`).
         engine: What scans and measures for markers, or what does the inner loops before a wrist device.
-        stop: Set by a signal handler, or by the command "stop" on the bus.
-        say: Called with one line when it is ready, and one at the end.
-        service: Called with what it does, for the system's service manager.
-        access: How it comes to the master's bus.
         raw_frames: Where raw frames go when somebody asks for them; None: nowhere.
 
     Raises:
         CalibrationError: Something of a wrist device is not calibrated.
         CameraError: The camera is gone.
     """
-    workers = ThreadPoolExecutor(1, thread_name_prefix=f"{name} colours")
-    raw = RawFrames(name, raw_frames, lambda: tuning.files, clock, lambda: uplink.started)
-    read = raw.reading(source)
+    workers = ThreadPoolExecutor(1, thread_name_prefix=f"{sender.name} colours")
+    raw = RawFrames(
+        sender.name, raw_frames, lambda: tuning.files, sender.clock, lambda: sender.uplink.started
+    )
     if isinstance(engine, WristEngine):
-        line = _wrist_line(name, files, read, uplink, clock, colours, engine, stop, service)
+        line = _wrist_line(sender, files, colours, engine)
     else:
-        line = _marker_line(name, files, read, uplink, clock, colours, scan, engine, stop, workers, service)
-    tuning = CameraTuning(
-        files, source, line.prepare, lambda: line.numbers.counts()["frames"] > 0, line.sampler
+        line = _marker_line(sender, files, colours, scan, engine, workers)
+    counters = line.pipeline.counters
+    tuning = CameraTuning(files, source, line.prepare, lambda: counters.total > 0, line.sample)
+    sender.send(
+        raw.reading(source),
+        line.pipeline,
+        reported=line.reported,
+        previews=line.previews,
+        parts=(tuning, raw),
+        close=(raw.close, lambda: workers.shutdown(cancel_futures=True)),
     )
-    reporter = Reporter(
-        name,
-        uplink,
-        line.numbers,
-        clock,
-        lambda endpoint: ZenohBus(None, endpoint, access),
-        stop.set,
-        shown=line.previews,
-        camera=tuning,
-        raw=raw,
-    )
-    try:
-        gc.collect()
-        gc.freeze()  # what lives until the end is never walked again: no pause in the loop
-        notify("ready, waiting for the master")
-        service.ready(lambda: uplink.started)
-        if wait_for_start(uplink, stop, service.waiting):
-            line.run()
-    finally:
-        service.stopping()
-        reporter.close()
-        line.previews.close()
-        uplink.close()
-        source.close()
-        raw.close()
-        workers.shutdown(cancel_futures=True)
-    notify(f"{line.numbers.counts()['frames']} frames, sent {uplink.counts['sent']}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,48 +92,39 @@ class _Line:
     """What a slave does with its frames.
 
     Attributes:
-        run: The loop; returns at the end.
-        numbers: What it counts.
-        previews: Who shows them.
+        pipeline: Detects in a frame and sends.
+        previews: Shows them.
         prepare: How changed files reach it; None: it uses none of them.
-        sampler: Who makes a colour of a click; None: it uses none.
+        sample: Makes a colour of a click; None: it uses none.
+        reported: What the reports have in place of the counters; None: those.
     """
 
-    run: Callable[[], None]
-    numbers: Numbers
+    pipeline: MarkerPipeline | WristPipeline
     previews: Previews
-    prepare: Prepare | None
-    sampler: ColourSampler | None = None
+    prepare: Prepare | None = None
+    sample: Sample | None = None
+    reported: LightReport | None = None
 
 
 def _marker_line(
-    name: str,
+    sender: Sender,
     files: CameraFiles,
-    source: FrameSource,
-    uplink: Uplink,
-    clock: Clock,
     colours: Colours,
     scan: Scan,
     engine: Engine,
-    stop: threading.Event,
     workers: ThreadPoolExecutor,
-    service: Service,
 ) -> _Line:
-    rig, alive = files.rig, service.working
+    rig, name, uplink = files.rig, sender.name, sender.uplink
     tags = LiveTags(files.camera, files.objects)
     if colours == "none":
-        null_detector, counters = NullDetector(len(rig.markers)), Counters(rig.markers, tags.counts)
-        plain = Previews(name, clock)
-        return _Line(
-            lambda: run(source, null_detector, uplink, name, counters, stop, plain.offer, alive=alive),
-            counters,
-            plain,
-            None,
-        )
+        null, counters = NullDetector(len(rig.markers)), DetectionCounters(rig.markers, tags.counts)
+        previews = Previews(name, sender.clock)
+        pipeline = MarkerPipeline(name, uplink.session, uplink.send, null.push, counters, previews.offer)
+        return _Line(pipeline, previews)
     make = _maker(files, colours, engine, workers)
     choice = ScanChoice(scan, files.camera)
     detector = ReloadableDetector(make(files.camera, rig), choice)
-    counters = Counters(
+    counters = DetectionCounters(
         rig.markers,
         lambda: (
             tags.counts()
@@ -182,17 +134,39 @@ def _marker_line(
         ),
         lambda: ambiguity_gauges(detector.plain),
     )
-    previews = Previews(name, clock, MarkerOverlay(detector, rig.markers))
-    numbers, seen = counters, previews.offer
+    previews = Previews(name, sender.clock, MarkerOverlay(detector, rig.markers))
+    light = show = None
     if colours == "follow":
-        numbers = LightReport(name, detector, counters, rig.markers, previews.offer)
-        seen = numbers.offer
+        light = LightReport(name, detector, counters, rig.markers, previews.offer)
+        show = light.offer
+    show = show or previews.offer
     return _Line(
-        lambda: run(source, detector, uplink, name, counters, stop, seen, tags, alive),
-        numbers,
+        MarkerPipeline(name, uplink.session, uplink.send, detector.push, counters, show, tags.push),
         previews,
         _both(marker_changes(detector, make), _tag_changes(tags)),
-        ColourSampler(detector, previews.shown, rig.markers),
+        ColourSampler(detector, previews.shown, rig.markers).pick,
+        light,
+    )
+
+
+def _wrist_line(sender: Sender, files: CameraFiles, colours: Colours, engine: WristEngine) -> _Line:
+    name, uplink = sender.name, sender.uplink
+    if colours == "none":
+        counters, previews = DetectionCounters(()), Previews(name, sender.clock)
+        detect = NullWristDetector().push
+        return _Line(
+            WristPipeline(name, uplink.session, uplink.send, detect, counters, previews.offer), previews
+        )
+    detector = WristDetector(view_of(files), files.camera.frame_rate_hz, engine=engine)
+    names = tuple(f"{what}.{finger}" for what in ("laser", "tip") for finger in FINGERS)
+    counters = DetectionCounters(
+        names, lambda: {f"strobe.{event}": count for event, count in detector.counts.items()}
+    )
+    previews = Previews(name, sender.clock, WristOverlay(detector))
+    return _Line(
+        WristPipeline(name, uplink.session, uplink.send, detector.push, counters, previews.offer),
+        previews,
+        wrist_changes(detector),
     )
 
 
@@ -225,38 +199,6 @@ def _both(first: Prepare, second: Prepare) -> Prepare:
     return prepare
 
 
-def _wrist_line(
-    name: str,
-    files: CameraFiles,
-    source: FrameSource,
-    uplink: Uplink,
-    clock: Clock,
-    colours: Colours,
-    engine: WristEngine,
-    stop: threading.Event,
-    service: Service,
-) -> _Line:
-    alive = service.working
-    if colours == "none":
-        counters, plain = Counters(()), Previews(name, clock)
-        return _Line(
-            lambda: run_wrist(source, NullWristDetector(), uplink, name, counters, stop, plain.offer, alive),
-            counters,
-            plain,
-            None,
-        )
-    detector = WristDetector(view_of(files), files.camera.frame_rate_hz, engine=engine)
-    names = tuple(f"{what}.{finger}" for what in ("laser", "tip") for finger in FINGERS)
-    counters = Counters(names, lambda: {f"strobe.{event}": count for event, count in detector.counts.items()})
-    previews = Previews(name, clock, WristOverlay(detector))
-    return _Line(
-        lambda: run_wrist(source, detector, uplink, name, counters, stop, previews.offer, alive),
-        counters,
-        previews,
-        wrist_changes(detector),
-    )
-
-
 def _uncalibrated(missing: Sequence[str]) -> dict[str, int]:
     """What `Health` says of markers without a colour."""
     return {"uncalibrated": int(bool(missing))} | {f"uncalibrated.{name}": 1 for name in missing}
@@ -265,7 +207,7 @@ def _uncalibrated(missing: Sequence[str]) -> dict[str, int]:
 def _maker(
     files: CameraFiles, colours: Colours, engine: Engine, workers: ThreadPoolExecutor
 ) -> Callable[[CameraCalibration, RigCalibration], AnyDetector]:
-    """What makes a detector for given content of the files, now and whenever it changes."""
+    """What makes a detector for the content of files, now and when it changes."""
 
     def make(camera: CameraCalibration, rig: RigCalibration) -> AnyDetector:
         if missing := [name for name in rig.markers if name not in (camera.markers or {})]:

@@ -5,16 +5,15 @@ found in its last frames.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol
 
 import cv2
 import numpy as np
 
 from common.arrays import Float, Image
 from common.calibration import HsvRange
-from slave.cameras.source import Frame
 from slave.markers.classify import HUES
 from slave.markers.reloadable import ReloadableDetector
+from slave.sources import Frame
 from slave.wrist.detector import WristDetector
 
 TINT = 0.7  # of the tint in a tinted pixel: what lies below stays to be seen
@@ -22,26 +21,6 @@ SEVERAL = (255, 255, 255)  # a pixel in the ranges of several markers: they coll
 ARM_PX = 6, 9  # of a cross, from and to; its middle is left free, for a far marker is as small
 WHITE, BLACK = (255, 255, 255), (0, 0, 0)
 LASER, TIP = (60, 60, 255), (80, 255, 80)
-
-
-class Overlay(Protocol):
-    """What is drawn over the pictures of one camera."""
-
-    @property
-    def markers(self) -> tuple[str, ...]:
-        """Those whose pixels can be tinted."""
-        ...
-
-    def draw(self, small: Image, frame: Frame, mask: Sequence[str], found: bool) -> Image:
-        """A new picture (h, w, 3).
-
-        Args:
-            small: (h, w, 3) BGR or (h, w) grey: the frame shrunk.
-            frame: The frame itself.
-            mask: Markers to tint.
-            found: Whether to cross what was found in that frame.
-        """
-        ...
 
 
 class MarkerOverlay:
@@ -57,7 +36,14 @@ class MarkerOverlay:
         return self._markers
 
     def draw(self, small: Image, frame: Frame, mask: Sequence[str], found: bool) -> Image:
-        """Tint by the colour table in use, which follows the light; cross the centroids."""
+        """A new picture (h, w, 3): tinted by the colour table in use, which follows the light; centroids crossed.
+
+        Args:
+            small: (h, w, 3) BGR or (h, w) grey: the frame shrunk.
+            frame: The frame itself.
+            mask: Markers to tint.
+            found: Whether to cross what was found in that frame.
+        """
         drawn, plain = small.copy(), self._detector.plain
         if mask and plain is not None:
             height, width = small.shape[:2]
@@ -83,7 +69,7 @@ class WristOverlay:
         return ()
 
     def draw(self, small: Image, frame: Frame, mask: Sequence[str], found: bool) -> Image:
-        """Cross the laser points red and the fingertips green."""
+        """A new picture with the laser points crossed red and the fingertips green; as of `MarkerOverlay`."""
         del mask
         drawn = (
             np.asarray(cv2.cvtColor(small, cv2.COLOR_GRAY2BGR), np.uint8) if small.ndim == 2 else small.copy()

@@ -22,17 +22,14 @@ from common.clock import Clock
 from common.errors import BusError, CalibrationError
 from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Preview, Still
 from common.preview_wish import PreviewWish
-from slave.cameras.source import Frame
 from slave.failures import Failures
-from slave.overlay import Overlay
+from slave.overlay import MarkerOverlay, WristOverlay
+from slave.sources import Frame
 
 PERIOD_NS = 100_000_000
 POLL_NS = 3_000_000_000
-SHOWN = 10  # frames that are kept for a click on one of them: the last second
 FOUND = ""  # stands beside the names of markers for the wish to see what was found
-QUALITY = 80
 STILL_QUALITIES = (95, 90, 80, 60, 30)  # the first whose file fits into a message
-WAIT_S = 0.5
 _NEVER_NS = -(2**63)
 _LOG = logging.getLogger(__name__)
 
@@ -69,7 +66,9 @@ class Previews:
     one, and how many pictures went out.
     """
 
-    def __init__(self, camera: str, clock: Clock, overlay: Overlay | None = None) -> None:
+    def __init__(
+        self, camera: str, clock: Clock, overlay: MarkerOverlay | WristOverlay | None = None
+    ) -> None:
         """Start the thread; nothing is published before `use` and `ask`.
 
         Args:
@@ -79,7 +78,8 @@ class Previews:
         """
         self._camera, self._overlay = camera, overlay
         self._wishes: dict[str, int] = {}  # what -> until when [ns]
-        self._shown: deque[Frame] = deque(maxlen=SHOWN)
+        # The last second, for a click on one of them
+        self._shown: deque[Frame] = deque(maxlen=10)
         self._clock = clock
         self._gate = Gate()
         self._waiting: deque[Frame] = deque(maxlen=1)
@@ -143,7 +143,7 @@ class Previews:
 
     def _work(self) -> None:
         while not self._closing.is_set():
-            if not self._wake.wait(WAIT_S):
+            if not self._wake.wait(0.5):  # seconds, five pictures
                 self._shown.clear()  # nobody looks any more
             self._wake.clear()
             try:
@@ -214,7 +214,7 @@ def _half(image: Image) -> Image:
 def _within(image: Image) -> bytes:
     """JPEG file of `image`, shrunk until it fits into a message."""
     while True:
-        data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+        data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
         if len(data) <= MAX_PREVIEW_BYTES:
             return data
         image = _half(image)

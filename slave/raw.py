@@ -22,9 +22,9 @@ from common.clock import Clock
 from common.errors import CalibrationError, RecordingError
 from common.frame_recording import Manifest
 from common.raw_wish import RawWish
-from slave.cameras.source import Frame, FrameSource
 from slave.progress import Length, megabytes
 from slave.recorder import ENCODERS, RESERVE_BYTES, Recorder, clock_of
+from slave.sources import Frame, FrameSource
 from slave.tuning import CameraFiles
 
 GONE_S = 10.0  # a master that was away for so long ends it: nobody else could
@@ -113,7 +113,7 @@ class RawFrames:
         frames, dropped = (0, 0) if now is None else (now.frames, now.dropped)
         return {"raw.frames": frames, "raw.dropped": dropped, "raw.ended": self._ended}
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """`raw.megabytes` of the same recording, and whether frames are taken now: `raw.on`."""
         if self._settings is None:
             return {}
@@ -147,7 +147,7 @@ class RawFrames:
                     f"raw: {settings.folder / self._name} is being recorded: raw_stop ends it"
                 )
             self._lease_s, self._until = wish.lease_s, time.monotonic() + wish.lease_s
-        return self.figures()
+        return self.metrics()
 
     def _raw_stop(self, body: str) -> dict[str, float]:
         self._wanted("raw_stop")
@@ -157,7 +157,7 @@ class RawFrames:
             self._look()
             self._end("raw_stop")
             self._join()
-        return self.figures()
+        return self.metrics()
 
     def _hand_over(self, frame: Frame, recorder: Recorder | None) -> None:
         if recorder is None or self._fault is not None:  # ended meanwhile, or about to be

@@ -26,13 +26,12 @@ from common.errors import RecordingError
 from common.frame_recording import Illumination, Manifest, RecordedClock
 from common.frame_writing import RecordingWriter, encode_png
 from slave.cameras.replay import is_grey
-from slave.cameras.source import Frame, FrameSource
 from slave.progress import Length, Progress, megabytes
+from slave.sources import Frame, FrameSource
 
 RESERVE_BYTES = 200_000_000  # a system without any room left cannot even be logged in to
 QUEUE_BYTES = 128_000_000  # a quarter of the smallest slave's memory; at 640x480, 90 Hz it bridges 1.5 s
 ENCODERS = 4
-SHOW_S = 1.0
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # Linux: a new one at every start of the machine
 
 
@@ -211,7 +210,7 @@ class Recorder:
 
     def _show_all(self) -> None:
         since_ns, before = time.monotonic_ns(), 0
-        while not self._closing.wait(SHOW_S):
+        while not self._closing.wait(1.0):
             now_ns, written = time.monotonic_ns(), self._bytes
             self._bytes_per_s = (written - before) * 1e9 / max(now_ns - since_ns, 1)
             since_ns, before = now_ns, written

@@ -1,14 +1,14 @@
-"""Report to the master how the slave is: `Health` twice a second and on command, on a thread of its own.
+"""Report how the slave is: `Health` twice a second, and on command.
 
-The camera loop never waits for the bus: this thread opens it when the uplink has learned where the master's
+The sender loop never waits for the bus: this thread opens it when the uplink has learned where the master's
 bus is, opens it anew when another master takes over, and lives on without it when there is none.
 """
 
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from common.bus import Bus
 from common.clock import Clock
@@ -16,125 +16,56 @@ from common.errors import BusError
 from common.machine import Machine, program
 from common.messages import Command, Health
 from slave.failures import Failures
+from slave.sources import Reporting
+from slave.uplink import Uplink
 
-PERIOD_S = (
-    0.5  # two reports make a judgement in the checklist of the master, which is to be out within two seconds
-)
+if TYPE_CHECKING:  # of cameras alone
+    from slave.preview import Previews
+    from slave.raw import RawFrames
+    from slave.tuning import CameraTuning
+
 LOG_EVERY = 20  # reports
 ALONE_AT = 6  # the report after which a slave without a master says what it hears
 _LOG = logging.getLogger(__name__)
 
 
-class Link(Protocol):
-    """What the reporter asks the uplink."""
-
-    @property
-    def session(self) -> int:
-        """Random id of this process."""
-        ...
-
-    @property
-    def zenoh_endpoint(self) -> str | None:
-        """Where the master's bus listens, if known."""
-        ...
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Event -> how often."""
-        ...
-
-
-class Numbers(Protocol):
-    """Where the counts and gauges of the loop come from; a `Counters`."""
-
-    def counts(self) -> Mapping[str, int]:
-        """Event -> how often."""
-        ...
-
-    def metrics(self) -> Mapping[str, float]:
-        """Quantity with unit -> value."""
-        ...
-
-
-class Shown(Protocol):
-    """What shows the camera's picture; a `Previews`."""
-
-    def ask(self, body: str = "") -> None:
-        """Somebody looks, and wishes for what the body says. Raises `PhalanxError` where that is wrong."""
-        ...
-
-    def ask_still(self) -> None:
-        """Somebody wants one whole frame."""
-        ...
-
-    def use(self, bus: Bus | None) -> None:
-        """Publish there from now on."""
-        ...
-
-
-class Tuned(Protocol):
-    """What has commands of its own: the camera whose settings can be changed, a `CameraTuning`; `RawFrames`."""
-
-    def commands(self) -> Mapping[str, Callable[[str], Mapping[str, float]]]:
-        """Verb -> what to do with its body; the gauges of the answer. Each may raise `PhalanxError`."""
-        ...
-
-    def look(self) -> None:
-        """Once a period: apply files that were changed, end what is over."""
-        ...
-
-    def counts(self) -> Mapping[str, int]:
-        """Event of it -> how often."""
-        ...
-
-    def figures(self) -> Mapping[str, float]:
-        """What it has now."""
-        ...
-
-
 class Reporter:
-    """Publishes `Health` and answers "report", "stop" and, where there is a picture, "preview" and "still";
-    where the camera can be changed, or raw frames kept, also their commands. Once a period it lets them look.
+    """Publishes `Health`, and answers commands.
 
-    Holds the bus while a master is there, and the gauges of the last period.
+    These are "report", "stop", where there is a picture "preview" and "still", and those of the parts, which also look
+    after their files once a period. Holds the bus while a master is there, and the metrics of the last period.
     """
 
     def __init__(
         self,
         name: str,
-        link: Link,
-        numbers: Numbers,
+        uplink: Uplink,
+        counters: Reporting,
         clock: Clock,
         connect: Callable[[str], Bus],
         stop: Callable[[], None],
-        period_s: float = PERIOD_S,
-        shown: Shown | None = None,
-        camera: Tuned | None = None,
-        raw: Tuned | None = None,
+        period_s: float = 0.5,
+        *,
+        previews: "Previews | None" = None,
+        parts: "Sequence[CameraTuning | RawFrames]" = (),
     ) -> None:
         """Start the thread.
 
         Args:
             name: Name of this slave on the bus.
-            link: Uplink, which learns the endpoint.
-            numbers: Counts of the loop.
+            uplink: Learns the endpoint of the bus.
+            counters: Counts of the loop.
             clock: Clock of the reports' times.
             connect: Opens a bus to an endpoint.
             stop: Called on the command "stop".
-            period_s: Time between reports [s].
-            shown: Shows the camera's picture on the command "preview".
-            camera: Changes the settings of the camera.
-            raw: Keeps raw frames.
+            period_s: Time between reports [s]: two of them make a judgement in the checklist of the master, which is to
+                be out within two seconds.
+            previews: Shows the camera's picture on the command "preview".
+            parts: Change the settings of the camera; keep raw frames.
         """
-        self._name = name
-        self._link = link
-        self._numbers = numbers
-        self._clock = clock
-        self._connect = connect
-        self._stop = stop
-        self._period_s = period_s
-        self._shown = shown
-        self._parts = tuple(part for part in (camera, raw) if part is not None)
+        self._name, self._uplink, self._counters, self._clock = name, uplink, counters, clock
+        self._connect, self._stop, self._period_s = connect, stop, period_s
+        self._previews, self._parts = previews, tuple(parts)
         self._commands = {verb: act for part in self._parts for verb, act in part.commands().items()}
         self._machine = Machine(Path.cwd())
         self._metrics: dict[str, float] = {}
@@ -146,12 +77,12 @@ class Reporter:
         self._thread.start()
 
     def health(self, now: Mapping[str, float] | None = None) -> Health:
-        """The report of this moment, with the gauges of the last period, or `now` in their place."""
-        counts = {**self._numbers.counts(), **self._link.counts}
+        """The report of this moment, with the metrics of the last period, or `now`."""
+        counts = {**self._counters.counts(), **self._uplink.counts}
         for part in self._parts:
             counts |= part.counts()
         metrics = self._metrics | dict(now or {})
-        return Health(self._name, self._link.session, self._clock.now_ns(), counts, metrics, *program())
+        return Health(self._name, self._uplink.session, self._clock.now_ns(), counts, metrics, *program())
 
     def answer(self, command: Command) -> Health:
         """Obey a command.
@@ -164,8 +95,8 @@ class Reporter:
             ValueError: Another verb; the asker reads which ones there are.
         """
         plain: dict[str, Callable[[], None]] = {"report": lambda: None, "stop": self._stop}
-        if (shown := self._shown) is not None:
-            plain |= {"preview": lambda: shown.ask(command.body), "still": shown.ask_still}
+        if (previews := self._previews) is not None:
+            plain |= {"preview": lambda: previews.ask(command.body), "still": previews.ask_still}
         if command.verb in plain:
             plain[command.verb]()
             return self.health()
@@ -182,13 +113,13 @@ class Reporter:
     def _work(self) -> None:
         count = 0
         while not self._closing.wait(self._period_s):
-            if count % LOG_EVERY == ALONE_AT and self._link.zenoh_endpoint is None:
-                _LOG.warning("%s", _why_alone(self._link.counts))
+            if count % LOG_EVERY == ALONE_AT and self._uplink.zenoh_endpoint is None:
+                _LOG.warning("%s", _why_alone(self._uplink.counts))
             try:
                 for part in self._parts:
                     part.look()
-                self._metrics = dict(self._numbers.metrics()) | self._figures()
-                self._follow(self._link.zenoh_endpoint)
+                self._metrics = self._measured()
+                self._follow(self._uplink.zenoh_endpoint)
                 if self._bus is not None:
                     self._bus.publish("health", self._name, self.health())
             except BusError as error:
@@ -197,14 +128,16 @@ class Reporter:
                     _LOG.warning("no bus: %s", error)
             except Exception as error:  # noqa: BLE001 - whatever it is of, the next report is tried
                 self._failures.log("no report", error)
-            if count % LOG_EVERY == 0 and self._numbers.counts().get("frames", 0):
+            if count % LOG_EVERY == 0 and self._counters.counts().get("frames", 0):
                 _LOG.info("%s", "  ".join(f"{k} {_short(v)}" for k, v in self._metrics.items()))
             count += 1
         self._leave()
 
-    def _figures(self) -> dict[str, float]:
-        own = {name: value for part in self._parts for name, value in part.figures().items()}
-        return own | self._machine.metrics()
+    def _measured(self) -> dict[str, float]:
+        metrics = dict(self._counters.metrics())
+        for part in self._parts:
+            metrics |= part.metrics()
+        return metrics | self._machine.metrics()
 
     def _follow(self, endpoint: str | None) -> None:
         if endpoint is None or endpoint == self._endpoint:
@@ -214,24 +147,24 @@ class Reporter:
         bus.announce(self._name)
         bus.serve(self._name, self.answer)
         self._bus, self._endpoint = bus, endpoint
-        if self._shown is not None:
-            self._shown.use(bus)
+        if self._previews is not None:
+            self._previews.use(bus)
 
     def _leave(self) -> None:
-        if self._shown is not None:
-            self._shown.use(None)
+        if self._previews is not None:
+            self._previews.use(None)
         if self._bus is not None:
             self._bus.close()
         self._bus, self._endpoint = None, None
 
 
 def _short(value: float) -> str:
-    """Three digits at least, and no exponent for microseconds: a gain of 0.83 is not 1."""
+    """Three digits at least, and no exponent: a gain of 0.83 is not 1."""
     return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
 
 
 def _why_alone(counts: Mapping[str, int]) -> str:
-    """What to look at when no master has answered, from the reasons of what was refused."""
+    """What to look at when no master has answered, by what was refused."""
     if counts.get("refused.foreign", 0):
         return "a master is heard, but of another rig key (or another program): compare the key files of both sides"
     if counts.get("refused.version", 0):

@@ -14,8 +14,6 @@ from typing import Protocol
 
 from common.service_manager import WATCHDOG, ServiceManager, one_line
 
-NOTIFIES = 4  # in a period of the watchdog
-STATUS_NS = 5_000_000_000  # between two lines of status where there is no watchdog
 LOST_PATIENCE_S = (
     90.0  # opening a camera again, all settings checked, takes seconds; one that hangs is given up
 )
@@ -60,7 +58,8 @@ class Service:
         self._send, self._period_us = self._manager.send, self._manager.watchdog_us
         self._now_ns, self._noun = now_ns, noun
         self._linked: Callable[[], bool] = lambda: False
-        self._every_ns = self._period_us * 1000 // NOTIFIES or STATUS_NS
+        # Four times in a period of the watchdog; without one, a line of status every five seconds
+        self._every_ns = self._period_us * 1000 // 4 or 5_000_000_000
         self._ready = self._patient = False
         self._rounds, self._since_ns = 0, 0
         self._due_ns = NEVER_NS

@@ -16,7 +16,7 @@ import threading
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 from msgspec import structs
 
@@ -34,8 +34,8 @@ from common.camera_settings import (
 from common.errors import CalibrationError, PhalanxError
 from common.file_monitor import MonitoredFiles
 from common.object_profile import ObjectProfile
-from slave.cameras.settings import Tunable
 from slave.colours_in_use import in_use
+from slave.sources import Tunable
 
 _ALL = "give all processes of the rig the same files, then restart them"
 _LOG = logging.getLogger(__name__)
@@ -96,18 +96,8 @@ def object_paths(rig_path: Path, rig: RigCalibration) -> tuple[Path, ...]:
 Prepare: TypeAlias = Callable[[CameraFiles, CameraFiles], Callable[[], None] | None]
 
 
-class Sampler(Protocol):
-    """What makes a colour of a click; a `slave.colour_sampler.ColourSampler`."""
-
-    def pick(
-        self, wish: ColourPick, camera: CameraCalibration
-    ) -> tuple[CameraCalibration, Mapping[str, float]]:
-        """The camera file with the colour, and gauges that say how good it is.
-
-        Raises:
-            PhalanxError: There is none, or no frame.
-        """
-        ...
+# Makes the colour that a click shows: the camera file with it, and how good it is. Raises `PhalanxError`.
+Sample: TypeAlias = Callable[[ColourPick, CameraCalibration], tuple[CameraCalibration, Mapping[str, float]]]
 
 
 class CameraTuning:
@@ -123,7 +113,7 @@ class CameraTuning:
         source: object,
         prepare: Prepare | None,
         running: Callable[[], bool],
-        sampler: Sampler | None = None,
+        sample: Sample | None = None,
     ) -> None:
         """Tune a camera.
 
@@ -132,11 +122,11 @@ class CameraTuning:
             source: The camera; a `Tunable`, or nothing can be changed but what senses.
             prepare: Makes what senses for other files; None: nobody senses.
             running: Whether frames are read: before, no change can be verified.
-            sampler: Makes a colour of a click; None: no markers are sought.
+            sample: Makes a colour of a click; None: no markers are sought.
         """
         self._used = self._on_disk = files
         self._source = source if isinstance(source, Tunable) else None
-        self._prepare, self._running, self._sampler = prepare, running, sampler
+        self._prepare, self._running, self._sample = prepare, running, sample
         self._lock = threading.Lock()
         self._monitored = MonitoredFiles()
         self._applied = self._refused = 0
@@ -162,14 +152,14 @@ class CameraTuning:
     def counts(self) -> dict[str, int]:
         """`reload.applied`, `reload.refused`: changed files; and the events of the camera."""
         own = {"reload.applied": self._applied, "reload.refused": self._refused}
-        return own if self._source is None else own | self._source.counts()
+        return own if self._source is None else {**own, **self._source.counts()}
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """What the camera has and does now, and what the content in use says of settings, size and colours."""
         used = self._used
         stated = {WANTED + name: value for name, value in figures(used.camera).items()}
         stated |= in_use(used.camera, used.rig.markers)
-        return stated if self._source is None else self._source.figures() | stated
+        return stated if self._source is None else {**self._source.metrics(), **stated}
 
     def look(self) -> None:
         """Apply the files if they were changed; where that fails, say so once and go on as before."""
@@ -190,7 +180,7 @@ class CameraTuning:
         if body:
             raise CalibrationError("settings: takes no body")
         used = self._used
-        return self.figures() | range_figures(used.camera, used.rig.markers)
+        return self.metrics() | range_figures(used.camera, used.rig.markers)
 
     def _set(self, body: str) -> dict[str, float]:
         with self._lock:
@@ -205,12 +195,12 @@ class CameraTuning:
     def _pick(self, body: str) -> dict[str, float]:
         with self._lock:
             wish = parse(body.encode(), ColourPick, "pick")
-            if self._sampler is None:
+            if self._sample is None:
                 raise CalibrationError(
                     "pick: this slave seeks no markers: the camera of a wrist device, or started with --colours none"
                 )
             refuse_strange((wish.marker,), self._used.rig.markers, "pick: marker")
-            camera, report = self._sampler.pick(wish, self._used.camera)
+            camera, report = self._sample(wish, self._used.camera)
             self._apply(replace(self._used, camera=_with_provenance(camera, "pick", (wish.marker,))))
         return self._settings("") | dict(report)
 

@@ -23,7 +23,6 @@ from slave.link import SlaveLink
 
 ANYWHERE = "0.0.0.0"
 LOOPBACK_BROADCAST = "127.255.255.255"
-BEACON_TIMEOUT_S = 0.1
 LOG_NS = 1_000_000_000
 _LOG = logging.getLogger(__name__)
 
@@ -60,7 +59,7 @@ class Uplink:
         self._clock = clock
         self._link = SlaveLink(name, key, clock, random)
         beacon_host, data_host = _hosts(bind)
-        self._beacons = UdpSocket((beacon_host, beacon_port), shared=True, timeout_s=BEACON_TIMEOUT_S)
+        self._beacons = UdpSocket((beacon_host, beacon_port), shared=True, timeout_s=0.1)
         self._data = UdpSocket((data_host, 0))
         self._lock = threading.Lock()
         self._sent = 0

@@ -24,12 +24,12 @@ from bench.aarch64.frames import FRAME_NS, SIX, TWELVE, WRIST, MarkedFrames, rea
 from bench.aarch64.parts import counted_parts
 from common.messages import Message, WristDetections, encode
 from master.link import MasterLink
-from slave.app import run
-from slave.cameras.source import Frame
-from slave.counters import Counters
+from slave.counters import DetectionCounters
 from slave.link import SlaveLink
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.engine import engine_named
+from slave.sender import MarkerPipeline, run
+from slave.sources import Frame
 from slave.wrist import engine as wrist_engine
 from slave.wrist.detector import WristDetector
 from slave.wrist.view import WristView
@@ -164,10 +164,9 @@ def run_case(case: str, folder: Path, marks: Marks) -> str:
         wire = _Wire(frames.camera.name)
         run(
             _Source(frames, mark),
-            detector,
-            wire,
-            frames.camera.name,
-            Counters(frames.names),
+            MarkerPipeline(
+                frames.camera.name, wire.session, wire.send, detector.push, DetectionCounters(frames.names)
+            ),
             threading.Event(),
         )
         digest.add(np.frombuffer(b"".join(wire.datagrams), np.uint8))

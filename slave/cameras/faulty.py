@@ -5,23 +5,21 @@ The pictures, settings and times are those of the camera inside; here they are s
 """
 
 import logging
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import cv2
 import numpy as np
 from msgspec import Meta, Struct
-from msgspec.structs import replace as with_fields
+from msgspec.structs import replace
 
 from common.arrays import Image
 from common.calibration import CameraCalibration
 from common.errors import CalibrationError, CameraError
 from common.json_file import decode_json
-from slave.cameras.source import Frame
 from slave.cameras.synthetic import SyntheticCamera
+from slave.sources import Frame
 
-POLL_NS = 100_000_000
 _LOG = logging.getLogger(__name__)
 Byte = Annotated[int, Meta(ge=0, le=255)]
 
@@ -109,7 +107,7 @@ class FaultyCamera:
             RuntimeError: Its driver is to raise something that no driver of ours raises.
         """
         while (frame := self._source.read()) is not None:
-            if frame.ready_t_ns - self._looked_ns >= POLL_NS:
+            if frame.ready_t_ns - self._looked_ns >= 100_000_000:  # the file is looked at ten times a second
                 self._looked_ns = frame.ready_t_ns
                 try:
                     self._look()
@@ -138,9 +136,9 @@ class FaultyCamera:
         self._source.tune(self._exposed(camera, self._faults))
         self._camera = camera
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """Its settings as they are, which is not as they were told where it exposes by itself."""
-        return self._source.figures()
+        return self._source.metrics()
 
     def counts(self) -> dict[str, int]:
         """Those of the camera inside."""
@@ -175,7 +173,7 @@ class FaultyCamera:
         self._faults = faults
 
     def _exposed(self, camera: CameraCalibration, faults: Faults) -> CameraCalibration:
-        return with_fields(camera, exposure_us=camera.exposure_us * faults.exposes)
+        return replace(camera, exposure_us=camera.exposure_us * faults.exposes)
 
     def _swapped(self, frame: Frame) -> Image:
         """The picture that comes under the stamp of `frame`."""

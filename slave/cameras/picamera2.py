@@ -3,8 +3,8 @@
 Settings are part of the configuration, so the first frames already have them. libcamera takes some frames until what
 it reports is what was asked for; then exposure, gains, frame duration and focus of three frames in a row must be
 those of the camera file. Image and metadata always come from the same captured request, which is released whatever
-happens. When a frame was taken, and its number, are in `picamera2_frames`; whether cameras run in step, in
-`picamera2_sync`, which streams there are in `picamera2_streams`.
+happens. When a frame was taken, its number, and whether cameras run in step, are in `picamera2_timing`; modes and
+streams in `picamera2_streams`.
 
 Exposure, gains and rate can be changed while frames are read: another thread writes the controls and watches the
 metadata of the frames that the loop reads, until three in a row show them. The mode stays, so a rate may not be above
@@ -23,11 +23,8 @@ from common.arrays import Image
 from common.calibration import CameraCalibration
 from common.clock import Clock
 from common.errors import CameraError
-from slave.cameras.frame_observer import FrameObserver
 from slave.cameras.grey import Pixels
-from slave.cameras.picamera2_frames import Timeline
 from slave.cameras.picamera2_library import open_library
-from slave.cameras.picamera2_modes import choose_mode, choose_raw_mode, read_modes, view_text
 from slave.cameras.picamera2_settings import (
     LIVE_CONTROLS,
     RATE_CONTROL,
@@ -37,18 +34,15 @@ from slave.cameras.picamera2_settings import (
     read_figures,
     wanted_settings,
 )
-from slave.cameras.picamera2_streams import Streams
-from slave.cameras.picamera2_sync import SyncMonitor, wait_in_step
-from slave.cameras.settings import as_values, change, demand, differences
-from slave.cameras.source import Frame
+from slave.cameras.picamera2_streams import Streams, choose_mode, choose_raw_mode, read_modes, view_text
+from slave.cameras.picamera2_timing import SyncMonitor, Timeline, wait_in_step
+from slave.cameras.settings import FrameObserver, as_values, change, demand, differences
+from slave.sources import Frame
 
 BUFFERS = 6  # picamera2's own number for video: the pipeline never starves while one frame is held
 TIMEOUT_S = 2.0  # libcamera itself gives a silent sensor up after 1 s
 SETTLE_FRAMES = 60  # sensors apply exposure and gain 2-3 frames late, the pipeline adds its own depth: ample
 GOOD_FRAMES = 3
-INSIST_FRAMES = 20  # ample for one writing to show
-SYNC_MARGIN = 1.05  # a client catches up by shorter frames, so the mode must be faster than the rig
-GIVE_BACK_S = 5.0
 _LOG = logging.getLogger(__name__)
 
 
@@ -150,7 +144,7 @@ class Picamera2Camera:
         # In a thread, because a camera whose cable is loose can block `close` for ever (picamera2 issue 1264).
         thread = threading.Thread(target=give_back, name="camera close", daemon=True)
         thread.start()
-        thread.join(GIVE_BACK_S)
+        thread.join(5.0)  # seconds: ample for a camera that lets itself be closed
         if thread.is_alive():
             raise CameraError(f"{self._where}: libcamera does not let it go; restart the slave")
         if failure:
@@ -171,11 +165,11 @@ class Picamera2Camera:
         change(self._apply, self._calibration, camera)
         self._calibration = camera
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """Settings as the metadata of the last frame has them, and whether it runs in step."""
         metadata = self._metadata.newest
         found = {} if metadata is None else read_figures(metadata)
-        return found if self._sync is None else found | self._sync.figures()
+        return found if self._sync is None else found | self._sync.metrics()
 
     def counts(self) -> dict[str, int]:
         """`camera.out_of_step`, where it is to be in step."""
@@ -200,7 +194,7 @@ class Picamera2Camera:
         takes the controls, then makes an empty set of them).
         """
         for count, metadata in enumerate(self._metadata.following(SETTLE_FRAMES, TIMEOUT_S)):
-            if count % INSIST_FRAMES == 0:
+            if count % 20 == 0:  # frames: ample for one writing to show
                 try:
                     self._library.set_controls(live)
                 except RuntimeError as error:
@@ -210,7 +204,8 @@ class Picamera2Camera:
     def _start(self) -> None:
         camera, library = self._calibration, self._library
         size = (camera.width_px, camera.height_px)
-        need_hz = camera.frame_rate_hz * (1.0 if self._options.sync == "off" else SYNC_MARGIN)
+        # A client catches up by shorter frames, so the mode must be faster than the rig
+        need_hz = camera.frame_rate_hz * (1.0 if self._options.sync == "off" else 1.05)
         try:
             modes = read_modes(library.sensor_modes)
             choose = choose_raw_mode if self._options.pixels is Pixels.GREY else choose_mode

@@ -11,10 +11,9 @@ from common.errors import CameraError, PictureError, RecordingError
 from common.frame_pictures import FramePictures
 from common.frame_recording import FrameRow, Manifest, open_recording
 from common.pictures import decode, read_picture
-from slave.cameras.source import Frame
+from slave.sources import Frame
 
 GAP_NS = 600_000_000_000  # longer than that it does not wait for the next frame
-STEP_S = 0.05  # longest sleep at a time, so that a signal ends a wait soon
 
 
 class ReplayCamera:
@@ -86,7 +85,7 @@ class ReplayCamera:
             "recording has no exposure or gain to change; only the colours of markers can be loaded"
         )
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """The settings that the recording was made with."""
         return figures(self._calibration)
 
@@ -102,7 +101,8 @@ class ReplayCamera:
 
     def _wait_until(self, t_ns: int) -> None:
         while (left_s := (t_ns - self._clock.now_ns()) * 1e-9) > 0.0:
-            time.sleep(min(left_s, STEP_S))
+            # 0.05 s at most at a time, so that a signal ends a wait soon
+            time.sleep(min(left_s, 0.05))
 
 
 def is_grey(manifest: Manifest, camera: str) -> bool:

@@ -1,38 +1,18 @@
-"""Camera settings: what was asked for, what the camera says it has, and whether that is the same.
+"""Compare the settings of a camera with what was asked for.
 
 A camera rounds: exposure to whole rows, gain to whole register codes. So every setting carries how far the value
 read back may be from the value wanted, and why. Whatever is further off is an error that names setting, wanted,
-got and what to do; nothing is taken on trust.
+got and what to do; nothing is taken on trust. What changes settings of a running camera watches its frames go by
+(`FrameObserver`), without holding them up.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Generic, TypeVar
 
 from common.calibration import CameraCalibration
 from common.errors import CameraError
-
-
-@runtime_checkable
-class Tunable(Protocol):
-    """A camera that tells what it has, and whose settings may be changed by another thread while it is read."""
-
-    def tune(self, camera: CameraCalibration) -> None:
-        """Take exposure, gains and rate of `camera`; its size is that it was opened with.
-
-        Raises:
-            CameraError: Refused, or not taken. The text names setting, wanted and got; the old settings are back, or
-                the text says that they are not.
-        """
-        ...
-
-    def figures(self) -> dict[str, float]:
-        """What the camera has and does now, read back; names of `common.camera_settings`, and others."""
-        ...
-
-    def counts(self) -> dict[str, int]:
-        """Events of the camera -> how often since it was first opened."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,3 +112,49 @@ def _number(value: float) -> str:
 
 def _space(unit: str) -> str:
     return f" {unit}" if unit else ""
+
+
+T = TypeVar("T")
+
+
+class FrameObserver(Generic[T]):
+    """Holds the newest of what went by, and how many there were."""
+
+    def __init__(self) -> None:
+        """Nothing went by yet."""
+        self._changed = threading.Condition()
+        self._newest: T | None = None
+        self._count = 0
+
+    @property
+    def newest(self) -> T | None:
+        """What went by last, if anything."""
+        return self._newest
+
+    def put(self, item: T) -> None:
+        """The loop has read `item`. Never waits longer than a look at it takes."""
+        with self._changed:
+            self._newest = item
+            self._count += 1
+            self._changed.notify_all()
+
+    def following(self, count: int, timeout_s: float) -> Iterator[T]:
+        """Wait for `count` items that go by from now on.
+
+        A watcher who is late misses some; those do not count.
+
+        Raises:
+            CameraError: None came for `timeout_s` [s].
+        """
+        return self._after(self._count, count, timeout_s)
+
+    def _after(self, last: int, count: int, timeout_s: float) -> Iterator[T]:
+        for _ in range(count):
+            with self._changed:
+                if not self._changed.wait_for(lambda seen=last: self._count > seen, timeout_s):
+                    raise CameraError(
+                        f"no frame was read for {timeout_s:g} s: the camera is away, or the slave waits for a master"
+                    )
+                last, item = self._count, self._newest
+            assert item is not None  # it was counted
+            yield item

@@ -16,7 +16,6 @@ and gains, at the start or later, make the picture brighter or darker against th
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -24,7 +23,7 @@ import numpy as np
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration
 from common.camera_settings import figures
-from common.clock import Clock
+from common.clock import Clock, SkewedClock
 from common.errors import CalibrationError, CameraError
 from common.frame_recording import Illumination
 from common.sim.board import BoardScene
@@ -32,29 +31,9 @@ from common.sim.scene import Scene
 from common.sim.scenes import renderer_of
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
-from slave.cameras.source import Frame
 from slave.lights.schedule import CYCLE as STROBE
-from slave.lights.synthetic import Lit
-
-WHOLE = 0.999  # of an exposure; what lit that much lit all of it
-STEP_S = 0.05  # longest sleep at a time, so that a signal ends a wait soon
-
-
-@runtime_checkable
-class _Skewed(Protocol):
-    """A clock that can be told apart from true time."""
-
-    def to_true(self, t_ns: int) -> int: ...
-
-    def from_true(self, t_ns: int) -> int: ...
-
-
-class LitBy(Protocol):
-    """What lights the scene; a `SimulatedStrobe`."""
-
-    def during(self, start_ns: int, stop_ns: int) -> Lit:
-        """How much of an exposure [ns] each light was on; exposures are asked for one after another."""
-        ...
+from slave.lights.simulated import SimulatedStrobe
+from slave.sources import Frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +60,7 @@ class SyntheticCamera:
         start_offset_ns: int,
         true_clock: Clock,
         sleep: Callable[[float], None] = time.sleep,
-        lights: LitBy | None = None,
+        lights: SimulatedStrobe | None = None,
         *,
         live: bool = False,
     ) -> None:
@@ -132,7 +111,8 @@ class SyntheticCamera:
         self._next = seq + 1
         due = self._true_ns(t_ns + self._readout_ns)
         while (left_s := (due - self._true.now_ns()) * 1e-9) > 0.0:
-            self._sleep(min(left_s, STEP_S))
+            # 0.05 s at most at a time, so that a signal ends a wait soon
+            self._sleep(min(left_s, 0.05))
         return Frame(seq, t_ns, self._clock.now_ns(), image, lit, exposure_us=self._camera.exposure_us)
 
     def close(self) -> None:
@@ -161,7 +141,7 @@ class SyntheticCamera:
         gains_bgr = _sensitivity(camera) / _sensitivity(self._lit_for)
         self._camera, self._renderer = camera, self._renderer.exposed(camera.exposure_us, gains_bgr)
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """Its settings."""
         return figures(self._camera)
 
@@ -183,13 +163,14 @@ class SyntheticCamera:
         return image, Illumination.AMBIENT
 
     def _draw_lit(
-        self, renderer: WristRenderer, t_s: float, t_ns: int, lights: LitBy
+        self, renderer: WristRenderer, t_s: float, t_ns: int, lights: SimulatedStrobe
     ) -> tuple[Image, Illumination]:
         """What the lights had on during the exposure; a light that was on for a part of it adds that part."""
         half_ns = round(self._camera.exposure_us * 500.0)
         lit = lights.during(t_ns - half_ns, t_ns + half_ns)
         shares = {Illumination.LASER: lit.laser, Illumination.LED: lit.led}
-        if all(share <= 0.0 or share >= WHOLE for share in shares.values()) and lit.laser * lit.led == 0.0:
+        # What lit 0.999 of an exposure lit all of it
+        if all(share <= 0.0 or share >= 0.999 for share in shares.values()) and lit.laser * lit.led == 0.0:
             return renderer.render(t_s, lit.mostly), lit.mostly
         ambient = renderer.render(t_s, Illumination.AMBIENT).astype(np.float32)
         image = ambient.copy()
@@ -226,10 +207,10 @@ class SyntheticCamera:
         return self._pace.exposed_ns(seq)
 
     def _own(self, t_ns: int) -> int:
-        return self._clock.from_true(t_ns) if isinstance(self._clock, _Skewed) else t_ns
+        return self._clock.from_true(t_ns) if isinstance(self._clock, SkewedClock) else t_ns
 
     def _true_ns(self, t_ns: int) -> int:
-        return self._clock.to_true(t_ns) if isinstance(self._clock, _Skewed) else t_ns
+        return self._clock.to_true(t_ns) if isinstance(self._clock, SkewedClock) else t_ns
 
 
 def _refuse_other_size(camera: CameraCalibration, true: CameraCalibration) -> None:

@@ -35,13 +35,12 @@ from common.camera_settings import same_exposed
 from common.clock import Clock
 from common.errors import CameraError
 from slave.cameras import v4l2_abi as abi
-from slave.cameras.frame_observer import FrameObserver
 from slave.cameras.grey import Pixels
-from slave.cameras.settings import change
-from slave.cameras.source import Frame
-from slave.cameras.stamps import ForeignClock, clock_of, system_clock
+from slave.cameras.settings import FrameObserver, change
 from slave.cameras.v4l2_formats import Layout, Offer, choose_offer, read_offers, set_format
 from slave.cameras.v4l2_settings import SETTLE_FRAMES, TIMEOUT_S, V4l2Settings
+from slave.clocks import ForeignClock, clock_of, system_clock
+from slave.sources import Frame
 
 BUFFERS = 4
 RATE_SHARE = (
@@ -49,7 +48,6 @@ RATE_SHARE = (
 )
 INTERRUPT_SIGMA_NS, USB_SIGMA_NS, USB_CLOCK_SIGMA_NS = 50e3, 1.2e6, 0.3e6  # see above
 USB_CLOCK = Path("/sys/module/uvcvideo/parameters/hwtimestamps")
-NOT_INCREASING = 2**31  # steps of a 32-bit frame number beyond this run backwards
 _LOG = logging.getLogger(__name__)
 
 
@@ -68,6 +66,11 @@ class V4l2Options:
     controls: Mapping[str, int] = field(default_factory=dict[str, int])
     allow_missing: tuple[str, ...] = ()
     pixels: Pixels = Pixels.COLOUR
+
+
+def device_path(place: str) -> Path:
+    """The device of a number or a path; empty: the first one."""
+    return Path(f"/dev/video{place or '0'}" if place.isdecimal() or not place else place)
 
 
 class V4l2Camera:
@@ -203,9 +206,9 @@ class V4l2Camera:
                 f"{self._where}: {failed}; and the settings before did not come back: {error}"
             ) from error
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """Settings as the camera has them now, and the rate measured at the start; nothing where it is gone."""
-        found = {} if self._settings is None else self._settings.figures()
+        found = {} if self._settings is None else self._settings.metrics()
         return found | {"frame_rate_hz": self._rate_hz} if found else found
 
     def counts(self) -> dict[str, int]:
@@ -340,7 +343,8 @@ class V4l2Camera:
     def _count(self, sequence: int) -> None:
         """Number of the frame, from the driver's 32-bit number; a driver that does not count adds one."""
         step = 1 if self._sequence is None else (sequence - self._sequence) % 2**32
-        self._seq += step if 0 < step < NOT_INCREASING else 1
+        # A step of half the 32-bit range or more runs backwards
+        self._seq += step if 0 < step < 2**31 else 1
         self._sequence = sequence
 
     def _row_zero_ns(self, buffer: abi.Buffer) -> int:

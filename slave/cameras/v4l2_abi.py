@@ -32,6 +32,11 @@ CTRL_HAS_PAYLOAD, CTRL_NEXT = 0x100, 0x8000_0000
 TYPE_INTEGER, TYPE_BOOLEAN, TYPE_MENU, TYPE_INTEGER64, TYPE_BITMASK, TYPE_INTEGER_MENU = 1, 2, 3, 5, 8, 9
 
 
+def _words(*names: str) -> list[tuple[str, type[c.c_uint32]]]:
+    """Fields of 32 bits."""
+    return [(name, c.c_uint32) for name in names]
+
+
 class Capability(c.Structure):
     """struct v4l2_capability."""
 
@@ -39,9 +44,7 @@ class Capability(c.Structure):
         ("driver", c.c_char * 16),
         ("card", c.c_char * 32),
         ("bus_info", c.c_char * 32),
-        ("version", c.c_uint32),
-        ("capabilities", c.c_uint32),
-        ("device_caps", c.c_uint32),
+        *_words("version", "capabilities", "device_caps"),
         ("reserved", c.c_uint32 * 3),
     ]
 
@@ -50,9 +53,7 @@ class FormatDescription(c.Structure):
     """struct v4l2_fmtdesc."""
 
     _fields_ = [
-        ("index", c.c_uint32),
-        ("type", c.c_uint32),
-        ("flags", c.c_uint32),
+        *_words("index", "type", "flags"),
         ("description", c.c_char * 32),
         ("pixelformat", c.c_uint32),
         ("mbus_code", c.c_uint32),
@@ -64,9 +65,7 @@ class FrameSizes(c.Structure):
     """struct v4l2_frmsizeenum; `size` is width, height, or min, max, step of width, then of height."""
 
     _fields_ = [
-        ("index", c.c_uint32),
-        ("pixel_format", c.c_uint32),
-        ("type", c.c_uint32),
+        *_words("index", "pixel_format", "type"),
         ("size", c.c_uint32 * 6),
         ("reserved", c.c_uint32 * 2),
     ]
@@ -76,11 +75,7 @@ class FrameIntervals(c.Structure):
     """struct v4l2_frmivalenum; `interval` is one fraction [s], or min, max and step."""
 
     _fields_ = [
-        ("index", c.c_uint32),
-        ("pixel_format", c.c_uint32),
-        ("width", c.c_uint32),
-        ("height", c.c_uint32),
-        ("type", c.c_uint32),
+        *_words("index", "pixel_format", "width", "height", "type"),
         ("interval", c.c_uint32 * 6),
         ("reserved", c.c_uint32 * 2),
     ]
@@ -89,13 +84,10 @@ class FrameIntervals(c.Structure):
 class PixelFormat(c.Structure):
     """struct v4l2_pix_format."""
 
-    _fields_ = [
-        (name, c.c_uint32)
-        for name in (
-            *("width", "height", "pixelformat", "field", "bytesperline", "sizeimage"),
-            *("colorspace", "priv", "flags", "ycbcr_enc", "quantization", "xfer_func"),
-        )
-    ]
+    _fields_ = _words(
+        *("width", "height", "pixelformat", "field", "bytesperline", "sizeimage"),
+        *("colorspace", "priv", "flags", "ycbcr_enc", "quantization", "xfer_func"),
+    )
 
 
 class _FormatUnion(c.Union):
@@ -112,11 +104,7 @@ class StreamParameters(c.Structure):
     """struct v4l2_streamparm with struct v4l2_captureparm."""
 
     _fields_ = [
-        ("type", c.c_uint32),
-        ("capability", c.c_uint32),
-        ("capturemode", c.c_uint32),
-        ("numerator", c.c_uint32),
-        ("denominator", c.c_uint32),
+        *_words("type", "capability", "capturemode", "numerator", "denominator"),
         ("rest", c.c_uint8 * 184),
     ]
 
@@ -125,10 +113,7 @@ class RequestBuffers(c.Structure):
     """struct v4l2_requestbuffers."""
 
     _fields_ = [
-        ("count", c.c_uint32),
-        ("type", c.c_uint32),
-        ("memory", c.c_uint32),
-        ("capabilities", c.c_uint32),
+        *_words("count", "type", "memory", "capabilities"),
         ("flags", c.c_uint8),
         ("reserved", c.c_uint8 * 3),
     ]
@@ -138,20 +123,11 @@ class Buffer(c.Structure):
     """struct v4l2_buffer; `offset` is the first member of the union m, which is a pointer wide."""
 
     _fields_ = [
-        ("index", c.c_uint32),
-        ("type", c.c_uint32),
-        ("bytesused", c.c_uint32),
-        ("flags", c.c_uint32),
-        ("field", c.c_uint32),
+        *_words("index", "type", "bytesused", "flags", "field"),
         ("tv_sec", c.c_int64),
         ("tv_usec", c.c_int64),
         ("timecode", c.c_uint8 * 16),
-        ("sequence", c.c_uint32),
-        ("memory", c.c_uint32),
-        ("offset", c.c_uint32),
-        ("m_rest", c.c_uint32),
-        ("length", c.c_uint32),
-        ("reserved2", c.c_uint32),
+        *_words("sequence", "memory", "offset", "m_rest", "length", "reserved2"),
         ("request_fd", c.c_int32),
     ]
 
@@ -167,10 +143,7 @@ class QueryControl(c.Structure):
         ("maximum", c.c_int64),
         ("step", c.c_uint64),
         ("default_value", c.c_int64),
-        ("flags", c.c_uint32),
-        ("elem_size", c.c_uint32),
-        ("elems", c.c_uint32),
-        ("nr_of_dims", c.c_uint32),
+        *_words("flags", "elem_size", "elems", "nr_of_dims"),
         ("dims", c.c_uint32 * 4),
         ("reserved", c.c_uint32 * 32),
     ]
@@ -180,12 +153,7 @@ class QueryMenu(c.Structure):
     """struct v4l2_querymenu, packed."""
 
     _pack_ = 1
-    _fields_ = [
-        ("id", c.c_uint32),
-        ("index", c.c_uint32),
-        ("name", c.c_char * 32),
-        ("reserved", c.c_uint32),
-    ]
+    _fields_ = [("id", c.c_uint32), ("index", c.c_uint32), ("name", c.c_char * 32), ("reserved", c.c_uint32)]
 
 
 class _ControlValue(c.Union):
@@ -197,21 +165,14 @@ class ControlValue(c.Structure):
     """struct v4l2_ext_control, packed."""
 
     _pack_ = 1
-    _fields_ = [
-        ("id", c.c_uint32),
-        ("size", c.c_uint32),
-        ("reserved2", c.c_uint32),
-        ("of", _ControlValue),
-    ]
+    _fields_ = [*_words("id", "size", "reserved2"), ("of", _ControlValue)]
 
 
 class ControlValues(c.Structure):
     """struct v4l2_ext_controls."""
 
     _fields_ = [
-        ("which", c.c_uint32),
-        ("count", c.c_uint32),
-        ("error_idx", c.c_uint32),
+        *_words("which", "count", "error_idx"),
         ("request_fd", c.c_int32),
         ("reserved", c.c_uint32),
         ("controls", c.POINTER(ControlValue)),

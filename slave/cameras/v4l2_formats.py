@@ -38,7 +38,6 @@ from slave.cameras.v4l2_abi import (
 )
 
 RATE_SHARE = 0.01  # 59.94 Hz serves 60 Hz
-MOST = 256  # entries of an enumeration; a driver that never ends it is broken
 PREFERENCE = {
     Pixels.COLOUR: ("BGR3", "RGB3", "YUYV", "UYVY", *JPEG_FORMATS),
     Pixels.GREY: GREY_FORMATS,
@@ -195,7 +194,7 @@ def _colours(raw: Image, name: str, size: tuple[int, int], stride: int) -> Image
 
 def _enumerate(device: Device, request: int, entry: Callable[[int], EntryT]) -> Iterator[EntryT]:
     """Entries 0, 1, … until the driver says that there is no more."""
-    for index in range(MOST):
+    for index in range(256):  # a driver that never ends its enumeration is broken
         item = entry(index)
         try:
             device.ioctl(request, item)

@@ -10,9 +10,8 @@ from typing import TypeVar
 
 from common.calibration import CameraCalibration
 from common.errors import CameraError
-from slave.cameras.frame_observer import FrameObserver
 from slave.cameras.grey import Pixels
-from slave.cameras.settings import change, demand, differences
+from slave.cameras.settings import FrameObserver, change, demand, differences
 from slave.cameras.v4l2_abi import Device
 from slave.cameras.v4l2_controls import (
     AUTOMATICS,
@@ -105,7 +104,7 @@ class V4l2Settings:
             raise CameraError("exposure_us cannot be changed: the camera has no control for it")
         change(lambda camera: self._apply(camera, frames), old, new)
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """Exposure and codes as the camera has them now; nothing where it is gone."""
         shown = [setting for setting in self._wanted if setting.name not in AUTOMATICS]
         try:

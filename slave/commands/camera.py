@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING
 from common.calibration import CameraCalibration, RigCalibration
 from common.clock import Clock
 from common.errors import CameraError
-from slave.cameras import real
-from slave.cameras.source import FrameSource
+from slave import devices
 from slave.commands.options import epoch_of, world_of
 from slave.drivers import CAMERAS
-from slave.lights.factory import SYNTHETIC, choose, limits_for, open_guarded
 from slave.service import ConnectionLost, nobody
+from slave.sources import FrameSource
 
 if TYPE_CHECKING:
-    from slave.cameras.synthetic import LitBy
+    from slave.lights.simulated import SimulatedStrobe
 
 
 def open_lit(
@@ -46,19 +45,21 @@ def open_lit(
         LightsError: The lights are not said, do not fit, or cannot be opened.
         CalibrationError: A file of the simulated world is missing or broken.
     """
-    lights = choose(options.lights, rig, str(options.camera))
-    if lights is None or (lights == SYNTHETIC and options.scene == "board"):  # a simulated board is not lit
+    lights = devices.choose_lights(options.lights, rig, str(options.camera))
+    if lights is None or (
+        lights == devices.SYNTHETIC and options.scene == "board"
+    ):  # a simulated board is not lit
         return _open(options, rig, camera, clock, true_clock, stop, connection_lost)
     from slave.lights.controller import StrobeController
     from slave.lights.simulated import SimulatedStrobe
     from slave.lights.strobed import StrobedCamera, schedule_of
 
-    limits, schedule = limits_for(lights, rig), schedule_of(rig, camera)
-    if lights == SYNTHETIC:
+    limits, schedule = devices.light_limits(lights, rig), schedule_of(rig, camera)
+    if lights == devices.SYNTHETIC:
         strobe = SimulatedStrobe(schedule, limits)
         source = _open(options, rig, camera, clock, true_clock, stop, nobody, strobe)
         return StrobedCamera(source, camera, rig, strobe)
-    interlock = open_guarded(lights, rig)
+    interlock = devices.open_lights(lights, rig)
     try:
         source = _open(options, rig, camera, clock, true_clock, stop, connection_lost)
     except Exception:
@@ -75,9 +76,9 @@ def _open(
     true_clock: Clock,
     stop: threading.Event | None,
     connection_lost: ConnectionLost,
-    lights: "LitBy | None" = None,
+    lights: "SimulatedStrobe | None" = None,
 ) -> FrameSource:
-    found = real.open_real(
+    found = devices.open_camera(
         options.camera,
         options,
         camera,
@@ -106,7 +107,7 @@ def _open_synthetic(
     true_clock: Clock,
     stop: threading.Event | None,
     connection_lost: ConnectionLost,
-    lights: "LitBy | None",
+    lights: "SimulatedStrobe | None",
 ) -> FrameSource:
     from slave.cameras.synthetic import SyntheticCamera
     from slave.simulated import FrameClock, scene_of
@@ -128,7 +129,7 @@ def _open_synthetic(
 
     frozen = Frozen()
 
-    return real.persistent(
+    return devices.reconnecting_camera(
         lambda file: FaultyCamera(draw(file), file, options.faults, frozen),
         camera,
         clock,

@@ -8,13 +8,14 @@ from common.clock import SystemClock
 from common.errors import CalibrationError
 from common.imu_csv_columns import ACCEL, GYRO, MAG, TIME
 from common.terminal import echo
+from slave import devices
 from slave.commands.options import clock_of, epoch_of, rig_of, secrets_of, world_of
-from slave.imu import factory
 from slave.service import Service
 from slave.stopping import stop_by_signal
 
 if TYPE_CHECKING:
-    from slave.imu.source import ImuSource
+    from slave.sources import ImuSource
+
 USUAL_NAME = "imu"
 
 
@@ -24,9 +25,8 @@ def send_imu(options: argparse.Namespace) -> int:
     Raises:
         PhalanxError: A file, the IMU, a key or the network is not as it must be.
     """
-    from slave.imu.live import run_live
-    from slave.imu.synthetic import SyntheticImu
-    from slave.simulated import imu_of
+    from slave.sender import Sender, send_samples
+    from slave.simulated import SyntheticSensor, imu_of
     from slave.uplink import Uplink
 
     rig = rig_of(options)
@@ -35,7 +35,7 @@ def send_imu(options: argparse.Namespace) -> int:
     if rig.imu is None or options.name != rig.imu.name:
         has = "it has none" if rig.imu is None else f"its IMU is {rig.imu.name!r}"
         raise CalibrationError(f"rig {rig.name!r} has no IMU {options.name!r}; {has}")
-    orientation = factory.orientation_of(rig.imu)
+    orientation = devices.orientation_of(rig.imu)
     true_clock = SystemClock()
     clock = clock_of(options, true_clock)
     key, access = secrets_of(options)
@@ -48,13 +48,14 @@ def send_imu(options: argparse.Namespace) -> int:
         if options.imu == "synthetic":
             epoch_ns = epoch_of(options, true_clock)
             imu = imu_of(options.imu, *world_of(options, rig), options.scene, options.seed)
-            source: ImuSource = SyntheticImu(imu, epoch_ns, clock, stop)
+            source: ImuSource = SyntheticSensor(imu.sample, imu.rate_hz, epoch_ns, clock, stop)
         else:
-            source = factory.open_real(
+            source = devices.open_imu(
                 options.name, options.imu, rig.imu.rate_hz, clock, stop, service.connection_lost
             )
         uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
-        run_live(options.name, source, orientation, uplink, clock, stop, print_line, service, access)
+        sender = Sender(options.name, uplink, clock, stop, print_line, service, access)
+        send_samples(sender, source, orientation)
     return 0
 
 

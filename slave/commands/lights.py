@@ -6,8 +6,8 @@ from common.calibration import CameraCalibration, load
 from common.errors import LightsError
 from common.terminal import echo
 from slave.commands.options import camera_path, rig_of
+from slave.devices import open_lights
 from slave.drivers import SWITCHED_LIGHTS
-from slave.lights.factory import open_guarded
 from slave.stopping import stop_by_signal
 
 USUAL_RIG = "wrist"
@@ -29,7 +29,7 @@ def look_at_lights(options: argparse.Namespace) -> int:
     if not options.lights:
         raise LightsError(f"--blink and --off need the lights: --lights {SWITCHED_LIGHTS}")
     with stop_by_signal() as stop:
-        interlock = open_guarded(options.lights, rig)  # dark from here on
+        interlock = open_lights(options.lights, rig)  # dark from here on
         try:
             if options.blink:
                 echo(budget(rig, camera))

@@ -16,12 +16,12 @@ from common.clock import Clock, SkewedClock, SystemClock
 from common.command_line import UsageError
 from common.errors import CalibrationError, CameraError, PhalanxError
 from common.terminal import echo, remark
+from slave import devices
 from slave.commands.camera import open_lit
 from slave.commands.importing import import_foreign
 from slave.commands.imu import import_table_of_imu
 from slave.commands.join import join
 from slave.commands.options import camera_of, camera_path, clock_of, objects_of, skew_of, world_of
-from slave.imu import factory
 from slave.stopping import stop_by_signal
 
 if TYPE_CHECKING:
@@ -169,9 +169,9 @@ def _imu_recorder(options: argparse.Namespace, scene: _Scene) -> "Generator[ImuR
     imu = scene.rig.imu
     if imu is None:
         raise CalibrationError(f"rig {scene.rig.name!r}: imu: missing; there is none to record")
-    orientation, stop = factory.orientation_of(imu), threading.Event()
+    orientation, stop = devices.orientation_of(imu), threading.Event()
     imu_recorder = ImuRecorder(
-        factory.open_real(imu.name, options.imu, imu.rate_hz, scene.clock, stop), orientation, stop
+        devices.open_imu(imu.name, options.imu, imu.rate_hz, scene.clock, stop), orientation, stop
     )
     try:
         yield imu_recorder

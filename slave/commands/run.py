@@ -68,8 +68,9 @@ def send_camera(options: argparse.Namespace) -> int:
         PhalanxError: A file, the camera, its lights, a key or the network is not as it must be.
     """
     # Imported here: to detect in a recording needs neither sockets nor zenoh, and starts twice as fast.
-    from slave.live import run_live
+    from slave.live import send_detections
     from slave.markers import engine as marker_engine
+    from slave.sender import Sender
     from slave.uplink import Uplink
     from slave.wrist import engine as wrist_engine
 
@@ -88,21 +89,8 @@ def send_camera(options: argparse.Namespace) -> int:
     def print_line(line: str) -> None:
         echo(f"{options.name}: {line}")
 
-    run_live(
-        options.name,
-        files,
-        source,
-        uplink,
-        clock,
-        options.colours,
-        options.scan,
-        engine,
-        stop,
-        print_line,
-        service,
-        access,
-        raw,
-    )
+    sender = Sender(options.name, uplink, clock, stop, print_line, service, access)
+    send_detections(sender, files, source, options.colours, options.scan, engine, raw)
     return 0
 
 

@@ -9,10 +9,10 @@ from common.clock import SkewedClock, SystemClock
 from common.errors import PhalanxError
 from common.object_profile import ObjectProfile
 from common.terminal import echo
+from slave import devices
 from slave.commands.options import clock_of, epoch_of, rig_of, secrets_of, tree_of, world_of
-from slave.objects import factory
-from slave.objects.source import TrackerSource
 from slave.service import ConnectionLost, Service
+from slave.sources import TrackerSource
 from slave.stopping import stop_by_signal
 
 
@@ -22,11 +22,11 @@ def send_tracker(options: argparse.Namespace) -> int:
     Raises:
         PhalanxError: A file, the tracker, a key or the network is not as it must be.
     """
-    from slave.objects.live import run_live
+    from slave.sender import Sender, send_poses
     from slave.uplink import Uplink
 
     rig = rig_of(options)
-    profile = factory.object_with(tree_of(options), rig, options.name)
+    profile = devices.object_with(tree_of(options), rig, options.name)
     true_clock = SystemClock()
     clock = clock_of(options, true_clock)
     key, access = secrets_of(options)
@@ -43,7 +43,8 @@ def send_tracker(options: argparse.Namespace) -> int:
             source.close()
             raise
         recorded = options.tracker.startswith("survive:")
-        run_live(options.name, source, uplink, clock, stop, print_line, service, access, recorded)
+        sender = Sender(options.name, uplink, clock, stop, print_line, service, access)
+        send_poses(sender, source, recorded)
     return 0
 
 
@@ -58,10 +59,9 @@ def _open(
 ) -> TrackerSource:
     if options.tracker != "synthetic":
         named = options.tracker, options.serial, options.program
-        return factory.open_real(options.name, *named, clock, stop, connection_lost)
-    from slave.objects.synthetic import SyntheticTracker
-    from slave.simulated import tracker_of
+        return devices.open_tracker(options.name, *named, clock, stop, connection_lost)
+    from slave.simulated import TRACKER_HZ, SyntheticSensor, poses_of, tracker_of
 
     epoch_ns = epoch_of(options, true_clock)
     tracker = tracker_of(*world_of(options, rig), options.scene, options.seed, profile)
-    return SyntheticTracker(options.name, tracker, epoch_ns, clock, stop)
+    return SyntheticSensor(poses_of(options.name, tracker), TRACKER_HZ, epoch_ns, clock, stop)

@@ -12,8 +12,9 @@ from pathlib import Path
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.clock import SystemClock
 from common.errors import PhalanxError
-from slave.cameras import real
+from slave import devices
 from slave.cameras.settings import Setting, differences
+from slave.cameras.v4l2 import device_path
 from slave.cameras.v4l2_abi import KernelDevice
 from slave.cameras.v4l2_controls import AUTOMATICS, read_back, read_controls
 from slave.doctor.finding import Finding, fail, ok, unseen
@@ -41,12 +42,12 @@ def check_camera(slave: argparse.Namespace, taken: bool) -> Iterator[Finding]:
         return
     yield ok("camera file", f"{file.width_px}x{file.height_px} at {file.frame_rate_hz:g} Hz, rig {rig.name}")
     kind, _, place = str(slave.camera).partition(":")
-    if kind not in real.DRIVERS:
+    if kind not in devices.REAL_CAMERAS:
         yield unseen("camera", f"{slave.camera}: no device")
     elif not taken:
         yield _opened(slave, file, wrist=rig.kind == "wrist")
     elif kind == "v4l2":
-        yield _automatics(Path(f"/dev/video{place or '0'}" if place.isdecimal() or not place else place))
+        yield _automatics(device_path(place))
     else:
         yield unseen(
             "camera", "the running service has it, and read its settings back; else: systemctl stop it first"
@@ -59,7 +60,7 @@ def _opened(slave: argparse.Namespace, file: CameraCalibration, *, wrist: bool) 
 
     def look() -> None:
         try:
-            camera = real.open_real(str(slave.camera), slave, file, SystemClock(), None, wrist=wrist)
+            camera = devices.open_camera(str(slave.camera), slave, file, SystemClock(), None, wrist=wrist)
             assert camera is not None  # its driver is a real one
             try:
                 seen = sum(camera.read() is not None for _ in range(FRAMES))

@@ -33,7 +33,7 @@ def run(options: argparse.Namespace) -> int:
         PhalanxError: The lights cannot be looked at or switched.
     """
     if options.ports:
-        from slave.imu.factory import places
+        from slave.devices import imu_places as places
 
         echo(places())
         return 0

@@ -14,7 +14,6 @@ from common.imu_recording import IMU, write_imu
 from common.imu_score import TiltErrors
 from common.messages import ImuSample
 
-_GAP = 1.5  # periods
 _NO_QUATERNION = np.full(4, np.nan)
 
 
@@ -50,7 +49,7 @@ def import_table(table: Table, source: str, folder: Path | None, notify: Callabl
         rest_s += period_s if fusion.at_rest else 0.0
     for what, names in table.columns.items():
         notify(f"{what + ':':12s} {names}{' in ' + table.units[what] if what in table.units else ''}")
-    gaps = step_s > _GAP * period_s
+    gaps = step_s > 1.5 * period_s
     longest = f", the longest {step_s.max():.3f} s" if gaps.any() else ""
     notify(
         f"samples:     {len(samples)} in {float(step_s.sum()):.2f} s, {1.0 / period_s:.1f} Hz; "

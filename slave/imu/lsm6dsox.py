@@ -21,8 +21,8 @@ from smbus2 import SMBus, i2c_msg
 from common.clock import Clock
 from common.errors import ImuError
 from common.messages import ImuSample
+from slave.clocks import ClockSteppedError, DeviceClock
 from slave.imu import lsm6dsox_fifo as chip
-from slave.imu.device_clock import ClockSteppedError, DeviceClock
 from slave.imu.lsm6dsox_fifo import Rate, Register
 
 ADDRESS = 0x6A  # its pin SA0 to ground; 0x6B: to the supply
@@ -59,6 +59,24 @@ class I2cPlace:
 
     bus: int
     address: int = ADDRESS
+
+    @classmethod
+    def of(cls, text: str) -> "I2cPlace":
+        """BUS or BUS:ADDRESS, numbers; the address in C's notation.
+
+        Raises:
+            ImuError: Neither, or no address of a part.
+        """
+        bus, _, address = text.partition(":")
+        try:
+            place = cls(int(bus), int(address, 0) if address else ADDRESS)
+        except ValueError:
+            place = None
+        if place is None or place.bus < 0 or not 0x08 <= place.address <= 0x77:
+            raise ImuError(
+                f"--imu lsm6dsox:{text}: write lsm6dsox:BUS or lsm6dsox:BUS:ADDRESS, for example lsm6dsox:1:0x6b"
+            )
+        return place
 
     def __str__(self) -> str:
         """For people."""

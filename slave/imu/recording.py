@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import TextIO
 
 from common.errors import ImuError, PhalanxError, RecordingError
+from common.imu_fusion import OrientationFilter
 from common.imu_recording import HEADERS, IMU, row
-from slave.imu.counters import Orientation, SampleCounters
-from slave.imu.source import ImuSource
+from slave.counters import imu_counters
+from slave.sources import ImuSource
 
 
 class ImuRecorder:
@@ -18,7 +19,9 @@ class ImuRecorder:
     Holds the thread, the file, and in `failure` what has ended it before its time.
     """
 
-    def __init__(self, source: ImuSource, orientation: Orientation | None, stop: threading.Event) -> None:
+    def __init__(
+        self, source: ImuSource, orientation: OrientationFilter | None, stop: threading.Event
+    ) -> None:
         """Start to read: nothing grows old in a buffer while the camera is opened.
 
         Args:
@@ -27,7 +30,7 @@ class ImuRecorder:
             stop: Ends the stream of the source; set by `close`.
         """
         self._source, self._orientation, self._stop = source, orientation, stop
-        self._counters = SampleCounters(source, orientation)
+        self._counters = imu_counters(source, orientation)
         self._file: TextIO | None = None
         self._kept = False
         self.failure: PhalanxError | None = None
@@ -75,7 +78,7 @@ class ImuRecorder:
                 sample = sample if self._orientation is None else self._orientation.push(sample)
                 if (file := self._file) is not None:
                     csv.writer(file, lineterminator="\n").writerow(row(sample))
-                    self._counters.sample(sample.seq)
+                    self._counters.item(sample.seq)
         except ImuError as error:
             self.failure = error
         except OSError as error:

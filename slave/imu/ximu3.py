@@ -32,7 +32,7 @@ from serial.tools import list_ports
 from common.clock import Clock
 from common.errors import ImuError
 from common.messages import ImuSample
-from slave.imu.device_clock import ClockSteppedError, DeviceClock
+from slave.clocks import ClockSteppedError, DeviceClock
 from slave.imu.ximu3_protocol import Answer, Data, Decoder, Fault, Kind, encode, plain
 
 SAMPLE_RATE_HZ = 400.0  # of the inertial sensor, whatever of it is sent
@@ -77,6 +77,22 @@ class SerialPlace:
 
     path: str
     baud: int | None = None
+
+    @classmethod
+    def of(cls, text: str) -> "SerialPlace":
+        """PORT or PORT@BAUD.
+
+        Raises:
+            ImuError: Neither.
+        """
+        path, at, baud = text.rpartition("@")
+        if not at:
+            return cls(text)
+        if not path or not baud.isdecimal() or int(baud) < 1:
+            raise ImuError(
+                f"--imu ximu3:{text}: write ximu3:PORT or ximu3:PORT@BAUD, for example /dev/serial0@115200"
+            )
+        return cls(path, int(baud))
 
 
 def open_port(place: SerialPlace) -> Port:

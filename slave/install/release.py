@@ -32,7 +32,7 @@ _UNPACKED = 1.4  # what is compiled and what a disk rounds up, share of what is 
 _SPARE_MB = 50.0
 _PIP_S = 1500.0  # under emulation, too
 # What a slave loads; its service may not write, so what is not compiled now is compiled at each start.
-_LOADS = "import slave.__main__, slave.live, slave.uplink, slave.imu.live, slave.imu.factory, slave.simulated"
+_LOADS = "import slave.__main__, slave.live, slave.sender, slave.devices, slave.simulated"
 _LOADS_S = 300.0
 _SCRIPT = """\
 #!{python}

@@ -1,4 +1,4 @@
-"""Switches ambient -> laser -> LED in step with a camera: the push machine, and the thread that lives by it.
+"""Switch ambient -> laser -> LED in step with a camera.
 
 `Strober.step` does what is due and says when to come again; it never waits. The thread does nothing but wait and step.
 A light goes on a lead before its exposure and off right after it. Whoever comes too late for the beginning of an
@@ -16,14 +16,14 @@ from slave.lights.interlock import Interlock
 from slave.lights.schedule import Pulse, StrobeSchedule
 
 FAILED_NS = 500_000_000  # after a driver has failed, no light for so long; then it is tried again
-IDLE_S = 0.5  # without frames
-LOG_EVERY_NS = 10_000_000_000
 EVENTS = ("skipped", "late")
 _LOG = logging.getLogger(__name__)
 
 
 class Strober:
-    """Makes the light of each frame. Holds the pulse that is on, and the last frame that was seen to.
+    """Makes the light of each frame.
+
+    Holds the pulse that is on, and the number of the last frame that was lit or left out.
 
     Attributes:
         counts: Event -> how often.
@@ -97,65 +97,88 @@ class Strober:
         self._number = -1
 
     def _log_fault(self, now_ns: int, error: LightsError) -> None:
-        if self._logged_ns is None or now_ns - self._logged_ns >= LOG_EVERY_NS:
+        if self._logged_ns is None or now_ns - self._logged_ns >= 10_000_000_000:  # one line in ten seconds
             self._logged_ns = now_ns
             _LOG.warning("lights: %s", error)
 
 
-def light_counts(interlock: Interlock, strober: Strober, schedule: StrobeSchedule) -> dict[str, int]:
-    """`lights.<event>` -> how often, of all three."""
-    own = {**interlock.events(), **strober.counts, "restarts": schedule.restarts}
-    return {f"lights.{event}": count for event, count in own.items()}
-
-
-class StrobeController:
-    """Keeps a camera lit, on a thread of its own. Holds the strober and its schedule under one lock."""
+class Strobe:
+    """Keeps a camera lit: schedule of exposures, strober, lights."""
 
     def __init__(self, schedule: StrobeSchedule, interlock: Interlock, clock: Clock) -> None:
-        """Start the thread.
+        """Begin dark.
 
         Args:
             schedule: Fed by `push`.
-            guard: The lights; closed by `close`.
+            interlock: The lights; closed by `close`.
             clock: That of the frames' stamps.
         """
         self._schedule, self._interlock, self._clock = schedule, interlock, clock
         self._strober = Strober(schedule, interlock, clock)
+
+    def push(self, seq: int, t_ns: int) -> None:
+        """A frame came; its mid-exposure [ns]."""
+        if self._schedule.push(seq, t_ns):
+            self._strober.renumber()
+
+    def expose(self, exposure_us: float) -> None:
+        """The camera exposes for so long from now on [us]."""
+        self._schedule.expose(exposure_us)
+
+    def stalled(self) -> None:
+        """There are no frames any more: go dark, and know nothing."""
+        self._schedule.forget()
+        self._strober.renumber()
+        self._strober.dark()
+
+    def counts(self) -> dict[str, int]:
+        """`lights.<event>` -> how often, of lights, strober and schedule."""
+        own = {**self._interlock.events(), **self._strober.counts, "restarts": self._schedule.restarts}
+        return {f"lights.{event}": count for event, count in own.items()}
+
+    def close(self) -> None:
+        """Go dark, give the lights back. Safe to call twice.
+
+        Raises:
+            LightsError: The lights could not be darkened.
+        """
+        self._strober.dark()
+        self._interlock.close()
+
+
+class StrobeController(Strobe):
+    """A strobe that works on a thread of its own.
+
+    Holds the strober and its schedule under one lock.
+    """
+
+    def __init__(self, schedule: StrobeSchedule, interlock: Interlock, clock: Clock) -> None:
+        """Start the thread; arguments as of `Strobe`."""
+        super().__init__(schedule, interlock, clock)
         self._news = threading.Condition()
         self._closed = False
         self._thread = threading.Thread(target=self._work, name="strobe", daemon=True)
         self._thread.start()
 
     def push(self, seq: int, t_ns: int) -> None:
-        """A frame came; its mid-exposure [ns]."""
+        """As of `Strobe`."""
         with self._news:
-            if self._schedule.push(seq, t_ns):
-                self._strober.renumber()
+            super().push(seq, t_ns)
             self._news.notify_all()
 
     def expose(self, exposure_us: float) -> None:
-        """The camera exposes for so long from now on [us]."""
+        """As of `Strobe`."""
         with self._news:
-            self._schedule.expose(exposure_us)
+            super().expose(exposure_us)
 
     def stalled(self) -> None:
-        """There are no frames any more: go dark, and know nothing."""
+        """As of `Strobe`."""
         with self._news:
-            self._schedule.forget()
-            self._strober.renumber()
-            self._strober.dark()
+            super().stalled()
             self._news.notify_all()
 
-    def counts(self) -> dict[str, int]:
-        """`lights.<event>` -> how often."""
-        return light_counts(self._interlock, self._strober, self._schedule)
-
     def close(self) -> None:
-        """Go dark, end the thread, give the lights back. Safe to call twice.
-
-        Raises:
-            LightsError: The lights could not be darkened.
-        """
+        """Go dark, end the thread, give the lights back; as of `Strobe`."""
         with self._news:
             self._closed = True
             self._strober.dark()
@@ -169,7 +192,7 @@ class StrobeController:
                 while not self._closed:
                     again_ns = self._strober.step()
                     if again_ns is None:
-                        self._news.wait(IDLE_S)
+                        self._news.wait(0.5)  # there are no frames
                     elif (left_s := (again_ns - self._clock.now_ns()) * 1e-9) > 0.0:
                         self._news.wait(left_s)
             finally:

@@ -12,18 +12,43 @@ import logging
 import threading
 from collections import Counter, deque
 from collections.abc import Callable
+from typing import Protocol
 
 from common.clock import Clock, SystemClock
 from common.errors import LightsError
 from common.frame_recording import Illumination
 from common.strobe_calibration import StrobeCalibration
-from slave.lights.source import Lights
 
 WINDOW_NS = 1_000_000_000  # over which the duty is reckoned; any second, not every second
-RETRY_S = 0.01  # between attempts to darken a driver that fails
 EVENTS = ("pulses", "refused", "off_by_watchdog", "failed")
 _SHINING = (Illumination.LASER, Illumination.LED)
 _LOG = logging.getLogger(__name__)
+
+
+class Lights(Protocol):
+    """Laser and LEDs of a wrist device. Opened dark by its constructor."""
+
+    def switch(self, lit: Illumination) -> None:
+        """Have the laser on (`LASER`), the LEDs on (`LED`), or nothing (`AMBIENT`, `NONE`); never both.
+
+        Returns when it is done.
+
+        Raises:
+            LightsError: The device is gone, or did not do it. What it does then, nobody knows: `off` is tried next.
+        """
+        ...
+
+    def off(self) -> None:
+        """Have nothing on, now. As `switch`."""
+        ...
+
+    def close(self) -> None:
+        """Leave it dark and give the device back. Safe to call twice."""
+        ...
+
+    def counts(self) -> dict[str, int]:
+        """Event of the device -> how often."""
+        ...
 
 
 class Interlock:
@@ -116,7 +141,7 @@ class Interlock:
             except LightsError as error:
                 if not was_failing:
                     _LOG.error("laser or LEDs cannot be switched off: %s", error)
-                return RETRY_S
+                return 0.01  # seconds between attempts to darken a driver that fails
             return None
 
     def close(self) -> None:

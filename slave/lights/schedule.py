@@ -24,9 +24,7 @@ KEPT = 45  # stamps: half a second at 90 Hz, over which no oscillator drifts by 
 LEAST = 9  # stamps before anything is predicted
 AHEAD = 9  # periods after the last stamp: a frame is handed over late, and some may be lost
 OFF_LINE = 0.25  # periods; a stamp farther from the line belongs to another one
-FORGOTTEN = 90  # periods without a frame, after which a new line is begun
-SIGMAS = 3.0  # of the prediction that must fit into `INTERLOCK_NS`
-INTERLOCK_NS = 200_000  # a light is on from so long before an exposure to so long after it at least
+MARGIN_NS = 200_000  # a light is on from so long before an exposure to so long after it at least
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +92,7 @@ class StrobeSchedule:
     @property
     def length_ns(self) -> int:
         """Of a pulse as planned [ns]."""
-        return self._lead_ns + 2 * self._half_ns + INTERLOCK_NS
+        return self._lead_ns + 2 * self._half_ns + MARGIN_NS
 
     @property
     def ready(self) -> bool:
@@ -113,7 +111,8 @@ class StrobeSchedule:
         line = self._line or _Line(number, last_ns, 0.0, self._nominal_ns)
         periods = (t_ns - line.at(number)) / line.period_ns
         step = round(periods)
-        if abs(periods - step) > OFF_LINE or not 0 <= step <= FORGOTTEN:
+        # After 90 periods without a frame a new line is begun
+        if abs(periods - step) > OFF_LINE or not 0 <= step <= 90:
             self.restarts += 1
             self._stamps.clear()
             self._stamps.append((seq, t_ns))
@@ -147,9 +146,7 @@ class StrobeSchedule:
             if lit is not Illumination.AMBIENT:
                 middle_ns = round(self._line.at(k)) + self._offset_ns
                 start_ns, stop_ns = middle_ns - self._half_ns, middle_ns + self._half_ns
-                return Pulse(
-                    k, lit, start_ns - self._lead_ns, start_ns - INTERLOCK_NS // 2, stop_ns + INTERLOCK_NS
-                )
+                return Pulse(k, lit, start_ns - self._lead_ns, start_ns - MARGIN_NS // 2, stop_ns + MARGIN_NS)
         return None
 
     def _fitted(self) -> _Line | None:
@@ -166,6 +163,7 @@ class StrobeSchedule:
         rms = float(np.sqrt(((t - at_first - slope * k) ** 2).sum() / (len(k) - 2)))
         farthest = k[-1] + AHEAD - middle
         sigma = rms * float(np.sqrt(1.0 / len(k) + farthest**2 / spread))
-        if SIGMAS * sigma > INTERLOCK_NS or abs(slope / self._nominal_ns - 1.0) > OFF_LINE / AHEAD:
+        # Three standard deviations of the prediction must fit into the margin
+        if 3.0 * sigma > MARGIN_NS or abs(slope / self._nominal_ns - 1.0) > OFF_LINE / AHEAD:
             return None
         return _Line(first_number, first_ns, at_first, slope)

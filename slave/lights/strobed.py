@@ -1,46 +1,20 @@
 """A camera whose frames are lit by a strobe: every frame's stamp goes to the controller on its way to the detector."""
 
-from typing import Protocol
-
 from msgspec.structs import replace
 
 from common.calibration import CameraCalibration, RigCalibration
 from common.errors import CalibrationError, CameraError
 from common.strobe_calibration import StrobeCalibration
-from slave.cameras.settings import Tunable
-from slave.cameras.source import Frame, FrameSource
-from slave.lights.schedule import CYCLE, INTERLOCK_NS, StrobeSchedule
-
-
-class Controller(Protocol):
-    """What keeps a camera lit: a `StrobeController`, or that of the simulation."""
-
-    def push(self, seq: int, t_ns: int) -> None:
-        """A frame came; its mid-exposure [ns]."""
-        ...
-
-    def expose(self, exposure_us: float) -> None:
-        """The camera exposes for so long from now on [us]."""
-        ...
-
-    def stalled(self) -> None:
-        """There are no frames any more: dark at once."""
-        ...
-
-    def counts(self) -> dict[str, int]:
-        """`lights.<event>` -> how often."""
-        ...
-
-    def close(self) -> None:
-        """Dark for good. Safe to call twice."""
-        ...
+from slave.lights.controller import Strobe
+from slave.lights.schedule import CYCLE, MARGIN_NS, StrobeSchedule
+from slave.sources import Frame, FrameSource, Tunable
 
 
 class StrobedCamera:
     """A `FrameSource` around one, `Tunable` where that is. Closes camera and lights. Holds the exposure limit."""
 
     def __init__(
-        self, source: FrameSource, camera: CameraCalibration, rig: RigCalibration, controller: Controller
+        self, source: FrameSource, camera: CameraCalibration, rig: RigCalibration, controller: Strobe
     ) -> None:
         """Begin dark; light comes once the stamps are understood.
 
@@ -93,14 +67,14 @@ class StrobedCamera:
         finally:
             self._controller.expose(_exposed_us(self._camera))
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """Those of the camera."""
-        return self._source.figures() if isinstance(self._source, Tunable) else {}
+        return dict(self._source.metrics()) if isinstance(self._source, Tunable) else {}
 
     def counts(self) -> dict[str, int]:
         """Those of the camera, and `lights.<event>`."""
-        own = self._source.counts() if isinstance(self._source, Tunable) else {}
-        return own | self._controller.counts()
+        own = self._source.counts() if isinstance(self._source, Tunable) else dict[str, int]()
+        return {**own, **self._controller.counts()}
 
 
 def schedule_of(rig: RigCalibration, camera: CameraCalibration) -> StrobeSchedule:
@@ -127,7 +101,7 @@ def check_pulses(rig: RigCalibration, camera: CameraCalibration) -> StrobeCalibr
         )
     strobe, where = rig.strobe, f"camera {camera.name!r}: exposure_us {camera.exposure_us:g}"
     period_us = 1e6 / camera.frame_rate_hz
-    pulse_us = strobe.lead_us + _exposed_us(camera) + INTERLOCK_NS * 1e-3
+    pulse_us = strobe.lead_us + _exposed_us(camera) + MARGIN_NS * 1e-3
     if pulse_us > period_us:
         raise CalibrationError(
             f"{where} and row_time_us {camera.row_time_us:g} ({_rows_us(camera):.0f} us for all rows): with"

@@ -15,7 +15,7 @@ import numpy as np
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, RigCalibration
 from common.errors import CalibrationError, CameraError
-from slave.cameras.frame_observer import FrameObserver
+from slave.cameras.settings import FrameObserver
 from slave.markers.calibrated import CalibratedDetector
 from slave.markers.colour_monitor import ColourWarning
 from slave.markers.detector import Detections, MarkerDetector

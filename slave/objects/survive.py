@@ -24,8 +24,7 @@ from typing import BinaryIO, cast
 from common.clock import Clock
 from common.errors import TrackerError
 from common.messages import TrackerPose
-from slave.objects.survive_device import SurviveDevice
-from slave.objects.survive_lines import LineDecoder, Pose, Serial
+from slave.objects.survive_lines import LineDecoder, Pose, Serial, SurviveDevice
 
 PROGRAM = "survive-cli"
 OPTIONS = ("--record-stdout", "1", "--record-rawlight", "0", "--record-imu", "0", "--record-angle", "0")
@@ -34,9 +33,6 @@ INSTALL = (
     "--program; docs/tracker.md says how"
 )
 SILENT_NS = 250_000_000  # no pose for so long: it has lost itself
-READ_S = 0.05  # a read waits so long, and looks whether it is to stop
-END_S = 3.0  # it closes its USB devices in that time
-LOG_EVERY_NS = 10_000_000_000
 _CHUNK = 1 << 16
 # The leader of a new session gets the first terminal that it opens as its own; then it becomes the program.
 _IN_ITS_TERMINAL = 'terminal=$1; shift; exec "$0" "$@" <"$terminal"'
@@ -99,7 +95,7 @@ class SurviveTracker:
             return
         self._process.terminate()
         try:
-            self._process.wait(END_S)
+            self._process.wait(3.0)  # seconds: it closes its USB devices in that time
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
@@ -116,7 +112,7 @@ class SurviveTracker:
 
     def _receive(self, terminal: int) -> None:
         """Read what has come, and wait a little for it."""
-        ready, _, _ = select.select([terminal], [], [], READ_S)
+        ready, _, _ = select.select([terminal], [], [], 0.05)  # then it is looked whether it is to stop
         if not ready:
             return
         try:
@@ -131,7 +127,7 @@ class SurviveTracker:
     def _lost(self, now_ns: int) -> TrackerPose:
         """A pose of NaN: of a time between the last pose and any that may still be on its way."""
         self._received_ns = now_ns
-        if now_ns - self._logged_ns >= LOG_EVERY_NS:
+        if now_ns - self._logged_ns >= 10_000_000_000:  # one line in ten seconds
             self._logged_ns = now_ns
             wanted = "any device" if self._wanted is None else self._wanted
             _LOG.warning("%s: no pose of %s; there is %s", self._program, wanted, self._device.there())

@@ -1,7 +1,7 @@
-"""The lines that libsurvive writes with --record-stdout or --record: bytes in, messages out, no input or output.
+"""Decode libsurvive's lines to poses of one device on the slave's clock.
 
-Every line begins with the program's time [s since its start], then who, then what (src/survive_recording.c of
-https://github.com/collabora/libsurvive, read at the versions of 2019 to 2025):
+Every line that --record-stdout or --record writes begins with the program's time [s since its start], then who, then
+what (src/survive_recording.c of https://github.com/collabora/libsurvive, read at the versions of 2019 to 2025):
 
     8.042091 WM0 POSE -0.284080 0.936063 0.374069 0.707107 0.000000 0.000000 0.707107 CR LF
     0.331402 WM0 CONFIG {... "device_serial_number": "LHR-1A2B3C4D" ...} CR LF
@@ -11,24 +11,40 @@ https://github.com/collabora/libsurvive, read at the versions of 2019 to 2025):
 A pose is the device's in libsurvive's world, metres, its quaternion with w first. The world is z up, its origin and
 heading those of its calibration. Numbers are decimals, or hexadecimal where it was built with SURVIVE_HEX_FLOATS. Lines
 carry no checksum: that a quaternion has length 1 is what shows a line whose end was cut or run into by another thread.
+
+Devices are called by kind and order of appearance (WM0, T20), which a restart may turn about; what stays is the serial
+number. Without a choice there must be one device only: with two, a guess would show one object as the other.
+
+A stamp is the program's own time when it wrote the line. The clock behind it is this machine's wall clock, which may be
+set or slewed, so stamps become times of the slave's clock as those of any foreign device do (`DeviceClock`): by the
+least delay, whatever jitter and bunches the arrivals have. How late a pose is when its line is written is unknown; it
+is constant, and `phalanx-master calibrate tracker` measures it.
 """
 
 import math
 import re
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from enum import Enum
 from typing import NamedTuple, TypeAlias
 
+import numpy as np
+
+from common.errors import TrackerChoiceError
+from common.messages import TrackerPose
+from slave.clocks import ClockSteppedError, DeviceClock
+
 LONGEST = 1 << 17  # bytes; the longest lines are CONFIG, some 10 kB
-UNIT_WITHIN = 1e-3  # six decimals are within 3e-6; a component that lost its last digits is not
-FARTHEST_M = 100.0  # no base station reaches so far
 _SERIAL = re.compile(rb'"device_serial_number"\s*:\s*"([^"]{1,64})"')
 _DEVICE = re.compile(rb"[A-Za-z0-9_.-]{1,32}")
 _SIZE = 7  # numbers of a pose
 
 
 class Pose(NamedTuple):
-    """Where a device is: time [s] of the program, place [m], quaternion wxyz. NaN: it does not know."""
+    """Where a device is: time [s] of the program, place [m], quaternion wxyz.
+
+    NaN: it does not know.
+    """
 
     device: str
     t_s: float
@@ -70,7 +86,7 @@ class LineDecoder:
         self._rest = b""
 
     def push(self, data: bytes) -> Iterator[Found]:
-        """What the lines say that end in `data`, in order; lines about other things say nothing."""
+        """What the lines say that end in `data`, in order; other lines: nothing."""
         lines = (self._rest + data).split(b"\n")
         self._rest = lines.pop()
         if len(self._rest) > LONGEST:
@@ -115,9 +131,10 @@ def _pose(device: str, stamp: bytes, rest: bytes) -> Pose | Fault:
     x, y, z, *quaternion = values
     place, (qw, qx, qy, qz) = (x, y, z), quaternion
     length = math.hypot(*quaternion)
-    if abs(length - 1.0) > UNIT_WITHIN:
+    # Six decimals are within 3e-6 of length 1; a component that lost its last digits is not within 1e-3
+    if abs(length - 1.0) > 1e-3:
         return Fault.QUATERNION
-    if math.hypot(*place) > FARTHEST_M:
+    if math.hypot(*place) > 100.0:  # m: no base station reaches so far
         return Fault.PLACE
     return Pose(device, t_s, place, (qw / length, qx / length, qy / length, qz / length))
 
@@ -128,3 +145,109 @@ def _number(word: bytes) -> float:
     if "_" in text:  # Python's own spelling, which nobody sends
         raise ValueError(text)
     return float.fromhex(text) if "0x" in text else float(text)
+
+
+SLEWED = 600e-6  # at most 500 ppm by NTP, and the crystals
+
+
+class SurviveDevice:
+    """Push machine that dates the poses of one device.
+
+    Holds who is there, the clock of the program, and number and time of the newest pose.
+    """
+
+    def __init__(self, name: str, wanted: str | None) -> None:
+        """Begin with a program that was just started.
+
+        Args:
+            name: Of the device in our messages.
+            wanted: Its serial number, or what libsurvive calls it; None: there is one only.
+        """
+        self._name, self._wanted = name, wanted
+        self._decoder = LineDecoder()
+        self._clock = DeviceClock(SLEWED)
+        self._serials: dict[str, str] = {}
+        self._posed: list[str] = []
+        self._seq = -1
+        self._last_ns: int | None = None
+        self._counts: Counter[str] = Counter()
+
+    def push(self, data: bytes, arrival_ns: int) -> list[TrackerPose]:
+        """Take bytes that were there at `arrival_ns`; return the poses in them.
+
+        Raises:
+            TrackerChoiceError: A second device has poses, and nobody said which one is meant.
+        """
+        ours = [one for found in self._decoder.push(data) if (one := self._ours(found)) is not None]
+        dated = [(one, self._observe(one, arrival_ns)) for one in ours]  # all, before one becomes a time
+        poses: list[TrackerPose] = []
+        for one, possible in dated:
+            t_ns = self._clock.at(round(one.t_s * 1e9))
+            if not possible or (self._last_ns is not None and t_ns <= self._last_ns):
+                self._counts["broken.time"] += 1
+                continue
+            poses.append(self.numbered(t_ns, one))
+        return poses
+
+    def numbered(self, t_ns: int, pose: Pose | None) -> TrackerPose:
+        """The next message; None: it does not know where it is."""
+        self._seq += 1
+        self._last_ns = t_ns
+        place = np.full(3, np.nan) if pose is None else np.array(pose.position_m)
+        quaternion = np.full(4, np.nan) if pose is None else np.array(pose.orientation_wxyz)
+        return TrackerPose(self._name, 0, self._seq, t_ns, place, quaternion)
+
+    @property
+    def last_ns(self) -> int | None:
+        """When its newest message holds [ns]; None: there is none yet."""
+        return self._last_ns
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """Events: `broken.` lines by reason, `clock_steps`, `gone`.
+
+        `others`: poses of other devices.
+        """
+        return self._counts
+
+    def there(self) -> str:
+        """Which devices have told anything, as text for people."""
+        names = list(dict.fromkeys([*self._posed, *self._serials]))
+        return ", ".join(self._called(one) for one in names) or "no device at all"
+
+    def _ours(self, found: Found) -> Pose | None:
+        """The pose if it is one of the device that is meant."""
+        if isinstance(found, Fault):
+            self._counts[f"broken.{found.name.lower()}"] += 1
+        elif isinstance(found, Serial):
+            self._serials[found.device] = found.serial
+        elif isinstance(found, Gone):
+            self._counts["gone"] += self._is_ours(found.device)
+        else:
+            if found.device not in self._posed:
+                self._posed.append(found.device)
+            if self._is_ours(found.device):
+                return found
+            self._counts["others"] += 1
+        return None
+
+    def _is_ours(self, device: str) -> bool:
+        if self._wanted is not None:
+            return self._wanted in (device, self._serials.get(device))
+        if len(self._posed) > 1:
+            raise TrackerChoiceError(
+                f"several devices have poses: {self.there()}; say with --serial which one sits on the object"
+            )
+        return True
+
+    def _called(self, device: str) -> str:
+        serial = self._serials.get(device)
+        return device if serial is None else f"{device} (serial {serial})"
+
+    def _observe(self, pose: Pose, arrival_ns: int) -> bool:
+        try:
+            return self._clock.observe(round(pose.t_s * 1e9), arrival_ns)
+        except ClockSteppedError:  # somebody set the wall clock
+            self._counts["clock_steps"] += 1
+            self._clock = DeviceClock(SLEWED)
+            return self._clock.observe(round(pose.t_s * 1e9), arrival_ns)

@@ -1,4 +1,4 @@
-"""The tags of a live slave: sought once a frame's markers are sent, as often as time allows, and replaced with files.
+"""Detect the tags of frames once their markers are sent, as time allows.
 
 Nothing of it is loaded where no object has tags.
 """
@@ -10,11 +10,60 @@ from typing import TYPE_CHECKING
 from common.calibration import CameraCalibration
 from common.messages import TagDetections
 from common.object_profile import ObjectProfile
-from slave.cameras.source import Frame
-from slave.tags.pace import Pace
+from slave.sources import Frame
 
 if TYPE_CHECKING:
     from slave.tags.finder import TagFinder
+
+
+SHARE = 0.8  # of the time between two frames that markers and tags together may take
+LEARNING = 0.2  # weight of the newest search in what one is expected to take
+LONGEST_NS = 250_000_000  # without a search: half of what an object is held for without its tags
+
+
+class Pace:
+    """Grants searches out of the time that frames leave.
+
+    Holds what is left [ns], what a search takes [ns], and the
+    times of the last frame and the last search.
+
+    What a frame leaves of its share of the time since the frame before is saved until a search fits into it, and no
+    more than one search is saved up: so a machine that is too slow for tags in every frame looks at every second or
+    fifth. One whose markers take all the time there is looks four times a second all the same.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        """For a camera of this rate."""
+        self._period_ns = 1e9 / rate_hz
+        self._left_ns = 0.0
+        self._takes_ns = 0.0
+        self._frame_ns: int | None = None
+        self._sought_ns: int | None = None
+
+    @property
+    def takes_ns(self) -> float:
+        """What a search takes of late [ns]."""
+        return self._takes_ns
+
+    def grants(self, t_ns: int, spent_ns: int) -> bool:
+        """Whether tags may be searched in a frame whose markers took `spent_ns`."""
+        since_ns = (
+            self._period_ns if self._frame_ns is None else max(float(t_ns - self._frame_ns), self._period_ns)
+        )
+        self._frame_ns = t_ns
+        most = max(self._takes_ns, SHARE * self._period_ns)
+        self._left_ns = min(max(self._left_ns + SHARE * since_ns - spent_ns, -most), most)
+        late = self._sought_ns is None or t_ns - self._sought_ns >= LONGEST_NS
+        granted = late or self._left_ns >= self._takes_ns
+        if granted:
+            self._sought_ns = t_ns
+        return granted
+
+    def took(self, spent_ns: int) -> None:
+        """A search took so long."""
+        self._left_ns -= spent_ns
+        known = self._takes_ns > 0.0
+        self._takes_ns += (spent_ns - self._takes_ns) * (LEARNING if known else 1.0)
 
 
 class LiveTags:
@@ -62,7 +111,7 @@ class LiveTags:
         self._finder = finder
 
     def counts(self) -> dict[str, int]:
-        """`tags.searched`, `tags.skipped` frames, `tags.found` in all; nothing where there are no tags."""
+        """`tags.searched`, `tags.skipped` frames, `tags.found`; none without tags."""
         if self._finder is None and not self._searched:
             return {}
         return {

@@ -11,7 +11,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.messages import WristDetections
-from slave.cameras.source import Frame
+from slave.sources import Frame
 from slave.wrist.background import lit, lit_line
 from slave.wrist.engine import NUMPY, Engine
 from slave.wrist.fingers import separate

@@ -1,6 +1,6 @@
 """Sees no finger: for the slave of a wrist device whose lens, laser or palm is still being measured."""
 
-from slave.cameras.source import Frame
+from slave.sources import Frame
 
 
 class NullWristDetector:

@@ -17,7 +17,7 @@ from common.errors import CalibrationError, RecordingError
 from common.frame_recording import FrameRecording, Illumination, open_recording
 from common.messages import WristDetections
 from slave.cameras.replay import read_png
-from slave.cameras.source import Frame
+from slave.sources import Frame
 from slave.wrist.detector import WristDetector
 from slave.wrist.strobe import StrobeCycle
 from slave.wrist.view import WristView

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from common.arrays import Image
-from slave.cameras.source import Frame
+from slave.sources import Frame
 from slave.wrist.illumination import NO_EVIDENCE, brighter, coarse, evidence, unlit
 
 CYCLE = 3  # periods

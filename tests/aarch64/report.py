@@ -26,8 +26,8 @@ from common.errors import PhalanxError
 from common.frame_recording import Illumination
 from common.messages import Health, ImuSample, MarkerDetections, Message, WristDetections, decode, encode
 from common.session import RigKeys
-from slave.cameras.source import Frame
 from slave.markers.detector import MarkerDetector
+from slave.sources import Frame
 from slave.wrist.detector import WristDetector
 from slave.wrist.view import WristView
 

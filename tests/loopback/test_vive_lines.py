@@ -8,7 +8,7 @@ from common.messages import TrackerPose
 from common.object_profile import ObjectProfile
 from master.calibrate.tracker.registration import documented, register
 from master.objects.tracker import TrackerLine
-from slave.objects.survive_device import SurviveDevice
+from slave.objects.survive_lines import SurviveDevice
 from tests.master.calibrate.tracker.simulated import ZERO_NS, Motion
 from tests.slave.objects.recorded import HEAD
 

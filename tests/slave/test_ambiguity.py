@@ -86,11 +86,11 @@ def test_a_simulated_camera_is_spoiled_as_its_file_says_and_well_without(tmp_pat
     assert spoiled is not None
     np.testing.assert_array_equal(spoiled.image[450, 30], [64, 178, 130])
     assert spoiled.seq - first.seq == 3
-    assert faulty.figures()["exposure_us"] == 1.5 * camera.exposure_us
+    assert faulty.metrics()["exposure_us"] == 1.5 * camera.exposure_us
     path.unlink()
     clock.sleep(0.2)
     faulty.read()
-    assert faulty.figures()["exposure_us"] == camera.exposure_us
+    assert faulty.metrics()["exposure_us"] == camera.exposure_us
     path.write_text(json.dumps({"unplugged": True}))
     clock.sleep(0.2)
     with pytest.raises(CameraError, match="unplugged"):

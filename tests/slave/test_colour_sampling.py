@@ -16,7 +16,6 @@ from common.errors import CameraError, FitError
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from common.srgb import gain_tables
-from slave.cameras.source import Frame
 from slave.colour_sampler import ColourSampler
 from slave.markers.calibrated import CalibratedDetector
 from slave.markers.classify import in_range
@@ -26,6 +25,7 @@ from slave.markers.detector import MarkerDetector
 from slave.markers.light_adaptive import LightAdaptiveDetector
 from slave.markers.reloadable import ReloadableDetector, marker_changes
 from slave.markers.workers import Inline
+from slave.sources import Frame
 from slave.tuning import CameraTuning
 from tests.slave import painted
 from tests.slave.painted import HUE, NAMES
@@ -171,7 +171,7 @@ def test_from_no_colour_at_all_to_a_slave_that_follows_the_light(tmp_path: Path)
     knobs = Knobs()
     shown: dict[int, Frame] = {}
     sampler = ColourSampler(detector, shown.get, NAMES)
-    tuning = CameraTuning(files, knobs, marker_changes(detector, make), lambda: True, sampler)
+    tuning = CameraTuning(files, knobs, marker_changes(detector, make), lambda: True, sampler.pick)
     commands = tuning.commands()
 
     def sample(name: str, t_ns: int | None = None) -> dict[str, float]:

@@ -12,30 +12,21 @@ from msgspec.structs import replace
 from common.arrays import Image
 from common.calibration import CameraCalibration
 from common.clock import SystemClock
-from common.errors import CameraError, ImuError
-from common.messages import ImuSample, MarkerDetections, Message, TrackerPose
+from common.errors import CameraError
+from common.messages import MarkerDetections, Message
 from slave import failures
-from slave.app import run, run_wrist
-from slave.cameras import reconnecting
 from slave.cameras.grey import Pixels
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
-from slave.cameras.reconnecting import ReconnectingCamera
-from slave.cameras.repeated import CONTRAST, RepeatedPictures
-from slave.cameras.source import Frame, FrameSource
+from slave.cameras.reconnecting import CONTRAST, ReconnectingCamera, RepeatedPictures
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
-from slave.counters import Counters
+from slave.counters import DetectionCounters
 from slave.failures import LOG_EVERY_NS, Failures
-from slave.imu import live as imu_live
-from slave.imu import reconnecting as imu_reconnecting
-from slave.imu.counters import SampleCounters
-from slave.imu.reconnecting import ReconnectingImu
 from slave.markers.detector import Detections
 from slave.markers.null_detector import NullDetector
-from slave.objects import live as objects_live
-from slave.objects import reconnecting as objects_reconnecting
-from slave.objects.counters import PoseCounters
-from slave.objects.reconnecting import ReconnectingTracker
+from slave.reconnect import Backoff
+from slave.sender import MarkerPipeline, WristPipeline, run
+from slave.sources import Frame, FrameSource
 from slave.wrist.null_detector import NullWristDetector
 from tests.slave.fake_picamera2 import OV7251, Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice
@@ -57,14 +48,7 @@ GREY = {"GREY": {(640, 480): (30.0,)}}
 CLOCK = SystemClock()
 
 
-@pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is waited for as long as it would be."""
-    monkeypatch.setattr(reconnecting, "FIRST_WAIT_S", 0.001)
-    monkeypatch.setattr(reconnecting, "FROZEN_NS", 30_000_000)
-    monkeypatch.setattr(imu_reconnecting, "FIRST_WAIT_S", 0.001)
-    monkeypatch.setattr(objects_reconnecting, "FIRST_WAIT_S", 0.001)
-    monkeypatch.setattr(objects_reconnecting, "LOG_LOST_S", 0.001)
+QUICK = Backoff(first_s=0.001)
 
 
 class Wire:
@@ -88,14 +72,27 @@ def usb(camera: Camera, file: CameraCalibration, pixels: Pixels = Pixels.GREY) -
     )
 
 
+def camera_of(
+    opener: Callable[[CameraCalibration], FrameSource], stop: threading.Event
+) -> ReconnectingCamera:
+    """A camera that is lost after 30 ms of one picture, and for which nothing is waited for long."""
+    return ReconnectingCamera(opener, FILE, CLOCK, stop, backoff=QUICK, frozen_s=0.03)
+
+
 def tracked(
     opener: Callable[[CameraCalibration], FrameSource], most: int
 ) -> tuple[ReconnectingCamera, list[Frame]]:
     """Run the slave's loop with a camera until it has sent so many frames: the camera, and what was sent of."""
     stop = threading.Event()
-    source = ReconnectingCamera(opener, FILE, CLOCK, stop)
+    source = camera_of(opener, stop)
     wire, shown = Wire(stop, most), list[Frame]()
-    run(source, NullDetector(6), wire, "left", Counters(("a",) * 6), stop, shown.append)
+    run(
+        source,
+        MarkerPipeline(
+            "left", wire.session, wire.send, NullDetector(6).push, DetectionCounters(("a",) * 6), shown.append
+        ),
+        stop,
+    )
     source.close()
     seqs = [one.seq for one in wire.sent if isinstance(one, MarkerDetections)]
     assert len(seqs) == len(shown) == most
@@ -137,40 +134,16 @@ def test_a_pi_library_that_raises_something_of_its_own_costs_no_process(
     assert len(sensor.opened) == 2
 
 
-@pytest.mark.parametrize("where", ["open", "close", "counts", "figures", "tune"])
-def test_nothing_else_that_a_driver_raises_ends_the_slave(where: str) -> None:
-    class Faulty(V4l2Camera):
-        pass
-
+def test_a_driver_that_cannot_change_its_settings_is_asked_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_arguments: object) -> None:
-        raise KeyError(where)
+        raise KeyError("tune")
 
-    opened = list[V4l2Camera]()
-
-    def opener(file: CameraCalibration) -> V4l2Camera:
-        if where == "open" and len(opened) == 1:
-            opened.append(opened[0])
-            fail()
-        camera = Faulty(file, V4l2Options(controls=CODES, pixels=Pixels.GREY), CLOCK, device)
-        opened.append(camera)
-        return camera
-
-    def device(_path: object) -> FakeDevice:
-        return FakeDevice(Camera(formats=GREY, gone_after=20 if not opened else None))
-
-    if where != "open":
-        setattr(Faulty, where, fail)
-    stop = threading.Event()
-    source = ReconnectingCamera(opener, FILE, CLOCK, stop)
-    wire = Wire(stop, 30)
-    run(source, NullDetector(1), wire, "left", Counters(("a",)), stop)
-    assert len(wire.sent) == 30
-    if where == "tune":
-        with pytest.raises(CameraError, match="its settings cannot be changed: KeyError"):
-            source.tune(FILE)
-    assert source.figures().keys() >= (set() if where == "figures" else {"exposure_us"})
-    assert source.counts()["camera.lost"] == 1
-    assert source.counts()["camera.raised"] >= 1
+    monkeypatch.setattr(V4l2Camera, "tune", fail)
+    source = camera_of(lambda file: usb(Camera(formats=GREY), file), threading.Event())
+    with pytest.raises(CameraError, match="its settings cannot be changed: KeyError"):
+        source.tune(FILE)
+    assert source.metrics().keys() >= {"exposure_us"}
+    assert source.counts()["camera.raised"] == 1
     source.close()
 
 
@@ -207,9 +180,20 @@ def test_a_camera_that_stays_frozen_is_never_measured_again() -> None:
             stop.set()
         return usb(opened[-1], file)
 
-    source = ReconnectingCamera(opener, FILE, CLOCK, stop)
-    counters = Counters(())
-    run_wrist(source, NullWristDetector(), Wire(stop, 1), "left", counters, stop, lambda _frame: stop.set())
+    source = camera_of(opener, stop)
+    counters = DetectionCounters(())
+    run(
+        source,
+        WristPipeline(
+            "left",
+            77,
+            Wire(stop, 1).send,
+            NullWristDetector().push,
+            counters,
+            lambda _frame: stop.set(),
+        ),
+        stop,
+    )
     source.close()
     assert counters.counts()["frames"] == 1, "its first picture, and no other"
     assert source.counts()["camera.lost"] >= 3
@@ -273,8 +257,13 @@ class Failing(NullDetector):
 def test_a_frame_that_the_detector_fails_of_is_dropped_and_counted(caplog: pytest.LogCaptureFixture) -> None:
     stop, alive = threading.Event(), list[int]()
     source = usb(Camera(formats=GREY), FILE)
-    wire, counters = Wire(stop, 20), Counters(("a",))
-    run(source, Failing(frozenset({3, 4, 9})), wire, "left", counters, stop, alive=lambda: alive.append(1))
+    wire, counters = Wire(stop, 20), DetectionCounters(("a",))
+    run(
+        source,
+        MarkerPipeline("left", wire.session, wire.send, Failing(frozenset({3, 4, 9})).push, counters),
+        stop,
+        lambda: alive.append(1),
+    )
     source.close()
     counts = counters.counts()
     assert (counts["frames"], counts["failed"], counts["dropped"]) == (20, 3, 3)
@@ -288,85 +277,11 @@ def test_what_shows_or_finds_tags_costs_no_detection() -> None:
 
     stop = threading.Event()
     source = usb(Camera(formats=GREY), FILE)
-    wire, counters = Wire(stop, 10), Counters(("a",))
-    run(source, NullDetector(1), wire, "left", counters, stop, fail)
+    wire, counters = Wire(stop, 10), DetectionCounters(("a",))
+    run(source, MarkerPipeline("left", wire.session, wire.send, NullDetector(1).push, counters, fail), stop)
     source.close()
     counts = counters.counts()
     assert (counts["frames"], counts["failed"], len(wire.sent)) == (10, 10, 10)
-
-
-class Samples:
-    """An IMU whose driver, and whose filter, raise something of their own."""
-
-    def __init__(self, fails: bool) -> None:
-        self._fails, self._seq = fails, 0
-
-    def read(self) -> ImuSample:
-        if self._fails and self._seq == 5:
-            raise IndexError("a fault in the driver")
-        self._seq += 1
-        return ImuSample(
-            "imu",
-            0,
-            self._seq,
-            CLOCK.now_ns(),
-            np.zeros(3),
-            np.ones(3),
-            np.full(3, np.nan),
-            np.full(4, np.nan),
-        )
-
-    def close(self) -> None:
-        raise OSError("cannot be closed")
-
-
-def test_an_imu_whose_driver_raises_something_of_its_own_is_opened_again(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    stop = threading.Event()
-    made = [Samples(True), Samples(False)]
-
-    def opener() -> Samples:
-        if len(made) == 1 and not raised:
-            raised.append(True)
-            raise ImuError("not there yet")
-        return made.pop(0)
-
-    raised = list[bool]()
-    source = ReconnectingImu(opener, 100.0, CLOCK, stop)
-    wire, counters = Wire(stop, 20), SampleCounters(source)
-    imu_live.run(source, wire, counters, stop)
-    source.close()
-    assert len(wire.sent) == 20
-    assert (source.counts()["lost"], source.counts()["back"]) == (1, 1)
-    assert source.counts()["raised"] == 3  # what it raised once, and twice when it was given back
-    assert "IMU: lost: IndexError: a fault in the driver" in caplog.text
-
-
-class Poses:
-    """A tracking system whose driver raises something of its own."""
-
-    def __init__(self, fails: bool) -> None:
-        self._fails, self._seq = fails, 0
-
-    def read(self) -> TrackerPose:
-        if self._fails and self._seq == 5:
-            raise IndexError("a fault in the driver")
-        self._seq += 1
-        return TrackerPose("wand", 0, self._seq, CLOCK.now_ns(), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
-
-    def close(self) -> None:
-        return
-
-
-def test_a_tracker_whose_driver_raises_something_of_its_own_is_opened_again() -> None:
-    stop = threading.Event()
-    made = [Poses(True), Poses(False)]
-    source = ReconnectingTracker("wand", lambda: made.pop(0), CLOCK, stop)
-    wire, counters = Wire(stop, 30), PoseCounters(source)
-    objects_live.run(source, wire, counters, stop)
-    source.close()
-    assert (source.counts()["lost"], source.counts()["back"], source.counts()["raised"]) == (1, 1, 1)
 
 
 def test_failures_are_logged_once_in_ten_seconds_with_how_many_were_left_out(

@@ -12,16 +12,16 @@ from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
 from common.frame_recording import Illumination, open_recording
+from slave import devices
 from slave.__main__ import main
-from slave.app import run_wrist
-from slave.cameras import real
 from slave.cameras import v4l2_abi as abi
 from slave.cameras.grey import GREY_FORMATS, Pixels, grey, luma
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
-from slave.counters import Counters
+from slave.counters import DetectionCounters
 from slave.preview import small_jpeg, whole_jpeg
+from slave.sender import WristPipeline, run
 from slave.wrist.detector import WristDetector
 from tests.slave.fake_picamera2 import OV7251, OV9281, Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice, colour, level, row_bytes, webcam_knobs
@@ -251,7 +251,7 @@ def test_settings_of_a_grey_pi_camera_are_read_back_and_change_live(monkeypatch:
         loop.join()
         camera.close()
     assert exposures[-1] == 1600.0
-    assert camera.figures()["exposure_us"] == 1600.0
+    assert camera.metrics()["exposure_us"] == 1600.0
 
 
 def test_a_pi_camera_with_colours_is_refused_until_luma_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -286,7 +286,11 @@ def test_a_hand_before_a_real_camera_is_found_as_in_the_same_pictures_of_8_bits(
     source, wire = usb(strobed_camera()), Wire()
     detector = WristDetector(VIEW, RATE_HZ)
     taken = (frame for _ in range(12) if (frame := source.read()) is not None)
-    run_wrist(Source(list(taken)), detector, wire, "wrist", Counters(NAMES), threading.Event())
+    run(
+        Source(list(taken)),
+        WristPipeline("wrist", wire.session, wire.send, detector.push, DetectionCounters(NAMES)),
+        threading.Event(),
+    )
     source.close()
     assert detector.counts["cycles"] >= 3
     plain = WristDetector(VIEW, RATE_HZ)
@@ -300,7 +304,7 @@ def test_a_real_wrist_camera_is_recorded_grey(tmp_path: Path, monkeypatch: pytes
     def fake(file: CameraCalibration, asked: V4l2Options, clock: Any) -> V4l2Camera:
         return V4l2Camera(file, asked, clock, lambda _path: FakeDevice(strobed_camera()))
 
-    monkeypatch.setattr(real, "V4l2Camera", fake)
+    monkeypatch.setattr(devices, "V4l2Camera", fake)
     out = tmp_path / "rec"
     command = [
         "record",

@@ -1,14 +1,16 @@
 """Warnings about the light: counted once each time they begin, logged with marker and fix, not every frame."""
 
 import logging
+from typing import cast
 
 import numpy as np
 import pytest
 
 from common.arrays import Float
-from slave.cameras.source import Frame
 from slave.light_report import LightReport
 from slave.markers.colour_monitor import ColourWarning
+from slave.markers.reloadable import ReloadableDetector
+from slave.sources import Frame
 
 SECOND = 1_000_000_000
 IMAGE = np.zeros((2, 2, 3), np.uint8)
@@ -39,7 +41,7 @@ def frame(t_s: float) -> Frame:
 
 def report() -> tuple[Detector, LightReport]:
     detector = Detector()
-    return detector, LightReport("left", detector, Others(), ("thumb", "index"))
+    return detector, LightReport("left", cast(ReloadableDetector, detector), Others(), ("thumb", "index"))
 
 
 def test_a_warning_is_counted_when_it_begins() -> None:

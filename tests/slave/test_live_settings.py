@@ -12,12 +12,14 @@ import pytest
 from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
-from slave.cameras import frame_observer, picamera2, reconnecting, v4l2_settings
+from slave.cameras import picamera2, v4l2_settings
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
 from slave.cameras.reconnecting import ReconnectingCamera
-from slave.cameras.source import FrameSource
+from slave.cameras.settings import FrameObserver
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
+from slave.reconnect import Backoff
+from slave.sources import FrameSource
 from tests.network_helpers import until
 from tests.slave.fake_picamera2 import Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice
@@ -63,7 +65,7 @@ def test_a_pi_camera_takes_settings_while_it_is_read(monkeypatch: pytest.MonkeyP
     source = pi(monkeypatch, Sensor(delay=7))
     with reading(source):
         source.tune(changed(exposure_us=9000.0, analogue_gain=2.0, colour_gains=(1.1, 1.6)))
-        got = source.figures()
+        got = source.metrics()
     assert got["exposure_us"] == pytest.approx(9000.0, abs=33.6)
     assert got["analogue_gain"] == 2.0
     assert (got["red_gain"], got["blue_gain"]) == pytest.approx((1.1, 1.6), abs=1e-6)
@@ -74,7 +76,7 @@ def test_controls_that_picamera2_loses_are_written_again(monkeypatch: pytest.Mon
     source = pi(monkeypatch, Sensor(loses=2))
     with reading(source):
         source.tune(changed(exposure_us=9000.0))
-        assert source.figures()["exposure_us"] == pytest.approx(9000.0, abs=33.6)
+        assert source.metrics()["exposure_us"] == pytest.approx(9000.0, abs=33.6)
 
 
 def pinned(name: str, value: object, after: int) -> Callable[[int, dict[str, Any]], None]:
@@ -102,7 +104,7 @@ def test_what_a_pi_camera_does_not_take_is_named_and_the_old_settings_come_back(
         with pytest.raises(CameraError, match=expected) as error:
             source.tune(changed(exposure_us=9000.0, analogue_gain=2.0))
         assert str(error.value).endswith("the settings before are back")
-        got = source.figures()
+        got = source.metrics()
     assert got["exposure_us"] == pytest.approx(5000.0, abs=33.6)
     assert got["analogue_gain"] == 1.25
 
@@ -143,8 +145,8 @@ def test_a_usb_camera_takes_an_exposure_while_it_is_read() -> None:
         while len(times) < 5:
             time.sleep(0.001)
         source.tune(changed(exposure_us=9000.0))
-        assert source.figures()["exposure_us"] == 9000.0
-        assert source.figures()["control.gain"] == 32.0
+        assert source.metrics()["exposure_us"] == 9000.0
+        assert source.metrics()["control.gain"] == 32.0
         count = len(times)
         while len(times) < count + 5:
             time.sleep(0.001)
@@ -172,10 +174,10 @@ def test_a_pi_camera_takes_another_rate_within_its_mode_unless_it_runs_in_step(
     source = pi(monkeypatch, Sensor())
     with reading(source):
         source.tune(changed(frame_rate_hz=20.0))
-        assert source.figures()["frame_rate_hz"] == pytest.approx(20.0, rel=2e-3)
+        assert source.metrics()["frame_rate_hz"] == pytest.approx(20.0, rel=2e-3)
         with pytest.raises(CameraError, match=r"FrameDurationLimits 1000, 1000 is not within"):
             source.tune(changed(frame_rate_hz=1000.0, exposure_us=500.0))
-        assert source.figures()["frame_rate_hz"] == pytest.approx(20.0, rel=2e-3)
+        assert source.metrics()["frame_rate_hz"] == pytest.approx(20.0, rel=2e-3)
     install(monkeypatch, Sensor())
     led = Picamera2Camera(FILE, Picamera2Options(sync="server"), SystemClock())
     with (
@@ -189,7 +191,7 @@ def test_a_usb_camera_takes_another_rate_where_its_driver_does() -> None:
     source = usb(Camera())
     with reading(source):
         source.tune(changed(frame_rate_hz=15.0))
-        assert source.figures()["frame_rate_hz"] == pytest.approx(15.0, rel=1e-2)
+        assert source.metrics()["frame_rate_hz"] == pytest.approx(15.0, rel=1e-2)
         with pytest.raises(CameraError, match="exposure_us 70000 does not fit into a frame of 66667 us"):
             source.tune(changed(frame_rate_hz=15.0, exposure_us=70_000.0))
     source = usb(Camera(keeps_rate=True))
@@ -199,7 +201,7 @@ def test_a_usb_camera_takes_another_rate_where_its_driver_does() -> None:
         ):
             source.tune(changed(frame_rate_hz=15.0))
         source.tune(changed(exposure_us=9000.0))
-        assert source.figures()["frame_rate_hz"] == pytest.approx(30.0, rel=1e-2)
+        assert source.metrics()["frame_rate_hz"] == pytest.approx(30.0, rel=1e-2)
 
 
 def test_a_usb_camera_takes_rate_and_exposure_together_in_the_order_that_it_can() -> None:
@@ -209,13 +211,13 @@ def test_a_usb_camera_takes_rate_and_exposure_together_in_the_order_that_it_can(
     with reading(source):
         for file in (slow, fast):
             source.tune(file)
-            got = source.figures()
+            got = source.metrics()
             assert got["exposure_us"] == file.exposure_us
             assert got["frame_rate_hz"] == pytest.approx(file.frame_rate_hz, rel=1e-2)
         camera.real_rate_hz = 30.0  # the second step fails: the first one is taken back
         with pytest.raises(CameraError, match="frame_rate_hz: wanted 15, frames come at 30 Hz"):
             source.tune(changed(frame_rate_hz=15.0, exposure_us=4000.0))
-        assert source.figures()["exposure_us"] == fast.exposure_us
+        assert source.metrics()["exposure_us"] == fast.exposure_us
 
 
 def test_what_a_usb_camera_cannot_change_is_said() -> None:
@@ -237,12 +239,15 @@ def test_without_a_loop_that_reads_frames_nothing_can_be_verified(monkeypatch: p
         source.close()
 
 
-def test_a_camera_that_comes_back_has_the_settings_it_was_given_last(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reconnecting, "FIRST_WAIT_S", 0.001)
+def test_a_camera_that_comes_back_has_the_settings_it_was_given_last() -> None:
     first, second = Camera(damaged=frozenset({20, 21})), Camera(damaged=frozenset({13}))
     plugged = [first, second]
     source = ReconnectingCamera(
-        lambda file: usb(plugged.pop(0), file), FILE, SystemClock(), threading.Event()
+        lambda file: usb(plugged.pop(0), file),
+        FILE,
+        SystemClock(),
+        threading.Event(),
+        backoff=Backoff(first_s=0.001),
     )
     with reading(source):
         source.tune(changed(exposure_us=9000.0))
@@ -251,11 +256,12 @@ def test_a_camera_that_comes_back_has_the_settings_it_was_given_last(monkeypatch
         assert until(lambda: source.counts()["camera.broken"] == 3)
         assert source.counts() == {
             "camera.lost": 1,
+            "camera.back": 1,
             "camera.frozen": 0,
             "camera.raised": 0,
             "camera.broken": 3,
         }
-        assert source.figures()["exposure_us"] == 9000.0
+        assert source.metrics()["exposure_us"] == 9000.0
     assert second.knob("Exposure Time").value == 90
 
 
@@ -264,11 +270,11 @@ def test_a_camera_that_is_away_cannot_be_changed() -> None:
     source.close()
     with pytest.raises(CameraError, match="camera 'left' is away"):
         source.tune(changed(exposure_us=9000.0))
-    assert source.figures() == {}
+    assert source.metrics() == {"camera.away_s": 0.0}
 
 
 def test_a_late_watcher_sees_only_the_newest() -> None:
-    frames = frame_observer.FrameObserver[int]()
+    frames = FrameObserver[int]()
     assert frames.newest is None
     frames.put(1)
     seen = frames.following(2, 5.0)

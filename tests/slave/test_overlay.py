@@ -11,12 +11,12 @@ from common.calibration import HsvRange
 from common.errors import CalibrationError
 from common.messages import Command, Preview
 from common.preview_wish import PreviewWish
-from slave.cameras.source import Frame
 from slave.markers.calibrated import CalibratedDetector
 from slave.markers.detector import MarkerDetector
 from slave.markers.reloadable import ReloadableDetector
 from slave.overlay import ARM_PX, SEVERAL, MarkerOverlay, WristOverlay, contrast_of
 from slave.preview import Previews
+from slave.sources import Frame
 from tests.network_helpers import ManualClock
 from tests.slave import painted
 from tests.slave.painted import NAMES

@@ -16,9 +16,8 @@ from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
 from slave.cameras.picamera2 import BUFFERS, Picamera2Camera
-from slave.cameras.picamera2_frames import without_padding
-from slave.cameras.picamera2_modes import choose_mode, read_modes
 from slave.cameras.picamera2_settings import Picamera2Options
+from slave.cameras.picamera2_streams import choose_mode, read_modes, without_padding
 from tests.slave.fake_picamera2 import (
     IMX219,
     OV5647,

@@ -10,7 +10,7 @@ import pytest
 from common.clock import SystemClock
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
-from slave.cameras.picamera2_sync import MOST_OFF_US, PERIOD_FRAMES, SILENT_FRAMES, SyncMonitor
+from slave.cameras.picamera2_timing import MOST_OFF_US, PERIOD_FRAMES, SILENT_FRAMES, SyncMonitor
 from tests.slave.fake_picamera2 import Sensor, install
 from tests.slave.test_live_settings import FILE
 
@@ -59,7 +59,7 @@ def watched(metadata: list[dict[str, Any]]) -> tuple[SyncMonitor, list[bool]]:
 def test_a_client_that_hears_its_server_is_in_step_from_the_agreed_moment_on() -> None:
     watch, locked = watched(frames(1000))
     assert locked == [False] * READY_AT + [True] * 900
-    assert watch.figures() == {"sync_locked": 1.0, "sync_error_us": 0.0}
+    assert watch.metrics() == {"sync_locked": 1.0, "sync_error_us": 0.0}
     assert watch.lost == 0
 
 
@@ -82,9 +82,9 @@ def test_a_server_that_is_no_longer_heard_is_a_lost_lock_and_comes_back(
 def test_a_correction_is_the_error_until_a_message_finds_none() -> None:
     metadata = frames(400, off_us={241: 180})
     watch, _ = watched(metadata[:250])
-    assert watch.figures() == {"sync_locked": 1.0, "sync_error_us": 180.0}
+    assert watch.metrics() == {"sync_locked": 1.0, "sync_error_us": 180.0}
     watch, locked = watched(metadata)
-    assert watch.figures()["sync_error_us"] == 0.0
+    assert watch.metrics()["sync_error_us"] == 0.0
     assert all(locked[READY_AT:])
 
 
@@ -110,10 +110,10 @@ def test_a_camera_that_begins_anew_is_not_in_step(caplog: pytest.LogCaptureFixtu
 def test_a_server_is_in_step_when_it_is_ready() -> None:
     watch = SyncMonitor("camera 'left'", client=False)
     watch.push({"SyncReady": False})
-    assert watch.figures() == {"sync_locked": 0.0}
+    assert watch.metrics() == {"sync_locked": 0.0}
     for _ in range(1000):
         watch.push({"SyncReady": True})
-    assert watch.figures() == {"sync_locked": 1.0}
+    assert watch.metrics() == {"sync_locked": 1.0}
 
 
 def test_junk_in_the_metadata_is_no_lock() -> None:
@@ -134,7 +134,7 @@ def test_a_running_camera_reports_its_lock(
     locks: list[float] = []
     for _ in range(300):
         assert camera.read() is not None
-        locks.append(camera.figures()["sync_locked"])
+        locks.append(camera.metrics()["sync_locked"])
     camera.close()
     assert locks[0] == 1.0
     assert sum(locks) == 290.0
@@ -146,6 +146,6 @@ def test_a_camera_that_runs_free_reports_no_lock(monkeypatch: pytest.MonkeyPatch
     install(monkeypatch, Sensor())
     camera = Picamera2Camera(FILE, Picamera2Options(), SystemClock())
     camera.read()
-    assert "sync_locked" not in camera.figures()
+    assert "sync_locked" not in camera.metrics()
     assert camera.counts() == {}
     camera.close()

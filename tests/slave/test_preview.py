@@ -2,6 +2,7 @@
 
 import threading
 from itertools import pairwise
+from typing import cast
 
 import cv2
 import numpy as np
@@ -14,15 +15,16 @@ from common.bus import LoopbackBus
 from common.errors import BusError
 from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Command, Message, Preview, Still
 from slave import preview
-from slave.app import run
-from slave.cameras.source import Frame
-from slave.counters import Counters
+from slave.counters import DetectionCounters
 from slave.markers.detector import MarkerDetector
 from slave.preview import PERIOD_NS, POLL_NS, Gate, Previews, small_jpeg, whole_jpeg
 from slave.report import Reporter
+from slave.sender import MarkerPipeline, run
+from slave.sources import Frame
+from slave.uplink import Uplink
 from tests.network_helpers import ManualClock, until
 from tests.slave.painted import NAMES, camera, hand, render
-from tests.slave.test_app import Source, Wire
+from tests.slave.test_sender import Source, Wire
 
 STEP_NS = 16_666_667
 IMAGE = np.full((480, 640, 3), 80, np.uint8)
@@ -84,7 +86,14 @@ def test_a_request_over_the_bus_shows_the_newest_frames_until_it_expires() -> No
     feed = bus.subscribe("preview", "left", depth=100)
     shown = Previews("left", clock)
     reporter = Reporter(
-        "left", wire, Counters(NAMES), clock, lambda _: bus.join(), lambda: None, period_s=0.005, shown=shown
+        "left",
+        cast(Uplink, wire),
+        DetectionCounters(NAMES),
+        clock,
+        lambda _: bus.join(),
+        lambda: None,
+        period_s=0.005,
+        previews=shown,
     )
     try:
         wire.zenoh_endpoint = "tcp/127.0.0.1:1"
@@ -132,7 +141,7 @@ def test_a_slow_bus_never_holds_the_loop_and_the_newest_frame_comes_next() -> No
     feed = bus.subscribe("preview")
     shown = Previews("left", clock)
     picture = render(hand())
-    wire, counters = Wire(), Counters(NAMES)
+    wire, counters = Wire(), DetectionCounters(NAMES)
     try:
         shown.use(bus)
         shown.ask()
@@ -142,12 +151,10 @@ def test_a_slow_bus_never_holds_the_loop_and_the_newest_frame_comes_next() -> No
         source = Source([Frame(i, i * 5 * STEP_NS, i * 5 * STEP_NS, picture) for i in range(1, 13)])
         run(
             source,
-            MarkerDetector(camera(), NAMES),
-            wire,
-            "left",
-            counters,
+            MarkerPipeline(
+                "left", wire.session, wire.send, MarkerDetector(camera(), NAMES).push, counters, shown.offer
+            ),
             threading.Event(),
-            shown.offer,
         )
         assert len(wire.sent) == 12
         assert shown.published == 0

@@ -6,6 +6,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from shutil import copytree
+from typing import cast
 
 import msgspec
 import numpy as np
@@ -20,15 +21,16 @@ from common.messages import Command, Health
 from common.raw_wish import RawWish, raw_name
 from slave import raw
 from slave.__main__ import main
-from slave.app import run
-from slave.cameras.source import Frame
-from slave.counters import Counters
+from slave.counters import DetectionCounters
 from slave.join import join_recordings
 from slave.markers.null_detector import NullDetector
 from slave.offline import detect_recording
 from slave.raw import RawFrames, RawSettings
 from slave.report import Reporter
+from slave.sender import MarkerPipeline, run
+from slave.sources import Frame
 from slave.tuning import CameraFiles
+from slave.uplink import Uplink
 from tests.common.test_frame_writing import check_whole
 from tests.network_helpers import until
 from tests.slave.test_recorder import ListCamera
@@ -51,16 +53,27 @@ class Slave:
         self.raw = RawFrames(
             name, settings, lambda: self.files, SystemClock(), lambda: self.here, lambda _: self.free
         )
-        self.counters = Counters(rig.markers)
+        self.counters = DetectionCounters(rig.markers)
         self.reporter = Reporter(
-            name, Wire(), self.counters, SystemClock(), lambda _: bus.join(), lambda: None, 0.01, raw=self.raw
+            name,
+            cast(Uplink, Wire()),
+            self.counters,
+            SystemClock(),
+            lambda _: bus.join(),
+            lambda: None,
+            0.01,
+            parts=(self.raw,),
         )
         assert until(lambda: name in bus.alive())
 
     def read(self, given: list[Frame]) -> None:
         """The loop, over these frames."""
         source = self.raw.reading(ListCamera(given))
-        run(source, NullDetector(6), Wire(), self.name, self.counters, threading.Event())
+        run(
+            source,
+            MarkerPipeline(self.name, 77, Wire().send, NullDetector(6).push, self.counters),
+            threading.Event(),
+        )
 
     def ask(self, verb: str, body: str = "") -> Health:
         return self.bus.ask(Command(self.name, verb, body), 10.0)
@@ -203,7 +216,7 @@ def test_it_ends_when_nobody_is_left_who_could_end_it(
     with slave(calibration, tmp_path) as left:
 
         def ends(name: str) -> bool:
-            over = until(lambda: left.raw.figures()["raw.on"] == 0.0)
+            over = until(lambda: left.raw.metrics()["raw.on"] == 0.0)
             left.ask("raw_stop")
             return over and check_whole(tmp_path / name) == 6
 

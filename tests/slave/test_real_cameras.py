@@ -10,13 +10,13 @@ import pytest
 from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
-from slave.cameras import real, reconnecting
+from slave import devices
 from slave.cameras.grey import Pixels
-from slave.cameras.real import open_real
 from slave.cameras.reconnecting import ReconnectingCamera
-from slave.cameras.source import FrameSource
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
 from slave.cli.options import add_camera
+from slave.reconnect import Backoff
+from slave.sources import FrameSource
 from tests.slave.fake_picamera2 import Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice
 
@@ -37,7 +37,7 @@ def opened(driver: str, *arguments: str, wrist: bool = False) -> FrameSource | N
     parser = argparse.ArgumentParser()
     add_camera(parser)
     options = parser.parse_args(arguments)
-    return open_real(driver, options, CALIBRATION, SystemClock(), threading.Event(), wrist=wrist)
+    return devices.open_camera(driver, options, CALIBRATION, SystemClock(), threading.Event(), wrist=wrist)
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[V4l2Options]:
         options.append(asked)
         return V4l2Camera(calibration, asked, clock, lambda _path: FakeDevice(Camera()))
 
-    monkeypatch.setattr(real, "V4l2Camera", make)
+    monkeypatch.setattr(devices, "V4l2Camera", make)
     return options
 
 
@@ -87,7 +87,7 @@ def test_without_a_stop_a_lost_camera_is_an_error(seen: list[V4l2Options]) -> No
     parser = argparse.ArgumentParser()
     add_camera(parser)
     options = parser.parse_args(["--control", "gain=32", "--control", "white_balance_temperature=4600"])
-    source = open_real("v4l2", options, CALIBRATION, SystemClock(), None)
+    source = devices.open_camera("v4l2", options, CALIBRATION, SystemClock(), None)
     assert isinstance(source, V4l2Camera)
     source.close()
     assert len(seen) == 1
@@ -143,8 +143,7 @@ def test_a_missing_camera_at_the_start_is_an_error(monkeypatch: pytest.MonkeyPat
         opened("v4l2:/dev/there-is-none")
 
 
-def test_an_unplugged_camera_comes_back_with_all_its_settings(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reconnecting, "FIRST_WAIT_S", 0.001)
+def test_an_unplugged_camera_comes_back_with_all_its_settings() -> None:
     first, second = Camera(gone_after=15), Camera()
     plugged = [first, second]
     asked = V4l2Options(controls={"gain": 32, "white_balance_temperature": 4600})
@@ -154,18 +153,18 @@ def test_an_unplugged_camera_comes_back_with_all_its_settings(monkeypatch: pytes
         CALIBRATION,
         clock,
         threading.Event(),
+        backoff=Backoff(first_s=0.001),
     )
     seqs = [frame.seq for _ in range(6) if (frame := source.read()) is not None]
     assert len(seqs) == 6
     assert seqs == sorted(set(seqs)), "the numbers keep rising"
-    assert source.lost == 1
+    assert source.counts()["camera.lost"] == 1
     assert (second.knob("Gain").value, second.knob("Exposure Time").value) == (32, 50)
     source.close()
     assert (first.closed, second.closed) == (1, 1)
 
 
-def test_a_lost_grey_camera_comes_back_grey(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reconnecting, "FIRST_WAIT_S", 0.001)
+def test_a_lost_grey_camera_comes_back_grey() -> None:
     formats = {"Y10P": {(640, 480): (30.0,)}}
     plugged = [Camera(formats=formats, gone_after=14, padding=16), Camera(formats=formats, padding=16)]
     asked = V4l2Options(controls={"gain": 32, "white_balance_temperature": 4600}, pixels=Pixels.GREY)
@@ -175,8 +174,9 @@ def test_a_lost_grey_camera_comes_back_grey(monkeypatch: pytest.MonkeyPatch) -> 
         CALIBRATION,
         clock,
         threading.Event(),
+        backoff=Backoff(first_s=0.001),
     )
     shapes = [frame.image.shape for _ in range(4) if (frame := source.read()) is not None]
     source.close()
     assert shapes == [(480, 640)] * 4
-    assert source.lost == 1
+    assert source.counts()["camera.lost"] == 1

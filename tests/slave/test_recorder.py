@@ -26,11 +26,11 @@ from common.frame_recording import Illumination, Manifest, open_recording
 from common.imu_recording import read_imu
 from slave.__main__ import main
 from slave.cameras.replay import ReplayCamera
-from slave.cameras.source import Frame
 from slave.markers.detector import MarkerDetector
 from slave.offline import detect_recording
 from slave.progress import Length, Progress, ProgressDisplay, progress_text
 from slave.recorder import Recorder, clock_of, feed
+from slave.sources import Frame
 from tests.common.test_frame_writing import check_whole, small_disk
 from tests.network_helpers import until
 from tests.slave.painted import NAMES, camera, hand, render
@@ -114,7 +114,7 @@ def run(
 
 def test_it_replays_with_the_same_bits_and_times(tmp_path: Path) -> None:
     given = frames(40, first=7)
-    given[3] = replace(given[3], illumination=Illumination.LASER)
+    given[3] = msgspec.structs.replace(given[3], illumination=Illumination.LASER)
     done = run(tmp_path / "wave", ListCamera(given)).progress()
     assert (done.frames, done.dropped, done.lost) == (40, 0, 0)
     assert done.written_bytes == sum(p.stat().st_size for p in (tmp_path / "wave").rglob("*.png"))
@@ -323,7 +323,9 @@ def tree(folder: Path, count: int = 240, rate_hz: float = 1000.0) -> list[str]:
         (folder / name).mkdir()
     save(folder / "rigs/desk.json", RIG)
     save(folder / "cameras/left.json", model)
-    given = [replace(frame, t_ns=round(k * 1e9 / rate_hz)) for k, frame in enumerate(frames(count))]
+    given = [
+        msgspec.structs.replace(frame, t_ns=round(k * 1e9 / rate_hz)) for k, frame in enumerate(frames(count))
+    ]
     run(folder / "given", ListCamera(given))
     return [
         "record",

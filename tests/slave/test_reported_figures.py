@@ -3,19 +3,22 @@
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 from common.bus import LoopbackBus
 from common.camera_settings import WANTED, figures
 from common.clock import SystemClock
+from common.keys import Access
 from common.messages import Command, Health, decode, encode
 from master.checklist.slave_rules import AMBIGUOUS, OFF, OVERLAP, UNCOLOURED
 from master.checklist.unseen import COLOUR, SEEN
 from slave import live
 from slave.markers.engine import NUMPY
 from slave.report import Reporter
+from slave.sender import Sender
 from slave.service import Service
 from slave.tuning import CameraTuning
+from slave.uplink import Uplink
 from tests.network_helpers import until
 from tests.slave.test_tuning import FILE, RIG, Knobs, Wire, tree
 
@@ -31,7 +34,7 @@ COUNTS = {"frames", "uncalibrated", *(kind + marker for kind in (SEEN, AMBIGUOUS
 class Camera(Knobs):
     """It has what it was told."""
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return figures((self.tuned or [FILE])[-1])
 
 
@@ -43,14 +46,14 @@ class Alone(Wire):
 
 def test_a_slave_reports_what_the_checklist_judges(tmp_path: Path) -> None:
     files, clock, stop = tree(tmp_path), SystemClock(), threading.Event()
-    nothing = cast(Any, None)  # neither frames nor datagrams are needed to be asked
+    uplink = cast(Uplink, Alone())
+    sender = Sender("left", uplink, clock, stop, lambda _line: None, Service({}), cast(Access, None))
     with ThreadPoolExecutor(1) as workers:
-        line = live._marker_line(
-            "left", files, nothing, nothing, clock, "follow", "full", NUMPY, stop, workers, Service({})
-        )
-    tuning = CameraTuning(files, Camera(), line.prepare, lambda: True, line.sampler)
+        line = live._marker_line(sender, files, "follow", "full", NUMPY, workers)
+    assert line.reported is not None
+    tuning = CameraTuning(files, Camera(), line.prepare, lambda: True, line.sample)
     reporter = Reporter(
-        "left", Alone(), line.numbers, clock, lambda _: LoopbackBus(), stop.set, 0.01, camera=tuning
+        "left", uplink, line.reported, clock, lambda _: LoopbackBus(), stop.set, 0.01, parts=(tuning,)
     )
 
     def ask(verb: str, body: str = "") -> Health:

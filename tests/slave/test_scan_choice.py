@@ -10,17 +10,17 @@ import pytest
 
 from common.errors import CameraError
 from slave.__main__ import main
-from slave.app import run
-from slave.cameras.source import Frame
 from slave.cli.table import PROGRAM
-from slave.counters import Counters
+from slave.counters import DetectionCounters
 from slave.markers.calibrated import CalibratedDetector
 from slave.markers.detector import MarkerDetector
 from slave.markers.reloadable import ReloadableDetector
 from slave.markers.scan_choice import JUDGED, PROBE_EVERY, PROBES, Scan, ScanChoice
 from slave.offline import calibrate_colours
+from slave.sender import MarkerPipeline, run
+from slave.sources import Frame
 from tests.slave.painted import NAMES, RANGES, camera, hand, render
-from tests.slave.test_app import Source, Wire, frame
+from tests.slave.test_sender import Source, Wire, frame
 
 STEP_NS = 16_666_667
 PERIOD_MS = 1000.0 / 60.0  # of the camera of `painted`
@@ -119,17 +119,27 @@ def reloadable(scan: Scan, whole_ms: float = 1.0) -> tuple[ReloadableDetector, M
 
 def test_the_running_slave_measures_and_chooses_and_counts() -> None:
     detector, plain = reloadable("auto", whole_ms=20.0)
-    counters = Counters(NAMES, lambda: {"windows": 0 if detector.choice is None else detector.choice.frames})
+    counters = DetectionCounters(
+        NAMES, lambda: {"windows": 0 if detector.choice is None else detector.choice.frames}
+    )
     wire, count = Wire(), JUDGED + 20
     frames: list[Frame | CameraError] = [frame(k, HAND) for k in range(count)]
-    run(Source(frames), detector, wire, "left", counters, threading.Event())
+    run(
+        Source(frames),
+        MarkerPipeline("left", wire.session, wire.send, detector.push, counters),
+        threading.Event(),
+    )
     assert plain.windows_only
     counts = counters.counts()
     assert (counts["frames"], counts["windows"], counts["failed"]) == (count, 20, 0)
     for message in wire.sent[1:]:
         np.testing.assert_array_equal(message.uv, wire.sent[0].uv)
     detector, plain = reloadable("auto", whole_ms=2.0)
-    run(Source([frame(k, HAND) for k in range(count)]), detector, wire, "left", counters, threading.Event())
+    run(
+        Source([frame(k, HAND) for k in range(count)]),
+        MarkerPipeline("left", wire.session, wire.send, detector.push, counters),
+        threading.Event(),
+    )
     assert not plain.windows_only
 
 

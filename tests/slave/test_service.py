@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from common.messages import Message
-from slave.app import run, wait_for_start
-from slave.cameras.source import Frame
-from slave.counters import Counters
+from slave.counters import DetectionCounters
 from slave.markers.detector import Detections
+from slave.sender import MarkerPipeline, run, wait_for_start
 from slave.service import LOST_PATIENCE_S, WAITING, Service
+from slave.sources import Frame
 
 PERIOD_US = 4_000_000
 QUARTER_NS = 1_000_000_000
@@ -221,11 +221,9 @@ def test_a_detection_that_hangs_feeds_nothing(manager: Manager) -> None:
         time.passes(1.5)
         service.working()
 
-    loop = threading.Thread(
-        target=run,
-        args=(Frames(10, lambda: None), detector, Nowhere(), "left", Counters(("index",)), stop),
-        kwargs={"alive": alive},
-    )
+    wire, counters = Nowhere(), DetectionCounters(("index",))
+    pipeline = MarkerPipeline("left", wire.session, wire.send, detector.push, counters)
+    loop = threading.Thread(target=run, args=(Frames(10, lambda: None), pipeline, stop, alive))
     loop.start()
     try:
         assert detector.hangs.wait(30.0)
@@ -260,5 +258,5 @@ def test_the_wait_for_the_master_comes_round(manager: Manager) -> None:
         time.passes(0.2)
         service.waiting()
 
-    assert not wait_for_start(Never(stop, 50), stop, alive)
+    assert not wait_for_start(Never(stop, 50).wait_for_start, stop, alive)
     assert len(manager.received()) >= 8

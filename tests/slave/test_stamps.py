@@ -3,7 +3,7 @@ import time
 import pytest
 
 from common.clock import SystemClock
-from slave.cameras.stamps import OLDEST_NS, TRIES, ForeignClock, clock_of, system_clock
+from slave.clocks import OLDEST_NS, TRIES, ForeignClock, clock_of, system_clock
 
 PERIOD_NS = 16_666_667
 LATENCY_NS = 25_000_000

@@ -199,9 +199,9 @@ def test_it_says_what_it_has_and_refuses_what_does_not_fit_into_a_frame() -> Non
     source = camera(StageClock(EPOCH_NS))
     with pytest.raises(CameraError, match="exposure_us: wanted 17000, a frame at 60 Hz has 16666"):
         source.tune(msgspec.structs.replace(CAMERAS["left"], exposure_us=17_000.0))
-    assert source.figures()["exposure_us"] == 5000.0
+    assert source.metrics()["exposure_us"] == 5000.0
     source.tune(msgspec.structs.replace(CAMERAS["left"], exposure_us=7000.0, colour_gains=(0.9, 1.1)))
-    got = source.figures()
+    got = source.metrics()
     assert (got["exposure_us"], got["red_gain"], got["blue_gain"], got["frame_rate_hz"]) == (
         7000,
         0.9,
@@ -229,7 +229,7 @@ def test_another_rate_holds_from_the_next_frame_on() -> None:
     assert [frame.seq for frame in frames] == [3, 4, 5], "none is counted as lost"
     times += [frame.t_ns for frame in frames]
     np.testing.assert_allclose(np.diff(times) * 1e-9, [1 / 60, 1 / 60, 1 / 60, 1 / 30, 1 / 30], atol=1e-8)
-    assert source.figures()["frame_rate_hz"] == 30.0
+    assert source.metrics()["frame_rate_hz"] == 30.0
     with pytest.raises(
         CameraError, match="frame_rate_hz: wanted 120, the rows of a frame are read out in 9888 us"
     ):

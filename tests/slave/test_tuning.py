@@ -5,7 +5,7 @@ import threading
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -19,16 +19,17 @@ from common.messages import Command, Health, MarkerDetections, Message
 from common.sim.motion import HandState
 from common.sim.render import Renderer
 from common.sim.scene import Scene
-from slave.app import run
-from slave.cameras.source import Frame
 from slave.cameras.synthetic import SyntheticCamera
-from slave.counters import Counters
+from slave.counters import DetectionCounters
 from slave.markers.light_adaptive import detector_for
 from slave.markers.reloadable import ReloadableDetector, marker_changes
 from slave.markers.scan_choice import Scan, ScanChoice
 from slave.markers.workers import Inline
 from slave.report import Reporter
+from slave.sender import MarkerPipeline, run
+from slave.sources import Frame
 from slave.tuning import CameraFiles, CameraTuning
+from slave.uplink import Uplink
 from tests.network_helpers import until
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -74,7 +75,7 @@ class Knobs:
             raise CameraError("exposure_us: wanted 9000 us, got 8000 us; the settings before are back")
         self.tuned.append(camera)
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {"exposure_us": (self.tuned or [FILE])[-1].exposure_us}
 
     def counts(self) -> dict[str, int]:
@@ -260,14 +261,22 @@ class Slave:
             return detector_for(camera, rig.markers, Inline(), free=rig.free_markers)
 
         self.detector = ReloadableDetector(make(FILE, RIG), ScanChoice(scan, FILE))
-        counters = Counters(RIG.markers)
+        counters = DetectionCounters(RIG.markers)
         changes = marker_changes(self.detector, make)
         self.tuning = CameraTuning(files, self.source, changes, lambda: counters.counts()["frames"] > 0)
         self.light = np.zeros(3)
         self.reporter = Reporter(
-            "left", self.wire, counters, clock, lambda _: self.bus.join(), stop.set, 0.05, camera=self.tuning
+            "left",
+            cast(Uplink, self.wire),
+            counters,
+            clock,
+            lambda _: self.bus.join(),
+            stop.set,
+            0.05,
+            parts=(self.tuning,),
         )
-        loop = (self.source, self.detector, self.wire, "left", counters, stop, self._look)
+        pipeline = MarkerPipeline("left", 77, self.wire.send, self.detector.push, counters, self._look)
+        loop = (self.source, pipeline, stop)
         self.thread = threading.Thread(target=run, args=loop)
         self.thread.start()
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.arrays import Float
-from slave.imu.device_clock import IMPOSSIBLE_NS, SUSPECTS, ClockSteppedError, DeviceClock
+from slave.clocks import IMPOSSIBLE_NS, SUSPECTS, ClockSteppedError, DeviceClock
 
 PERIOD_NS = 7_500_000
 BEGAN_NS = 40_000_000_000  # on the slave's clock, when the sensor's shows 0

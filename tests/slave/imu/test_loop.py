@@ -1,7 +1,9 @@
 """The loop of an IMU's slave: every sample is sent once, gaps are counted; and what its command refuses."""
 
 import threading
+from functools import partial
 from pathlib import Path
+from typing import cast
 
 import msgspec
 import numpy as np
@@ -11,11 +13,13 @@ from common.bus import LoopbackBus
 from common.calibration import ImuCalibration, RigCalibration, load, save
 from common.clock import SystemClock
 from common.errors import ImuError
+from common.imu_fusion import OrientationFilter
 from common.messages import Command, ImuSample, Message
 from slave.__main__ import main
-from slave.imu.counters import SampleCounters
-from slave.imu.live import run, wait_for_start
+from slave.counters import imu_counters
 from slave.report import Reporter
+from slave.sender import ImuPipeline, run, skip_one, wait_for_start
+from slave.uplink import Uplink
 from tests.network_helpers import until
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -60,24 +64,15 @@ class Wire:
 
 
 def test_every_sample_is_sent_in_the_name_of_this_process_and_gaps_are_counted() -> None:
-    wire, counters = Wire(), SampleCounters()
-    run(Source([sample(k) for k in (40, 41, 45, 46)]), wire, counters, threading.Event())
+    wire, counters = Wire(), imu_counters(None)
+    source = Source([sample(k) for k in (40, 41, 45, 46)])
+    run(source, ImuPipeline(77, wire.send, counters), threading.Event())
     assert [(one.source, one.session, one.seq, one.t_ns) for one in wire.sent] == [
         ("imu", 77, seq, 8_333_333 * seq) for seq in (40, 41, 45, 46)
     ]
     assert counters.counts() == {"samples": 4, "skipped": 3, "failed": 0}
     assert counters.metrics()["rate_hz"] > 0.0
     assert set(counters.metrics()) == {"rate_hz"}
-
-
-def test_the_loop_ends_when_stopped_and_when_the_device_is_gone() -> None:
-    wire, stop = Wire(), threading.Event()
-    with pytest.raises(ImuError, match="unplugged"):
-        run(Source([sample(0), ImuError("unplugged"), sample(1)]), wire, SampleCounters(), stop)
-    assert len(wire.sent) == 1
-    stop.set()
-    run(Source([sample(2)]), wire, SampleCounters(), stop)
-    assert len(wire.sent) == 1
 
 
 class Filter:
@@ -106,8 +101,8 @@ class Reporting(Source):
 
 def test_the_filters_orientation_is_sent_and_its_counts_and_those_of_the_imu_are_reported() -> None:
     wire, source, orientation = Wire(), Reporting([sample(0), sample(1)]), Filter()
-    counters = SampleCounters(source, orientation)
-    run(source, wire, counters, threading.Event(), orientation)
+    counters = imu_counters(source, cast(OrientationFilter, orientation))
+    run(source, ImuPipeline(77, wire.send, counters, orientation.push), threading.Event())
     assert [one.orientation_wxyz.tolist() for one in wire.sent] == [[1.0, 0.0, 0.0, 0.0]] * 2
     assert counters.counts() == {
         "samples": 2,
@@ -130,34 +125,38 @@ def test_the_filters_orientation_is_sent_and_its_counts_and_those_of_the_imu_are
     }, "only what is a number"
 
 
-class Barrier:
-    """A master that starts after some looks."""
+def test_samples_before_the_start_are_read_and_only_the_filter_sees_them() -> None:
+    source, orientation, wire = Source([sample(k) for k in range(5)]), Filter(), Wire()
+    pipeline = ImuPipeline(77, wire.send, imu_counters(source), orientation.push)
+    waits = iter([False, False, False, True])
 
-    def __init__(self, looks: int) -> None:
-        self.looks = looks
-
-    def wait_for_start(self, timeout_s: float) -> bool:
+    def started(timeout_s: float) -> bool:
         assert timeout_s < 0.01
-        self.looks -= 1
-        return self.looks < 0
+        return next(waits)
+
+    assert wait_for_start(started, threading.Event(), skip=partial(skip_one, source, pipeline))
+    assert (len(source.samples), orientation.pushed, len(wire.sent)) == (2, 3, 0)
+    assert pipeline.counters.counts()["samples"] == 0
 
 
-def test_samples_before_the_start_are_read_and_forgotten() -> None:
-    source, orientation = Source([sample(k) for k in range(5)]), Filter()
-    assert wait_for_start(source, Barrier(3), threading.Event(), orientation)
-    assert len(source.samples) == 2
-    assert orientation.pushed == 3, "but the filter has seen them"
-    assert not wait_for_start(source, Barrier(9), threading.Event()), "the source has ended"
-    stop = threading.Event()
-    stop.set()
-    assert not wait_for_start(Source([sample(0)]), Barrier(9), stop)
+def test_a_sample_that_the_filter_fails_of_is_left_out_before_the_start_and_after() -> None:
+    def fail(_sample: ImuSample) -> ImuSample:
+        raise IndexError("a fault in the filter")
+
+    source, wire = Source([sample(k) for k in range(5)]), Wire()
+    pipeline = ImuPipeline(77, wire.send, imu_counters(source), fail)
+    assert skip_one(source, pipeline)
+    run(source, pipeline, threading.Event())
+    assert (pipeline.counters.counts()["failed"], wire.sent) == (5, [])
 
 
 def test_it_reports_and_stops_on_the_bus() -> None:
-    bus, stop, counters = LoopbackBus(), threading.Event(), SampleCounters()
+    bus, stop, counters = LoopbackBus(), threading.Event(), imu_counters(None)
     for seq in (1, 2, 4):
-        counters.sample(seq)
-    reporter = Reporter("imu", Wire(), counters, SystemClock(), lambda _endpoint: bus, stop.set, 0.01)
+        counters.item(seq)
+    reporter = Reporter(
+        "imu", cast(Uplink, Wire()), counters, SystemClock(), lambda _endpoint: bus, stop.set, 0.01
+    )
     assert until(lambda: "imu" in bus.alive())
     health = bus.ask(Command("imu", "report", ""), 5.0)
     assert (health.source, health.session) == ("imu", 77)

@@ -14,7 +14,7 @@ from common.errors import ImuError
 from common.messages import ImuSample
 from slave.imu.lsm6dsox import SILENT_POLLS, I2cPlace, Lsm6dsoxImu, buses, rate_of
 from slave.imu.lsm6dsox_fifo import Register, Slots, temperature_c
-from slave.imu.reconnecting import ReconnectingImu
+from slave.reconnect import ReconnectingDriver
 from tests.slave.imu.fake_i2c import FakeLsm6dsox
 
 PLACE = I2cPlace(1)
@@ -55,7 +55,7 @@ def opened(part: FakeLsm6dsox, world: Dispatcher | None = None, place: I2cPlace 
     return Lsm6dsoxImu("imu", place, 120.0, world, world, part)
 
 
-def samples(imu: Lsm6dsoxImu | ReconnectingImu, count: int) -> Iterator[ImuSample]:
+def samples(imu: Lsm6dsoxImu | ReconnectingDriver[ImuSample], count: int) -> Iterator[ImuSample]:
     for _ in range(count):
         sample = imu.read()
         assert sample is not None
@@ -154,8 +154,8 @@ def test_the_impossible_is_reported() -> None:
 def test_wires_that_come_off_are_a_loss_and_it_comes_back() -> None:
     part = FakeLsm6dsox()
     world = Dispatcher(part)
-    imu = ReconnectingImu(
-        lambda: Lsm6dsoxImu("imu", PLACE, 120.0, world, world, part), 208.34375, world, world
+    imu = ReconnectingDriver(
+        "IMU", lambda: Lsm6dsoxImu("imu", PLACE, 120.0, world, world, part), world, world, rate_hz=208.34375
     )
     before = [*samples(imu, 50)]
     part.plugged = False

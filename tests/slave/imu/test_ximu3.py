@@ -11,10 +11,10 @@ import pytest
 from common.clock import SystemClock
 from common.errors import ImuError
 from common.messages import ImuSample
-from slave.imu.reconnecting import ReconnectingImu
-from slave.imu.source import ImuSource, Reporting
 from slave.imu.ximu3 import SerialPlace, Ximu3Imu, divisor, open_port
 from slave.imu.ximu3_protocol import Kind
+from slave.reconnect import ReconnectingDriver
+from slave.sources import ImuSource, Reporting
 from tests.slave.imu.fake_ximu3 import FakeXimu3
 
 CLOCK = SystemClock()
@@ -205,10 +205,11 @@ def test_a_rate_it_does_not_have_is_refused() -> None:
         divisor(500.0)
 
 
-def reconnecting(link: Path, stop: threading.Event) -> ReconnectingImu:
-    return ReconnectingImu(
-        lambda: Ximu3Imu("imu", SerialPlace(str(link)), 120.0, CLOCK, stop), 400.0 / 3.0, CLOCK, stop
-    )
+def reconnecting(link: Path, stop: threading.Event) -> ReconnectingDriver[ImuSample]:
+    def opener() -> Ximu3Imu:
+        return Ximu3Imu("imu", SerialPlace(str(link)), 120.0, CLOCK, stop)
+
+    return ReconnectingDriver("IMU", opener, CLOCK, stop, rate_hz=400.0 / 3.0)
 
 
 def test_unplugged_it_is_lost_and_plugged_in_again_it_is_back(link: Path) -> None:

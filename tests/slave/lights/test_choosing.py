@@ -9,7 +9,7 @@ import pytest
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.errors import CalibrationError, LightsError
 from slave.__main__ import main
-from slave.lights.factory import choose, limits_for, open_guarded
+from slave.devices import choose_lights, light_limits, open_lights
 from slave.lights.strobed import check_pulses, schedule_of
 from tests.slave.lights.stage import CAMERA, RIG, ROOT
 
@@ -30,7 +30,7 @@ DESK = load(ROOT / "calib_json/rigs/desk.json", RigCalibration)
     ],
 )
 def test_what_lights_a_camera(lights: str | None, camera: str, choice: str | None) -> None:
-    assert choose(lights, RIG, camera) == choice
+    assert choose_lights(lights, RIG, camera) == choice
 
 
 @pytest.mark.parametrize(
@@ -40,31 +40,31 @@ def test_what_lights_a_camera(lights: str | None, camera: str, choice: str | Non
         (None, "picamera2", "say who switches"),
         ("synthetic", "v4l2", "lights nothing before --camera v4l2"),
         ("gpio:0:1,2", "synthetic", "a simulated hand is lit by synthetic"),
-        ("none", "v4l2", "no such lights; there are gpio:"),
-        ("gpio", "v4l2", "no such lights"),
+        ("none", "v4l2", "no such driver; there are gpio:"),
+        ("gpio", "v4l2", "no such driver"),
         ("i2c:1", "replay:rec", "a recording is lit already"),
     ],
 )
 def test_what_is_refused(lights: str | None, camera: str, expected: str) -> None:
     with pytest.raises(LightsError, match=expected):
-        choose(lights, RIG, camera)
+        choose_lights(lights, RIG, camera)
 
 
 def test_cameras_of_markers_have_no_lights() -> None:
-    assert choose(None, DESK, "v4l2") is None
+    assert choose_lights(None, DESK, "v4l2") is None
     with pytest.raises(LightsError, match="sees markers"):
-        choose("camera", DESK, "v4l2")
+        choose_lights("camera", DESK, "v4l2")
 
 
 def test_no_lights_without_limits() -> None:
     bare = msgspec.structs.replace(RIG, strobe=None)
-    for attempt in (lambda: limits_for("i2c:1", bare), lambda: open_guarded("gpio:0:1,2", bare)):
+    for attempt in (lambda: light_limits("i2c:1", bare), lambda: open_lights("gpio:0:1,2", bare)):
         with pytest.raises(LightsError, match="strobe: missing"):
             attempt()
     with pytest.raises(CalibrationError, match="strobe: missing"):
         schedule_of(bare, CAMERA)
     with pytest.raises(LightsError, match="does not switch these"):
-        open_guarded("camera", RIG)
+        open_lights("camera", RIG)
 
 
 @pytest.mark.parametrize(

@@ -10,12 +10,11 @@ from common.errors import CameraError
 from common.frame_recording import Illumination
 from common.sim.wrist.scene import WristScene
 from slave.__main__ import main
-from slave.cameras.source import Frame
 from slave.cameras.synthetic import SyntheticCamera
-from slave.lights.simulated import SimulatedStrobe
+from slave.lights.simulated import SimulatedStrobe, SyntheticLights, Timeline
 from slave.lights.strobed import StrobedCamera, schedule_of
-from slave.lights.synthetic import SyntheticLights, Timeline
 from slave.simulated import scene_of
+from slave.sources import Frame
 from slave.wrist.strobe import Strobe
 from tests.slave.lights.stage import (
     AMBIENT,
@@ -132,12 +131,12 @@ def test_the_lights_follow_the_exposure_and_refuse_one_that_is_too_long(scene: W
     camera = device(scene, StageClock())
     taken(camera, 15)
     camera.tune(msgspec.structs.replace(CAMERA, exposure_us=2500.0))
-    assert camera.figures()["exposure_us"] == 2500.0
+    assert camera.metrics()["exposure_us"] == 2500.0
     illuminations = [frame.illumination for frame in taken(camera, 6)]
     assert illuminations == [(AMBIENT, LASER, LED)[seq % 3] for seq in range(15, 21)]
     with pytest.raises(CameraError, match=r"exposure_us 4000: needs light for 5200 us, strobe.max_pulse_us"):
         camera.tune(msgspec.structs.replace(CAMERA, exposure_us=4000.0))
-    assert camera.figures()["exposure_us"] == 2500.0
+    assert camera.metrics()["exposure_us"] == 2500.0
 
 
 def test_recorded_frames_say_what_lit_them(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slave.lights.schedule import AHEAD, INTERLOCK_NS, LEAST, Pulse, StrobeSchedule
+from slave.lights.schedule import AHEAD, LEAST, MARGIN_NS, Pulse, StrobeSchedule
 from tests.slave.lights.stage import FIRST_NS, LASER, LED, MS, PERIOD_NS, exposures, stamp
 
 
@@ -36,7 +36,7 @@ def test_laser_and_leds_cover_their_exposures_and_no_other() -> None:
         start, stop = exposures(pulse.number)
         assert pulse.on_ns == pytest.approx(start - MS, abs=2000)
         assert pulse.on_ns < pulse.latest_ns < start
-        assert pulse.off_ns == pytest.approx(stop + INTERLOCK_NS, abs=2000)
+        assert pulse.off_ns == pytest.approx(stop + MARGIN_NS, abs=2000)
         assert exposures(pulse.number - 1)[1] < pulse.on_ns
         assert pulse.off_ns < exposures(pulse.number + 1)[0]
         assert pulse.off_ns - pulse.on_ns == pytest.approx(one.length_ns, abs=2)
@@ -56,7 +56,7 @@ def test_jitter_and_lost_frames_move_the_prediction_by_a_part_of_the_guard(seed:
             worst = max(worst, abs(pulse.on_ns - (exposures(pulse.number)[0] - MS)))
     assert one.ready
     assert one.restarts == 0
-    assert worst < INTERLOCK_NS
+    assert worst < MARGIN_NS
 
 
 @pytest.mark.parametrize("ppm", [-3000.0, -50.0, 50.0, 3000.0])

@@ -1,13 +1,16 @@
 """A strobed camera: its lights hear of every frame, go dark when it is lost, and are dark before it is closed."""
 
+from typing import cast
+
 import msgspec
 import numpy as np
 import pytest
 
 from common.calibration import CameraCalibration
 from common.errors import CameraError, LightsError
-from slave.cameras.source import Frame
+from slave.lights.controller import Strobe
 from slave.lights.strobed import StrobedCamera
+from slave.sources import Frame
 from tests.slave.lights.stage import CAMERA, RIG
 
 
@@ -31,7 +34,7 @@ class Source:
             raise CameraError("not taken")
         self.output.append(("camera", camera.exposure_us))
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {"exposure_us": 1.0}
 
     def counts(self) -> dict[str, int]:
@@ -64,7 +67,7 @@ class Controller:
 
 def test_frames_are_reported_and_a_lost_camera_is_dark() -> None:
     output: list[object] = []
-    camera = StrobedCamera(Source(output), CAMERA, RIG, Controller(output))
+    camera = StrobedCamera(Source(output), CAMERA, RIG, cast(Strobe, Controller(output)))
     assert camera.read() is not None
     assert camera.read() is not None
     with pytest.raises(CameraError, match="lost"):
@@ -77,7 +80,7 @@ def test_frames_are_reported_and_a_lost_camera_is_dark() -> None:
 @pytest.mark.parametrize("fails", [False, True])
 def test_lights_go_first_and_the_camera_is_closed_in_any_case(fails: bool) -> None:
     output: list[object] = []
-    camera = StrobedCamera(Source(output), CAMERA, RIG, Controller(output, fails))
+    camera = StrobedCamera(Source(output), CAMERA, RIG, cast(Strobe, Controller(output, fails)))
     if fails:
         with pytest.raises(LightsError):
             camera.close()
@@ -89,14 +92,14 @@ def test_lights_go_first_and_the_camera_is_closed_in_any_case(fails: bool) -> No
 @pytest.mark.parametrize(("wanted_us", "between_us"), [(1500.0, 2000.0), (2500.0, 2500.0)])
 def test_while_the_exposure_changes_the_longer_one_is_lit(wanted_us: float, between_us: float) -> None:
     output: list[object] = []
-    camera = StrobedCamera(Source(output), CAMERA, RIG, Controller(output))
+    camera = StrobedCamera(Source(output), CAMERA, RIG, cast(Strobe, Controller(output)))
     camera.tune(msgspec.structs.replace(CAMERA, exposure_us=wanted_us))
     assert output == [("lights", between_us), ("camera", wanted_us), ("lights", wanted_us)]
 
 
 def test_an_exposure_that_is_not_taken_changes_no_light() -> None:
     output: list[object] = []
-    camera = StrobedCamera(Source(output, tunes=False), CAMERA, RIG, Controller(output))
+    camera = StrobedCamera(Source(output, tunes=False), CAMERA, RIG, cast(Strobe, Controller(output)))
     with pytest.raises(CameraError, match="not taken"):
         camera.tune(msgspec.structs.replace(CAMERA, exposure_us=2500.0))
     assert output == [("lights", 2500.0), ("lights", 2000.0)]

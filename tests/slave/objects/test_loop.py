@@ -1,6 +1,7 @@
 """The loop of a tracker's slave, the synthetic tracker, and what its command says of what is missing."""
 
 import threading
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,9 @@ from common.messages import Message, TrackerPose
 from common.object_profile import ObjectProfile
 from common.sim.tracker import SET_UP_TRACKER, SET_UP_TRACKING, SimulatedTracker
 from slave.__main__ import main
-from slave.objects.counters import PoseCounters
-from slave.objects.live import run, wait_for_start
-from slave.objects.synthetic import SyntheticTracker
-from slave.simulated import tracker_of
+from slave.counters import pose_counters
+from slave.sender import PosePipeline, run, skip_one, wait_for_start
+from slave.simulated import TRACKER_HZ, SyntheticSensor, poses_of, tracker_of
 
 CALIB = Path(__file__).resolve().parents[3] / "calib_json"
 KEY = "11" * 32
@@ -75,28 +75,27 @@ class Wire:
 
 def test_every_pose_is_sent_in_the_name_of_this_process_and_counted() -> None:
     source = Source([pose(0), pose(1, known=False), pose(4)])
-    wire, counters = Wire(), PoseCounters(source)
-    run(source, wire, counters, threading.Event())
+    wire, counters = Wire(), pose_counters(source)
+    run(source, PosePipeline(77, wire.send, counters), threading.Event())
     assert [(one.session, one.seq) for one in wire.sent] == [(77, 0), (77, 1), (77, 4)]
-    assert counters.counts() == {"poses": 3, "skipped": 2, "nowhere": 1, "lost": 2}
+    assert counters.counts() == {"poses": 3, "skipped": 2, "failed": 0, "nowhere": 1, "lost": 2}
+    assert counters.summary() == "3 poses, 1 of them nowhere"
     metrics = counters.metrics()
     assert metrics.pop("rate_hz") > 0.0
     assert metrics == {"tracked": 1.0, "away_s": 0.5}
-    with pytest.raises(TrackerError, match="gone"):
-        run(Source([TrackerError("gone")]), wire, PoseCounters(), threading.Event())
 
 
-def test_poses_before_the_start_are_forgotten() -> None:
-    source = Source([pose(k) for k in range(9)])
-    assert wait_for_start(source, Wire(waits=3), threading.Event())
-    assert [one.seq for one in source.poses if isinstance(one, TrackerPose)] == [3, 4, 5, 6, 7, 8]
-    assert not wait_for_start(Source([]), Wire(waits=3), threading.Event())
-
-
-def test_a_recording_begins_with_the_start_and_misses_nothing() -> None:
-    source = Source([pose(k) for k in range(9)])
-    assert wait_for_start(source, Wire(waits=30), threading.Event(), recorded=True)
-    assert len(source.poses) == 9
+@pytest.mark.parametrize("recorded", [False, True])
+def test_poses_before_the_start_are_forgotten_but_of_a_recording_nothing_is_missed(recorded: bool) -> None:
+    source, wire = Source([pose(k) for k in range(9)]), Wire(waits=3)
+    pipeline = PosePipeline(77, wire.send, pose_counters(source))
+    skip = None if recorded else partial(skip_one, source, pipeline)
+    assert wait_for_start(wire.wait_for_start, threading.Event(), skip=skip)
+    assert len(source.poses) == (9 if recorded else 6)
+    source.poses = []
+    wire.waits = 3
+    ended = wait_for_start(wire.wait_for_start, threading.Event(), skip=skip)
+    assert ended == recorded, "a source that has ended is waited for no longer"
 
 
 def tree(folder: Path) -> Path:
@@ -142,7 +141,7 @@ def test_in_real_time_its_stamps_are_on_the_slaves_clock(tmp_path: Path) -> None
     true_clock = SystemClock()
     epoch_ns = true_clock.now_ns()
     clock = SkewedClock(5_000_000_000, 40.0, true_clock)
-    source = SyntheticTracker("tracker", tracker, epoch_ns, clock, threading.Event())
+    source = SyntheticSensor(poses_of("tracker", tracker), TRACKER_HZ, epoch_ns, clock, threading.Event())
     poses = [one for one in (source.read() for _ in range(12)) if one is not None]
     source.close()
     assert source.read() is None
@@ -160,7 +159,7 @@ def test_in_real_time_its_stamps_are_on_the_slaves_clock(tmp_path: Path) -> None
     [
         ("tracker", "survive", 1, "cannot start"),
         ("tracker", "survive:nowhere.rec", 1, "nowhere.rec: cannot read"),
-        ("tracker", "magic", 1, "no such system; there are openvr | survive | survive:FILE | synthetic"),
+        ("tracker", "magic", 1, "no such driver; there are openvr | survive | survive:FILE | synthetic"),
         ("somebody", "survive", 1, "no object has the tracker 'somebody'; there is 'tracker' on cube"),
     ],
 )
@@ -186,7 +185,7 @@ def test_the_command_says_in_one_line_what_is_missing(
 
 
 def test_an_object_without_a_tracker_is_said_to_have_none() -> None:
-    from slave.objects.factory import object_with
+    from slave.devices import object_with
 
     rig = load(CALIB / "rigs" / "desk-wand.json", RigCalibration)
     with pytest.raises(CalibrationError, match="no object has the tracker 'tracker'; there is none"):

@@ -14,7 +14,7 @@ from common.messages import TrackerPose
 from slave.objects import openvr_library
 from slave.objects.openvr_library import connect, load_library
 from slave.objects.openvr_tracker import OpenVrTracker
-from slave.objects.reconnecting import ReconnectingTracker
+from slave.reconnect import ReconnectingTracker
 from tests.slave.objects.fake_openvr import (
     CONTROLLER,
     HMD,

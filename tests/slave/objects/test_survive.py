@@ -12,8 +12,8 @@ import pytest
 from common.clock import SystemClock
 from common.errors import TrackerChoiceError, TrackerError
 from common.messages import TrackerPose
-from slave.objects.reconnecting import ReconnectingTracker
 from slave.objects.survive import OPTIONS, SurviveFile, SurviveTracker
+from slave.reconnect import ReconnectingTracker
 from tests.network_helpers import until
 from tests.slave.objects.recorded import HEAD, pose, program
 
@@ -25,6 +25,15 @@ def opened(command: str, wanted: str | None = None) -> SurviveTracker:
 def read(source: SurviveTracker | SurviveFile | ReconnectingTracker, count: int) -> list[TrackerPose]:
     poses = [source.read() for _ in range(count)]
     return [one for one in poses if one is not None]
+
+
+def known(source: SurviveTracker) -> list[TrackerPose]:
+    """Poses until one that is known; those of NaN come first, as long as a busy machine takes."""
+    poses: list[TrackerPose] = []
+    while not poses or np.isnan(poses[-1].position_m).any():
+        poses += read(source, 1)
+        assert len(poses) < 200
+    return poses
 
 
 def output(folder: Path, *parts: bytes) -> str:
@@ -39,12 +48,12 @@ def test_it_is_asked_to_write_poses_alone_and_they_come_at_once(tmp_path: Path) 
     )
     source = opened(command)
     begin_ns = SystemClock().now_ns()
-    poses = read(source, 2)
+    poses = [known(source)[-1], *read(source, 1)]
     source.close()
     source.close()
     assert source.read() is None
     assert (tmp_path / "arguments").read_text().split() == list(OPTIONS)
-    assert [one.seq for one in poses] == [0, 1]
+    assert poses[1].seq == poses[0].seq + 1
     assert poses[1].t_ns - poses[0].t_ns == 10_000_000
     assert 0 < poses[1].t_ns - begin_ns < 10_000_000_000
     np.testing.assert_allclose(poses[0].position_m, [-0.28408, 0.936063, 0.374069])
@@ -55,11 +64,9 @@ def test_a_device_that_vanishes_is_nowhere_and_comes_back(tmp_path: Path) -> Non
     first, then = output(tmp_path, HEAD, pose(8.0), b"8.1 WM0 DISCONNECT\r\n"), tmp_path / "then"
     then.write_bytes(pose(9.0))
     source = opened(program(tmp_path, f"{first}; sleep 0.7; cat {then}; sleep 60"))
-    poses = read(source, 4)
+    poses = [known(source)[-1], *known(source)]
     source.close()
-    known = [bool(np.isfinite(one.position_m).all()) for one in poses]
-    assert known[:2] == [True, False]
-    assert True in known[2:]
+    assert len(poses) > 2, "nowhere in between"
     assert (np.diff([one.t_ns for one in poses]) > 0).all()
     assert source.counts()["gone"] == 1
 

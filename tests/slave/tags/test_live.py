@@ -16,13 +16,12 @@ from common.errors import CalibrationError
 from common.frame_recording import FrameRow, Illumination
 from common.messages import MarkerDetections, Message, TagDetections
 from common.object_profile import ObjectProfile, Tag, Tags
-from slave.app import run
-from slave.cameras.source import Frame
-from slave.counters import Counters
+from slave.counters import DetectionCounters
 from slave.markers.null_detector import NullDetector
-from slave.tags.live import LiveTags, finder_of
+from slave.sender import MarkerPipeline, run
+from slave.sources import Frame
+from slave.tags.live import SHARE, LiveTags, Pace, finder_of
 from slave.tags.offline import TagCollector, tagged_objects
-from slave.tags.pace import SHARE, Pace
 
 ROOT = Path(__file__).resolve().parents[3]
 FILE = load(ROOT / "calib_json/cameras/left.json", CameraCalibration)
@@ -59,9 +58,15 @@ class Wire:
 
 
 def test_the_tags_of_a_frame_follow_its_markers() -> None:
-    image, tags, counters = picture(), LiveTags(FILE, [BARE, BOX]), Counters(RIG.markers)
+    image, tags, counters = picture(), LiveTags(FILE, [BARE, BOX]), DetectionCounters(RIG.markers)
     wire = Wire([Frame(4, 16 * MS, 16 * MS + 5, image, t_sigma_ns=9.0)])
-    run(wire, NullDetector(len(RIG.markers)), wire, "left", counters, threading.Event(), tags=tags)
+    run(
+        wire,
+        MarkerPipeline(
+            "left", wire.session, wire.send, NullDetector(len(RIG.markers)).push, counters, tags=tags.push
+        ),
+        threading.Event(),
+    )
     markers, seen = wire.sent
     assert isinstance(markers, MarkerDetections)
     assert isinstance(seen, TagDetections)

@@ -9,9 +9,9 @@ from common.frame_recording import Illumination
 from common.sim.board import BoardScene
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
-from slave.cameras.source import Frame
 from slave.cameras.synthetic import SyntheticCamera
 from slave.simulated import scene_of
+from slave.sources import Frame
 
 ROOT = Path(__file__).resolve().parents[3]
 RIG = load(ROOT / "calib_json/rigs/wrist.json", RigCalibration)

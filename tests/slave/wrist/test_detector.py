@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
 from common.frame_recording import Illumination
-from slave.cameras.source import Frame
+from slave.sources import Frame
 from slave.wrist.detector import WristDetector, WristFound, prepared
 from tests.slave.wrist.wrist_frames import CAMERA, FIRST_NS, PERIOD_NS, VIEW, scene, spoiled, strobed
 
@@ -82,7 +83,7 @@ def test_no_row_comes_of_a_wrong_kind_of_frame(name: str) -> None:
 
 def test_labels_decide_nothing() -> None:
     frames = strobed("curl", 8)
-    lying = [replace(frame, illumination=Illumination.LASER) for frame in frames]
+    lying = [msgspec.structs.replace(frame, illumination=Illumination.LASER) for frame in frames]
     honest, lied = found_in(frames), found_in(lying)
     assert [one.cycle.laser.seq for one in honest] == [one.cycle.laser.seq for one in lied]
     for one, other in zip(honest, lied, strict=True):

@@ -18,7 +18,7 @@ from common.hand_profiles import generated_profile, mirrored_profile
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from slave.cameras.replay import read_png
-from slave.cameras.source import Frame
+from slave.sources import Frame
 from slave.wrist.background import lit
 from slave.wrist.fingers import separate
 from slave.wrist.fingertips import Fingertips, fingertips

@@ -9,9 +9,9 @@ import pytest
 from common.hand_model import FINGERS
 from common.messages import Message, WristDetections
 from slave.__main__ import main
-from slave.app import DARK_AFTER, run_wrist
-from slave.cameras.source import Frame
-from slave.counters import Counters
+from slave.counters import DetectionCounters
+from slave.sender import DARK_AFTER, WristPipeline, run
+from slave.sources import Frame
 from slave.wrist.detector import WristDetector, WristFound
 from slave.wrist.fingertips import Fingertips
 from slave.wrist.laser import LaserLines
@@ -72,10 +72,14 @@ def frames(numbers: list[int]) -> list[Frame]:
 
 
 def test_every_cycle_is_sent_the_empty_ones_too_and_all_frames_are_counted() -> None:
-    wire, counters, shown = Wire(), Counters(NAMES, lambda: {"strobe.cycles": 3}), list[int]()
+    wire, counters, shown = Wire(), DetectionCounters(NAMES, lambda: {"strobe.cycles": 3}), list[int]()
     source = Source(frames([0, 1, 2, 3, 4, 5, 9, 10, 11]))
-    run_wrist(
-        source, ByNumber(), wire, "wrist", counters, threading.Event(), lambda frame: shown.append(frame.seq)
+    run(
+        source,
+        WristPipeline(
+            "wrist", wire.session, wire.send, ByNumber().push, counters, lambda frame: shown.append(frame.seq)
+        ),
+        threading.Event(),
     )
     assert [(m.camera, m.session, m.seq, m.ready_t_ns) for m in wire.sent] == [
         ("wrist", 77, 1, 22_000_005),
@@ -91,15 +95,18 @@ def test_every_cycle_is_sent_the_empty_ones_too_and_all_frames_are_counted() -> 
 
 
 def test_while_there_are_no_cycles_every_frame_is_shown_and_nothing_is_sent() -> None:
-    wire, counters, shown = Wire(), Counters(()), list[int]()
-    run_wrist(
+    wire, counters, shown = Wire(), DetectionCounters(()), list[int]()
+    run(
         Source(frames(list(range(30)))),
-        NullWristDetector(),
-        wire,
-        "wrist",
-        counters,
+        WristPipeline(
+            "wrist",
+            wire.session,
+            wire.send,
+            NullWristDetector().push,
+            counters,
+            lambda frame: shown.append(frame.seq),
+        ),
         threading.Event(),
-        lambda frame: shown.append(frame.seq),
     )
     assert wire.sent == []
     assert shown == list(range(DARK_AFTER, 30))
@@ -110,11 +117,15 @@ def test_the_time_of_a_cycle_is_that_of_its_three_frames_however_long_there_was_
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     ticks = iter(range(0, 10**9, 1_000_000))  # every look at the clock a millisecond later
-    monkeypatch.setattr("slave.app.time.perf_counter_ns", lambda: next(ticks))
-    counters = Counters(NAMES)
+    monkeypatch.setattr("slave.sender.time.perf_counter_ns", lambda: next(ticks))
+    counters = DetectionCounters(NAMES)
     # 300 frames of which none is the last of a triple: nobody before the device.
     source = Source(frames([*(3 * k for k in range(300)), 900, 901, 902]))
-    run_wrist(source, ByNumber(), Wire(), "wrist", counters, threading.Event())
+    run(
+        source,
+        WristPipeline("wrist", 77, Wire().send, ByNumber().push, counters),
+        threading.Event(),
+    )
     metrics = counters.metrics()
     assert (metrics["detect_us"], metrics["detect_worst_us"]) == (3000.0, 3000.0)
 
@@ -122,14 +133,22 @@ def test_the_time_of_a_cycle_is_that_of_its_three_frames_however_long_there_was_
 def test_the_loop_ends_when_stopped() -> None:
     wire, stop = Wire(), threading.Event()
     stop.set()
-    run_wrist(Source(frames([0, 1, 2])), ByNumber(), wire, "wrist", Counters(NAMES), stop)
+    run(
+        Source(frames([0, 1, 2])),
+        WristPipeline("wrist", wire.session, wire.send, ByNumber().push, DetectionCounters(NAMES)),
+        stop,
+    )
     assert wire.sent == []
 
 
 def test_real_frames_go_through_the_loop_into_messages() -> None:
-    wire, counters = Wire(), Counters(NAMES)
+    wire, counters = Wire(), DetectionCounters(NAMES)
     detector = WristDetector(VIEW, CAMERA.frame_rate_hz)
-    run_wrist(Source(strobed("curl", 6)), detector, wire, "wrist", counters, threading.Event())
+    run(
+        Source(strobed("curl", 6)),
+        WristPipeline("wrist", wire.session, wire.send, detector.push, counters),
+        threading.Event(),
+    )
     assert len(wire.sent) == detector.counts["cycles"] >= 4
     counts = counters.counts()
     assert counts["frames"] == 18

@@ -12,8 +12,8 @@ from common.sim.motion import FIST, REST, HandMotion, HandState, angles_of
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene, WristTruth
 from common.wrist_joint import STRAIGHT
-from slave.cameras.source import Frame
 from slave.cameras.synthetic import STROBE
+from slave.sources import Frame
 from slave.wrist.background import lit
 from slave.wrist.detector import find
 from slave.wrist.fingers import separate

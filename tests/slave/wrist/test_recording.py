@@ -1,12 +1,12 @@
 """Recordings of a wrist device: written by `record`, read back, detected offline into the same bytes on every run."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from common.calibration import load, save
 from common.clock import SystemClock
@@ -15,7 +15,7 @@ from common.frame_recording import Illumination, Manifest, open_recording
 from common.frame_writing import RecordingWriter, encode_png
 from slave.__main__ import main
 from slave.cameras.replay import ReplayCamera
-from slave.cameras.source import Frame
+from slave.sources import Frame
 from slave.wrist.detector import WristDetector
 from slave.wrist.offline import detect_wrist_recording
 from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, ROOT, VIEW, strobed

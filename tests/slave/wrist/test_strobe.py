@@ -10,7 +10,7 @@ import pytest
 from bench.wrist_strobe import RATE_HZ, Delivered, Score, Shown, deliver, recorded, rendered, score
 from common.arrays import Image
 from common.frame_recording import Illumination
-from slave.cameras.source import Frame
+from slave.sources import Frame
 from slave.wrist.illumination import coarse, evidence
 from slave.wrist.strobe import Strobe, StrobeCycle
 

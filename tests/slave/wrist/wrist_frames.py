@@ -1,16 +1,16 @@
 """Strobed frames of the simulated wrist device, and what a bad camera makes of them."""
 
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
+from msgspec.structs import replace
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
-from slave.cameras.source import Frame
 from slave.cameras.synthetic import STROBE
+from slave.sources import Frame
 from slave.wrist.view import WristView
 
 ROOT = Path(__file__).resolve().parents[3]

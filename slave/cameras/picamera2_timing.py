@@ -1,10 +1,25 @@
-"""Whether the frames of a Pi camera run in step with those of the others, before the first frame and ever after.
+"""Date and number the frames of a Pi camera; see whether cameras are in step.
 
-libcamera's algorithm (src/ipa/rpi/controller/rpi/sync.cpp): every 30 frames the server tells when one of its frames
-began and when all shall be ready. A client that finds itself 50 us or more off makes one single frame shorter or longer
-by that much; less it leaves alone. `SyncReady` says that the agreed moment has passed, and stays; `SyncTimer` is the
-time from the frame to that moment. After it the timer tells nothing about the lag: the server reckons the moment back
-over all frames since, so its error grows with their number. What tells is
+libcamera documents `SensorTimestamp` as the time at which row 0 is exposed, on the boot clock. The kernel's receivers
+(bcm2835-unicam, rp1-cfe) take it, with `ktime_get_ns`, the monotonic clock, when the frame starts to arrive: a row is
+read out when its exposure *ends* (picamera2 issue 821; picamera2's own `flush` subtracts the exposure). So the middle
+of the exposure of row 0 is `SensorTimestamp` - `ExposureTime` / 2. `FrameWallClock` is the same moment after a
+regression from the boot clock to the wall clock (libcamera's ClockRecovery); it follows a stepped wall clock only
+slowly, and is used only where there is no `SensorTimestamp`.
+
+How far a stamp scatters. Between the interrupt and the reading of the clock lies the interrupt's latency: under load
+up to 50 to 200 us on a Pi with the usual kernel, mostly 10 to 30 us; and the first byte leaves the sensor within two
+rows (some 40 us) of the end of the exposure. 50 us cover both. The regression behind `FrameWallClock` follows the wall
+clock to about a millisecond.
+
+The library has no frame number that counts what the sensor dropped. Frames come at a fixed duration, so the number
+follows from the time.
+
+In step (src/ipa/rpi/controller/rpi/sync.cpp): every 30 frames the server tells when one of its frames began and when
+all shall be ready. A client that finds itself 50 us or more off makes one single frame shorter or longer by that much;
+less it leaves alone. `SyncReady` says that the agreed moment has passed, and stays; `SyncTimer` is the time from the
+frame to that moment. After it the timer tells nothing about the lag: the server reckons the moment back over all frames
+since, so its error grows with their number. What tells is
 
     that the server is heard     the agreed moment, FrameWallClock + SyncTimer, is reckoned anew with every message, and
                                  stands still without any
@@ -14,24 +29,90 @@ A server knows nothing of its clients: it is in step when it is ready.
 """
 
 import logging
+import math
 from collections.abc import Callable, Mapping
+from math import hypot
 
 from common.clock import Clock
 from common.errors import CameraError
-from slave.cameras.picamera2_frames import MICROSECONDS_BELOW
+from slave.clocks import ForeignClock, clock_of, system_clock
+
+SIGMA_NS: Mapping[str, float] = {"SensorTimestamp": 50e3, "FrameWallClock": 1e6}  # standard deviations
+MICROSECONDS_BELOW = 10**17  # wall clock: such a number of ns would be 1973, so it is in us
+
+
+class Timeline:
+    """Number and time of each frame from its metadata.
+
+    Holds the conversion of the camera's clock, and number and time of the last frame.
+    """
+
+    def __init__(self, frame_rate_hz: float, clock: Clock) -> None:
+        """Begin with number 0; times are on `clock`."""
+        self._rate_hz = frame_rate_hz
+        self._clock = clock
+        self._stamps: tuple[str, ForeignClock] | None = None  # of which key in the metadata
+        self._last: tuple[int, int] | None = None
+
+    @property
+    def sigma_ns(self) -> float:
+        """Standard deviation of the last time [ns]; 0 before the first."""
+        return 0.0 if self._stamps is None else hypot(SIGMA_NS[self._stamps[0]], self._stamps[1].sigma_ns)
+
+    def place(self, metadata: Mapping[str, object]) -> tuple[int, int] | None:
+        """Number, and middle of the exposure of row 0 [ns], of the next frame.
+
+        None for a frame without a time.
+
+        Raises:
+            CameraError: Its time is on no clock of this machine.
+        """
+        t_ns = self._row_zero_ns(metadata)
+        if t_ns is None:
+            return None
+        self._last = (self._number(t_ns, metadata), t_ns)
+        return self._last
+
+    def _row_zero_ns(self, metadata: Mapping[str, object]) -> int | None:
+        key = "SensorTimestamp" if "SensorTimestamp" in metadata else "FrameWallClock"
+        stamp, exposure = metadata.get(key), metadata.get("ExposureTime")
+        # Under load the receiver of Pi 4 and older can deliver a frame with time 0 (raspberrypi/linux 5118).
+        if not isinstance(stamp, int) or stamp <= 0 or not isinstance(exposure, (int, float)):
+            return None
+        if key == "FrameWallClock" and stamp < MICROSECONDS_BELOW:
+            stamp *= 1000
+        if self._stamps is None or self._stamps[0] != key:
+            name = clock_of(stamp)
+            if name is None:
+                raise CameraError(f"{key} {stamp} ns is on no clock of this machine")
+            self._stamps = (key, ForeignClock(self._clock, system_clock(name)))
+        return self._stamps[1].to_own(stamp) - round(exposure * 500.0)
+
+    def _number(self, t_ns: int, metadata: Mapping[str, object]) -> int:
+        """As many further than the last one as whole frame durations have passed."""
+        if self._last is None:
+            return 0
+        seq, before_ns = self._last
+        duration = metadata.get("FrameDuration")
+        period_us = 1e6 / self._rate_hz
+        if isinstance(duration, (int, float)) and duration > 0:
+            period_us = float(duration)
+        return seq + max(1, math.floor((t_ns - before_ns) / (period_us * 1e3) + 0.5))
+
 
 PERIOD_FRAMES = 30  # from message to message
 SILENT_FRAMES = (
     10 * PERIOD_FRAMES
 )  # some are lost on a wireless network; crystals drift 0.25 ms in 300 frames
 MOST_OFF_US = 1000.0  # further off in one correction, and it had not been in step
-LEAST_US = 50.0  # what libcamera corrects
-LOG_FRAMES = 120
 _LOG = logging.getLogger(__name__)
 
 
 class SyncMonitor:
-    """Push machine for a camera's metadata. Holds whether it is in step, and how far off the last message found it."""
+    """Push machine for a camera's metadata: whether it is in step.
+
+    Holds that, and how far off the last message found it.
+    """
 
     def __init__(self, where: str, *, client: bool) -> None:
         """Watch a client, or the server. `where` names the camera in the log."""
@@ -63,8 +144,11 @@ class SyncMonitor:
             _LOG.warning("%s: no longer in step with the others: %s", self._where, self._why(metadata))
         self._was_locked = self.locked
 
-    def figures(self) -> dict[str, float]:
-        """`sync_locked` 0 or 1; of a client also `sync_error_us`, the last correction: 0 is below 50 us."""
+    def metrics(self) -> dict[str, float]:
+        """`sync_locked` 0 or 1; of a client also `sync_error_us`.
+
+        That is the last correction: 0 is below 50 us.
+        """
         found = {"sync_locked": float(self.locked)}
         return found | {"sync_error_us": self.error_us} if self._client else found
 
@@ -89,7 +173,7 @@ class SyncMonitor:
         if duration == last:
             typical = float(duration)
         off_us = typical - duration if typical else 0.0
-        if abs(off_us) >= LEAST_US:
+        if abs(off_us) >= 50.0:  # us: less libcamera does not correct
             self.error_us, self._since_error = off_us, 0
         self._durations = (float(duration), typical)
 
@@ -143,6 +227,6 @@ def wait_in_step(
                 "Exactly one camera of the rig is the server, all have the same frame_rate_hz, clients start "
                 "first, and UDP multicast 239.255.255.250:10000 must pass between the machines"
             )
-        if count % LOG_FRAMES == 0:
+        if count % 120 == 0:  # frames, two seconds at 60 Hz
             _LOG.info("%s: --sync %s: waiting for %s, timer %s us", where, role, other, timer)
         count += 1

@@ -1,18 +1,20 @@
 import threading
-from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from common.bus import LoopbackBus
 from common.clock import SystemClock
 from common.errors import BusError, CameraError
 from common.messages import Command, Health, MarkerDetections, Message
-from slave.app import run, wait_for_start
-from slave.cameras.source import Frame
-from slave.counters import Counters
+from slave.counters import DetectionCounters
 from slave.markers.detector import MarkerDetector
 from slave.report import ALONE_AT, Reporter
+from slave.sender import MarkerPipeline, run, wait_for_start
+from slave.sources import Frame
+from slave.uplink import Uplink
 from tests.slave.painted import CENTRES, NAMES, camera, hand, render
 
 DETECTOR = MarkerDetector(camera(), NAMES)
@@ -63,14 +65,22 @@ def frame(seq: int, image: np.ndarray) -> Frame:
 def test_the_scatter_of_a_stamp_travels_with_it() -> None:
     wire = Wire()
     source = Source([replace(frame(3, HAND), t_sigma_ns=1.2e6), frame(4, HAND)])
-    run(source, DETECTOR.fresh(), wire, "left", Counters(NAMES), threading.Event())
+    run(
+        source,
+        MarkerPipeline("left", wire.session, wire.send, DETECTOR.fresh().push, DetectionCounters(NAMES)),
+        threading.Event(),
+    )
     assert [m.t_sigma_ns for m in wire.sent] == [1.2e6, 0.0]
 
 
 def test_every_frame_is_sent_with_its_times_the_empty_ones_too() -> None:
-    wire, counters = Wire(), Counters(NAMES)
+    wire, counters = Wire(), DetectionCounters(NAMES)
     source = Source([frame(3, HAND), frame(4, EMPTY), frame(7, HAND)])
-    run(source, DETECTOR.fresh(), wire, "left", counters, threading.Event())
+    run(
+        source,
+        MarkerPipeline("left", wire.session, wire.send, DETECTOR.fresh().push, counters),
+        threading.Event(),
+    )
     assert [(m.camera, m.session, m.seq, m.t_ns, m.ready_t_ns) for m in wire.sent] == [
         ("left", 77, 3, 48_000_000, 48_000_005),
         ("left", 77, 4, 64_000_000, 64_000_005),
@@ -87,28 +97,29 @@ def test_every_frame_is_sent_with_its_times_the_empty_ones_too() -> None:
 def test_the_loop_ends_when_stopped_and_passes_a_lost_camera_on() -> None:
     wire, stop = Wire(), threading.Event()
     stop.set()
-    run(Source([frame(0, HAND)]), DETECTOR.fresh(), wire, "left", Counters(NAMES), stop)
+    run(
+        Source([frame(0, HAND)]),
+        MarkerPipeline("left", wire.session, wire.send, DETECTOR.fresh().push, DetectionCounters(NAMES)),
+        stop,
+    )
     assert wire.sent == []
     with pytest.raises(CameraError, match="unplugged"):
         run(
             Source([CameraError("unplugged")]),
-            DETECTOR.fresh(),
-            wire,
-            "left",
-            Counters(NAMES),
+            MarkerPipeline("left", wire.session, wire.send, DETECTOR.fresh().push, DetectionCounters(NAMES)),
             threading.Event(),
         )
 
 
 def test_the_barrier_opens_with_the_start_and_with_stop() -> None:
     stop = threading.Event()
-    assert wait_for_start(Wire(), stop)
+    assert wait_for_start(Wire().wait_for_start, stop)
     stop.set()
-    assert not wait_for_start(Wire(), stop)
+    assert not wait_for_start(Wire().wait_for_start, stop)
 
 
 def test_gauges_speak_of_the_time_since_the_last_look() -> None:
-    counters = Counters(NAMES)
+    counters = DetectionCounters(NAMES)
     for seq in range(4):
         counters.frame(seq, 2_000_000 + seq, CENTRES)
     first = counters.metrics()
@@ -121,7 +132,7 @@ def test_gauges_speak_of_the_time_since_the_last_look() -> None:
 
 
 def test_health_is_published_and_commands_are_answered_once_the_bus_is_known() -> None:
-    hub, wire, counters, stop = LoopbackBus(), Wire(), Counters(NAMES), threading.Event()
+    hub, wire, counters, stop = LoopbackBus(), Wire(), DetectionCounters(NAMES), threading.Event()
     counters.frame(0, 1_000_000, CENTRES)
     asked: list[str] = []
 
@@ -130,7 +141,7 @@ def test_health_is_published_and_commands_are_answered_once_the_bus_is_known() -
         return hub.join()
 
     listener = hub.subscribe("health")
-    reporter = Reporter("left", wire, counters, SystemClock(), connect, stop.set, period_s=0.01)
+    reporter = Reporter("left", cast(Uplink, wire), counters, SystemClock(), connect, stop.set, period_s=0.01)
     try:
         assert listener.get(0.05) is None  # no endpoint, no bus
         wire.zenoh_endpoint = "tcp/127.0.0.1:1"
@@ -166,7 +177,15 @@ def test_a_bus_that_cannot_be_opened_is_tried_again_and_never_ends_the_slave() -
         return hub.join()
 
     listener = hub.subscribe("health")
-    reporter = Reporter("left", wire, Counters(NAMES), SystemClock(), connect, lambda: None, period_s=0.01)
+    reporter = Reporter(
+        "left",
+        cast(Uplink, wire),
+        DetectionCounters(NAMES),
+        SystemClock(),
+        connect,
+        lambda: None,
+        period_s=0.01,
+    )
     try:
         assert isinstance(listener.get(60.0), Health)
         assert len(tries) == 3
@@ -191,7 +210,13 @@ def test_a_slave_without_a_master_says_what_it_hears(
     wire.counts = counts
     looked = threading.Event()
     reporter = Reporter(
-        "left", wire, Seen(looked), SystemClock(), lambda _: LoopbackBus(), lambda: None, period_s=0.01
+        "left",
+        cast(Uplink, wire),
+        Seen(looked),
+        SystemClock(),
+        lambda _: LoopbackBus(),
+        lambda: None,
+        period_s=0.01,
     )
     try:
         assert looked.wait(60.0)
@@ -200,7 +225,7 @@ def test_a_slave_without_a_master_says_what_it_hears(
     assert output in caplog.text
 
 
-class Seen(Counters):
+class Seen(DetectionCounters):
     """Figures that tell when they have been read often enough for the slave to have spoken."""
 
     def __init__(self, looked: threading.Event) -> None:

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from common.clock import SkewedClock
+from common.messages import ImuSample
 from common.sim.imu import SimulatedImu
-from slave.imu.synthetic import SyntheticImu
+from slave.simulated import SyntheticSensor
 from tests.slave.wrist.wrist_frames import scene
 
 PERIOD_NS = 1e9 / 120.0
@@ -37,11 +38,11 @@ class Stage(threading.Event):
         return self.is_set()
 
 
-def imu(stage: Stage, ppm: float = 0.0) -> SyntheticImu:
-    return SyntheticImu(IMU, EPOCH_NS, SkewedClock(AHEAD_NS, ppm, stage), stage)
+def imu(stage: Stage, ppm: float = 0.0) -> SyntheticSensor[ImuSample]:
+    return SyntheticSensor(IMU.sample, IMU.rate_hz, EPOCH_NS, SkewedClock(AHEAD_NS, ppm, stage), stage)
 
 
-def numbers(source: SyntheticImu, count: int) -> list[int]:
+def numbers(source: SyntheticSensor[ImuSample], count: int) -> list[int]:
     return [sample.seq for _ in range(count) if (sample := source.read()) is not None]
 
 
@@ -60,7 +61,7 @@ def test_what_it_says_is_that_of_the_scene_at_the_true_time_of_the_sample() -> N
     stage = Stage(EPOCH_NS - 1)
     clock = SkewedClock(AHEAD_NS, 200.0, stage)
     stage.t_ns += 20_000_000_000
-    sample = SyntheticImu(IMU, EPOCH_NS, clock, stage).read()
+    sample = SyntheticSensor(IMU.sample, IMU.rate_hz, EPOCH_NS, clock, stage).read()
     assert sample is not None
     true_ns = clock.to_true(sample.t_ns)
     assert abs(true_ns - stage.t_ns) < 1_000
@@ -117,14 +118,14 @@ def test_it_ends_when_closed_or_stopped_also_while_it_waits() -> None:
     source.close()
     source.close()
     assert source.read() is None
-    begun = Stage(EPOCH_NS - 10**12, until=1)  # before a scene that begins in a quarter of an hour
-    assert imu(begun).read() is None
+    told = Stage(EPOCH_NS - 10**12, until=1)  # before a scene that begins in a quarter of an hour
+    assert imu(told).read() is None
 
 
 def test_a_stop_in_the_middle_of_a_wait_ends_it_at_once() -> None:
     stop = threading.Event()
     clock = SkewedClock(0, 0.0)
-    source = SyntheticImu(IMU, clock.now_ns() + 3600 * 10**9, clock, stop)
+    source = SyntheticSensor(IMU.sample, IMU.rate_hz, clock.now_ns() + 3600 * 10**9, clock, stop)
     ended = threading.Event()
     thread = threading.Thread(target=lambda: source.read() is None and ended.set())
     thread.start()

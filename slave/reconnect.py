@@ -1,0 +1,261 @@
+"""Reconnect a device that was unplugged, without restarting the slave.
+
+An error at the first opening is an error. Later, losing the device is an event: its driver is closed, and opened again
+after 0.2 s, 0.4 s ... until the device is there or the slave ends. Every opening asks who is there and writes all
+settings again. `seq` goes on behind a gap of as many items as fit into the absence, so that they count as dropped.
+
+Whatever a driver raises, also what is no error of ours, is a loss of its device. Only that several devices are there
+and nobody said which one is meant is mended by no waiting: that error goes on to the user.
+"""
+
+import threading
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+from msgspec.structs import replace
+
+from common.clock import Clock
+from common.errors import TrackerChoiceError
+from common.messages import ImuSample, TrackerPose
+from slave.failures import Failures
+from slave.service import ConnectionLost, nobody
+from slave.sources import Frame, Reporting, Source
+
+ItemT = TypeVar("ItemT", Frame, ImuSample, TrackerPose)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Backoff:
+    """How long to wait between two tries to open a device: twice as long each time.
+
+    Attributes:
+        first_s: The first wait [s].
+        longest_s: No wait is longer [s]: what is plugged in again tracks within two seconds.
+    """
+
+    first_s: float = 0.2
+    longest_s: float = 1.0
+
+
+class ReconnectingDriver(Generic[ItemT]):
+    """A driver around one whose device can be lost.
+
+    Holds the open driver, if there is one, number and time of the last item, since when the device is away, and counts.
+    """
+
+    def __init__(
+        self,
+        device: str,
+        opener: Callable[[], Source[ItemT]],
+        clock: Clock,
+        stop: threading.Event,
+        connection_lost: ConnectionLost = nobody,
+        *,
+        rate_hz: float = 0.0,
+        backoff: Backoff | None = None,
+        prefix: str = "",
+    ) -> None:
+        """Open the device.
+
+        Args:
+            device: What log lines call it.
+            opener: Opens it; called again after each loss.
+            clock: The clock of the items' times.
+            stop: Set when the slave is to end; `read` then waits for the device no longer.
+            connection_lost: Called when it is lost, and before each try to open it again.
+            rate_hz: Counts the items of an absence; 0: numbers go on without a gap.
+            backoff: How long to wait between two tries.
+            prefix: Stands before the names of its counts and metrics.
+
+        Raises:
+            PhalanxError: It is not there, or refused a setting.
+        """
+        self._device, self._open, self._clock, self._stop = device, opener, clock, stop
+        self._connection_lost, self._prefix = connection_lost, prefix
+        self._rate_hz, self._backoff = rate_hz, backoff or Backoff()
+        self._closed = threading.Event()
+        self._source: Source[ItemT] | None = opener()
+        self._offset = 0  # added to the driver's own numbers
+        self._opened_again = False  # and no item was read since
+        self._last: tuple[int, int] | None = None  # seq, t_ns
+        self._away_ns: int | None = None  # since when; until an item has come
+        self._wait_s = self._left_s = self._backoff.first_s
+        self._why = ""
+        self._counts = Counter({"lost": 0, "back": 0})
+        self._closed_counts: Counter[str] = Counter()  # of the drivers that were closed
+        self._failures = Failures(device, clock.now_ns)
+
+    def read(self) -> ItemT | None:
+        """Next item; waits for a lost device.
+
+        None at the end of the stream, when stopped, or once closed.
+
+        Raises:
+            TrackerChoiceError: As the driver.
+        """
+        while not self._closed.is_set():
+            source = self._source if self._source is not None else self._reconnected()
+            if source is None:
+                item = self._wait()
+                if self._stop.is_set() or self._closed.is_set():
+                    return None
+                if item is not None:
+                    return self._numbered(item)
+                continue
+            try:
+                item = source.read()
+                if item is None:
+                    return None
+                if self._is_measured(item):
+                    return self._numbered(item)
+            except TrackerChoiceError:
+                raise
+            except Exception as error:  # noqa: BLE001 - whatever a driver raises is its device's failure
+                if self._closed.is_set():  # by another thread, while it was read
+                    return None
+                self._lose(error)
+            if self._stop.is_set():
+                return None
+        return None
+
+    def close(self) -> None:
+        """Give the device back.
+
+        Safe to call twice, and from another thread that ends a wait.
+        """
+        self._closed.set()
+        self._drop()
+
+    def counts(self) -> dict[str, int]:
+        """Event -> how often, of this device and of all drivers that were opened.
+
+        `lost`, `back`; `late`: items no later than the one before; `raised`: what a driver raised that is no error of
+        ours.
+        """
+        own = {**self._counts, "raised": self._failures.raised}
+        counts = Counter({self._prefix + event: count for event, count in own.items()})
+        counts.update(self._closed_counts)
+        counts.update(self._counts_of(self._source))
+        return dict(counts)
+
+    def metrics(self) -> dict[str, float]:
+        """`away_s`, how long it has been lost, 0: it is there; those of the driver."""
+        source, away_ns = self._source, self._away_ns
+        away_s = 0.0 if away_ns is None else (self._clock.now_ns() - away_ns) * 1e-9
+        own = {f"{self._prefix}away_s": away_s}
+        return own | (self._failures.ask(source.metrics) if isinstance(source, Reporting) else {})
+
+    def _wait(self) -> ItemT | None:
+        """Wait until the next try; return a stand-in for an item, if there is one."""
+        self._stop.wait(self._left_s)
+        self._left_s = 0.0
+        return None
+
+    def _is_measured(self, item: ItemT) -> bool:
+        """Whether an item is a new measurement; one no later than the last is not."""
+        if self._last is not None and item.t_ns <= self._last[1]:
+            self._counts["late"] += 1
+            return False
+        return True
+
+    def _ends_absence(self, item: ItemT) -> bool:
+        """Whether an item shows that the device is back."""
+        del item
+        return True
+
+    def _lose(self, error: Exception) -> None:
+        self._counts["lost"] += 1
+        if self._away_ns is None:
+            self._away_ns = self._clock.now_ns()
+        self._why = self._failures.log("lost", error)
+        self._connection_lost(f"{self._device} lost: {self._why}")
+        self._left_s = self._wait_s
+        self._drop()
+
+    def _drop(self) -> None:
+        source, self._source = self._source, None
+        if source is None:
+            return
+        self._closed_counts.update(self._counts_of(source))
+        self._failures.close(source.close)
+
+    def _counts_of(self, source: Source[ItemT] | None) -> dict[str, int]:
+        return self._failures.ask(source.counts) if isinstance(source, Reporting) else {}
+
+    def _reconnected(self) -> Source[ItemT] | None:
+        """The driver, opened again if a try is due; None: not yet, or not there."""
+        if self._left_s > 0.0:
+            return None
+        self._connection_lost(f"{self._device} away: {self._why}")
+        self._wait_s = min(2.0 * self._wait_s, self._backoff.longest_s)  # until an item has come
+        self._left_s = self._wait_s
+        try:
+            self._source = self._open()
+        except Exception as error:  # noqa: BLE001 - as above
+            self._why = self._failures.log("still away", error)
+            return None
+        self._opened_again = True
+        if self._closed.is_set():  # while it was being opened
+            self._drop()
+        return self._source
+
+    def _numbered(self, item: ItemT) -> ItemT:
+        """The item with a number that goes on where the last driver ended."""
+        if self._away_ns is not None and self._ends_absence(item):
+            self._failures.over(f"back after loss number {self._counts['lost']}")
+            self._counts["back"] += 1
+            self._away_ns, self._wait_s = None, self._backoff.first_s
+        if self._last is not None and (self._opened_again or not self._rate_hz):
+            seq, t_ns = self._last
+            self._offset = seq + max(1, round((item.t_ns - t_ns) * 1e-9 * self._rate_hz)) - item.seq
+        self._opened_again = False
+        seq = item.seq + self._offset
+        self._last = (seq, item.t_ns)
+        return item if self._offset == 0 else replace(item, seq=seq)
+
+
+class ReconnectingTracker(ReconnectingDriver[TrackerPose]):
+    """Gives poses of NaN, four a second, while the tracker's system is away.
+
+    Holds its name.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        opener: Callable[[], Source[TrackerPose]],
+        clock: Clock,
+        stop: threading.Event,
+        connection_lost: ConnectionLost = nobody,
+        *,
+        backoff: Backoff | None = None,
+        absent_s: float = 0.25,
+    ) -> None:
+        """Open the tracker; see `ReconnectingDriver`.
+
+        Args:
+            name: Of the device, for poses of NaN.
+            opener, clock, stop, connection_lost: As there.
+            backoff: By default at most 10 s, as each try leaves 100 kB in openvr (ValveSoftware/openvr, issue 1221).
+            absent_s: From one pose of NaN to the next [s].
+
+        Raises:
+            TrackerError: It is not there.
+        """
+        self._name, self._absent_s = name, absent_s
+        backoff = backoff or Backoff(longest_s=10.0)
+        super().__init__("tracker", opener, clock, stop, connection_lost, backoff=backoff)
+
+    def _wait(self) -> TrackerPose:
+        self._stop.wait(self._absent_s)
+        self._left_s -= self._absent_s
+        t_ns = self._clock.now_ns() - round(0.5e9 * self._absent_s)
+        if self._last is not None:
+            t_ns = max(t_ns, self._last[1] + 1)
+        return TrackerPose(self._name, 0, 0, t_ns, np.full(3, np.nan), np.full(4, np.nan))
+
+    def _ends_absence(self, item: TrackerPose) -> bool:
+        return bool(np.isfinite(item.position_m).all())

@@ -1,0 +1,374 @@
+"""Send what a device measures: one loop for cameras, IMUs and trackers.
+
+    Source ── item ──▶ pipeline: detect or orient, send, count ──▶ uplink
+
+A camera that looks for markers sends of every frame, the camera of a wrist device of every strobe cycle, an IMU and a
+tracker every sample and pose. Whatever a pipeline raises costs its item alone; where all items fail, the watchdog is
+not fed, and the process begins anew.
+"""
+
+import gc
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Generic, TypeVar
+
+import numpy as np
+from msgspec.structs import replace
+
+from common.arrays import Image
+from common.clock import Clock
+from common.imu_fusion import OrientationFilter
+from common.keys import Access
+from common.messages import ImuSample, MarkerDetections, Message, TagDetections, TrackerPose
+from common.zenoh_bus import ZenohBus
+from slave.counters import Counters, DetectionCounters, imu_counters, pose_counters
+from slave.report import Reporter
+from slave.service import Service
+from slave.sources import Frame, ImuSource, Reporting, Source, TrackerSource
+from slave.uplink import Uplink
+
+if TYPE_CHECKING:  # of cameras alone: the slave of an IMU starts without them
+    from slave.markers.detector import Detections
+    from slave.preview import Previews
+    from slave.raw import RawFrames
+    from slave.tuning import CameraTuning
+    from slave.wrist.detector import WristFound
+
+ItemT = TypeVar("ItemT", Frame, ImuSample, TrackerPose)
+Send = Callable[[Message], None]
+DARK_AFTER = 9  # frames without a strobe cycle, 0.1 s at 90 Hz: then every frame is shown, lit or not
+
+
+def nothing(*_arguments: object) -> None:
+    """For whom nobody needs to be told."""
+
+
+class Pipeline(Generic[ItemT]):
+    """What is done with an item: detect or orient, send, count.
+
+    Holds its counters.
+    """
+
+    def __init__(self, session: int, send: Send, counters: Counters) -> None:
+        """Send in the name of the process with id `session`; `send` never waits."""
+        self._session, self._send, self.counters = session, send, counters
+
+    def push(self, item: ItemT) -> None:
+        """Take the next item."""
+        raise NotImplementedError
+
+    def skip(self, item: ItemT) -> None:
+        """Take an item that came before the start of the master and is not sent."""
+
+
+class MarkerPipeline(Pipeline[Frame]):
+    """Detects the markers of a frame and sends them, then its tags.
+
+    A frame without any marker is sent as well.
+    """
+
+    def __init__(
+        self,
+        camera: str,
+        session: int,
+        send: Send,
+        detect: "Callable[[Image, int], Detections]",
+        counters: DetectionCounters,
+        show: Callable[[Frame], None] = nothing,
+        tags: Callable[[Frame, int, int], TagDetections | None] | None = None,
+    ) -> None:
+        """Detect in the frames of one camera.
+
+        Args:
+            camera: Name of the camera.
+            session: Random id of this process.
+            send: Sends, or counts as unsent; never waits.
+            detect: Detects the markers of an image, taken at a time [ns].
+            counters: Counts them.
+            show: Is offered every frame after that; must not wait.
+            tags: Detects the tags of a frame in this session whose markers took so long [ns]; None: not searched.
+        """
+        super().__init__(session, send, counters)
+        self._camera, self._detect, self._detections = camera, detect, counters
+        self._show, self._tags = show, tags
+
+    def push(self, item: Frame) -> None:
+        """Detect in a frame, and send."""
+        began_ns = time.perf_counter_ns()
+        found = self._detect(item.image, item.t_ns)
+        detect_ns = time.perf_counter_ns() - began_ns
+        message = MarkerDetections(
+            self._camera,
+            self._session,
+            item.seq,
+            item.t_ns,
+            item.ready_t_ns,
+            found.uv,
+            found.area,
+            found.quality,
+            found.sigma_px,
+            found.alt_uv,
+            item.t_sigma_ns,
+        )
+        self._send(message)
+        self._detections.frame(item.seq, detect_ns, found.uv)
+        if self._tags is not None:
+            tags = self._tags(item, self._session, detect_ns)
+            if tags is not None:
+                self._send(tags)
+        self._show(item)
+
+
+class WristPipeline(Pipeline[Frame]):
+    """Detects fingers where a frame completes a strobe cycle, and sends them.
+
+    A cycle without any finger is sent as well.
+
+    Holds how long the last frames took, and how many there were since the last cycle.
+    """
+
+    def __init__(
+        self,
+        camera: str,
+        session: int,
+        send: Send,
+        detect: "Callable[[Frame], WristFound | None]",
+        counters: DetectionCounters,
+        show: Callable[[Frame], None] = nothing,
+    ) -> None:
+        """Detect in the frames of one camera; see `MarkerPipeline`.
+
+        `show` is offered the frame under the LEDs of every cycle, and every frame while there are none.
+        """
+        super().__init__(session, send, counters)
+        self._camera, self._detect, self._detections, self._show = camera, detect, counters, show
+        self._took_ns: deque[int] = deque(
+            maxlen=3
+        )  # of frames that may be a cycle; those before are none of it
+        self._parts = 0
+
+    def push(self, item: Frame) -> None:
+        """Detect in a frame, and send where it completes a cycle."""
+        began_ns = time.perf_counter_ns()
+        found = self._detect(item)
+        self._took_ns.append(time.perf_counter_ns() - began_ns)
+        if found is None:
+            self.counters.item(item.seq)
+            self._parts += 1
+            if self._parts > DARK_AFTER:
+                self._show(item)
+            return
+        self._send(found.message(self._camera, self._session))
+        uv = np.vstack([found.laser.uv, found.tips.uv])
+        self._detections.frame(item.seq, sum(self._took_ns), uv)
+        self._parts = 0
+        self._show(found.cycle.led)
+
+
+class ImuPipeline(Pipeline[ImuSample]):
+    """Sends samples with the orientation of a filter, or the sensor's own.
+
+    Rates and forces stay as they were measured.
+    """
+
+    def __init__(
+        self,
+        session: int,
+        send: Send,
+        counters: Counters,
+        orient: Callable[[ImuSample], ImuSample] | None = None,
+    ) -> None:
+        """Orient by a filter; None: the sensor's own orientation is sent."""
+        super().__init__(session, send, counters)
+        self._orient = orient
+
+    def push(self, item: ImuSample) -> None:
+        """Send a sample."""
+        oriented = item if self._orient is None else self._orient(item)
+        self._send(replace(oriented, session=self._session))
+        self.counters.item(item.seq)
+
+    def skip(self, item: ImuSample) -> None:
+        """Have the filter see a sample, so that it knows its bias when samples are sent."""
+        if self._orient is not None:
+            self._orient(item)
+
+
+class PosePipeline(Pipeline[TrackerPose]):
+    """Sends poses."""
+
+    def push(self, item: TrackerPose) -> None:
+        """Send a pose."""
+        self._send(replace(item, session=self._session))
+        self.counters.item(item.seq, bool(np.isfinite(item.position_m).all()))
+
+
+def wait_for_start(
+    started: Callable[[float], bool],
+    stop: threading.Event,
+    alive: Callable[[], None] = nothing,
+    skip: Callable[[], bool] | None = None,
+) -> bool:
+    """Wait for the master as long as it takes.
+
+    False if told to stop before, or the source has ended.
+
+    Args:
+        started: Waits for the start at most so many seconds; whether it has come.
+        stop: Set when the slave is to end.
+        alive: Called every time round.
+        skip: Reads an item and forgets it; False at the end of the stream. None: nothing is read meanwhile.
+    """
+    wait_s = 0.2 if skip is None else 0.5e-3  # between two items
+    while not stop.is_set():
+        if started(wait_s):
+            return True
+        if skip is not None and not skip():
+            return False
+        alive()
+    return False
+
+
+def skip_one(source: Source[ItemT], pipeline: Pipeline[ItemT]) -> bool:
+    """Read an item before the start; False at the end of the stream.
+
+    Raises:
+        PhalanxError: The device is gone.
+    """
+    item = source.read()
+    if item is None:
+        return False
+    try:
+        pipeline.skip(item)
+    except Exception as error:  # noqa: BLE001 - one item
+        pipeline.counters.failed(item.seq, error)
+    return True
+
+
+def run(
+    source: Source[ItemT],
+    pipeline: Pipeline[ItemT],
+    stop: threading.Event,
+    alive: Callable[[], None] = nothing,
+) -> None:
+    """Push every item until the source ends or `stop` is set.
+
+    `alive` is called after each.
+
+    What the pipeline raises costs that item alone; it is counted and logged.
+
+    Raises:
+        PhalanxError: The device is gone.
+    """
+    while not stop.is_set() and (item := source.read()) is not None:
+        try:
+            pipeline.push(item)
+            alive()
+        except Exception as error:  # noqa: BLE001 - one item
+            pipeline.counters.failed(item.seq, error)
+
+
+@dataclass(frozen=True, slots=True)
+class Sender:
+    """One sending process: its name, its link, and who stops and supervises it.
+
+    Attributes:
+        name: Camera, IMU or tracker, as the rig's files call it.
+        uplink: Where messages go.
+        clock: The slave's clock.
+        stop: Set by a signal handler, or by the command "stop" on the bus.
+        notify: Called with one line when it is ready, and one at the end.
+        service: Reports what it does to the system's service manager.
+        access: How it comes to the master's bus.
+    """
+
+    name: str
+    uplink: Uplink
+    clock: Clock
+    stop: threading.Event
+    notify: Callable[[str], None]
+    service: Service
+    access: Access
+
+    def send(
+        self,
+        source: Source[ItemT],
+        pipeline: Pipeline[ItemT],
+        *,
+        skips: bool = False,
+        reported: Reporting | None = None,
+        previews: "Previews | None" = None,
+        parts: "Sequence[CameraTuning | RawFrames]" = (),
+        close: Sequence[Callable[[], None]] = (),
+    ) -> None:
+        """Wait for the master, then push items; close source and uplink.
+
+        It ends when `stop` is set or the source ends.
+
+        Args:
+            source: The open device.
+            pipeline: What is done with its items.
+            skips: Whether items are read before the start, so that none grows old in a buffer. Drivers of cameras throw
+                old frames away themselves; of a recording nothing is to be missed.
+            reported: What the reports have in place of the counters.
+            previews: Shows the camera's picture.
+            parts: Change the camera's settings; keep raw frames.
+            close: What else ends with it.
+
+        Raises:
+            PhalanxError: The device is gone.
+        """
+        reporter = Reporter(
+            self.name,
+            self.uplink,
+            pipeline.counters if reported is None else reported,
+            self.clock,
+            lambda endpoint: ZenohBus(None, endpoint, self.access),
+            self.stop.set,
+            previews=previews,
+            parts=parts,
+        )
+        try:
+            gc.collect()
+            gc.freeze()  # what lives until the end is never walked again: no pause in the loop
+            self.notify("ready, waiting for the master")
+            self.service.ready(lambda: self.uplink.started)
+            skip = partial(skip_one, source, pipeline) if skips else None
+            if wait_for_start(self.uplink.wait_for_start, self.stop, self.service.waiting, skip):
+                run(source, pipeline, self.stop, self.service.working)
+        finally:
+            self.service.stopping()
+            reporter.close()
+            if previews is not None:
+                previews.close()
+            self.uplink.close()
+            source.close()
+            for end in close:
+                end()
+        self.notify(f"{pipeline.counters.summary()}, sent {self.uplink.counts['sent']}")
+
+
+def send_samples(sender: Sender, source: ImuSource, orientation: OrientationFilter | None) -> None:
+    """Send what an IMU measures, with a filter's orientation; None: its own.
+
+    Raises:
+        ImuError: The IMU is gone.
+    """
+    counters, uplink = imu_counters(source, orientation), sender.uplink
+    orient = None if orientation is None else orientation.push
+    sender.send(source, ImuPipeline(uplink.session, uplink.send, counters, orient), skips=True)
+
+
+def send_poses(sender: Sender, source: TrackerSource, recorded: bool = False) -> None:
+    """Send where a tracker is; a `recorded` source begins with the start.
+
+    Raises:
+        TrackerError: The tracking system is gone.
+    """
+    uplink = sender.uplink
+    pipeline = PosePipeline(uplink.session, uplink.send, pose_counters(source))
+    sender.send(source, pipeline, skips=not recorded)
