@@ -64,7 +64,7 @@ def ears_of(options: argparse.Namespace) -> Ears | None:
     words += ["--bind", options.bind or f"{address or '0.0.0.0'}:{DATA_PORT}"]
     default = "127.255.255.255" if (address or "").startswith("127.") else _EVERYWHERE
     words += ["--beacon", options.beacon or f"{default}:{BEACON_PORT}"]
-    return Ears(tuple(words), options.keys, options.wait_senders_s)
+    return Ears(tuple(words), options.keys, options.wait_s)
 
 
 def reached_of(options: argparse.Namespace) -> Reached:

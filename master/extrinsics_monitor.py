@@ -25,7 +25,7 @@ class ExtrinsicsMonitor:
         poses = counts.get("poses", 0) - self._poses
         self._poses += poses
         for name, before in self._rejected.items():
-            now = counts.get(f"mostly_left_out.{name}"[:_NAME], 0)
+            now = counts.get(f"mostly_rejected.{name}"[:_NAME], 0)
             mostly = poses > 0 and now - before > 0.5 * poses
             self._rejected[name] = now
             self._looks[name] = self._looks[name] + 1 if mostly else 0

@@ -31,7 +31,7 @@ class MovedRule:
         if cameras != self._cameras:
             self._cameras = cameras
             self._window.clear()
-        out = [counts.get(f"mostly_left_out.{name}"[:_NAME], 0) for name in cameras]
+        out = [counts.get(f"mostly_rejected.{name}"[:_NAME], 0) for name in cameras]
         self._window.push(t_ns, counts.get("poses", 0), counts.get("epipolar_outliers", 0), *out)
         poses, outliers, *rejected = self._window.increase()
         enough = self._window.full and poses >= LEAST_POSES

@@ -310,4 +310,4 @@ class MarkerPipeline:
         for c in np.flatnonzero(found.rejected.any(axis=1)):
             self.counts[f"rejected.{self._names[c]}"[:_NAME]] += int(found.rejected[c].sum())
             if mostly[c]:
-                self.counts[f"mostly_left_out.{self._names[c]}"[:_NAME]] += 1
+                self.counts[f"mostly_rejected.{self._names[c]}"[:_NAME]] += 1

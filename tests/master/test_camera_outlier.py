@@ -97,7 +97,7 @@ def test_a_camera_that_was_knocked_by_two_degrees_is_left_out(
     every = len(poses) * len(MARKERS)
     assert {name: n for name, n in counts.items() if "rejected" in name} == {
         f"rejected.{knocked}": every,
-        f"mostly_left_out.{knocked}": len(poses),
+        f"mostly_rejected.{knocked}": len(poses),
     }
     assert counts["epipolar_outliers"] == 0
     assert all((pose.source != Source.HELD).all() for pose in poses[1:])
@@ -111,7 +111,7 @@ def test_markers_that_one_camera_swaps_are_taken_from_the_others(
     assert off_mm(poses).max() < 5.0
     assert counts[f"rejected.{swapped}"] == 2 * len(poses)
     assert counts["epipolar_outliers"] == 0
-    assert f"mostly_left_out.{swapped}" not in counts
+    assert f"mostly_rejected.{swapped}" not in counts
 
 
 def test_nothing_is_left_out_where_rays_meet_or_two_cameras_disagree() -> None:

@@ -99,7 +99,7 @@ def test_the_same_run_makes_the_same_bytes(tmp_path: Path) -> None:
         written(folder)
     names = {path.name for path in first.iterdir()}
     assert names == {
-        *("poses.npz", "poses-worn.npz", "object_cube.npz", f"contact_{HAND}_cube.npz", "gestures.jsonl")
+        *("poses.npz", "poses-device.npz", "object_cube.npz", f"contact_{HAND}_cube.npz", "gestures.jsonl")
     }
     for name in names:
         assert (first / name).read_bytes() == (second / name).read_bytes()

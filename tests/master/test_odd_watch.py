@@ -16,13 +16,13 @@ def looks(watch: ExtrinsicsMonitor, counts: Counter[str], seconds: int, **per_se
     return out
 
 
-def test_a_camera_that_is_mostly_left_out_is_named_once() -> None:
+def test_a_camera_that_is_mostly_rejected_is_named_once() -> None:
     watch, counts = ExtrinsicsMonitor(("left", "right", "top")), Counter[str]()
     assert not looks(watch, counts, 20, poses=60)
-    assert not looks(watch, counts, 4, poses=60, mostly_left_out__right=60)
+    assert not looks(watch, counts, 4, poses=60, mostly_rejected__right=60)
     assert not looks(watch, counts, 1, poses=60)  # a short while is no knock
-    assert not looks(watch, counts, 30, poses=60, mostly_left_out__top=25)
-    [line] = looks(watch, counts, 300, poses=60, mostly_left_out__right=50)
+    assert not looks(watch, counts, 30, poses=60, mostly_rejected__top=25)
+    [line] = looks(watch, counts, 300, poses=60, mostly_rejected__right=50)
     assert line.startswith("camera right: its rays miss")
     assert "calibrate cameras stereo" in line
 
@@ -30,7 +30,7 @@ def test_a_camera_that_is_mostly_left_out_is_named_once() -> None:
 def test_a_master_that_solves_nothing_names_nobody() -> None:
     watch, counts = (
         ExtrinsicsMonitor(("left", "right")),
-        Counter[str](poses=10, **{"mostly_left_out.left": 9}),
+        Counter[str](poses=10, **{"mostly_rejected.left": 9}),
     )
     assert not looks(watch, counts, 30)
 

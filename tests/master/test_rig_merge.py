@@ -109,7 +109,7 @@ def test_cameras_together_are_placed_as_well_as_the_worst(bench: RigSetup) -> No
     ("changes", "expected"),
     [
         ({"markers": ("thumb", "index", "back")}, "'bench' and 'side': markers: differ"),
-        ({"frame_sync": "predict"}, "'bench' and 'side': pairing: differ"),
+        ({"frame_sync": "predict"}, "'bench' and 'side': frame_sync: differ"),
         ({"solver": "fabrik"}, "'bench' and 'side': solver: differ"),
         (
             {"T_world_rig": None},

@@ -32,7 +32,7 @@ def test_a_clear_marker_is_nearly_certain() -> None:
         ("fullness", 0.5),
         ("slender", 1.2),
         ("hue", 1.0),
-        ("rival", 1.0),
+        ("alternative", 1.0),
         ("ragged", 1.0),
         ("cut", 1.0),
     ],

@@ -379,7 +379,7 @@ def test_causes_silence_what_follows_from_them_and_nothing_else() -> None:
 def test_of_three_cameras_the_one_that_moved_is_named() -> None:
     rule, verdicts = MovedRule(), list[Verdict]()
     for k in range(20):
-        counts = {"poses": 15 * k, "mostly_left_out.top": 14 * k}
+        counts = {"poses": 15 * k, "mostly_rejected.top": 14 * k}
         verdicts = list(rule.look(("left", "right", "top"), 6, counts, 250_000_000 * k))
     assert [(one.subject, one.wrong) for one in verdicts] == [
         ("left", False),

@@ -21,11 +21,9 @@ from slave.install.systemd import Systemd
 ROOT = Path(__file__).resolve().parents[3]
 LOADED = (
     "live",
-    "uplink",
+    "sender",
+    "devices",
     "simulated",
-    "imu/__init__",
-    "imu/live",
-    "imu/opening",
 )  # by a release that is looked at
 
 
