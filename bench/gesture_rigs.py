@@ -1,7 +1,7 @@
 """The six study poses of simulated people before each rig that a user may have, through rendered frames.
 
 Everybody has bones of his own and is solved with bones as a calibration measures them; a wrist device sits a little
-otherwise than its file says, by what `calibrate wrist mounting` leaves (docs/calibrate.md). Hands turn by up to 35
+otherwise than its file says, by what `calibrate wrist extrinsics` leaves (docs/calibrate.md). Hands turn by up to 35
 degrees and hide their fingers. One rendering serves two rigs: two cameras are half of four, and markers are half of
 what is fused. Frames come at 30 Hz, so that two of them are 67 ms.
 

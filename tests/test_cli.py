@@ -85,7 +85,7 @@ def test_the_check_sees_an_option_that_nobody_declared() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("words", "expected"),
     [
         (("nonsense",), "there are demo, replay"),
         (("fleet", "stat"), "did you mean status?"),

@@ -76,7 +76,7 @@ def _judge_rig(calibration: Path, name: str, used: Mapping[str, CameraPlan]) -> 
         yield _absent(
             rig.imu.name,
             f"IMU {rig.imu.name}: how it is mounted is not known; its orientation is not used.",
-            "`phalanx calibrate wrist mounting`.",
+            "`phalanx calibrate wrist extrinsics`.",
         )
     for camera in rig.cameras:
         yield from _judge_camera(calibration, rig, camera, used.get(camera))

@@ -186,7 +186,7 @@ def extrinsics(command: ArgumentParser) -> None:
 
     Examples:
       phalanx replay RECORDING --detect-only --calibration calib_json --out found
-      phalanx calibrate wrist mounting RECORDING --detections found --out calib_json
+      phalanx calibrate wrist extrinsics RECORDING --detections found --out calib_json
     """
     command.add_argument(
         "recording",

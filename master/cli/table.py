@@ -198,11 +198,11 @@ TABLE: tuple[Command | Family, ...] = (
         "master.calibrate.wrist.subject_command:subject",
     ),
     Command(
-        "calibrate wrist mounting",
+        "calibrate wrist extrinsics",
         _WRIST,
         "how it sits, how its IMU lies, and its clocks, before marker cameras",
-        "master.cli.calibrate_wrist:mounting",
-        "master.calibrate.extrinsics.command:mounting",
+        "master.cli.calibrate_wrist:extrinsics",
+        "master.calibrate.extrinsics.command:extrinsics",
     ),
     Command(
         "calibrate object",

@@ -28,7 +28,7 @@ from master.calibrate.tree_files import provenance
 from master.estimator.laser_plane import in_image, laser_points
 from master.wrist_setup import WristSetup
 
-TOOL = "calibrate wrist mounting"
+TOOL = "calibrate wrist extrinsics"
 MOTION = (
     "for ten seconds bend fingers one by one and together, bend the wrist as far one way as the other, and turn the"
     " forearm about all its axes, before the marker cameras"

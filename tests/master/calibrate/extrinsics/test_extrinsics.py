@@ -79,9 +79,9 @@ def test_the_command_writes_the_true_extrinsics_into_a_tree(
     monkeypatch.setattr(extrinsics, "calibrate_extrinsics", noted)
     monkeypatch.setattr(fit, "_COARSE_ROUNDS", (3,))
     monkeypatch.setattr(fit, "_ROUNDS", (4, 3))
-    folder, tree, picture = recorded(seen, tmp_path), tmp_path / "tree", tmp_path / "mounting.png"
+    folder, tree, picture = recorded(seen, tmp_path), tmp_path / "tree", tmp_path / "extrinsics.png"
     files = ("--out", tree, "--picture", picture, "--json", tmp_path / "found.json")
-    calibrate("mounting", folder, "--detections", folder, *files)
+    calibrate("extrinsics", folder, "--detections", folder, *files)
 
     rotation_deg, shift_mm, imu_deg, camera_ms, imu_ms = errors(found[0], seen.both).tolist()
     assert rotation_deg < 2.0  # of which most is that nobody knows when a wrist is straight
